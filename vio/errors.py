@@ -1,0 +1,31 @@
+"""Errors a user can mend. Each message says what is wrong, where, and what to do."""
+
+from __future__ import annotations
+
+
+class VioError(Exception):
+    """An expected failure; the command line prints its message in one line and exits with 1."""
+
+
+class ConfigError(VioError):
+    """A setting is unknown, of the wrong type, or contradicts another."""
+
+
+class DataError(VioError):
+    """A recording, feature file or trajectory cannot be used as it is."""
+
+
+class CalibrationError(DataError):
+    """A calibration is missing or cannot be right (zero baseline, reflected rotation, …)."""
+
+
+class EstimationError(VioError):
+    """The estimator cannot go on (divergence, no usable start)."""
+
+
+class EvaluationError(VioError):
+    """Two trajectories cannot be compared."""
+
+
+class MissingDependencyError(VioError):
+    """An optional package is needed; the message names the extra to install."""

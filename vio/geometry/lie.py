@@ -1,0 +1,195 @@
+"""SO(3) and SE(3): exponential, logarithm, adjoint and the operators of the paper's filter.
+
+Convention: a twist is `xi = [rho; phi]`, translation first; every function takes leading batch dimensions.
+Reference: Barfoot, State Estimation for Robotics (2017), chapter 7.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+FloatArray = npt.NDArray[np.float64]
+
+# Below this angle the closed forms lose digits to cancellation and the Taylor series is exact to rounding.
+_SMALL_ANGLE_RAD = 1e-2
+
+
+def so3_hat(phi: npt.ArrayLike) -> FloatArray:
+    """Map vectors (..., 3) to skew-symmetric matrices (..., 3, 3), so that `so3_hat(a) @ b = a x b`."""
+    phi = np.asarray(phi, dtype=np.float64)
+    out = np.zeros((*phi.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -phi[..., 2], phi[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = phi[..., 2], -phi[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -phi[..., 1], phi[..., 0]
+    return out
+
+
+def _sinc_terms(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3, accurate down to a = 0."""
+    small = angle < _SMALL_ANGLE_RAD
+    safe = np.where(small, 1.0, angle)
+    a2 = angle * angle
+    first = np.where(small, 1 - a2 / 6 * (1 - a2 / 20 * (1 - a2 / 42)), np.sin(safe) / safe)
+    half = np.sin(safe / 2) / (safe / 2)
+    second = np.where(small, 0.5 - a2 / 24 * (1 - a2 / 30 * (1 - a2 / 56)), 0.5 * half * half)
+    third = np.where(small, 1 / 6 - a2 / 120 * (1 - a2 / 42 * (1 - a2 / 72)), (safe - np.sin(safe)) / safe**3)
+    return first, second, third
+
+
+def so3_exp(phi: npt.ArrayLike) -> FloatArray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues' formula)."""
+    phi = np.asarray(phi, dtype=np.float64)
+    a, b, _ = _sinc_terms(np.linalg.norm(phi, axis=-1))
+    W = so3_hat(phi)
+    return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
+
+
+def quat_xyzw_from_rotation(R: npt.ArrayLike) -> FloatArray:
+    """Unit quaternions (..., 4) in x y z w order, w >= 0, of rotation matrices (..., 3, 3).
+
+    Takes the largest of the four components first, so no rotation is close to a division by zero.
+    Reference: Shepperd, Quaternion from rotation matrix, J. Guidance and Control (1978).
+    """
+    R = np.asarray(R, dtype=np.float64)
+    trace: FloatArray = np.trace(R, axis1=-2, axis2=-1)
+    # Rows of 4 q q^T, one for each component that may be the largest.
+    d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    s01, s02, s12 = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
+    a0, a1, a2 = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
+    rows = np.stack(
+        [
+            np.stack([1 + d0 - d1 - d2, s01, s02, a0], axis=-1),
+            np.stack([s01, 1 - d0 + d1 - d2, s12, a1], axis=-1),
+            np.stack([s02, s12, 1 - d0 - d1 + d2, a2], axis=-1),
+            np.stack([a0, a1, a2, 1 + trace], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(np.stack([d0, d1, d2, trace], axis=-1), axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def rotation_from_quat_xyzw(q: npt.ArrayLike) -> FloatArray:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in x y z w order; they are normalised first."""
+    raw = np.asarray(q, dtype=np.float64)
+    unit = raw / np.linalg.norm(raw, axis=-1, keepdims=True)
+    vector, w = unit[..., :3], unit[..., 3, None, None]
+    V = so3_hat(vector)
+    return np.eye(3) + 2 * w * V + 2 * (V @ V)
+
+
+def so3_log(R: npt.ArrayLike) -> FloatArray:
+    """Rotation vectors (..., 3), angle in [0, pi], of rotation matrices (..., 3, 3)."""
+    q = quat_xyzw_from_rotation(R)
+    vector, w = q[..., :3], q[..., 3]
+    s = np.linalg.norm(vector, axis=-1)
+    small = s < 1e-7
+    angle_over_s = np.where(small, 2.0, 2 * np.arctan2(s, w) / np.where(small, 1.0, s))
+    out: FloatArray = angle_over_s[..., None] * vector
+    return out
+
+
+def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
+    """Left Jacobian of SO(3), (..., 3, 3): exp(phi + d) = exp(J d) exp(phi) to first order in d."""
+    phi = np.asarray(phi, dtype=np.float64)
+    _, b, c = _sinc_terms(np.linalg.norm(phi, axis=-1))
+    W = so3_hat(phi)
+    return np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
+
+
+def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
+    """Inverse of the left Jacobian of SO(3), (..., 3, 3), for angles below 2 pi."""
+    phi = np.asarray(phi, dtype=np.float64)
+    angle = np.linalg.norm(phi, axis=-1)
+    a, b, _ = _sinc_terms(angle)
+    small = angle < _SMALL_ANGLE_RAD
+    a2 = np.where(small, 1.0, angle * angle)
+    series = 1 / 12 + angle**2 / 720 * (1 + angle**2 / 42)
+    coefficient = np.where(small, series, (1 - a / (2 * np.where(small, 1.0, b))) / a2)
+    W = so3_hat(phi)
+    return np.eye(3) - 0.5 * W + coefficient[..., None, None] * (W @ W)
+
+
+def se3_from_parts(R: npt.ArrayLike, t: npt.ArrayLike) -> FloatArray:
+    """Homogeneous transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
+    R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    out = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = R, t, 1.0
+    return out
+
+
+def se3_exp(xi: npt.ArrayLike) -> FloatArray:
+    """Transforms (..., 4, 4) of twists (..., 6) `[rho; phi]` in metres and radians."""
+    xi = np.asarray(xi, dtype=np.float64)
+    rho, phi = xi[..., :3], xi[..., 3:]
+    return se3_from_parts(so3_exp(phi), (so3_left_jacobian(phi) @ rho[..., None])[..., 0])
+
+
+def se3_log(T: npt.ArrayLike) -> FloatArray:
+    """Twists (..., 6) `[rho; phi]` of transforms (..., 4, 4); the rotation angle lies in [0, pi]."""
+    T = np.asarray(T, dtype=np.float64)
+    phi = so3_log(T[..., :3, :3])
+    rho = (so3_left_jacobian_inverse(phi) @ T[..., :3, 3, None])[..., 0]
+    return np.concatenate([rho, phi], axis=-1)
+
+
+def se3_inverse(T: npt.ArrayLike) -> FloatArray:
+    """Inverse transforms (..., 4, 4), by transposing the rotation."""
+    T = np.asarray(T, dtype=np.float64)
+    Rt = np.swapaxes(T[..., :3, :3], -1, -2)
+    return se3_from_parts(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
+
+
+def se3_hat(xi: npt.ArrayLike) -> FloatArray:
+    """The paper's hat operator: twists (..., 6) to the algebra se(3) as (..., 4, 4) matrices."""
+    xi = np.asarray(xi, dtype=np.float64)
+    out = np.zeros((*xi.shape[:-1], 4, 4))
+    out[..., :3, :3], out[..., :3, 3] = so3_hat(xi[..., 3:]), xi[..., :3]
+    return out
+
+
+def se3_curly_hat(xi: npt.ArrayLike) -> FloatArray:
+    """The adjoint of the algebra: twists (..., 6) to (..., 6, 6), `exp(curly_hat(xi)) = Ad(exp(xi))`."""
+    xi = np.asarray(xi, dtype=np.float64)
+    W = so3_hat(xi[..., 3:])
+    out = np.zeros((*xi.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = W
+    out[..., :3, 3:] = so3_hat(xi[..., :3])
+    return out
+
+
+def se3_adjoint(T: npt.ArrayLike) -> FloatArray:
+    """Adjoint matrices (..., 6, 6): `T exp(xi) T^-1 = exp(Ad(T) xi)`."""
+    T = np.asarray(T, dtype=np.float64)
+    R = T[..., :3, :3]
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = R
+    out[..., :3, 3:] = so3_hat(T[..., :3, 3]) @ R
+    return out
+
+
+def circledot(p: npt.ArrayLike) -> FloatArray:
+    """The paper's operator on points (..., 3): (..., 4, 6) with `hat(xi) [p; 1] = circledot(p) xi`."""
+    p = np.asarray(p, dtype=np.float64)
+    out = np.zeros((*p.shape[:-1], 4, 6))
+    out[..., :3, :3] = np.eye(3)
+    out[..., :3, 3:] = -so3_hat(p)
+    return out
+
+
+def transform_points(T_a_b: npt.ArrayLike, p_b: npt.ArrayLike) -> FloatArray:
+    """Map points (N, 3) or (3,) from frame b to frame a with one transform (4, 4)."""
+    T_a_b, p_b = np.asarray(T_a_b, dtype=np.float64), np.asarray(p_b, dtype=np.float64)
+    out: FloatArray = p_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    return out
+
+
+def nearest_rotation(R: npt.ArrayLike) -> FloatArray:
+    """The rotations (..., 3, 3) closest to given matrices in the Frobenius norm (by SVD)."""
+    U, _, Vt = np.linalg.svd(np.asarray(R, dtype=np.float64))
+    U[..., :, -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
+    out: FloatArray = U @ Vt
+    return out

@@ -1,0 +1,110 @@
+"""The rectified stereo camera: projection, its Jacobian, triangulation and its uncertainty.
+
+Pixels: u right, v down, the centre of the top-left pixel is (0, 0). `z = [ul vl ur vr]`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.errors import CalibrationError
+from vio.geometry.lie import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class StereoCamera:
+    """A rectified stereo pair: one intrinsic matrix, image rows aligned, cam1 at +baseline on cam0's x axis."""
+
+    fu: float  # focal length, pixels, along u
+    fv: float  # focal length, pixels, along v
+    cu: float  # principal point, pixels
+    cv: float  # principal point, pixels
+    baseline_m: float  # distance from cam0 to cam1, positive
+    width: int | None = None  # image size in pixels; None where only features are given
+    height: int | None = None
+
+    def __post_init__(self) -> None:
+        values = (self.fu, self.fv, self.cu, self.cv, self.baseline_m)
+        if not np.all(np.isfinite(values)):
+            raise CalibrationError(f"camera intrinsics are not finite: {values}; check the calibration file")
+        if self.fu <= 0 or self.fv <= 0:
+            raise CalibrationError(f"focal lengths must be positive, got fu={self.fu:g}, fv={self.fv:g}")
+        if self.baseline_m <= 0:
+            raise CalibrationError(
+                f"stereo baseline must be positive, got {self.baseline_m:g} m; a zero or negative baseline "
+                "means that both projection matrices are the same or that the cameras are swapped"
+            )
+
+    @property
+    def M(self) -> FloatArray:
+        """The paper's stereo calibration matrix (4, 4): `z = M pi(q)`."""
+        fu, fv, cu, cv = self.fu, self.fv, self.cu, self.cv
+        return np.array(
+            [[fu, 0, cu, 0], [0, fv, cv, 0], [fu, 0, cu, -fu * self.baseline_m], [0, fv, cv, 0]],
+            dtype=np.float64,
+        )
+
+    @property
+    def K(self) -> FloatArray:
+        """Intrinsic matrix (3, 3) of both cameras, pixels."""
+        return np.array([[self.fu, 0, self.cu], [0, self.fv, self.cv], [0, 0, 1]], dtype=np.float64)
+
+
+def project(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
+    """Stereo pixels (..., 4) of points (..., 3) in the cam0 frame, metres; the depth must not be zero."""
+    p = np.asarray(p_cam, dtype=np.float64)
+    x, y, depth = p[..., 0], p[..., 1], p[..., 2]
+    v = camera.fv * y / depth + camera.cv
+    ul = camera.fu * x / depth + camera.cu
+    return np.stack([ul, v, ul - camera.fu * camera.baseline_m / depth, v], axis=-1)
+
+
+def z_D_p_cam(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
+    """Jacobian (..., 4, 3) of `project` with respect to the point in the cam0 frame (pixels per metre)."""
+    p = np.asarray(p_cam, dtype=np.float64)
+    x, y, depth = p[..., 0], p[..., 1], p[..., 2]
+    out = np.zeros((*p.shape[:-1], 4, 3))
+    out[..., 0, 0] = out[..., 2, 0] = camera.fu / depth
+    out[..., 1, 1] = out[..., 3, 1] = camera.fv / depth
+    out[..., 0, 2] = -camera.fu * x / depth**2
+    out[..., 2, 2] = -camera.fu * (x - camera.baseline_m) / depth**2
+    out[..., 1, 2] = out[..., 3, 2] = -camera.fv * y / depth**2
+    return out
+
+
+def triangulate(
+    camera: StereoCamera, z: npt.ArrayLike, *, min_disparity_px: float = 0.1
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Points (N, 3) in the cam0 frame from stereo pixels (N, 4), and a mask (N,) of those that are usable.
+
+    The vertical coordinate is the mean of both images'. A disparity `ul - ur` below `min_disparity_px` (a point
+    behind the cameras, or too far to tell) gives False in the mask and an arbitrary finite point.
+    """
+    z = np.asarray(z, dtype=np.float64)
+    disparity = z[..., 0] - z[..., 2]
+    valid = np.isfinite(z).all(axis=-1) & (disparity >= min_disparity_px)
+    safe = np.where(valid, z, 0.0)
+    depth = camera.fu * camera.baseline_m / np.where(valid, disparity, 1.0)
+    x = (safe[..., 0] - camera.cu) / camera.fu * depth
+    y = ((safe[..., 1] + safe[..., 3]) / 2 - camera.cv) / camera.fv * depth
+    return np.stack([x, y, depth], axis=-1), valid
+
+
+def p_cam_D_z(camera: StereoCamera, z: npt.ArrayLike) -> FloatArray:
+    """Jacobian (..., 3, 4) of `triangulate` with respect to the stereo pixels (metres per pixel)."""
+    z = np.asarray(z, dtype=np.float64)
+    disparity = z[..., 0] - z[..., 2]
+    depth = camera.fu * camera.baseline_m / disparity
+    depth_D_ul = -depth / disparity
+    ray_x = (z[..., 0] - camera.cu) / camera.fu
+    ray_y = ((z[..., 1] + z[..., 3]) / 2 - camera.cv) / camera.fv
+    out = np.zeros((*z.shape[:-1], 3, 4))
+    out[..., 0, 0] = depth / camera.fu + ray_x * depth_D_ul
+    out[..., 0, 2] = -ray_x * depth_D_ul
+    out[..., 1, 0], out[..., 1, 2] = ray_y * depth_D_ul, -ray_y * depth_D_ul
+    out[..., 1, 1] = out[..., 1, 3] = depth / (2 * camera.fv)
+    out[..., 2, 0], out[..., 2, 2] = depth_D_ul, -depth_D_ul
+    return out

@@ -1,0 +1,81 @@
+"""The four replaceable boxes: dataset, front end, selector, viewer (and the back end they feed)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+from vio.records import (
+    Estimate,
+    Event,
+    FrontendOutput,
+    Landmarks,
+    MotionSample,
+    Observations,
+    Recording,
+    Selection,
+    StereoFrame,
+    TrackPrior,
+    UpdateReport,
+)
+
+
+class Dataset(Protocol):
+    """A recording as events in time order."""
+
+    @property
+    def recording(self) -> Recording:
+        """Calibration, times and ground truth, known without reading any frame."""
+
+    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        """Yield events of the frames `start <= index < stop` in time order.
+
+        A motion sample with the time of a frame comes before it. Motion samples from the time of frame `start` to
+        the time of frame `stop - 1` are included. With `images=False` frames carry None for both images.
+
+        Raises:
+            DataError: a file cannot be used; the message names it and the remedy.
+        """
+
+    def observations(self, index: int) -> Observations | None:
+        """Return the precomputed features of one frame; None where the recording holds images only."""
+
+
+class Frontend(Protocol):
+    """Images in, tracked stereo observations out."""
+
+    def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
+        """Track, match and detect in one frame; frames come in time order."""
+
+
+class Selector(Protocol):
+    """Decides which observations enter the filter's update."""
+
+    def select(self, observations: Observations) -> Selection:
+        """Rank the observations of one frame; called once per frame, in time order."""
+
+
+class Backend(Protocol):
+    """An estimator fed with motion samples and observations in time order."""
+
+    def propagate(self, sample: MotionSample) -> None:
+        """Take one motion sample; samples come in time order."""
+
+    def update(self, observations: Observations) -> UpdateReport:
+        """Move to the time of the observations and take them in."""
+
+    def estimate(self) -> Estimate:
+        """Return the current belief."""
+
+    def landmarks(self) -> Landmarks:
+        """Return the current map."""
+
+
+class Viewer(Protocol):
+    """Watches a run; must not change it."""
+
+    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+        """Show one processed frame."""
+
+    def close(self) -> None:
+        """Release whatever the viewer holds."""

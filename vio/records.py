@@ -1,0 +1,213 @@
+"""The records that travel between the parts: plain frozen data, no behaviour beyond slicing.
+
+Frames, units and pixel conventions are those of docs/conventions.md. Images are uint8 (H, W); ids int64;
+everything else float64. Missing is `None` or a mask, never a special number.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.stereo import StereoCamera
+
+Image: TypeAlias = npt.NDArray[np.uint8]
+IntArray: TypeAlias = npt.NDArray[np.int64]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
+BodyFrame: TypeAlias = Literal["imu", "cam0"]
+MotionSource: TypeAlias = Literal["imu", "velocity"]
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """One raw reading of an inertial measurement unit."""
+
+    time_ns: int
+    gyro: FloatArray  # (3,) rad/s, imu frame
+    accel: FloatArray  # (3,) m/s^2, imu frame, specific force (about +9.81 up at rest)
+
+
+@dataclass(frozen=True, slots=True)
+class VelocitySample:
+    """The paper's control input `u = [v; omega]`: body velocity and angular rate."""
+
+    time_ns: int
+    linear: FloatArray  # (3,) m/s, imu frame
+    angular: FloatArray  # (3,) rad/s, imu frame
+
+
+@dataclass(frozen=True, slots=True)
+class StereoFrame:
+    """One stereo exposure. The images are None where the recording holds features only, or none were asked for."""
+
+    index: int  # frame number in the recording, from 0, whatever --start says
+    time_ns: int
+    left: Image | None  # (H, W) rectified
+    right: Image | None  # (H, W) rectified
+
+
+MotionSample: TypeAlias = ImuSample | VelocitySample
+Event: TypeAlias = ImuSample | VelocitySample | StereoFrame
+
+
+@dataclass(frozen=True, slots=True)
+class Observations:
+    """What one stereo frame shows of the tracked features."""
+
+    frame_index: int
+    time_ns: int
+    ids: IntArray  # (N,) unique within the frame; an id names one feature for ever and is never reused
+    z: FloatArray  # (N, 4) rectified pixels [ul vl ur vr]; ur, vr are arbitrary where has_right is False
+    has_right: BoolArray  # (N,) False: seen in the left image only
+    stale: BoolArray  # (N,) True: the pixels are known to be old (repeated by the source) and must not be trusted
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def take(self, index: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Observations:
+        """Return the rows named by a mask (N,) or by indices (K,)."""
+        return replace(
+            self,
+            ids=self.ids[index],
+            z=self.z[index],
+            has_right=self.has_right[index],
+            stale=self.stale[index],
+        )
+
+
+def observations(
+    frame_index: int,
+    time_ns: int,
+    ids: npt.ArrayLike,
+    z: npt.ArrayLike,
+    has_right: npt.ArrayLike | None = None,
+    stale: npt.ArrayLike | None = None,
+) -> Observations:
+    """Build `Observations` from array-likes; without masks, every row is a fresh stereo observation.
+
+    Raises:
+        ValueError: shapes disagree or an id occurs twice.
+    """
+    ids_ = np.asarray(ids, dtype=np.int64).reshape(-1)
+    n = len(ids_)
+    z_ = np.asarray(z, dtype=np.float64).reshape(-1, 4)
+    right = np.ones(n, dtype=np.bool_) if has_right is None else np.asarray(has_right, dtype=np.bool_)
+    old = np.zeros(n, dtype=np.bool_) if stale is None else np.asarray(stale, dtype=np.bool_)
+    if not (len(z_) == n and right.shape == (n,) and old.shape == (n,)):
+        raise ValueError(f"observations disagree in length: {n} ids, {len(z_)} z, {right.shape}, {old.shape} masks")
+    if len(np.unique(ids_)) != n:
+        raise ValueError(f"frame {frame_index}: an id occurs twice among {n} observations")
+    return Observations(int(frame_index), int(time_ns), ids_, z_, right, old)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackPrior:
+    """What the filter expects of the next frame, offered to the front end as an initial guess."""
+
+    ids: IntArray  # (N,)
+    z: FloatArray  # (N, 4) predicted pixels
+    R_cam_prev: FloatArray | None = None  # (3, 3) rotation that maps the previous cam0 frame into the coming one
+
+
+@dataclass(frozen=True, slots=True)
+class FrontendOutput:
+    """The observations of one frame and what it took to get them."""
+
+    observations: Observations
+    tracked: int  # features carried over from the frame before, after all checks
+    matched: int  # features with a right match
+    detected: int  # features new in this frame
+    stages_ms: dict[str, float] = field(default_factory=dict)  # wall time per stage
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which observations enter the update, and why."""
+
+    chosen: BoolArray  # (N,)
+    score: FloatArray  # (N,) the quantity that was ranked; larger is better
+    reason: str  # one line for the log
+
+
+@dataclass(frozen=True, slots=True)
+class Landmarks:
+    """Points of the map."""
+
+    ids: IntArray  # (M,)
+    p_world: FloatArray  # (M, 3) metres
+    covariance: FloatArray  # (M, 3, 3) m^2
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """The filter's belief at one time."""
+
+    time_ns: int
+    T_world_imu: FloatArray  # (4, 4)
+    covariance: FloatArray  # (6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat, [rho; phi], m and rad
+    velocity_world: FloatArray | None = None  # (3,) m/s
+    gyro_bias: FloatArray | None = None  # (3,) rad/s
+    accel_bias: FloatArray | None = None  # (3,) m/s^2
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateReport:
+    """What one filter update did."""
+
+    used: int  # observations that moved the state
+    gated: int  # observations rejected by the chi-square gate
+    initialised: int  # landmarks created
+    landmarks: int  # landmarks in the map
+    innovation_median_px: float | None  # median absolute innovation before the update, all gated-in rows
+    nis_per_dof: float | None  # normalised innovation squared over its degrees of freedom; about 1 when consistent
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses over time of one named frame in some world frame."""
+
+    T_world_body: FloatArray  # (N, 4, 4)
+    times_ns: IntArray | None  # (N,) strictly increasing; None: poses are numbered by frame, as in KITTI files
+    body: BodyFrame  # what the poses describe
+    frame_indices: IntArray | None = None  # (N,) frame number of each pose where known
+
+    def __len__(self) -> int:
+        return len(self.T_world_body)
+
+    @property
+    def positions(self) -> FloatArray:
+        """Positions (N, 3) in the world frame, metres."""
+        return self.T_world_body[:, :3, 3]
+
+    def in_cam0(self, T_cam0_imu: FloatArray) -> Trajectory:
+        """Return the same motion described by the left camera; unchanged if it already is."""
+        if self.body == "cam0":
+            return self
+        return replace(self, T_world_body=self.T_world_body @ se3_inverse(T_cam0_imu), body="cam0")
+
+    def in_imu(self, T_cam0_imu: FloatArray) -> Trajectory:
+        """Return the same motion described by the IMU; unchanged if it already is."""
+        if self.body == "imu":
+            return self
+        return replace(self, T_world_body=self.T_world_body @ T_cam0_imu, body="imu")
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What is known of a recording before its first frame is read."""
+
+    kind: str  # "kitti", "ece276a", "utias", …
+    path: Path
+    camera: StereoCamera  # rectified
+    T_cam0_imu: FloatArray | None  # (4, 4); None: no inertial sensor, the body is cam0
+    frame_times_ns: IntArray  # (F,) strictly increasing
+    has_images: bool
+    motion: frozenset[MotionSource]  # which motion samples the events carry
+    reference: Trajectory | None  # ground truth lying in the recording
+    landmarks_reference: Landmarks | None = None  # surveyed landmark positions, covariance zero
+    notes: tuple[str, ...] = ()  # what the reader found and mended; each is logged once as a warning
