@@ -10,4 +10,4 @@ T = TypeVar("T")
 
 def setting(default: T, doc: str, *, unit: str = "") -> T:
     """Declare a dataclass field with a default, a one-line meaning and a unit, shown by `vio config --show`."""
-    return field(default=default, metadata={"doc": doc, "unit": unit})  # type: ignore[no-any-return]
+    return field(default=default, metadata={"doc": doc, "unit": unit})
