@@ -1,1 +1,43 @@
 """Images in, tracked stereo observations out. Knows OpenCV; nothing in `vio`'s filters imports it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from frontend.settings import FrontendSettings, KltSettings
+from vio.errors import ConfigError
+from vio.geometry.stereo import StereoCamera
+from vio.protocols import Dataset, Frontend
+
+__all__ = ["BUILDERS", "FrontendSettings", "KltSettings", "build_frontend"]
+
+
+def _build_klt(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
+    from frontend.klt import KltFrontend
+
+    return KltFrontend(camera, settings.klt)
+
+
+def _build_precomputed(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
+    from frontend.precomputed import PrecomputedFrontend
+
+    return PrecomputedFrontend(dataset.observations)
+
+
+BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset], Frontend]] = {
+    "klt": _build_klt,
+    "precomputed": _build_precomputed,
+}
+
+
+def build_frontend(name: str, camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
+    """Build the front end called `name`; "auto" is chosen by what the recording holds.
+
+    Raises:
+        ConfigError: no front end has this name.
+    """
+    if name == "auto":
+        name = "klt" if dataset.recording.has_images else "precomputed"
+    if name not in BUILDERS:
+        raise ConfigError(f"frontend.name: there is no front end {name!r}; choose one of auto, {', '.join(BUILDERS)}")
+    return BUILDERS[name](camera, settings, dataset)

@@ -1,0 +1,113 @@
+"""Corners for new tracks: strongest first, spread over a grid, at a distance from the features that are tracked."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from frontend.settings import KltSettings
+from vio.geometry.lie import FloatArray
+from vio.records import Image, IntArray
+
+Response = npt.NDArray[np.float32]
+
+_BLOCK_PX = 5
+_GRADIENT_PX = 3
+# cornerMinEigenVal sums squared Sobel derivatives over the block and scales them so that a ramp of one gray level a
+# pixel over the whole block gives this eigenvalue.
+_UNIT_RAMP = (1.0 / 255.0) ** 2 / _BLOCK_PX
+
+
+def feature_spacing(width: int, height: int, settings: KltSettings) -> float:
+    """Spacing in pixels of `target_features` points spread evenly over the image."""
+    return math.sqrt(width * height / settings.target_features)
+
+
+def min_distance_px(width: int, height: int, settings: KltSettings) -> int:
+    """Least distance in pixels between features in an image of this size."""
+    return max(2, round(settings.min_distance * feature_spacing(width, height, settings)))
+
+
+def grid_shape(width: int, height: int, settings: KltSettings) -> tuple[int, int]:
+    """Rows and columns of the balancing grid: nearly square cells that hold `cell_features` features each."""
+    cell = feature_spacing(width, height, settings) * math.sqrt(settings.cell_features)
+    return max(1, round(height / cell)), max(1, round(width / cell))
+
+
+def cell_index(points: FloatArray, width: int, height: int, shape: tuple[int, int]) -> IntArray:
+    """Number (N,) of the grid cell, row by row, that holds each point (N, 2)."""
+    rows, columns = shape
+    column = np.clip((points[:, 0] * columns / width).astype(np.int64), 0, columns - 1)
+    row = np.clip((points[:, 1] * rows / height).astype(np.int64), 0, rows - 1)
+    return row * columns + column
+
+
+def corner_response(image: Image) -> Response:
+    """Smaller eigenvalue (H, W) of the structure tensor, as mean squared gradient in the weakest direction.
+
+    Unit: squared gray levels per squared pixel. Reference: Shi & Tomasi, Good features to track, CVPR (1994).
+    """
+    response = cv2.cornerMinEigenVal(image, _BLOCK_PX, ksize=_GRADIENT_PX)
+    return np.asarray(response, dtype=np.float32) / np.float32(_UNIT_RAMP)
+
+
+def local_maxima(response: Response, occupied: FloatArray, distance: int, border: int, least: float) -> IntArray:
+    """Pixels (K, 2) `[u v]` that are the largest response within `distance` and not near `occupied` (N, 2).
+
+    Near is meant in the maximum norm. Neither the outermost `border` pixels nor responses below `least` give any.
+    """
+    height, width = response.shape
+    blocked = np.zeros((height, width), dtype=np.uint8)
+    if len(occupied):
+        taken = np.clip(np.rint(occupied).astype(np.int64), 0, [width - 1, height - 1])
+        blocked[taken[:, 1], taken[:, 0]] = 1
+        blocked = np.asarray(cv2.dilate(blocked, np.ones((2 * distance + 1, 2 * distance + 1), np.uint8)), np.uint8)
+    free = np.where(blocked == 0, response, np.float32(0.0))
+    peak = cv2.dilate(free, np.ones((2 * distance + 1, 2 * distance + 1), np.uint8))
+    found = (free == peak) & (free >= max(least, 1e-12))
+    found[:border], found[height - border :], found[:, :border], found[:, width - border :] = False, False, False, False
+    v, u = np.nonzero(found)
+    return np.stack([u, v], axis=1)
+
+
+def detect_corners(image: Image, occupied: FloatArray, settings: KltSettings) -> FloatArray:
+    """Find new corners (K, 2), sub-pixel, where the grid has too few of the tracked points `occupied` (N, 2).
+
+    Each cell is filled up to `cell_features` by its strongest corners; what is then missing of `target_features`
+    comes from cells with corners to spare, up to twice the cell's share. The strongest of each cell come first.
+    """
+    height, width = image.shape
+    missing = settings.target_features - len(occupied)
+    border = settings.stereo_radius_px + 3
+    if missing <= 0 or min(height, width) <= 4 * border:
+        return np.zeros((0, 2))
+    response = corner_response(image)
+    distance = min_distance_px(width, height, settings)
+    candidates = local_maxima(response, occupied, distance, border, settings.min_gradient**2)
+    shape = grid_shape(width, height, settings)
+    cell = cell_index(candidates.astype(np.float64), width, height, shape)
+    held = np.bincount(cell_index(occupied, width, height, shape), minlength=shape[0] * shape[1])
+    strength = response[candidates[:, 1], candidates[:, 0]]
+    order = np.lexsort((candidates[:, 0], candidates[:, 1], -strength, cell))
+    first = np.searchsorted(cell[order], np.arange(shape[0] * shape[1]))
+    level = np.arange(len(order)) - first[cell[order]] + held[cell[order]]  # features that the cell then holds already
+    # Cells are filled evenly, emptiest first; among equals the strongest corner wins.
+    queue = np.lexsort((-strength[order], level))
+    queue = queue[level[queue] < 2 * settings.cell_features][:missing]
+    chosen = candidates[order[queue]]
+    return chosen + _peak_offset(response, chosen)
+
+
+def _peak_offset(response: Response, pixels: IntArray) -> FloatArray:
+    """Sub-pixel offset (K, 2) of each response peak, by a parabola through its neighbours in each direction."""
+    u, v = pixels[:, 0], pixels[:, 1]
+    centre = response[v, u].astype(np.float64)
+    offsets = []
+    for before, after in ((response[v, u - 1], response[v, u + 1]), (response[v - 1, u], response[v + 1, u])):
+        curvature = before.astype(np.float64) - 2 * centre + after
+        slope = (before.astype(np.float64) - after) / 2
+        offsets.append(np.where(curvature < 0, slope / np.where(curvature < 0, curvature, 1.0), 0.0))
+    return np.clip(np.stack(offsets, axis=1), -0.5, 0.5)

@@ -1,0 +1,202 @@
+"""Which tracks move as the static world does: consensus on the camera's motion between two frames.
+
+Points triangulated in the previous frame are fitted to their pixels in the current one. Minimal sets of three points
+start from an expected motion and are refined by Gauss-Newton, all sets at once; the best is refined on its inliers.
+Reference: Fischler & Bolles, Random sample consensus, CACM (1981); Torr & Zisserman, MLESAC, CVIU (2000), for the
+truncated cost; Geiger et al., StereoScan, IV (2011), for Gauss-Newton on minimal sets of stereo points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from frontend.settings import KltSettings
+from vio.geometry.lie import FloatArray, circledot, se3_exp, se3_from_parts, so3_log, transform_points
+from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
+from vio.records import BoolArray
+
+_MIN_DEPTH_M = 0.05
+_MIN_POINTS = 8  # with fewer, agreement by chance cannot be told from motion
+_MIN_SHARE = 0.2  # a consensus of fewer points says nothing
+_SAMPLE_ITERATIONS = 5
+_REFINE_ITERATIONS = 6
+_DAMPING = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Consensus:
+    """The camera motion that most points agree on."""
+
+    T_curr_prev: FloatArray  # (4, 4) maps the previous cam0 frame into the current one
+    inliers: BoolArray  # (N,)
+
+
+def pixel_errors(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Distances (..., N) in pixels between points (N, 3) moved by motions (..., 4, 4) and pixels (N, 2).
+
+    Points that end up behind the camera have infinite distance.
+    """
+    p = p_prev @ np.swapaxes(T_curr_prev[..., :3, :3], -1, -2) + T_curr_prev[..., None, :3, 3]
+    ahead = p[..., 2] > _MIN_DEPTH_M
+    depth = np.where(ahead, p[..., 2], 1.0)
+    du = camera.fu * p[..., 0] / depth + camera.cu - pixels[:, 0]
+    dv = camera.fv * p[..., 1] / depth + camera.cv - pixels[:, 1]
+    return np.where(ahead, np.sqrt(du * du + dv * dv), np.inf)
+
+
+def _gauss_newton(
+    camera: StereoCamera,
+    T: FloatArray,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    weight: FloatArray,
+    *,
+    iterations: int,
+    free: slice,
+) -> FloatArray:
+    """Refine motions (H, 4, 4), each on its own points (H, K, 3), pixels (H, K, 2) and weights (H, K).
+
+    `free` names the part of the twist `[rho; phi]` that may change: all of it, or the translation alone.
+    """
+    for _ in range(iterations):
+        p = p_prev @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        ahead = p[..., 2] > _MIN_DEPTH_M
+        p = np.where(ahead[..., None], p, np.array([0.0, 0.0, 1.0]))
+        w = np.where(ahead, weight, 0.0)
+        residual = pixels - project(camera, p)[..., :2]
+        pixel_D_xi = z_D_p_cam(camera, p)[..., :2, :] @ circledot(p)[..., :3, free]
+        n = pixel_D_xi.shape[-1]
+        J = (pixel_D_xi * w[..., None, None]).reshape(len(T), -1, n)
+        r = (residual * w[..., None]).reshape(len(T), -1, 1)
+        A = np.swapaxes(J, 1, 2) @ J
+        A = A + (_DAMPING * np.trace(A, axis1=1, axis2=2)[:, None, None] / n + 1e-9) * np.eye(n)
+        step = np.linalg.solve(A, np.swapaxes(J, 1, 2) @ r)[..., 0]
+        xi = np.zeros((len(T), 6))
+        xi[:, free] = np.clip(step, -5.0, 5.0)
+        T = se3_exp(xi) @ T
+    return T
+
+
+def _refine(
+    camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray, scale_px: float, free: slice
+) -> FloatArray:
+    """Refine one motion (4, 4) on all points, those far from it counting little (Geman-McClure weights)."""
+    for _ in range(_REFINE_ITERATIONS):
+        error = pixel_errors(camera, T, p_prev, pixels)
+        weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
+        T = _gauss_newton(camera, T[None], p_prev[None], pixels[None], weight[None], iterations=1, free=free)[0]
+    return T
+
+
+def _search(
+    camera: StereoCamera,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    starts: FloatArray,
+    rng: np.random.Generator,
+    settings: KltSettings,
+    free: slice,
+) -> tuple[FloatArray, BoolArray]:
+    """Best motion (4, 4) over minimal sets and over the starts (S, 4, 4) themselves, with its inliers (N,)."""
+    limit = settings.consensus_px
+    sets = rng.integers(0, len(p_prev), size=(settings.consensus_samples, 3))
+    begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
+    T = np.broadcast_to(begin, (len(sets), 4, 4))
+    T = _gauss_newton(
+        camera, T, p_prev[sets], pixels[sets], np.ones(sets.shape), iterations=_SAMPLE_ITERATIONS, free=free
+    )
+    T = np.concatenate([starts, T])
+    cost = np.minimum(pixel_errors(camera, T, p_prev, pixels), limit) ** 2
+    best = _refine(camera, T[int(np.argmin(cost.sum(axis=1)))], p_prev, pixels, limit / 2, free)
+    return best, pixel_errors(camera, best, p_prev, pixels) <= limit
+
+
+def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:
+    """Index of the start whose median error is smallest; far beyond the limit all starts are alike."""
+    error = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)
+    return int(np.argmin(np.median(error, axis=1)))
+
+
+def rigid_consensus(
+    camera: StereoCamera,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    expected: FloatArray,
+    R_prior: FloatArray | None,
+    rng: np.random.Generator,
+    settings: KltSettings,
+) -> Consensus | None:
+    """Find the motion that most static points follow.
+
+    A large moving object can win the vote. Where a rotation is predicted from outside (`R_prior`) and the vote turns
+    away from it, the best motion with that rotation is preferred, provided enough points support it.
+
+    Args:
+        camera: rectified camera.
+        p_prev: points (N, 3) triangulated in the previous frame, metres, previous cam0 frame.
+        pixels: left pixels (N, 2) of the same points in the current frame.
+        expected: motion (4, 4) to start from, `T_curr_prev`.
+        R_prior: predicted rotation (3, 3) from the previous to the current cam0 frame, or None.
+        rng: source of the samples; the same state gives the same result to the bit.
+        settings: thresholds.
+
+    Returns:
+        None where there are too few points, or too few that agree.
+    """
+    if len(p_prev) < _MIN_POINTS:
+        return None
+    starts = [expected, np.eye(4)]
+    if R_prior is not None:
+        starts.insert(0, se3_from_parts(R_prior, expected[:3, 3]))
+    T, inliers = _search(camera, p_prev, pixels, np.stack(starts), rng, settings, slice(0, 6))
+    if R_prior is not None:
+        turn_deg = float(np.degrees(np.linalg.norm(so3_log(T[:3, :3] @ R_prior.T))))
+        if turn_deg > settings.prior_max_deviation_deg:
+            fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
+            T_prior, kept = _search(camera, p_prev, pixels, fixed, rng, settings, slice(0, 3))
+            if kept.sum() >= max(_MIN_POINTS, settings.prior_min_support * inliers.sum()):
+                T = _refine(camera, T_prior, p_prev[kept], pixels[kept], settings.consensus_px / 2, slice(0, 6))
+                inliers = pixel_errors(camera, T, p_prev, pixels) <= settings.consensus_px
+    if inliers.sum() < max(_MIN_POINTS, _MIN_SHARE * len(inliers)):
+        return None
+    return Consensus(T, inliers)
+
+
+def epipolar_distance(
+    camera: StereoCamera, T_curr_prev: FloatArray, previous: FloatArray, current: FloatArray, near_m: float
+) -> FloatArray:
+    """Distance (N,) in pixels from the part of the epipolar line between depth `near_m` and infinity.
+
+    `previous` and `current` are left pixels (N, 2). Unlike the epipolar line, the segment stays defined when the
+    camera only turns or stands still: it shrinks to a point.
+    """
+    rays = np.stack(
+        [(previous[:, 0] - camera.cu) / camera.fu, (previous[:, 1] - camera.cv) / camera.fv, np.ones(len(previous))],
+        axis=1,
+    )
+    ends = []
+    for p in (rays @ T_curr_prev[:3, :3].T, transform_points(T_curr_prev, rays * near_m)):
+        depth = np.maximum(p[:, 2:], 1e-3)
+        ends.append(p[:, :2] / depth * [camera.fu, camera.fv] + [camera.cu, camera.cv])
+    far, along = ends[0], ends[1] - ends[0]
+    length2 = np.maximum((along**2).sum(axis=1), 1e-12)
+    place = np.clip(((current - far) * along).sum(axis=1) / length2, 0.0, 1.0)
+    return np.linalg.norm(current - far - place[:, None] * along, axis=1)
+
+
+def fit_motion(
+    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, start: FloatArray, settings: KltSettings
+) -> FloatArray | None:
+    """Motion (4, 4) `T_curr_prev` that predicted pixels (N, 2) of points (N, 3) stand for; None with too few points."""
+    finite = np.isfinite(pixels).all(axis=1)
+    if finite.sum() < _MIN_POINTS:
+        return None
+    p, z = p_prev[finite], pixels[finite]
+    T = _gauss_newton(
+        camera, start[None], p[None], z[None], np.ones((1, len(p))), iterations=_SAMPLE_ITERATIONS, free=slice(0, 6)
+    )[0]
+    T = _refine(camera, T, p, z, settings.consensus_px, slice(0, 6))
+    fits = pixel_errors(camera, T, p, z) <= settings.consensus_px
+    return T if fits.mean() > 0.5 else None

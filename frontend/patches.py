@@ -1,0 +1,39 @@
+"""Small image patches around many points at once, without a loop over the points."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
+
+from vio.records import BoolArray, Image, IntArray
+
+Patches = npt.NDArray[np.float32]  # (N, h, w) gray levels
+
+
+def inside(image: Image, points: npt.NDArray[np.float64], margin: float) -> BoolArray:
+    """Mask (N,) of finite points (N, 2) at least `margin` pixels away from the image's outermost pixel centres."""
+    height, width = image.shape
+    u, v = points[:, 0], points[:, 1]
+    return (u >= margin) & (u <= width - 1 - margin) & (v >= margin) & (v <= height - 1 - margin)
+
+
+def integer_patches(image: Image, top_left: IntArray, height: int, width: int) -> Patches:
+    """Patches (N, height, width) whose first pixel is `top_left` (N, 2) `[u v]`; all must lie inside the image."""
+    windows = sliding_window_view(image, (height, width))
+    return windows[top_left[:, 1], top_left[:, 0]].astype(np.float32)
+
+
+def bilinear_patches(image: Image, centres: npt.NDArray[np.float64], radius: int) -> Patches:
+    """Patches (N, 2r+1, 2r+1) centred at sub-pixel points (N, 2), interpolated linearly.
+
+    Points closer than `radius + 1` pixels to the border are moved inwards: mask them out with `inside`.
+    """
+    height, width = image.shape
+    limit = np.array([width - radius - 2, height - radius - 2])
+    base = np.clip(np.floor(centres).astype(np.int64), radius, limit)
+    fraction = np.clip(centres - base, 0.0, 1.0).astype(np.float32)
+    block = integer_patches(image, base - radius, 2 * radius + 2, 2 * radius + 2)
+    a, b = fraction[:, 0, None, None], fraction[:, 1, None, None]
+    rows = block[:, :, :-1] + a * (block[:, :, 1:] - block[:, :, :-1])
+    return rows[:, :-1] + b * (rows[:, 1:] - rows[:, :-1])
