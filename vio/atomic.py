@@ -1,0 +1,130 @@
+"""Files and folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+from vio.errors import DataError, VioError
+
+logger = logging.getLogger(__name__)
+
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+def _sibling(path: Path, kind: str) -> Path:
+    """A name beside `path` that nobody else uses: hidden, on the same file system, so that a rename is atomic."""
+    return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.{kind}")
+
+
+def _unwritable(path: Path, error: OSError) -> DataError:
+    return DataError(f"cannot write {path}: {error.strerror or error}; choose a writable place with enough free space")
+
+
+def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file so that it holds either its old content or all of the new; its folder must exist.
+
+    Raises:
+        DataError: the folder is missing or not writable, or the disk is full.
+    """
+    target = Path(path)
+    partial = _sibling(target, "partial")
+    try:
+        try:
+            with partial.open("xb") as stream:
+                stream.write(data)
+                stream.flush()
+                os.fsync(stream.fileno())
+            partial.replace(target)
+        finally:
+            partial.unlink(missing_ok=True)
+    except OSError as error:
+        raise _unwritable(target, error) from error
+
+
+def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
+    r"""Write a UTF-8 text file with `\n` line ends, whole or not at all; its folder must exist.
+
+    Raises:
+        DataError: the folder is missing or not writable, or the disk is full.
+    """
+    atomic_write_bytes(path, text.encode("utf-8"))
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | os.PathLike[str], *, replace: bool, marker: str | None = None) -> Iterator[Path]:
+    """Give a temporary folder that becomes `path` when the block ends well, and vanishes when it does not.
+
+    Missing parent folders are made (and taken away again on failure). With `replace`, an old folder is moved aside at
+    the end and removed only after the new one stands; it must be empty or hold the file named by `marker`, so that
+    a mistyped path never costs a user's own files.
+
+    Raises:
+        VioError: `path` exists and may not be replaced.
+        DataError: the parent is not writable, or the disk is full.
+    """
+    target = Path(path).absolute()
+    _refuse_to_lose(target, replace, marker)
+    partial = _sibling(target, "partial")
+    parents = [parent for parent in target.parents if not parent.exists()]
+    done = False
+    try:
+        try:
+            partial.mkdir(parents=True)
+        except OSError as error:
+            raise _unwritable(target, error) from error
+        try:
+            yield partial
+        except OSError as error:
+            if error.errno in _NO_SPACE:
+                raise _unwritable(target, error) from error
+            raise
+        _refuse_to_lose(target, replace, marker)  # someone may have made it meanwhile
+        try:
+            _swap_in(partial, target)
+        except OSError as error:
+            raise _unwritable(target, error) from error
+        done = True
+    finally:
+        if not done:
+            shutil.rmtree(partial, ignore_errors=True)
+            for parent in parents:
+                with contextlib.suppress(OSError):
+                    parent.rmdir()
+
+
+def _refuse_to_lose(target: Path, replace: bool, marker: str | None) -> None:
+    """Raise VioError unless `target` is free or may be replaced."""
+    if not os.path.lexists(target):
+        return
+    if not replace:
+        raise VioError(f"{target} exists already; choose another place, remove it, or allow it to be replaced")
+    if target.is_symlink() or not target.is_dir():
+        raise VioError(f"{target} is not a folder and will not be replaced; choose another place")
+    if any(target.iterdir()) and (marker is None or not (target / marker).is_file()):
+        wanted = "" if marker is None else f" (it has no {marker})"
+        raise VioError(f"{target} was not made by this program{wanted} and will not be replaced; choose another place")
+
+
+def _swap_in(partial: Path, target: Path) -> None:
+    """Rename `partial` to `target`, and remove what stood there only after that."""
+    if not target.exists():
+        partial.rename(target)
+        return
+    old = _sibling(target, "old")
+    target.rename(old)
+    try:
+        partial.rename(target)
+    except OSError:
+        old.rename(target)
+        raise
+    try:
+        shutil.rmtree(old)
+    except OSError as error:
+        logger.warning("%s stands, but the folder it replaced is still at %s: %s", target, old, error)

@@ -1,0 +1,283 @@
+"""Trajectory files: TUM, KITTI and EuRoC ground truth.
+
+Times never pass through a float: they are integer nanoseconds here and decimal text in the files.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, NoReturn, TypeAlias, get_args
+
+import numpy as np
+
+from vio.atomic import atomic_write_text
+from vio.errors import DataError
+from vio.geometry.lie import (
+    FloatArray,
+    nearest_rotation,
+    quat_xyzw_from_rotation,
+    rotation_from_quat_xyzw,
+    se3_from_parts,
+)
+from vio.records import BodyFrame, IntArray, Trajectory
+
+logger = logging.getLogger(__name__)
+
+TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
+
+ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one that is still read as rounding
+_EXACT = 1e-12  # rotations this close to orthonormal keep their bits
+_NS_PER_S = 10**9
+_INT64_MAX = 2**63 - 1
+_COLUMNS: dict[TrajectoryFormat, str] = {
+    "tum": "8 columns 'timestamp tx ty tz qx qy qz qw'",
+    "kitti": "12 columns, the first three rows of a 4x4 pose",
+    "euroc": "at least 8 comma-separated columns 'timestamp [ns], px, py, pz, qw, qx, qy, qz'",
+}
+_DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """The fields of a text file, still text, and where they stood."""
+
+    path: Path
+    comments: list[str]  # without the leading '#'
+    rows: list[list[str]]
+    line_numbers: list[int]  # from 1, one per row
+    commas: bool  # what separates the fields of the first row; else white space
+
+    def fail(self, row: int, what: str) -> NoReturn:
+        raise DataError(f"{self.path}, line {self.line_numbers[row]}: {what}")
+
+
+def read_trajectory(
+    path: str | os.PathLike[str], *, fmt: TrajectoryFormat | None = None, body: BodyFrame | None = None
+) -> Trajectory:
+    """Read a trajectory; the format is told from the content unless given.
+
+    A KITTI file describes cam0 and has no times; an EuRoC file describes the IMU; a TUM file describes what its
+    comment `# body: imu` or `# body: cam0` says, else the IMU. `body` overrides all of these. A comment
+    `# frames: 0-41 45-99` in a TUM file (as `write_tum` leaves) numbers the poses.
+
+    Raises:
+        DataError: the file cannot be used; the message names file, line and remedy.
+    """
+    if fmt is not None and fmt not in get_args(TrajectoryFormat):
+        raise DataError(f"unknown trajectory format {fmt!r}; choose one of {', '.join(get_args(TrajectoryFormat))}")
+    table = _read_table(Path(path))
+    if not table.rows:
+        raise DataError(f"{table.path}: holds no poses; give a TUM, KITTI or EuRoC trajectory file")
+    kind = fmt or _detect(table)
+    _check_columns(table, kind)
+    if kind == "kitti":
+        return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
+    times_ns = _times_ns(table, kind)
+    poses = _quaternion_poses(table, kind)
+    said = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
+    frames = _header(table, r"frames:\s*(.*\S)") if kind == "tum" else None
+    return Trajectory(
+        poses,
+        times_ns,
+        _body(table, said, body) or _DEFAULT_BODY[kind],
+        None if frames is None else _parse_frames(table, frames),
+    )
+
+
+def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write `timestamp tx ty tz qx qy qz qw`, seconds with nine decimals, metres; body and frames in the comments.
+
+    Raises:
+        DataError: the trajectory has no times, or the place cannot be written.
+    """
+    if trajectory.times_ns is None:
+        raise DataError(f"cannot write {path}: a TUM file needs times and this trajectory has none; write KITTI form")
+    lines = [f"# body: {trajectory.body}"]
+    if trajectory.frame_indices is not None and len(trajectory):
+        lines.append(f"# frames: {_format_frames(trajectory.frame_indices)}")
+    lines.append("# timestamp tx ty tz qx qy qz qw")
+    q_xyzw = quat_xyzw_from_rotation(trajectory.T_world_body[:, :3, :3])
+    values = np.concatenate([trajectory.positions, q_xyzw], axis=1)
+    lines += [f"{_seconds(t)} {_numbers(row)}" for t, row in zip(trajectory.times_ns.tolist(), values, strict=True)]
+    atomic_write_text(path, "\n".join(lines) + "\n")
+
+
+def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write the first three rows of each cam0 pose as 12 numbers a line, without comments.
+
+    Row k is taken for frame k by every reader of this form; frames numbered otherwise are warned of.
+
+    Raises:
+        DataError: the poses describe the IMU, or the place cannot be written.
+    """
+    if trajectory.body != "cam0":
+        raise DataError(f"cannot write {path}: KITTI form describes cam0; convert with Trajectory.in_cam0 first")
+    frames = trajectory.frame_indices
+    if frames is not None and not np.array_equal(frames, np.arange(len(trajectory))):
+        logger.warning(
+            "%s: its rows are the frames %s; tools that number rows from 0 will misread them",
+            path,
+            _format_frames(frames),
+        )
+    rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12)
+    atomic_write_text(path, "".join(f"{_numbers(row)}\n" for row in rows))
+
+
+def _read_table(path: Path) -> _Table:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise DataError(f"cannot read trajectory {path}: {error.strerror}; give a readable file") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: is not a text file; give a TUM, KITTI or EuRoC trajectory file") from error
+    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    data = [(number, line) for number, line in lines if not line.startswith("#")]
+    commas = bool(data) and "," in data[0][1]
+    return _Table(
+        path,
+        comments=[line[1:].strip() for _, line in lines if line.startswith("#")],
+        rows=[[field.strip() for field in line.split(",")] if commas else line.split() for _, line in data],
+        line_numbers=[number for number, _ in data],
+        commas=commas,
+    )
+
+
+def _detect(table: _Table) -> TrajectoryFormat:
+    """Tell the format from the first row."""
+    if table.commas:
+        return "euroc"
+    n = len(table.rows[0])
+    if n not in (8, 12):
+        forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
+        table.fail(0, f"{n} columns fit no known format ({forms})")
+    return "tum" if n == 8 else "kitti"
+
+
+def _check_columns(table: _Table, kind: TrajectoryFormat) -> None:
+    expected = len(table.rows[0]) if kind == "euroc" else {"tum": 8, "kitti": 12}[kind]
+    if kind == "euroc":
+        expected = max(expected, 8)
+    for row, fields in enumerate(table.rows):
+        if len(fields) != expected:
+            table.fail(row, f"{len(fields)} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}")
+
+
+def _floats(table: _Table, first: int, last: int) -> FloatArray:
+    """Columns `first <= column < last` as finite numbers (N, last - first)."""
+    out = np.empty((len(table.rows), last - first))
+    for row, fields in enumerate(table.rows):
+        try:
+            out[row] = [float(field) for field in fields[first:last]]
+        except ValueError as error:
+            table.fail(row, f"{error}; only numbers and comment lines with '#' may stand here")
+    bad = ~np.isfinite(out).all(axis=1)
+    if bad.any():
+        table.fail(int(np.argmax(bad)), f"a pose is not finite (first of {int(bad.sum())}); remove such lines")
+    return out
+
+
+def _times_ns(table: _Table, kind: TrajectoryFormat) -> IntArray:
+    """The first column as strictly increasing integer nanoseconds (N,)."""
+    times = [_time_ns(table, row, kind) for row in range(len(table.rows))]
+    for row in range(1, len(times)):
+        if times[row] <= times[row - 1]:
+            what = "repeats" if times[row] == times[row - 1] else "runs backwards from"
+            table.fail(row, f"the time {what} that of the pose before; sort by time and remove doubles")
+    return np.array(times, dtype=np.int64)
+
+
+def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
+    text = table.rows[row][0]
+    if kind == "euroc":
+        if not re.fullmatch(r"[+-]?\d{1,19}", text) or abs(int(text)) > _INT64_MAX:
+            table.fail(row, f"the time {text!r} is not in whole nanoseconds; EuRoC form has {_COLUMNS[kind]}")
+        return int(text)
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        seconds = Decimal("NaN")
+    if not seconds.is_finite():
+        table.fail(row, f"the time {text!r} is not a number of seconds; remove or mend this line")
+    if abs(seconds) > _INT64_MAX // _NS_PER_S:
+        table.fail(row, f"the time {text!r} cannot be in seconds; divide nanoseconds by 1e9 first")
+    return int(seconds.scaleb(9).to_integral_value())
+
+
+def _quaternion_poses(table: _Table, kind: TrajectoryFormat) -> FloatArray:
+    values = _floats(table, 1, 8)
+    p, q = values[:, :3], values[:, 3:]
+    q_xyzw = q if kind == "tum" else np.roll(q, -1, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(q_xyzw, axis=1)
+    bad = np.abs(norm - 1) > ROTATION_TOLERANCE
+    if bad.any():
+        row = int(np.argmax(bad))
+        table.fail(row, f"the quaternion has norm {norm[row]:.6g}, not 1; check the column order ({_COLUMNS[kind]})")
+    return se3_from_parts(rotation_from_quat_xyzw(q_xyzw), p)
+
+
+def _kitti_poses(table: _Table) -> FloatArray:
+    values = _floats(table, 0, 12).reshape(-1, 3, 4)
+    R = values[:, :, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+        mirrored = np.linalg.det(R) < 0
+    bad = ~(deviation <= ROTATION_TOLERANCE) | mirrored
+    if bad.any():
+        row = int(np.argmax(bad))
+        why = "mirrors" if deviation[row] <= ROTATION_TOLERANCE else f"is off orthonormal by {deviation[row]:.3g}"
+        table.fail(row, f"the rotation {why}; KITTI form has {_COLUMNS['kitti']}, row by row")
+    mended = np.where((deviation <= _EXACT)[:, None, None], R, nearest_rotation(R))
+    return se3_from_parts(mended, values[:, :, 3])
+
+
+def _header(table: _Table, pattern: str) -> str | None:
+    """What the first comment that fits the pattern says."""
+    found = (re.fullmatch(pattern, comment) for comment in table.comments)
+    return next((match.group(1) for match in found if match), None)
+
+
+def _body(table: _Table, said: str | None, asked: BodyFrame | None) -> BodyFrame | None:
+    if said is not None and said not in get_args(BodyFrame):
+        raise DataError(f"{table.path}: its comment names the body {said!r}; write '# body: imu' or '# body: cam0'")
+    if asked is not None:
+        if said is not None and said != asked:
+            logger.warning("%s says that it describes %s; read as %s, as asked", table.path, said, asked)
+        return asked
+    return "cam0" if said == "cam0" else "imu" if said == "imu" else None
+
+
+def _format_frames(frames: IntArray) -> str:
+    """Frame numbers as runs: [0 1 2 5] becomes '0-2 5-5'."""
+    starts = np.flatnonzero(np.diff(frames, prepend=frames[0] - 2) != 1)
+    ends = np.append(starts[1:], len(frames)) - 1
+    return " ".join(f"{frames[a]}-{frames[b]}" for a, b in zip(starts, ends, strict=True))
+
+
+def _parse_frames(table: _Table, text: str) -> IntArray:
+    runs = [re.fullmatch(r"(\d{1,9})-(\d{1,9})", run) for run in text.split()]
+    spans = [range(int(run.group(1)), int(run.group(2)) + 1) for run in runs if run]
+    ordered = all(a.stop <= b.start for a, b in pairwise(spans))
+    if not all(runs) or not ordered or sum(map(len, spans)) != len(table.rows):
+        raise DataError(
+            f"{table.path}: its comment '# frames: {text[:60]}' does not number its {len(table.rows)} poses; "
+            "remove the comment or mend it"
+        )
+    return np.concatenate([np.arange(span.start, span.stop, dtype=np.int64) for span in spans])
+
+
+def _seconds(time_ns: int) -> str:
+    whole, rest = divmod(abs(time_ns), _NS_PER_S)
+    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
+
+
+def _numbers(values: Sequence[float] | FloatArray) -> str:
+    """Shortest text that reads back to the same bits."""
+    return " ".join(repr(float(v)) for v in values)
