@@ -86,7 +86,7 @@ def triangulate(
     z = np.asarray(z, dtype=np.float64)
     disparity = z[..., 0] - z[..., 2]
     valid = np.isfinite(z).all(axis=-1) & (disparity >= min_disparity_px)
-    safe = np.where(valid, z, 0.0)
+    safe = np.where(valid[..., None], z, 0.0)
     depth = camera.fu * camera.baseline_m / np.where(valid, disparity, 1.0)
     x = (safe[..., 0] - camera.cu) / camera.fu * depth
     y = ((safe[..., 1] + safe[..., 3]) / 2 - camera.cv) / camera.fv * depth

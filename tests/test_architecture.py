@@ -1,0 +1,86 @@
+"""Imports go one way, and nothing heavy is loaded before it is needed."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
+
+# Only the configuration, the pipeline builder and the command line know both packages.
+KNOW_BOTH = {"vio.config", "vio.pipeline", "vio.sim.oracle"}
+# Modules of the estimator: numbers in, numbers out.
+ESTIMATOR = ("vio.filters", "vio.geometry", "vio.records", "vio.selectors", "vio.protocols", "vio.evaluation")
+
+
+def _name(file: Path) -> str:
+    parts = file.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def _imports(file: Path, *, top_level_only: bool) -> Iterator[str]:
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    for node in tree.body if top_level_only else ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}: relative import"
+            yield node.module or ""
+
+
+def _heads(file: Path, *, top_level_only: bool) -> set[str]:
+    return {name.split(".")[0] for name in _imports(file, top_level_only=top_level_only)}
+
+
+@pytest.mark.parametrize("file", FILES, ids=_name)
+def test_imports_go_one_way(file: Path) -> None:
+    name = _name(file)
+    everything = set(_imports(file, top_level_only=False))
+    if name.startswith(ESTIMATOR):
+        forbidden = {"cv2", "torch", "kornia", "matplotlib", "pycolmap", "frontend", "rich"}
+        assert not forbidden & {i.split(".")[0] for i in everything}
+    if name.startswith("vio") and not name.startswith("vio.cli") and name not in KNOW_BOTH:
+        assert not any(i.split(".")[0] == "frontend" for i in everything), "only the pipeline knows the front end"
+    if name.startswith("frontend"):
+        beyond = {i for i in everything if i.startswith(("vio.pipeline", "vio.cli", "vio.filters", "vio.run_folder"))}
+        assert not beyond, "the front end knows records and geometry only"
+    if not name.startswith("vio.cli"):
+        assert not any(i.startswith("vio.cli") for i in everything), "nothing knows the command line"
+    assert "torch" not in _heads(file, top_level_only=True) or name == "frontend.learned"
+
+
+def test_pycolmap_stays_in_one_file() -> None:
+    users = [_name(f) for f in FILES if "pycolmap" in _heads(f, top_level_only=False)]
+    assert len(users) <= 1, users
+
+
+def test_matplotlib_stays_out_of_import_time() -> None:
+    assert not [_name(f) for f in FILES if "matplotlib" in _heads(f, top_level_only=True)]
+
+
+def test_help_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, vio, vio.cli; vio.cli.build_parser().format_help();"
+        "heavy = {'numpy','scipy','cv2','torch','matplotlib','pycolmap','rich','yaml'} & set(sys.modules);"
+        "sys.exit(', '.join(sorted(heavy)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, f"loaded: {done.stderr}"
+
+
+def test_no_print_or_exit_below_the_command_line() -> None:
+    for file in FILES:
+        if _name(file).startswith("vio.cli") or _name(file) == "vio.__main__":
+            continue
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id not in ("print", "exit", "quit"), f"{file}:{node.lineno}"
+            if isinstance(node, ast.ExceptHandler):
+                broad = node.type is None or (isinstance(node.type, ast.Name) and node.type.id == "BaseException")
+                assert not broad or file.name in ("atomic.py", "images.py"), f"{file}:{node.lineno}: broad except"

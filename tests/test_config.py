@@ -1,0 +1,100 @@
+"""The configuration: order of precedence, strictness, messages that name the remedy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from vio.config import Config, as_dict, describe, load_config, to_yaml
+from vio.errors import ConfigError
+
+
+def _write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "my.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_defaults_then_file_then_command_line(tmp_path: Path) -> None:
+    path = _write(tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: grid\n")
+    config = load_config(path, ["vislam.iterations=5", "selector.keep_fraction=0.5"])
+    assert config.vislam.pixel_sigma_px == 2.0
+    assert isinstance(config.vislam.pixel_sigma_px, float)
+    assert config.vislam.iterations == 5
+    assert config.selector.name == "grid"
+    assert config.selector.keep_fraction == 0.5
+    assert config.frontend == Config().frontend
+
+
+def test_effective_configuration_reads_back_equal(tmp_path: Path) -> None:
+    config = load_config(None, ["vislam.gate_probability=null", "motion=none", "selector.name=visibility"])
+    assert config.vislam.gate_probability is None
+    assert load_config(_write(tmp_path, to_yaml(config))) == config
+
+
+def test_empty_file_changes_nothing(tmp_path: Path) -> None:
+    assert load_config(_write(tmp_path, "")) == Config()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "vislam:\n  pixel_sigma: 2\n",
+            r"my\.yaml: unknown setting 'vislam\.pixel_sigma'; did you mean 'vislam\.pixel_sigma_px'",
+        ),
+        ("visalm:\n  iterations: 2\n", r"did you mean 'vislam'"),
+        ("zzzzqq: 1\n", r"valid here: motion, backend"),
+        ("vislam: 3\n", r"'vislam' is a section"),
+        ("vislam:\n  iterations: 2.5\n", r"vislam\.iterations takes a whole number, got 2\.5"),
+        ("vislam:\n  iterations: true\n", r"takes a whole number, got True"),
+        ("vislam:\n  pixel_sigma_px: 1e-3\n", r"to YAML 1\.1 this is text; write 0\.001"),
+        ("vislam:\n  pixel_sigma_px: .nan\n", r"must be a number, got nan"),
+        ("vislam:\n  use_stale: 1\n", r"takes true or false, got 1"),
+        ("vislam:\n  noise: litral\n", r"is one of consistent, literal, not 'litral'; did you mean 'literal'"),
+        ("- 1\n- 2\n", r"is a mapping of settings, not a list"),
+        ("vislam: [\n", r"not valid YAML"),
+        ("motion:\n", r"motion is one of auto"),
+    ],
+)
+def test_mistakes_in_the_file_are_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_config(_write(tmp_path, text))
+
+
+@pytest.mark.parametrize("override", ["vislam.iterations", "=3", "vislam.iterations=[", "vislam=3", "a.b.c=1"])
+def test_mistakes_in_an_override_are_named(override: str) -> None:
+    with pytest.raises(ConfigError, match="--set"):
+        load_config(None, [override])
+
+
+def test_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none\.yaml.*check the path"):
+        load_config(tmp_path / "none.yaml")
+
+
+def test_binary_file_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "image.yaml"
+    path.write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(ConfigError, match=r"image\.yaml"):
+        load_config(path)
+
+
+def test_every_setting_is_explained_and_quantities_have_units() -> None:
+    rows = list(describe(Config()))
+    assert len({row.key for row in rows}) == len(rows)
+    for row in rows:
+        assert row.doc, f"{row.key} has no meaning"
+        for suffix in ("_px", "_mps", "_m", "_s", "_deg", "_radps", "_mps2", "_radps2"):
+            if row.key.endswith(suffix):
+                assert row.unit, f"{row.key} has no unit"
+
+
+def test_shipped_files_are_valid_and_hold_deviations_only() -> None:
+    folder = Path(__file__).resolve().parent.parent / "configs"
+    files = sorted(folder.glob("*.yaml"))
+    assert files
+    defaults = as_dict(Config())
+    for file in files:
+        assert as_dict(load_config(file)) != defaults

@@ -1,0 +1,236 @@
+"""The pipeline with fakes in its boxes: what flows where, in which order, and what a run leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vio.config import Config, load_config
+from vio.errors import ConfigError, DataError, VioError
+from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, transform_points
+from vio.geometry.stereo import StereoCamera, project
+from vio.pipeline import resolve_motion, run
+from vio.records import (
+    Estimate,
+    Event,
+    FrontendOutput,
+    Observations,
+    Recording,
+    StereoFrame,
+    Trajectory,
+    UpdateReport,
+    VelocitySample,
+    observations,
+)
+from vio.run_folder import read_run, write_run_folder
+from vio.trajectory_io import read_trajectory
+
+CAMERA = StereoCamera(700.0, 700.0, 600.0, 180.0, 0.54, 1242, 375)
+T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.1, 0.7, -1.1]))
+STEP_NS = 100_000_000
+
+
+class FakeDrive:
+    """A short drive with perfect features and velocities, without images."""
+
+    def __init__(self, frames: int = 30, *, reference: bool = True, velocity: bool = True) -> None:
+        self.u = np.array([6.0, 0, 0, 0, 0, 0.25])
+        poses = np.array([se3_exp(0.1 * k * self.u) for k in range(frames)])
+        times = np.arange(frames, dtype=np.int64) * STEP_NS
+        rng = np.random.default_rng(0)
+        self.points = np.column_stack([rng.uniform(0, 50, 500), rng.uniform(-20, 30, 500), rng.uniform(-1, 6, 500)])
+        self.poses = poses
+        self._recording = Recording(
+            kind="fake",
+            path=Path("somewhere/drive"),
+            camera=CAMERA,
+            T_cam0_imu=T_CAM0_IMU,
+            frame_times_ns=times,
+            has_images=False,
+            motion=frozenset({"velocity"}) if velocity else frozenset(),
+            reference=Trajectory(poses, times, "imu", np.arange(frames)) if reference else None,
+        )
+
+    @property
+    def recording(self) -> Recording:
+        return self._recording
+
+    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        for k in range(start, min(stop or len(self.poses), len(self.poses))):
+            if self._recording.motion:
+                yield VelocitySample(k * STEP_NS, self.u[:3], self.u[3:])
+            yield StereoFrame(k, k * STEP_NS, None, None)
+
+    def observations(self, index: int) -> Observations | None:
+        p = transform_points(T_CAM0_IMU @ se3_inverse(self.poses[index]), self.points)
+        near = (p[:, 2] > 2) & (p[:, 2] < 40)
+        z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
+        ids = np.flatnonzero(near & (z[:, 2] > 0) & (z[:, 0] < 1242) & (z[:, 1] > 0) & (z[:, 1] < 375))
+        return observations(index, index * STEP_NS, ids, z[ids])
+
+
+def test_perfect_features_give_a_perfect_trajectory() -> None:
+    drive = FakeDrive()
+    result = run(drive, Config())
+    np.testing.assert_allclose(result.trajectory.positions, drive.poses[:, :3, 3], atol=1e-6)
+    assert result.dead_reckoning is not None
+    np.testing.assert_allclose(result.dead_reckoning.positions, drive.poses[:, :3, 3], atol=1e-9)
+    assert result.trajectory.frame_indices is not None
+    assert result.trajectory.frame_indices.tolist() == list(range(30))
+
+
+def test_part_of_a_recording_keeps_its_frame_numbers() -> None:
+    result = run(FakeDrive(), Config(), start=5, stop=12)
+    assert [f.index for f in result.frames] == list(range(5, 12))
+
+
+def test_images_alone_run_on_features_too() -> None:
+    drive = FakeDrive(velocity=False)
+    result = run(drive, Config())
+    assert result.motion is None
+    assert result.dead_reckoning is None
+    assert np.linalg.norm(result.trajectory.positions[-1] - drive.poses[-1, :3, 3]) < 0.05
+
+
+def test_two_runs_give_the_same_bits() -> None:
+    a, b = run(FakeDrive(), Config()), run(FakeDrive(), Config())
+    np.testing.assert_array_equal(a.trajectory.T_world_body, b.trajectory.T_world_body)
+
+
+def test_only_selected_stereo_rows_reach_the_filter() -> None:
+    class Half:
+        def select(self, rows: Observations):  # type: ignore[no-untyped-def]
+            from vio.records import Selection
+
+            return Selection(rows.ids % 2 == 0, np.zeros(len(rows)), "even ids")
+
+    class LeftOnlyForThrees:
+        def __init__(self, drive: FakeDrive) -> None:
+            self.drive = drive
+
+        def process(self, frame: StereoFrame, prior: object = None) -> FrontendOutput:
+            seen = self.drive.observations(frame.index)
+            assert seen is not None
+            return FrontendOutput(replace(seen, has_right=seen.ids % 3 != 0), 0, 0, 0)
+
+    drive = FakeDrive()
+    result = run(drive, Config(), selector=Half(), frontend=LeftOnlyForThrees(drive))
+    assert len(result.landmarks.ids) > 0
+    assert not np.any(result.landmarks.ids % 2)
+    assert np.all(result.landmarks.ids % 3)
+
+
+def test_the_viewer_sees_each_frame_and_is_closed_even_after_an_error() -> None:
+    class Counting:
+        frames = 0
+        closed = False
+
+        def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+            self.frames += 1
+            if self.frames == 7:
+                raise DataError("enough")
+
+        def close(self) -> None:
+            self.closed = True
+
+    viewer = Counting()
+    with pytest.raises(DataError, match="enough"):
+        run(FakeDrive(), Config(), viewer=viewer)
+    assert viewer.frames == 7
+    assert viewer.closed
+
+
+@pytest.mark.parametrize(
+    ("overrides", "velocity", "message"),
+    [
+        (["motion=velocity"], False, "the recording holds no motion sensor"),
+        (["motion=imu"], True, "no model for --motion imu"),
+    ],
+)
+def test_motion_that_cannot_be_had_is_an_error(overrides: list[str], velocity: bool, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        resolve_motion(FakeDrive(velocity=velocity).recording, load_config(None, overrides))
+
+
+@pytest.mark.parametrize(("start", "stop"), [(-1, None), (5, 5), (30, None)])
+def test_frame_ranges_that_hold_nothing_are_errors(start: int, stop: int | None) -> None:
+    with pytest.raises(ConfigError, match="frame"):
+        run(FakeDrive(), Config(), start=start, stop=stop)
+
+
+def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
+    drive = FakeDrive()
+    result = run(drive, Config())
+    metrics = write_run_folder(tmp_path / "out", result, drive.recording.reference, lengths_m=(5.0,))
+    names = {f.name for f in (tmp_path / "out").iterdir()}
+    assert names == {
+        "config.yaml",
+        "trajectory.tum",
+        "trajectory.kitti",
+        "dead_reckoning.tum",
+        "landmarks.ply",
+        "frames.csv",
+        "metrics.json",
+        "trajectory.png",
+    }
+    assert load_config(tmp_path / "out" / "config.yaml") == result.config
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text()) == metrics
+    assert metrics["ate_m"] < 1e-6
+    assert metrics["t_err_percent"] < 1e-4
+    rows = list(csv.DictReader((tmp_path / "out" / "frames.csv").read_text().splitlines()))
+    assert len(rows) == 30
+    assert {"index", "read_ms", "tracked", "matched", "selected", "gated", "innovation_median_px"} <= set(rows[0])
+    read, T_cam0_imu = read_run(tmp_path / "out")
+    np.testing.assert_allclose(read.T_world_body, result.trajectory.T_world_body, atol=1e-9)
+    np.testing.assert_allclose(T_cam0_imu, T_CAM0_IMU)
+    kitti = read_trajectory(tmp_path / "out" / "trajectory.kitti")
+    np.testing.assert_allclose(kitti.T_world_body[0], np.eye(4), atol=1e-12)
+    cam0 = drive.poses @ se3_inverse(T_CAM0_IMU)
+    np.testing.assert_allclose(kitti.positions, (se3_inverse(cam0[0]) @ cam0)[:, :3, 3], atol=1e-5)
+
+
+def test_landmarks_in_the_ply_are_the_true_points(tmp_path: Path) -> None:
+    drive = FakeDrive()
+    result = run(drive, Config())
+    write_run_folder(tmp_path / "out", result, None)
+    blob = (tmp_path / "out" / "landmarks.ply").read_bytes()
+    header, _, body = blob.partition(b"end_header\n")
+    points = np.frombuffer(body, dtype="<f4").reshape(-1, 4)
+    assert f"element vertex {len(points)}".encode() in header
+    np.testing.assert_allclose(points[:, :3], drive.points[result.landmarks.ids], atol=0.05)
+
+
+def test_without_reference_the_scores_are_null(tmp_path: Path) -> None:
+    metrics = write_run_folder(tmp_path / "out", run(FakeDrive(reference=False), Config()), None)
+    assert metrics["ate_m"] is None
+    assert metrics["rpe"] is None
+    assert metrics["t_err_percent"] is None
+    assert metrics["path_length_m"] > 10
+
+
+def test_a_second_run_replaces_the_first_but_never_something_else(tmp_path: Path) -> None:
+    result = run(FakeDrive(frames=5), Config())
+    write_run_folder(tmp_path / "out", result, None)
+    write_run_folder(tmp_path / "out", result, None)
+    mine = tmp_path / "thesis"
+    mine.mkdir()
+    (mine / "chapter.txt").write_text("years of work")
+    with pytest.raises(VioError, match="thesis"):
+        write_run_folder(mine, result, None)
+    assert (mine / "chapter.txt").read_text() == "years of work"
+
+
+def test_a_reference_that_does_not_fit_is_a_warning_not_a_lost_run(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    drive = FakeDrive(frames=5)
+    late = Trajectory(drive.poses, np.arange(5, dtype=np.int64) + 10**15, "imu")
+    metrics = write_run_folder(tmp_path / "out", run(drive, Config()), late)
+    assert metrics["ate_m"] is None
+    assert "reference was not used" in caplog.text

@@ -1,0 +1,56 @@
+"""The command `vio`: subcommands, one file each; nothing heavy is imported before a command runs.
+
+Exit status: 0 fine, 1 an expected error told in one line, 2 wrong usage, 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Sequence
+
+from vio._version import __version__
+from vio.cli import config, demo, evaluate, reproduce, run
+from vio.errors import VioError
+
+_COMMANDS = (run, evaluate, demo, reproduce, config)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """Return the parser of the whole command line."""
+    parser = argparse.ArgumentParser(
+        prog="vio", description="Stereo visual-inertial odometry: from rectified stereo images to a trajectory."
+    )
+    parser.add_argument("--version", action="version", version=f"stereo-vio {__version__}")
+    parser.add_argument("--debug", action="store_true", help="show the traceback of an expected error, and debug logs")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for module in _COMMANDS:
+        module.add_parser(commands)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status."""
+    args = build_parser().parse_args(argv)
+    logging.basicConfig(
+        level=logging.DEBUG if args.debug else logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr
+    )
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
+    try:
+        status: int = args.execute(args)
+        sys.stdout.flush()
+    except VioError as error:
+        if args.debug:
+            raise
+        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("interrupted; nothing was written", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        # The reader of our output went away (`vio config --show | head`): not an error of ours.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    return status

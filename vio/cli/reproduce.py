@@ -1,0 +1,41 @@
+"""`vio reproduce`: the paper's experiment on the ECE276A files."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "reproduce",
+        help="repeat the paper's experiment",
+        description="Repeat the paper's experiment on ECE276A .npz files: dead reckoning, mapping, SLAM with all "
+        "features and with the most seen 1/7, and the recommended setting. One table, one figure per drive.",
+    )
+    parser.add_argument("files", nargs="+", metavar="FILE[=REF]", help="an .npz file, with its ground truth after '='")
+    parser.add_argument("--out", type=Path, default=Path("reproduce"), metavar="DIR", help="folder (default reproduce)")
+    parser.add_argument("--json", action="store_true", help="print the table as one JSON object")
+    parser.set_defaults(execute=execute)
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    import json
+
+    from vio.reproduce import reproduce
+
+    tables = [reproduce(*_split(text), args.out) for text in args.files]
+    if args.json:
+        print(json.dumps([table.as_dict() for table in tables]))
+    else:
+        for table in tables:
+            print(table.as_text())
+    return 0
+
+
+def _split(text: str) -> tuple[Path, Path | None]:
+    file, equals, reference = text.partition("=")
+    return Path(file), Path(reference) if equals else None

@@ -1,0 +1,134 @@
+"""What `vio run`, `vio demo` and `vio reproduce` share: process a source, show progress, report."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from vio.config import Config
+from vio.datasets import open_dataset
+from vio.errors import VioError
+from vio.evaluation import KITTI_LENGTHS_M
+from vio.pipeline import run
+from vio.records import Estimate, FrontendOutput, Recording, Trajectory, UpdateReport
+from vio.run_folder import MARKER, write_run_folder
+from vio.threads import one_blas_thread
+from vio.trajectory_io import read_trajectory
+
+log = logging.getLogger(__name__)
+
+
+class ProgressViewer:
+    """A progress bar on stderr with frames per second; silent where stderr is no terminal."""
+
+    def __init__(self, frames: int, label: str) -> None:
+        self._progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            disable=not sys.stderr.isatty(),
+        )
+        self._task = self._progress.add_task(label, total=frames, rate="")
+        self._progress.start()
+
+    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+        """Advance by one frame."""
+        task = self._progress.tasks[0]
+        rate = f"{task.speed:.1f} frames/s" if task.speed else ""
+        self._progress.update(self._task, advance=1, rate=rate)
+
+    def close(self) -> None:
+        """Leave the bar as it stands."""
+        self._progress.stop()
+
+
+def process(
+    source: str,
+    config: Config,
+    *,
+    out: Path | None,
+    reference: Path | None = None,
+    start: int = 0,
+    stop: int | None = None,
+    lengths_m: Sequence[float] | None = None,
+    save_observations: bool = False,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Process a source into a run folder and return its metrics."""
+    dataset = open_dataset(source, config.dataset)
+    recording = dataset.recording
+    for note in recording.notes:
+        log.warning("%s", note)
+    truth = recording.reference if reference is None else read_reference(reference, recording)
+    folder = check_out(out) if out is not None else free_folder(recording.path)
+    total = len(recording.frame_times_ns)
+    frames = max(min(total, total if stop is None else stop) - start, 0)
+    viewer = ProgressViewer(frames, recording.path.name) if progress else None
+    with one_blas_thread():
+        result = run(dataset, config, start=start, stop=stop, keep_observations=save_observations, viewer=viewer)
+    return write_run_folder(
+        folder, result, truth, lengths_m=lengths_m or KITTI_LENGTHS_M, save_observations=save_observations
+    )
+
+
+def read_reference(path: Path, recording: Recording) -> Trajectory:
+    """Read ground truth; what a file does not say of the frame it describes follows from its form."""
+    return read_trajectory(path)
+
+
+def check_out(folder: Path) -> Path:
+    """Refuse a folder that holds something else before the work begins, not after.
+
+    Raises:
+        VioError: the folder is not an earlier run's, or the path is a file.
+    """
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / MARKER).is_file():
+        raise VioError(f"{folder}: the folder holds something that is no run of ours; give --out another folder")
+    if folder.exists() and not folder.is_dir():
+        raise VioError(f"{folder}: is a file; --out takes a folder")
+    return folder
+
+
+def free_folder(source: Path, root: Path = Path("runs")) -> Path:
+    """Return the first of runs/NAME, runs/NAME-2, … that does not exist."""
+    name = source.stem or "run"
+    number = 1
+    while (folder := root / (name if number == 1 else f"{name}-{number}")).exists():
+        number += 1
+    return folder
+
+
+def report(metrics: dict[str, Any], *, as_json: bool) -> None:
+    """Print the metrics to stdout: one JSON object for machines, or a few lines for people."""
+    if as_json:
+        print(json.dumps(metrics))
+        return
+    stages = ", ".join(f"{name} {ms:.1f}" for name, ms in metrics["stages_ms"].items())
+    rows = [
+        ("frames", f"{metrics['frames']}, path {metrics['path_length_m']:.2f} m"),
+        ("time", f"{metrics['ms_per_frame']:.1f} ms a frame ({stages})"),
+        ("back end", f"{metrics['backend']}, motion {metrics['motion']}"),
+    ]
+    if metrics["ate_m"] is None:
+        rows.append(("ATE", "no reference"))
+    else:
+        against = metrics["dead_reckoning"]
+        beside = "" if against is None else f"   (dead reckoning {against['ate_m']:.3f} m)"
+        rows.append(("ATE", f"{metrics['ate_m']:.3f} m after SE(3) alignment{beside}"))
+    if metrics["t_err_percent"] is not None:
+        rows.append(("drift", f"{metrics['t_err_percent']:.2f} %, {metrics['r_err_deg_per_100m']:.3f} deg/100 m"))
+    rows.append(("results", metrics["out"]))
+    rows.append(("picture", str(Path(metrics["out"]) / "trajectory.png")))
+    for name, value in rows:
+        print(f"{name:<9} {value}")

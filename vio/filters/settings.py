@@ -1,0 +1,54 @@
+"""Settings of the back ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vio.setting import setting
+
+
+@dataclass(frozen=True, slots=True)
+class VislamSettings:
+    """The paper's visual-inertial SLAM by EKF (docs/math.md, section 1)."""
+
+    mode: Literal["slam", "mapping", "dead_reckoning"] = setting(
+        "slam", "what runs: pose and landmark updates, landmark updates along the predicted pose, or prediction alone"
+    )
+    noise: Literal["consistent", "literal"] = setting(
+        "consistent",
+        "how W is read: 'consistent' adds (sigma * step)^2 per step; 'literal' adds the paper's numbers as variances",
+    )
+    linear_velocity_sigma_mps: float = setting(0.5, "noise of the measured body velocity", unit="m/s")
+    angular_rate_sigma_radps: float = setting(0.05, "noise of the measured angular rate", unit="rad/s")
+    input_at: Literal["midpoint", "start", "end"] = setting(
+        "midpoint", "which input carries the pose from one frame to the next; the paper holds the one at the start"
+    )
+    acceleration_sigma_mps2: float = setting(
+        3.0, "without a motion sensor: how much the body velocity may change", unit="m/s^2"
+    )
+    angular_acceleration_sigma_radps2: float = setting(
+        1.0, "without a motion sensor: how much the angular rate may change", unit="rad/s^2"
+    )
+    start_velocity_sigma_mps: float = setting(
+        10.0, "without a motion sensor: unknown velocity at the start", unit="m/s"
+    )
+    start_rate_sigma_radps: float = setting(1.0, "without a motion sensor: unknown rate at the start", unit="rad/s")
+    pixel_sigma_px: float = setting(1.0, "noise of one pixel coordinate; V is its square", unit="px")
+    gate_probability: float | None = setting(
+        0.95, "observations outside this chi-square quantile are rejected; null keeps all, as the paper does"
+    )
+    landmark_uncertainty: bool = setting(
+        True, "let the landmarks' covariance widen the innovation of the pose update; the paper takes them as known"
+    )
+    landmark_prior: Literal["stereo", "isotropic"] = setting(
+        "stereo", "covariance of a new landmark: propagated from its first pixels and pose, or the same for all"
+    )
+    landmark_prior_sigma_m: float = setting(1.0, "the isotropic prior's standard deviation", unit="m")
+    iterations: int = setting(
+        3, "Gauss-Newton iterations of the pose update; 1 is the paper's filter, more help a start in motion"
+    )
+    use_stale: bool = setting(False, "take in observations flagged as stale; the paper knows no such flag")
+    max_landmark_distance_m: float = setting(
+        150.0, "observations farther away are neither initialised nor used", unit="m"
+    )

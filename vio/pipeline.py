@@ -1,0 +1,284 @@
+"""The whole flow on one screen: events in, front end, selector, filter, result out."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from vio.config import Config
+from vio.errors import ConfigError, DataError
+from vio.filters.vislam import Vislam
+from vio.geometry.lie import FloatArray
+from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
+from vio.records import (
+    BodyFrame,
+    Estimate,
+    FrontendOutput,
+    Landmarks,
+    MotionSample,
+    MotionSource,
+    Observations,
+    Recording,
+    Selection,
+    StereoFrame,
+    Trajectory,
+    UpdateReport,
+)
+from vio.selectors import build_selector
+
+log = logging.getLogger(__name__)
+
+_TAKES: dict[str, tuple[MotionSource, ...]] = {"vislam": ("velocity",)}
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLog:
+    """What happened in one frame: one row of frames.csv."""
+
+    index: int
+    time_ns: int
+    read_ms: float
+    frontend_ms: float
+    select_ms: float
+    filter_ms: float
+    detected: int
+    tracked: int
+    matched: int
+    selected: int
+    stale: int
+    used: int
+    gated: int
+    landmarks: int
+    innovation_median_px: float | None
+    nis_per_dof: float | None
+    stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """All that a run leaves behind."""
+
+    recording: Recording
+    config: Config
+    motion: MotionSource | None  # what carried the pose between frames
+    body: BodyFrame  # what the trajectory describes
+    T_cam0_body: FloatArray  # (4, 4)
+    estimates: tuple[Estimate, ...]
+    dead_reckoning: Trajectory | None
+    landmarks: Landmarks
+    frames: tuple[FrameLog, ...]
+    observations: tuple[Observations, ...] | None  # kept on request
+    motion_samples: tuple[MotionSample, ...] | None  # kept on request
+    wall_s: float
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """The estimated poses of the body, one per frame."""
+        return _trajectory([e.T_world_imu for e in self.estimates], self.frames, self.body)
+
+
+class NullViewer:
+    """Shows nothing."""
+
+    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+        """Ignore the frame."""
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def run(
+    dataset: Dataset,
+    config: Config,
+    *,
+    start: int = 0,
+    stop: int | None = None,
+    keep_observations: bool = False,
+    viewer: Viewer | None = None,
+    frontend: Frontend | None = None,
+    selector: Selector | None = None,
+    backend: Backend | None = None,
+) -> RunResult:
+    """Process a recording from its frame `start` to before frame `stop`.
+
+    Args:
+        dataset: the recording.
+        config: every setting.
+        start: first frame.
+        stop: frame after the last one; None: to the end.
+        keep_observations: keep what the front end gave, for writing an observation log.
+        viewer: watches each frame.
+        frontend: used in place of the configured front end.
+        selector: used in place of the configured selector.
+        backend: used in place of the configured back end.
+
+    Raises:
+        VioError: the configuration, the data or the estimation is at fault; the message says which.
+    """
+    recording = dataset.recording
+    if start < 0 or (stop is not None and stop <= start):
+        raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
+    if start >= len(recording.frame_times_ns):
+        raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
+    motion = resolve_motion(recording, config)
+    body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
+    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+
+    frontend = frontend or _build_frontend(dataset, config)
+    selector = selector or _build_selector(dataset, config)
+    backend = backend or Vislam(recording.camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
+    viewer = viewer or NullViewer()
+    dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
+
+    estimates: list[Estimate] = []
+    frames: list[FrameLog] = []
+    kept: list[Observations] = []
+    samples: list[MotionSample] = []
+    began = clock = time.perf_counter()
+    try:
+        for event in dataset.events(start, stop, images=_needs_images(dataset, config)):
+            if not isinstance(event, StereoFrame):
+                if motion is not None:
+                    backend.propagate(event)
+                if dead_reckoning is not None:
+                    dead_reckoning.propagate(event)
+                if keep_observations:
+                    samples.append(event)
+                continue
+            marks = [clock, time.perf_counter()]
+            output = frontend.process(event)
+            marks.append(time.perf_counter())
+            stereo = output.observations.take(output.observations.has_right)
+            selection = selector.select(stereo)
+            marks.append(time.perf_counter())
+            report = backend.update(stereo.take(selection.chosen))
+            estimate = backend.estimate()
+            marks.append(time.perf_counter())
+
+            estimates.append(estimate)
+            frames.append(_frame_log(event, marks, output, selection, report))
+            if dead_reckoning is not None:
+                dead_reckoning.frame(event)
+            if keep_observations:
+                kept.append(output.observations)
+            viewer.frame(output, estimate, report)
+            clock = time.perf_counter()
+    finally:
+        viewer.close()
+    if not frames:
+        raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
+    return RunResult(
+        recording=recording,
+        config=config,
+        motion=motion,
+        body=body,
+        T_cam0_body=T_cam0_body,
+        estimates=tuple(estimates),
+        dead_reckoning=_trajectory(dead_reckoning.poses, frames, body) if dead_reckoning is not None else None,
+        landmarks=backend.landmarks(),
+        frames=tuple(frames),
+        observations=tuple(kept) if keep_observations else None,
+        motion_samples=tuple(samples) if keep_observations else None,
+        wall_s=time.perf_counter() - began,
+    )
+
+
+def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
+    """Decide what carries the pose between frames: a motion source, or None for images alone.
+
+    Raises:
+        ConfigError: the recording lacks what was asked for, or the back end has no model for it.
+    """
+    taken = _TAKES[config.backend]
+    if config.motion == "none":
+        return None
+    if config.motion == "auto":
+        return next((source for source in taken if source in recording.motion), None)
+    if config.motion not in taken:
+        raise ConfigError(
+            f"backend {config.backend} has no model for --motion {config.motion}; it takes {', '.join(taken)} or none"
+        )
+    if config.motion not in recording.motion:
+        held = ", ".join(sorted(recording.motion)) or "no motion sensor"
+        raise ConfigError(f"{recording.path}: --motion {config.motion} asked for, but the recording holds {held}")
+    return config.motion
+
+
+class _DeadReckoning:
+    """The paper's first result: prediction alone, beside the filter."""
+
+    def __init__(self, recording: Recording, config: Config, T_cam0_body: FloatArray) -> None:
+        settings = replace(config.vislam, mode="dead_reckoning")
+        self._filter = Vislam(recording.camera, T_cam0_body, settings, motion_sensor=True)
+        self.poses: list[FloatArray] = []
+
+    def propagate(self, sample: MotionSample) -> None:
+        self._filter.propagate(sample)
+
+    def frame(self, frame: StereoFrame) -> None:
+        self._filter.advance(frame.time_ns)
+        self.poses.append(self._filter.estimate().T_world_imu)
+
+
+def _build_frontend(dataset: Dataset, config: Config) -> Frontend:
+    from frontend import build_frontend
+
+    return build_frontend(config.frontend.name, dataset.recording.camera, config.frontend, dataset)
+
+
+def _build_selector(dataset: Dataset, config: Config) -> Selector:
+    recording = dataset.recording
+    indices = range(len(recording.frame_times_ns))
+    precomputed = dataset.observations(0) is not None
+    camera = recording.camera
+
+    def whole_record() -> list[Observations]:
+        return [o for o in map(dataset.observations, indices) if o is not None]
+
+    return build_selector(
+        config.selector,
+        image_size=None if camera.width is None or camera.height is None else (camera.width, camera.height),
+        whole_record=whole_record if precomputed else None,
+    )
+
+
+def _needs_images(dataset: Dataset, config: Config) -> bool:
+    return dataset.recording.has_images and config.frontend.name != "precomputed"
+
+
+def _frame_log(
+    frame: StereoFrame, marks: list[float], output: FrontendOutput, selection: Selection, report: UpdateReport
+) -> FrameLog:
+    read, front, select, filtered = (1e3 * (b - a) for a, b in pairwise(marks))
+    return FrameLog(
+        index=frame.index,
+        time_ns=frame.time_ns,
+        read_ms=read,
+        frontend_ms=front,
+        select_ms=select,
+        filter_ms=filtered,
+        detected=output.detected,
+        tracked=output.tracked,
+        matched=output.matched,
+        selected=int(selection.chosen.sum()),
+        stale=int(output.observations.stale.sum()),
+        used=report.used,
+        gated=report.gated,
+        landmarks=report.landmarks,
+        innovation_median_px=report.innovation_median_px,
+        nis_per_dof=report.nis_per_dof,
+        stages_ms=output.stages_ms,
+    )
+
+
+def _trajectory(poses: list[FloatArray], frames: list[FrameLog] | tuple[FrameLog, ...], body: BodyFrame) -> Trajectory:
+    return Trajectory(
+        T_world_body=np.array(poses),
+        times_ns=np.array([f.time_ns for f in frames], dtype=np.int64),
+        body=body,
+        frame_indices=np.array([f.index for f in frames], dtype=np.int64),
+    )

@@ -1,0 +1,139 @@
+"""Pictures of a run. matplotlib is imported here and nowhere else, and without its global state."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vio.evaluation import Evaluation
+from vio.geometry.lie import FloatArray, transform_points
+from vio.pipeline import RunResult
+
+_ESTIMATE, _REFERENCE, _DEAD_RECKONING, _LANDMARKS = "#1f5fbf", "#111111", "#d9822b", "#9aa5b1"
+
+
+def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
+    """Draw the map seen from above and, beside it, what happened over time; write a PNG.
+
+    Args:
+        path: the PNG to write.
+        result: the run.
+        evaluation: the trajectory against the reference, or None without one.
+        dead_reckoning: dead reckoning against the reference, or None.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 7.2), dpi=110, layout="constrained")
+    grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
+    _draw_map(figure.add_subplot(grid[:, 0]), result, evaluation, dead_reckoning)
+    seconds = np.array([f.time_ns - result.frames[0].time_ns for f in result.frames]) * 1e-9
+    _draw_error(figure.add_subplot(grid[0, 1]), seconds, result, evaluation, dead_reckoning)
+    _draw_counts(figure.add_subplot(grid[1, 1]), seconds, result)
+    _draw_time(figure.add_subplot(grid[2, 1]), seconds, result)
+    figure.suptitle(_title(result, evaluation), fontsize=12)
+    figure.savefig(path)
+
+
+def _title(result: RunResult, evaluation: Evaluation | None) -> str:
+    name = f"{result.recording.path.name}: {result.config.backend}, motion {result.motion or 'none'}"
+    if evaluation is None:
+        return f"{name}, no reference"
+    scores = evaluation.as_dict()
+    drift = scores["t_err_percent"]
+    return f"{name}, ATE {scores['ate_m']:.3f} m" + ("" if drift is None else f", drift {drift:.2f} %")
+
+
+def _draw_map(axes: Any, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
+    """Draw trajectories and landmarks in the plane in which the motion spreads most."""
+    own = result.trajectory.in_cam0(result.T_cam0_body).positions
+    if evaluation is None:
+        T_ref_world, curves = np.eye(4), [("estimate", own, _ESTIMATE, "-", 1.8)]
+    else:
+        T_ref_world = evaluation.T_ref_est
+        curves = [
+            ("ground truth", evaluation.reference.positions, _REFERENCE, "-", 3.0),
+            ("estimate", evaluation.aligned.positions, _ESTIMATE, "-", 1.6),
+        ]
+        if dead_reckoning is not None:
+            curves.insert(1, ("dead reckoning", dead_reckoning.aligned.positions, _DEAD_RECKONING, "--", 1.2))
+    points = transform_points(T_ref_world, result.landmarks.p_world)
+    main = curves[0][1]
+    first, second = _plane(main)
+    low, high = _view(np.concatenate([c[1] for c in curves]), (first, second))
+    inside = np.all((points[:, (first, second)] >= low) & (points[:, (first, second)] <= high), axis=1)
+    axes.scatter(
+        *points[inside][:, (first, second)].T, s=1.2, c=_LANDMARKS, linewidths=0, label="landmarks", rasterized=True
+    )
+    for label, positions, colour, style, width in curves:
+        axes.plot(*positions[:, (first, second)].T, color=colour, ls=style, lw=width, label=label)
+    axes.plot(*main[0, (first, second)], "o", color=_REFERENCE, ms=6, mfc="white", label="start")
+    axes.set_aspect("equal", adjustable="datalim")
+    names = ("x", "y", "z")
+    axes.set_xlabel(f"{names[first]} (m)")
+    axes.set_ylabel(f"{names[second]} (m)")
+    axes.legend(loc="best", fontsize=9, markerscale=1.5)
+    axes.grid(alpha=0.25)
+
+
+def _plane(positions: FloatArray) -> tuple[int, int]:
+    """The two axes along which the positions spread most, in ascending order."""
+    spread = np.ptp(positions, axis=0)
+    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
+    return first, second
+
+
+def _view(positions: FloatArray, axes: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Limits that hold all trajectories and a margin of the surroundings."""
+    chosen = positions[:, axes]
+    low, high = chosen.min(axis=0), chosen.max(axis=0)
+    margin = max(0.15 * float((high - low).max()), 1.0)
+    return low - margin, high + margin
+
+
+def _draw_error(
+    axes: Any,
+    seconds: FloatArray,
+    result: RunResult,
+    evaluation: Evaluation | None,
+    dead_reckoning: Evaluation | None,
+) -> None:
+    axes.grid(alpha=0.25)
+    axes.set_xlim(0, max(float(seconds[-1]), 1e-3))
+    if evaluation is None:
+        sigma = np.sqrt([np.trace(e.covariance[:3, :3]) for e in result.estimates])
+        axes.plot(seconds, sigma, color=_ESTIMATE, lw=1.2)
+        axes.set_ylabel("position σ (m)")
+        axes.set_title("no reference: the filter's own uncertainty", fontsize=9, loc="left")
+        return
+    axes.plot(seconds[evaluation.rows], evaluation.errors_m, color=_ESTIMATE, lw=1.4, label="estimate")
+    if dead_reckoning is not None:
+        axes.plot(seconds[dead_reckoning.rows], dead_reckoning.errors_m, "--", color=_DEAD_RECKONING, lw=1.1)
+    axes.set_ylabel("position error (m)")
+    axes.set_ylim(bottom=0)
+
+
+def _draw_counts(axes: Any, seconds: FloatArray, result: RunResult) -> None:
+    for name, colour in (("matched", _LANDMARKS), ("selected", _DEAD_RECKONING), ("used", _ESTIMATE)):
+        axes.plot(seconds, [getattr(f, name) for f in result.frames], color=colour, lw=1.2, label=name)
+    axes.set_ylabel("features")
+    axes.set_ylim(bottom=0)
+    axes.set_xlim(0, max(float(seconds[-1]), 1e-3))
+    axes.legend(loc="best", fontsize=8, ncols=3)
+    axes.grid(alpha=0.25)
+
+
+def _draw_time(axes: Any, seconds: FloatArray, result: RunResult) -> None:
+    stages = ("read", "frontend", "select", "filter")
+    values = [[getattr(f, f"{stage}_ms") for f in result.frames] for stage in stages]
+    axes.stackplot(
+        seconds, values, labels=stages, colors=("#c9d1d9", "#6aa2d8", "#e8b04b", "#1f5fbf"), linewidth=0, step="mid"
+    )
+    axes.set_ylabel("time (ms)")
+    axes.set_xlabel("time in the recording (s)")
+    axes.set_xlim(0, max(float(seconds[-1]), 1e-3))
+    total = np.sum(values, axis=0)
+    axes.set_ylim(0, max(1.2 * float(np.percentile(total, 98)), 1.0))
+    axes.legend(loc="upper right", fontsize=8, ncols=4)
+    axes.grid(alpha=0.25)

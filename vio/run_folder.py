@@ -1,0 +1,194 @@
+"""The folder that a run leaves behind: configuration, trajectory, map, per-frame log, metrics, picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vio._version import __version__
+from vio.atomic import atomic_folder
+from vio.config import to_yaml
+from vio.errors import DataError, EvaluationError
+from vio.evaluation import KITTI_LENGTHS_M, Evaluation, evaluate, path_length_m
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.pipeline import FrameLog, RunResult
+from vio.records import Landmarks, Trajectory
+from vio.trajectory_io import read_trajectory, write_kitti, write_tum
+
+log = logging.getLogger(__name__)
+
+MARKER = "metrics.json"  # a folder that holds it is one of ours and may be replaced
+
+
+def write_run_folder(
+    folder: Path,
+    result: RunResult,
+    reference: Trajectory | None,
+    *,
+    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    save_observations: bool = False,
+) -> dict[str, Any]:
+    """Write all results of a run, appearing at once when complete, and return the metrics.
+
+    Args:
+        folder: replaced if it is an earlier run's folder.
+        result: the run.
+        reference: ground truth, or None.
+        lengths_m: path lengths of the KITTI metric.
+        save_observations: also write `observations.npz`; the result must have kept them.
+
+    Raises:
+        VioError: the folder cannot be written, or holds something else.
+    """
+    evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
+    metrics = metrics_of(result, evaluation, dead_reckoning, folder)
+    with atomic_folder(folder, replace=True, marker=MARKER) as inside:
+        (inside / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
+        write_tum(inside / "trajectory.tum", result.trajectory)
+        write_kitti(inside / "trajectory.kitti", kitti_form(result))
+        if result.dead_reckoning is not None:
+            write_tum(inside / "dead_reckoning.tum", result.dead_reckoning)
+        (inside / "landmarks.ply").write_bytes(landmarks_ply(result.landmarks))
+        (inside / "frames.csv").write_text(frames_csv(result.frames), encoding="utf-8")
+        if save_observations:
+            _write_observations(inside / "observations.npz", result)
+        from vio.plotting import plot_run
+
+        plot_run(inside / "trajectory.png", result, evaluation, dead_reckoning)
+        (inside / MARKER).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    return metrics
+
+
+def score(
+    result: RunResult, reference: Trajectory | None, *, lengths_m: Sequence[float] = KITTI_LENGTHS_M
+) -> tuple[Evaluation | None, Evaluation | None]:
+    """Evaluate a run's trajectory and its dead reckoning; None where there is nothing to compare with.
+
+    A reference that cannot be compared (too short, no common time) is reported as a warning: the run stands.
+    """
+    if reference is None:
+        return None, None
+    try:
+        truth = _with_times(reference, result)
+        own = evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
+        other = result.dead_reckoning
+        return own, None if other is None else evaluate(
+            other, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m
+        )
+    except EvaluationError as error:
+        log.warning("the reference was not used: %s", error)
+        return None, None
+
+
+def metrics_of(
+    result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None, folder: Path
+) -> dict[str, Any]:
+    """Collect what `--json` prints and metrics.json holds; null where there is no reference."""
+    frames = result.frames
+    work_ms = np.array([f.read_ms + f.frontend_ms + f.select_ms + f.filter_ms for f in frames])
+    scores = None if evaluation is None else evaluation.as_dict()
+    return {
+        "out": str(folder),
+        "source": str(result.recording.path),
+        "kind": result.recording.kind,
+        "version": __version__,
+        "python": platform.python_version(),
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "backend": result.config.backend,
+        "motion": result.motion or "none",
+        "body": result.body,
+        "frames": len(frames),
+        "first_frame": frames[0].index,
+        "last_frame": frames[-1].index,
+        "path_length_m": path_length_m(result.trajectory.positions),
+        "ms_per_frame": float(work_ms.mean()),
+        "ms_per_frame_median": float(np.median(work_ms)),
+        "ms_per_frame_95": float(np.percentile(work_ms, 95)),
+        "stages_ms": {
+            name: float(np.mean([getattr(f, f"{name}_ms") for f in frames]))
+            for name in ("read", "frontend", "select", "filter")
+        },
+        "landmarks": len(result.landmarks.ids),
+        "ate_m": None if scores is None else scores["ate_m"],
+        "rpe": None if scores is None else scores["rpe"],
+        "t_err_percent": None if scores is None else scores["t_err_percent"],
+        "r_err_deg_per_100m": None if scores is None else scores["r_err_deg_per_100m"],
+        "evaluation": scores,
+        "dead_reckoning": None if dead_reckoning is None else dead_reckoning.as_dict(),
+        "T_cam0_imu": result.T_cam0_body.tolist(),
+    }
+
+
+def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
+    """Read a trajectory file, or that of a run's folder with its extrinsics.
+
+    Raises:
+        DataError: the path holds no trajectory.
+    """
+    if not path.is_dir():
+        return read_trajectory(path), None
+    if not (path / MARKER).is_file():
+        raise DataError(f"{path}: no run folder (it has no {MARKER}); give a trajectory file or a folder of `vio run`")
+    metrics = json.loads((path / MARKER).read_text(encoding="utf-8"))
+    return read_trajectory(path / "trajectory.tum"), np.array(metrics["T_cam0_imu"], dtype=np.float64)
+
+
+def kitti_form(result: RunResult) -> Trajectory:
+    """Return the trajectory as KITTI writes it: cam0 poses relative to the first one."""
+    cam0 = result.trajectory.in_cam0(result.T_cam0_body)
+    return replace(cam0, T_world_body=se3_inverse(cam0.T_world_body[0]) @ cam0.T_world_body)
+
+
+def landmarks_ply(landmarks: Landmarks) -> bytes:
+    """Return the map as a binary PLY: x y z in metres, and the standard deviation along the worst axis."""
+    points = np.zeros(len(landmarks.ids), dtype=[(name, "<f4") for name in ("x", "y", "z", "sigma")])
+    points["x"], points["y"], points["z"] = landmarks.p_world.T
+    points["sigma"] = np.sqrt(np.maximum(np.linalg.eigvalsh(landmarks.covariance)[:, -1], 0.0))
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment landmarks in the world frame, metres\n"
+        f"element vertex {len(points)}\n"
+        + "".join(f"property float {name}\n" for name in ("x", "y", "z", "sigma"))
+        + "end_header\n"
+    )
+    return header.encode("ascii") + points.tobytes()
+
+
+def frames_csv(frames: tuple[FrameLog, ...]) -> str:
+    """Return the per-frame log as CSV text; the front end's own stages follow as columns of their own."""
+    stages = sorted({name for f in frames for name in f.stages_ms})
+    text = io.StringIO()
+    writer: csv.DictWriter[str] | None = None
+    for frame in frames:
+        row = asdict(frame)
+        own = row.pop("stages_ms")
+        row |= {f"frontend_{name}_ms": own.get(name) for name in stages}
+        if writer is None:
+            writer = csv.DictWriter(text, list(row), lineterminator="\n")
+            writer.writeheader()
+        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+    return text.getvalue()
+
+
+def _with_times(reference: Trajectory, result: RunResult) -> Trajectory:
+    """Number a reference without times by frame: pose k belongs to frame k of the recording."""
+    if reference.times_ns is not None or reference.frame_indices is not None:
+        return reference
+    return replace(reference, frame_indices=np.arange(len(reference), dtype=np.int64))
+
+
+def _write_observations(path: Path, result: RunResult) -> None:
+    from vio.datasets.observation_log import write_observation_log
+
+    assert result.observations is not None
+    assert result.motion_samples is not None
+    write_observation_log(path, result.recording, result.observations, result.motion_samples)
