@@ -73,16 +73,14 @@ def local_maxima(response: Response, occupied: FloatArray, distance: int, border
     return np.stack([u, v], axis=1)
 
 
-def detect_corners(image: Image, occupied: FloatArray, settings: KltSettings) -> FloatArray:
-    """Find new corners (K, 2), sub-pixel, where the grid has too few of the tracked points `occupied` (N, 2).
+def detect_corners(image: Image, occupied: FloatArray, wanted: int, settings: KltSettings) -> FloatArray:
+    """Find up to `wanted` new corners (K, 2), sub-pixel, where the grid has few tracked points `occupied` (N, 2).
 
-    Each cell is filled up to `cell_features` by its strongest corners; what is then missing of `target_features`
-    comes from cells with corners to spare, up to twice the cell's share. The strongest of each cell come first.
+    The emptiest cells are filled first, each by its strongest corners, up to twice a cell's even share.
     """
     height, width = image.shape
-    missing = settings.target_features - len(occupied)
     border = settings.stereo_radius_px + 3
-    if missing <= 0 or min(height, width) <= 4 * border:
+    if wanted <= 0 or min(height, width) <= 4 * border:
         return np.zeros((0, 2))
     response = corner_response(image)
     distance = min_distance_px(width, height, settings)
@@ -96,7 +94,7 @@ def detect_corners(image: Image, occupied: FloatArray, settings: KltSettings) ->
     level = np.arange(len(order)) - first[cell[order]] + held[cell[order]]  # features that the cell then holds already
     # Cells are filled evenly, emptiest first; among equals the strongest corner wins.
     queue = np.lexsort((-strength[order], level))
-    queue = queue[level[queue] < 2 * settings.cell_features][:missing]
+    queue = queue[level[queue] < 2 * settings.cell_features][:wanted]
     chosen = candidates[order[queue]]
     return chosen + _peak_offset(response, chosen)
 

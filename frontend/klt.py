@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import cv2
 import numpy as np
 
+from frontend.align import align, cut_patches, shift_warps, templates
 from frontend.detect import detect_corners, min_distance_px
-from frontend.outliers import Consensus, epipolar_distance, fit_motion, rigid_consensus
-from frontend.patches import inside
+from frontend.outliers import Consensus, epipolar_distance, fit_motion, pixel_errors, rigid_consensus
+from frontend.patches import Patches, inside
 from frontend.settings import KltSettings
 from frontend.stereo_match import RowPyramid, match_rows, mirrored, row_pyramid
 from vio.errors import DataError
@@ -26,6 +27,8 @@ _SWAP_FEW = 0.3  # share of matches below which a frame is suspicious
 _SWAP_MANY = 0.4  # share of matches in the mirrored images that proves the swap
 _SWAP_MIN_POINTS = 20
 _LK_EPSILON_PX = 0.01
+_ALIGN_ITERATIONS = 8
+_ALIGN_MAX_PX = 2.5
 _LK_MIN_EIGENVALUE = 1e-4
 
 
@@ -39,26 +42,29 @@ class _Tracks:
     has_right: BoolArray  # (N,)
     blind: IntArray  # (N,) frames in a row without a right match
     velocity: FloatArray  # (N, 2) pixels moved since the frame before; zero for new features
+    anchor: Patches  # (N, 2r+3, 2r+3) what the feature looked like when its anchor was cut
+    warp: FloatArray  # (N, 3, 3) from offsets in the anchor to pixels of the current left image
 
     def __len__(self) -> int:
         return len(self.ids)
 
     def take(self, index: BoolArray | IntArray) -> _Tracks:
         """Return the rows named by a mask or by indices."""
-        return _Tracks(
-            self.ids[index],
-            self.left[index],
-            self.right[index],
-            self.has_right[index],
-            self.blind[index],
-            self.velocity[index],
-        )
+        return _Tracks(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
 
 
-def _new_tracks(ids: IntArray, left: FloatArray) -> _Tracks:
+def _new_tracks(image: Image, ids: IntArray, left: FloatArray, radius: int) -> _Tracks:
     n = len(ids)
-    zeros = np.zeros((n, 2))
-    return _Tracks(ids, left, zeros, np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.int64), zeros)
+    return _Tracks(
+        ids,
+        left,
+        right=np.zeros((n, 2)),
+        has_right=np.zeros(n, dtype=np.bool_),
+        blind=np.zeros(n, dtype=np.int64),
+        velocity=np.zeros((n, 2)),
+        anchor=cut_patches(image, left, radius),
+        warp=shift_warps(left),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,29 +121,32 @@ class KltFrontend:
         left, right = row_pyramid(left_image), row_pyramid(right_image)
         watch.lap("prepare")
         memory = self._memory
-        tracks = _new_tracks(np.zeros(0, dtype=np.int64), np.zeros((0, 2)))
+        tracks = self._fresh(left_image, np.zeros((0, 2)))
         twist = np.zeros(6)
         disparity = np.zeros(0)
         motion: Consensus | None = None
         if memory is not None and len(memory.tracks):
             seconds = max(1, frame.time_ns - memory.time_ns) * 1e-9
-            before, tracks = self._track(memory, left_image, prior, seconds)
+            found, seen = self._flow_all(memory, left_image, prior, seconds)
             watch.lap("track")
-            keep, motion = self._consensus(memory, before, tracks, prior, seconds, frame.index)
-            before, tracks = before.take(keep), tracks.take(keep)
-            alone = _apart(tracks.left, 0.5 * min_distance_px(left_image.shape[1], left_image.shape[0], self._settings))
-            before, tracks = before.take(alone), tracks.take(alone)
+            seen, motion = self._consensus(memory, found, seen, prior, seconds, frame.index)
+            watch.lap("reject")
+            before, tracks = self._aligned(memory.tracks, left_image, found, seen, motion)
             twist = memory.twist_per_s if motion is None else se3_log(motion.T_curr_prev) / seconds
             disparity = self._expected_disparity(before, motion)
-            watch.lap("reject")
-        corners = detect_corners(left_image, tracks.left, self._settings)
-        new_ids = np.arange(self._next_id, self._next_id + len(corners), dtype=np.int64)
-        self._next_id += len(corners)
-        watch.lap("detect")
+            watch.lap("align")
         carried = len(tracks)
-        tracks = _joined(tracks, _new_tracks(new_ids, corners))
+        missing = self._settings.target_features - carried
+        tried = round(missing * (1.0 + self._settings.spare_corners))
+        corners = detect_corners(left_image, tracks.left, tried, self._settings)
+        watch.lap("detect")
         expected = np.concatenate([disparity, np.full(len(corners), np.nan)])
-        tracks = self._match(left, right, tracks, expected, motion is not None)
+        match = match_rows(left, right, np.concatenate([tracks.left, corners]), expected, self._settings)
+        # Of the new corners, those with a right match come first, the best of them as the detector ranked them.
+        chosen = np.argsort(~match.valid[carried:], kind="stable")[: max(0, missing)]
+        rows = np.concatenate([np.arange(carried), carried + chosen])
+        tracks = _joined(tracks, self._fresh(left_image, corners[chosen]))
+        tracks = self._with_right(tracks, match.right[rows], match.valid[rows], expected[rows], motion is not None)
         watch.lap("stereo")
         self._check_swap(frame, left, right, tracks)
         tracks = tracks.take(tracks.blind <= self._settings.max_left_only_frames)
@@ -148,7 +157,7 @@ class KltFrontend:
             observations(frame.index, frame.time_ns, tracks.ids, z, tracks.has_right),
             tracked=carried,
             matched=int(tracks.has_right.sum()),
-            detected=len(corners),
+            detected=len(chosen),
             stages_ms=watch.stages_ms,
         )
 
@@ -184,18 +193,68 @@ class KltFrontend:
         left, right = self._clahe.apply(frame.left), self._clahe.apply(frame.right)
         return np.asarray(left, dtype=np.uint8), np.asarray(right, dtype=np.uint8)
 
-    def _track(
+    def _fresh(self, image: Image, points: FloatArray) -> _Tracks:
+        """Give new points (N, 2) of the left image their ids and anchors."""
+        ids = np.arange(self._next_id, self._next_id + len(points), dtype=np.int64)
+        self._next_id += len(points)
+        return _new_tracks(image, ids, points, self._settings.anchor_radius_px)
+
+    def _flow_all(
         self, memory: _Memory, image: Image, prior: TrackPrior | None, seconds: float
-    ) -> tuple[_Tracks, _Tracks]:
-        """Follow the features of the frame before; return those that survive, as they were and as they are."""
+    ) -> tuple[FloatArray, BoolArray]:
+        """Follow the features of the frame before; return pixels (N, 2) and the mask (N,) of those found."""
         old = memory.tracks
         guess, informed = self._predict(memory, prior, seconds)
         found, good = self._flow_both_ways(memory.image, image, old.left, guess)
         retry = np.flatnonzero(~good & informed)
         if len(retry):  # the prediction was wrong: start once more from where the feature was
             found[retry], good[retry] = self._flow_both_ways(memory.image, image, old.left[retry], old.left[retry])
-        before = old.take(good)
-        return before, replace(before, left=found[good], velocity=found[good] - before.left)
+        return found, good
+
+    def _aligned(
+        self, old: _Tracks, image: Image, found: FloatArray, seen: BoolArray, motion: Consensus | None
+    ) -> tuple[_Tracks, _Tracks]:
+        """Align the features with their anchors; return the survivors, as they were and as they are.
+
+        Lucas-Kanade steps add up to a drift; the anchor does not drift. Features that Lucas-Kanade lost are looked
+        for where the consensus motion puts them. Features that were found, but look too different from their anchor,
+        stay where they were found and get a new anchor.
+        """
+        settings = self._settings
+        start, tried, scale = found.copy(), seen.copy(), np.ones(len(old))
+        if motion is not None:
+            p, valid = self._points(old)
+            predicted = self._moved(old, motion.T_curr_prev)
+            tried |= valid & inside(image, predicted, settings.anchor_radius_px + 2.0)
+            start[~seen] = predicted[~seen]
+            depth = transform_points(motion.T_curr_prev, p)[:, 2]
+            scale = np.where(valid & (depth > 0.1), p[:, 2] / np.maximum(depth, 0.1), 1.0)
+        rows = np.flatnonzero(tried)
+        warp = old.warp[rows]
+        warp[:, :2, :2] *= scale[rows, None, None]
+        warp[:, :2, 2] = start[rows]
+        warp, score = align(templates(old.anchor[rows]), image, warp, "affine", _ALIGN_ITERATIONS)
+        place = warp[:, :2, 2].copy()
+        size = np.sqrt(np.abs(np.linalg.det(warp)))
+        good = (
+            (score >= settings.min_anchor_correlation)
+            & (np.abs(place - start[rows]).max(axis=1) <= _ALIGN_MAX_PX)
+            & (np.abs(np.log(np.maximum(size, 1e-3))) <= np.log(2 * settings.max_anchor_scale))
+        )
+        if motion is not None:
+            error = pixel_errors(self._camera, motion.T_curr_prev, p[rows], place)
+            good &= ~valid[rows] | (error <= settings.consensus_px)
+        kept = good | seen[rows]
+        rows, warp, place, size, good = rows[kept], warp[kept], place[kept], size[kept], good[kept]
+        place[~good] = found[rows[~good]]
+        renew = np.flatnonzero(~good | (np.abs(np.log(np.maximum(size, 1e-3))) > np.log(settings.max_anchor_scale)))
+        anchor = old.anchor[rows]
+        anchor[renew] = cut_patches(image, place[renew], settings.anchor_radius_px)
+        warp[renew] = shift_warps(place[renew])
+        before = old.take(rows)
+        now = replace(before, left=place, velocity=place - before.left, anchor=anchor, warp=warp)
+        alone = _apart(place, 0.5 * min_distance_px(image.shape[1], image.shape[0], settings))
+        return before.take(alone), now.take(alone)
 
     def _predict(self, memory: _Memory, prior: TrackPrior | None, seconds: float) -> tuple[FloatArray, BoolArray]:
         """Guess the left pixels (N, 2) in the coming frame, and tell which differ from the old ones."""
@@ -277,33 +336,34 @@ class KltFrontend:
     def _consensus(
         self,
         memory: _Memory,
-        before: _Tracks,
-        tracks: _Tracks,
+        found: FloatArray,
+        seen: BoolArray,
         prior: TrackPrior | None,
         seconds: float,
         frame_index: int,
     ) -> tuple[BoolArray, Consensus | None]:
-        """Mask (N,) of the features that move as the static world does, and that motion where one was found."""
-        p, valid = self._points(before)
-        known = np.flatnonzero(valid)
-        keep = np.ones(len(tracks), dtype=np.bool_)
+        """Mask (N,) of the found features that move as the static world does, and that motion where there is one."""
+        camera, settings, old = self._camera, self._settings, memory.tracks
+        p, valid = self._points(old)
+        known = np.flatnonzero(valid & seen)
         expected = self._expected_motion(memory, prior, seconds)
         R_prior = None if prior is None else prior.R_cam_prev
         if prior is not None and R_prior is None:
-            _, a, b = np.intersect1d(before.ids[known], prior.ids, assume_unique=True, return_indices=True)
-            fitted = fit_motion(self._camera, p[known[a]], prior.z[b, :2], expected, self._settings)
+            _, a, b = np.intersect1d(old.ids[known], prior.ids, assume_unique=True, return_indices=True)
+            fitted = fit_motion(camera, p[known[a]], prior.z[b, :2], expected, settings)
             if fitted is not None:
                 expected, R_prior = fitted, fitted[:3, :3]
-        rng = np.random.default_rng((self._settings.seed, frame_index))
-        found = rigid_consensus(self._camera, p[known], tracks.left[known], expected, R_prior, rng, self._settings)
-        if found is None:
-            return keep, None
-        keep[known] = found.inliers
-        flat = np.flatnonzero(~valid)
-        near_m = self._camera.fu * self._camera.baseline_m / (self._settings.max_disparity * memory.image.shape[1])
-        distance = epipolar_distance(self._camera, found.T_curr_prev, before.left[flat], tracks.left[flat], near_m)
-        keep[flat] = distance <= self._settings.consensus_px
-        return keep, found
+        rng = np.random.default_rng((settings.seed, frame_index))
+        motion = rigid_consensus(camera, p[known], found[known], expected, R_prior, rng, settings)
+        if motion is None:
+            return seen, None
+        keep = seen.copy()
+        keep[known] = motion.inliers
+        flat = np.flatnonzero(seen & ~valid)
+        near_m = camera.fu * camera.baseline_m / (settings.max_disparity * memory.image.shape[1])
+        distance = epipolar_distance(camera, motion.T_curr_prev, old.left[flat], found[flat], near_m)
+        keep[flat] = distance <= settings.consensus_px
+        return keep, motion
 
     def _expected_disparity(self, before: _Tracks, motion: Consensus | None) -> FloatArray:
         """Disparity (N,) in the current frame: the old point moved, or the old disparity; NaN where unknown."""
@@ -314,17 +374,14 @@ class KltFrontend:
             disparity = self._camera.fu * self._camera.baseline_m / np.maximum(depth, 0.05)
         return np.where(valid, disparity, np.nan)
 
-    def _match(
-        self, left: RowPyramid, right: RowPyramid, tracks: _Tracks, expected: FloatArray, moved: bool
+    def _with_right(
+        self, tracks: _Tracks, right: FloatArray, valid: BoolArray, expected: FloatArray, moved: bool
     ) -> _Tracks:
-        """Match all features into the right image; with a known motion, disparities must agree with the old ones."""
-        match = match_rows(left, right, tracks.left, expected, self._settings)
-        valid = match.valid
+        """Take in the right pixels; with a known motion, a disparity must agree with the one expected from it."""
         if moved:
-            change = np.abs(tracks.left[:, 0] - match.right[:, 0] - expected)
+            change = np.abs(tracks.left[:, 0] - right[:, 0] - expected)
             valid = valid & ~(change > self._settings.consensus_px)  # NaN, nothing expected, passes
-        blind = np.where(valid, 0, tracks.blind + 1)
-        return replace(tracks, right=match.right, has_right=valid, blind=blind)
+        return replace(tracks, right=right, has_right=valid, blind=np.where(valid, 0, tracks.blind + 1))
 
     def _check_swap(self, frame: StereoFrame, left: RowPyramid, right: RowPyramid, tracks: _Tracks) -> None:
         """Raise when several frames in a row match only with negative disparities."""
@@ -352,10 +409,5 @@ def _apart(points: FloatArray, distance: float) -> BoolArray:
 
 def _joined(a: _Tracks, b: _Tracks) -> _Tracks:
     return _Tracks(
-        np.concatenate([a.ids, b.ids]),
-        np.concatenate([a.left, b.left]),
-        np.concatenate([a.right, b.right]),
-        np.concatenate([a.has_right, b.has_right]),
-        np.concatenate([a.blind, b.blind]),
-        np.concatenate([a.velocity, b.velocity]),
+        **{column.name: np.concatenate([getattr(a, column.name), getattr(b, column.name)]) for column in fields(a)}
     )

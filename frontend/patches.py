@@ -37,3 +37,22 @@ def bilinear_patches(image: Image, centres: npt.NDArray[np.float64], radius: int
     a, b = fraction[:, 0, None, None], fraction[:, 1, None, None]
     rows = block[:, :, :-1] + a * (block[:, :, 1:] - block[:, :, :-1])
     return rows[:, :-1] + b * (rows[:, 1:] - rows[:, :-1])
+
+
+def warped_patches(image: Image, warp: npt.NDArray[np.float64], radius: int) -> Patches:
+    """Patches (N, 2r+1, 2r+1) at `warp @ [x, y, 1]` (N, 3, 3) of the offsets x, y in -r..r, interpolated linearly.
+
+    Pixels outside the image repeat its border.
+    """
+    height, width = image.shape
+    offset = np.arange(-radius, radius + 1, dtype=np.float64)
+    A = warp[:, :2, :, None, None]
+    u, v = np.moveaxis(A[:, :, 0] * offset[None, :] + A[:, :, 1] * offset[:, None] + A[:, :, 2], 1, 0)
+    u, v = np.clip(u, 0.0, width - 1.001), np.clip(v, 0.0, height - 1.001)
+    iu, iv = u.astype(np.int64), v.astype(np.int64)
+    a, b = (u - iu).astype(np.float32), (v - iv).astype(np.float32)
+    flat, index = image.reshape(-1), iv * width + iu
+    top, bottom = flat[index].astype(np.float32), flat[index + width].astype(np.float32)
+    top += a * (flat[index + 1] - top)
+    bottom += a * (flat[index + width + 1] - bottom)
+    return top + b * (bottom - top)

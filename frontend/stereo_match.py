@@ -1,9 +1,9 @@
 """Left-right matching on a rectified pair: a normalised search along the row, then sub-pixel alignment.
 
 The search compares zero-mean, unit-norm patches, so that exposure and gain may differ between the cameras. New points
-are searched over the whole disparity range at half resolution; points with a predicted disparity only near it. The
-alignment is an inverse-compositional Gauss-Newton fit of shift, gain and offset together.
-Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004), for the inverse-compositional form.
+are searched over the whole disparity range at half resolution; points with a predicted disparity only near it. In the
+alignment a patch may shift, shear and stretch along the row, because the disparity of a slanted surface (the road,
+above all) changes across it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
-from frontend.patches import Patches, bilinear_patches, inside, integer_patches
+from frontend.align import FLAT_RMS, align, cut_patches, shift_warps, templates
+from frontend.patches import inside, integer_patches
 from frontend.settings import KltSettings
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
@@ -24,10 +25,10 @@ _COARSE_RADIUS = 4  # pixels of the half-resolution image
 _NEAR_PX = 3  # half width of the search around a predicted or coarse disparity
 _BACK_PX = 6  # half width of the search back in the left image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
-_ALIGN_ITERATIONS = 8
-_ALIGN_DONE_PX = 0.005
+_SHIFT_ITERATIONS = 4
+_WARP_ITERATIONS = 6
+_MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
 _ALIGN_MAX_PX = 2.0  # a fit that moves further than this has left its peak
-_FLAT_NORM_PER_PX = 1.0  # gray levels; patches with less contrast match anything
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +75,7 @@ def row_correlation(
     total = sliding_window_view(strip.sum(axis=1), side, axis=1).sum(axis=-1)
     square = sliding_window_view(np.einsum("nhk,nhk->nk", strip, strip), side, axis=1).sum(axis=-1)
     target_norm = np.sqrt(np.maximum(square - total * total / side**2, 0.0))
-    flat = _FLAT_NORM_PER_PX * side
+    flat = FLAT_RMS * side
     good = (norm[:, None] > flat) & (target_norm > flat) & (columns >= radius) & (columns < width - radius)
     score = np.where(good, product / np.where(good, norm[:, None] * target_norm, 1.0), -1.0)
     return score.astype(np.float32)
@@ -103,57 +104,6 @@ def _search(
     best, top, second = _best(score)
     # The patches were cut at whole pixels; the shift carries over to the sub-pixel point.
     return (start + best).astype(np.float64), np.where((safe == centres).all(axis=1), top, -1.0), second
-
-
-def align(
-    source: Image, target: Image, points: FloatArray, start: FloatArray, radius: int
-) -> tuple[FloatArray, FloatArray]:
-    """Refine the target pixels (N, 2) of source points (N, 2) by Gauss-Newton over shift, gain and offset.
-
-    Returns:
-        The refined pixels (N, 2), and the normalised correlation (N,) there, -1 where the fit left its peak or the
-        image.
-    """
-    wide = bilinear_patches(source, points, radius + 1)
-    template = wide[:, 1:-1, 1:-1]
-    n = len(points)
-    basis = np.stack(
-        [
-            (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2,
-            (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2,
-            template,
-            np.ones_like(template),
-        ],
-        axis=1,
-    ).reshape(n, 4, -1)
-    normal = (basis @ basis.transpose(0, 2, 1)).astype(np.float64)
-    scale = np.trace(normal, axis1=1, axis2=2)
-    inverse = np.linalg.inv(normal + (1e-9 * scale[:, None, None] + 1e-9) * np.eye(4))
-    place = start.astype(np.float64)
-    active = np.arange(n)
-    for _ in range(_ALIGN_ITERATIONS):
-        view = bilinear_patches(target, place[active], radius).reshape(len(active), -1)
-        moment = np.einsum("nkp,np->nk", basis[active], view).astype(np.float64)
-        fit = np.einsum("nij,nj->ni", inverse[active], moment)
-        gain = np.where(np.abs(fit[:, 2]) > 0.1, fit[:, 2], 0.1)
-        step = np.clip(fit[:, :2] / gain[:, None], -1.0, 1.0)
-        place[active] -= step
-        active = active[np.max(np.abs(step), axis=1) > _ALIGN_DONE_PX]
-        if len(active) == 0:
-            break
-    score = _correlation(template, bilinear_patches(target, place, radius))
-    kept = inside(target, place, radius + 1) & (np.max(np.abs(place - start), axis=1) <= _ALIGN_MAX_PX)
-    return place, np.where(kept, score, -1.0)
-
-
-def _correlation(a: Patches, b: Patches) -> FloatArray:
-    """Normalised correlation (N,) of patches (N, h, w); -1 where one has no contrast."""
-    a = a - a.mean(axis=(1, 2), keepdims=True)
-    b = b - b.mean(axis=(1, 2), keepdims=True)
-    aa, bb = np.einsum("nhw,nhw->n", a, a), np.einsum("nhw,nhw->n", b, b)
-    flat = (_FLAT_NORM_PER_PX * a.shape[1]) ** 2
-    good = (aa > flat) & (bb > flat)
-    return np.where(good, np.einsum("nhw,nhw->n", a, b) / np.sqrt(np.where(good, aa * bb, 1.0)), -1.0)
 
 
 def match_rows(
@@ -186,12 +136,19 @@ def match_rows(
     if len(found) == 0:
         return StereoMatch(place, valid)
     start = points[found] + np.stack([shift[found], np.zeros(len(found))], axis=1)
-    place[found], score[found] = align(left.full, right.full, points[found], start, radius)
+    template = templates(cut_patches(left.full, points[found], radius))
+    warp, _ = align(template, right.full, shift_warps(start), "shift", _SHIFT_ITERATIONS)
+    warp, score[found] = align(template, right.full, warp, "row", _WARP_ITERATIONS)
+    place[found] = warp[:, :2, 2]
+    on_peak = (np.abs(place[found] - start).max(axis=1) <= _ALIGN_MAX_PX) & (
+        np.abs(warp[:, 0, :2] - [1.0, 0.0]).max(axis=1) <= _MAX_STRETCH
+    )
     back, _ = _near(right.full, left.full, place[found], points[found, 0] - place[found, 0], _BACK_PX, radius)
     returns = np.abs(place[found, 0] + back - points[found, 0]) <= 1.5  # whole-pixel search: one pixel plus rounding
     disparity = points[found, 0] - place[found, 0]
     valid[found] = (
         returns
+        & on_peak
         & (score[found] >= settings.min_correlation)
         & (np.abs(points[found, 1] - place[found, 1]) <= settings.max_epipolar_px)
         & (disparity >= settings.min_disparity_px)
