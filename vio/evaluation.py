@@ -16,7 +16,7 @@ from scipy.special import gammaincinv
 
 from vio.errors import EvaluationError
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_inverse, so3_exp, so3_hat, so3_log
-from vio.records import BodyFrame, BoolArray, IntArray, Trajectory
+from vio.records import BodyFrame, IntArray, Trajectory
 
 AlignMode: TypeAlias = Literal["se3", "sim3", "none"]
 AssociationMode: TypeAlias = Literal["time", "frame"]
@@ -154,7 +154,8 @@ def evaluate(
     Args:
         estimate: N poses.
         reference: associated by time where both have times, else by frame number; it may cover only a part.
-        align: rigid, rigid with scale, or none at all (the worlds are then taken to be the same).
+        align: rigid, rigid with scale, or none at all (the worlds are then taken to be the same). All metrics are
+            those of the aligned estimate, so `sim3` takes the scale out of the relative ones too.
         lengths_m: path lengths of the KITTI metric.
         max_time_difference_s: poses further apart in time are not compared.
         T_cam0_imu: extrinsic (4, 4), needed where the two trajectories describe different frames.
@@ -440,10 +441,10 @@ def _plain(record: Any) -> Any:
 
 
 def _require_finite(name: str, trajectory: Trajectory) -> None:
-    bad: BoolArray = ~np.isfinite(trajectory.T_world_body).all(axis=(1, 2))
+    bad = ~np.isfinite(trajectory.T_world_body.reshape(-1, 16)).all(axis=1)
     if bad.any():
         raise EvaluationError(
-            f"pose {int(np.argmax(bad))} of the {name} is not finite ({int(bad.sum())} of {len(bad)} are not); "
+            f"pose {int(np.argmax(bad))} of the {name} is not finite ({int(bad.sum())} of {len(trajectory)} are not); "
             "remove such poses or find out why the estimator diverged"
         )
 

@@ -36,6 +36,7 @@ ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from o
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _NS_PER_S = 10**9
 _INT64_MAX = 2**63 - 1
+_MAX_S = Decimal(_INT64_MAX).scaleb(-9)
 _COLUMNS: dict[TrajectoryFormat, str] = {
     "tum": "8 columns 'timestamp tx ty tz qx qy qz qw'",
     "kitti": "12 columns, the first three rows of a 4x4 pose",
@@ -205,7 +206,7 @@ def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
         seconds = Decimal("NaN")
     if not seconds.is_finite():
         table.fail(row, f"the time {text!r} is not a number of seconds; remove or mend this line")
-    if abs(seconds) > _INT64_MAX // _NS_PER_S:
+    if not -_MAX_S <= seconds <= _MAX_S:
         table.fail(row, f"the time {text!r} cannot be in seconds; divide nanoseconds by 1e9 first")
     return int(seconds.scaleb(9).to_integral_value())
 
