@@ -1,0 +1,129 @@
+"""Readers of recordings. A source is a path whose kind is told from its content, or `kind:path`."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+from vio.datasets.settings import DatasetSettings
+from vio.errors import DataError
+from vio.protocols import Dataset
+
+__all__ = ["READERS", "DatasetSettings", "open_dataset"]
+
+
+def _kitti(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.kitti import read_kitti
+
+    return read_kitti(path, settings)
+
+
+def _ece276a(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.ece276a import read_ece276a
+
+    return read_ece276a(path, settings)
+
+
+def _utias(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.utias import read_utias
+
+    return read_utias(path, settings)
+
+
+def _log(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.observation_log import read_observation_log
+
+    return read_observation_log(path)
+
+
+READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
+    "kitti": _kitti,
+    "ece276a": _ece276a,
+    "utias": _utias,
+    "log": _log,
+}
+_LOOKED_FOR = (
+    "a KITTI folder (image_0 image_1 calib.txt times.txt), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
+)
+
+
+def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None = None) -> Dataset:
+    """Open a recording.
+
+    Args:
+        source: a path whose kind is told from its content, or `kind:path`.
+        options: how to read it.
+
+    Raises:
+        DataError: nothing is there, or its content is of no known kind; the message says what was looked for.
+        CalibrationError: the recording's calibration cannot be right.
+    """
+    kind, path = _parse(os.fspath(source))
+    if not path.exists():
+        raise DataError(f"{path} does not exist; give {_LOOKED_FOR}")
+    return READERS[kind or _detect(path)](path, options or DatasetSettings())
+
+
+def _parse(source: str) -> tuple[str | None, Path]:
+    """Split `kind:path`. A path that exists as it stands is no such pair, nor is a drive letter a kind."""
+    head, colon, tail = source.partition(":")
+    if not colon or len(head) < 2 or not head.replace("_", "").isalnum() or Path(source).exists():
+        return None, Path(source)
+    if head not in READERS:
+        near = difflib.get_close_matches(head, READERS, 1)
+        hint = f"; did you mean '{near[0]}'?" if near else ""
+        raise DataError(f"'{head}' in '{source}' is no kind of recording; choose one of {', '.join(READERS)}{hint}")
+    if not tail:
+        raise DataError(f"'{source}' names no path; write {head}:PATH")
+    return head, Path(tail)
+
+
+def _detect(path: Path) -> str:
+    """Tell the kind of a recording from its content.
+
+    Raises:
+        DataError: it is none of those known.
+    """
+    kind = _folder_kind(path) if path.is_dir() else _file_kind(path)
+    if kind is None:
+        raise DataError(f"{path}: no known recording; looked for {_LOOKED_FOR}")
+    return kind
+
+
+def _folder_kind(path: Path) -> str | None:
+    from vio.datasets.kitti import is_kitti_folder
+
+    try:
+        names = sorted(child.name for child in path.iterdir())
+    except OSError as error:
+        raise DataError(f"cannot list {path}: {error.strerror or error}") from error
+    if not names:
+        raise DataError(f"{path} is empty; give {_LOOKED_FOR}")
+    if is_kitti_folder(path):
+        return "kitti"
+    if "sequences" in names:
+        raise DataError(f"{path} holds several KITTI sequences; name one of them, such as {path / 'sequences' / '00'}")
+    return None
+
+
+def _file_kind(path: Path) -> str | None:
+    from vio.datasets.observation_log import is_observation_log
+
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(128)
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+    if start.startswith(b"MATLAB"):
+        return "utias"
+    if not start.startswith(b"PK"):
+        return None
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [name.removesuffix(".npy") for name in archive.namelist()]
+    except (zipfile.BadZipFile, OSError) as error:
+        raise DataError(f"{path}: is damaged ({error}); copy it again") from error
+    return "log" if is_observation_log(names) else "ece276a"

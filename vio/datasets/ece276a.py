@@ -1,0 +1,188 @@
+"""ECE276A course files: velocities, stereo features and calibration in one `.npz`.
+
+Two generations of key names are read: `time_stamps features linear_velocity rotational_velocity K b cam_T_imu`, and
+`timestamps features v_t w_t K_l K_r extL_T_imu extR_T_imu`.
+
+In the published files of the first kind `cam_T_imu` mixes two conventions: its rotation maps the IMU frame to the
+camera, but its translation is the camera's position in the IMU frame. The consistent transform has `t = -R t_file`.
+Nothing in the matrix itself betrays this, so the recording is asked: see `vio.datasets.egomotion.judge_levers`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.common import checked_transform, clock_ns, read_npz, velocity_samples
+from vio.datasets.egomotion import LeverVerdict, judge_levers
+from vio.datasets.features import FeatureDataset
+from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
+from vio.datasets.tracks import FeatureTracks, moving_frames, settle_repeats, tracks_from_dense
+from vio.errors import CalibrationError, DataError
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.geometry.stereo import StereoCamera
+from vio.records import IntArray, Recording
+
+OLD_KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
+NEW_KEYS = ("timestamps", "features", "v_t", "w_t", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
+_RECTIFIED = 0.02  # share of the baseline by which a rectified right camera may lie off the left one's x axis
+_SAME_M = 1e-3  # both readings of the translation agree to this
+_ALIGNED = 2e-3  # largest entry by which the rotation between rectified cameras may differ from identity
+
+
+@dataclass(frozen=True, slots=True)
+class _Calibration:
+    camera: StereoCamera
+    T_cam0_imu: FloatArray  # as the file has it
+    ambiguous: bool  # the translation may follow either convention
+
+
+def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
+    """Read a course file.
+
+    Raises:
+        DataError: keys, shapes, clocks or values are wrong; the message says which and what was expected.
+        CalibrationError: the calibration cannot be right.
+    """
+    arrays = read_npz(path)
+    if set(OLD_KEYS) <= set(arrays):
+        time_key, linear_key, angular_key = "time_stamps", "linear_velocity", "rotational_velocity"
+        calibration = _old_calibration(arrays, path)
+    elif set(NEW_KEYS) <= set(arrays):
+        time_key, linear_key, angular_key = "timestamps", "v_t", "w_t"
+        calibration = _new_calibration(arrays, path)
+    else:
+        raise DataError(
+            f"{path}: an ECE276A file needs the keys {' '.join(OLD_KEYS)} (or {' '.join(NEW_KEYS)}); "
+            f"found {' '.join(sorted(arrays)) or 'none'}"
+        )
+    features = _array(arrays, "features", path, lambda s: len(s) == 3 and s[0] == 4 and s[2] > 1, "4 x M x T")
+    count = features.shape[2]
+    times_ns = clock_ns(
+        _array(arrays, time_key, path, lambda s: s in ((count,), (1, count), (count, 1)), f"1 x {count}").reshape(-1),
+        lambda k: f"{path}, {time_key}[{k}]",
+    )
+    linear = _velocities(arrays, linear_key, path, count)
+    angular = _velocities(arrays, angular_key, path, count)
+    tracks, stale_frames, notes = settle_repeats(
+        tracks_from_dense(features, path), moving_frames(linear, angular), settings.repeated_tracks
+    )
+    T_cam0_imu, said = _settle_extrinsics(
+        calibration, tracks, times_ns, np.concatenate([linear, angular], axis=1), settings.extrinsics
+    )
+    recording = Recording(
+        kind="ece276a",
+        path=path,
+        camera=calibration.camera,
+        T_cam0_imu=T_cam0_imu,
+        frame_times_ns=times_ns,
+        has_images=False,
+        motion=frozenset({"velocity"}),
+        reference=None,
+        notes=(*said, *notes),
+    )
+    motion = velocity_samples(times_ns, linear, angular)
+    return FeatureDataset(recording, tracks, motion, np.arange(count), stale_frames)
+
+
+def _array(
+    arrays: Mapping[str, np.ndarray], key: str, path: Path, fits: Callable[[tuple[int, ...]], bool], wanted: str
+) -> FloatArray:
+    """One array as float64, of a fitting shape."""
+    value = arrays[key]
+    if not fits(value.shape) or value.dtype.kind not in "fiu":
+        shape = " x ".join(map(str, value.shape)) or "one value"
+        raise DataError(f"{path}: {key} has shape {shape} and type {value.dtype}; expected {wanted} real numbers")
+    return value.astype(np.float64)
+
+
+def _velocities(arrays: Mapping[str, np.ndarray], key: str, path: Path, count: int) -> FloatArray:
+    values = _array(arrays, key, path, lambda s: s == (3, count), f"3 x {count}")
+    bad = ~np.isfinite(values).all(axis=0)
+    if bad.any():
+        raise DataError(
+            f"{path}: {key} is not finite in {int(bad.sum())} of {count} frames, first in frame {int(np.argmax(bad))}; "
+            "remove or repair them"
+        )
+    return np.ascontiguousarray(values.T)
+
+
+def _intrinsics(arrays: Mapping[str, np.ndarray], key: str, path: Path) -> FloatArray:
+    K = _array(arrays, key, path, lambda s: s == (3, 3), "3 x 3")
+    if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]):
+        raise CalibrationError(f"{path}: {key} is {K.tolist()}; expected [[fu, 0, cu], [0, fv, cv], [0, 0, 1]]")
+    return K
+
+
+def _camera(K: FloatArray, baseline_m: float) -> StereoCamera:
+    return StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), baseline_m)
+
+
+def _old_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibration:
+    K = _intrinsics(arrays, "K", path)
+    b = float(_array(arrays, "b", path, lambda s: int(np.prod(s)) == 1, "one value").reshape(()))
+    if not b > 0:
+        raise CalibrationError(
+            f"{path}: the stereo baseline b is {b:g} m; it must be positive, so check the calibration"
+        )
+    camera = _camera(K, b)
+    T = checked_transform(_array(arrays, "cam_T_imu", path, lambda s: s == (4, 4), "4 x 4"), f"{path}, cam_T_imu")
+    return _Calibration(camera, T, ambiguous=True)
+
+
+def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibration:
+    """Both cameras' extrinsics are given, so that the rectified pair itself tells which way they map."""
+    K, K_right = _intrinsics(arrays, "K_l", path), _intrinsics(arrays, "K_r", path)
+    if not np.allclose(K, K_right, rtol=1e-6):
+        raise CalibrationError(f"{path}: K_l and K_r differ, so the features are not rectified; rectify them first")
+    given = [
+        checked_transform(_array(arrays, key, path, lambda s: s == (4, 4), "4 x 4"), f"{path}, {key}")
+        for key in ("extL_T_imu", "extR_T_imu")
+    ]
+    for left, right in (given, [se3_inverse(T) for T in given]):
+        T_cam1_cam0 = right @ se3_inverse(left)
+        x, y, z = T_cam1_cam0[:3, 3]
+        aligned = np.abs(T_cam1_cam0[:3, :3] - np.eye(3)).max() < _ALIGNED
+        if aligned and x < 0 and np.hypot(y, z) < _RECTIFIED * -x:
+            return _Calibration(_camera(K, float(-x)), left, ambiguous=False)
+    raise CalibrationError(
+        f"{path}: extL_T_imu and extR_T_imu place the cameras {np.round(T_cam1_cam0[:3, 3], 4).tolist()} m apart; the "
+        "right camera of a rectified pair lies on the left one's positive x axis, turned alike"
+    )
+
+
+def _settle_extrinsics(
+    calibration: _Calibration, tracks: FeatureTracks, times_ns: IntArray, velocities: FloatArray, mode: ExtrinsicsMode
+) -> tuple[FloatArray, tuple[str, ...]]:
+    """Choose between the translation as it stands and the one for which it was mistaken."""
+    literal = calibration.T_cam0_imu
+    if not calibration.ambiguous or mode == "literal":
+        return literal, ()
+    R, t = literal[:3, :3], literal[:3, 3]
+    corrected = se3_from_parts(R, -R @ t)
+    if np.abs(corrected - literal).max() < _SAME_M:
+        return literal, ()
+    if mode == "corrected":
+        return corrected, ()
+    verdict = judge_levers(calibration.camera, tracks, times_ns, velocities, R, (-R.T @ t, t))
+    if verdict.better == 1:
+        return corrected, (_explain(verdict, t),)
+    if verdict.better is None:
+        return literal, (
+            "cam_T_imu is taken literally: this recording turns too little to tell whether its translation is the "
+            "camera's position in the IMU frame, as in the published files; set dataset.extrinsics if you know",
+        )
+    return literal, ()
+
+
+def _explain(verdict: LeverVerdict, t: FloatArray) -> str:
+    x, y, z = t
+    return (
+        f"the translation of cam_T_imu ({x:.2f}, {y:.2f}, {z:.2f}) is the camera's position in the IMU frame, not the "
+        f"IMU's in the camera frame as its rotation demands: velocities and features place it at {verdict.place:+.2f} "
+        f"+- {verdict.place_sigma:.2f} between literal (-1) and corrected (+1); corrected to t = -R t "
+        "(dataset.extrinsics=literal keeps it)"
+    )

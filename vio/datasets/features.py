@@ -1,0 +1,51 @@
+"""A recording whose features are known: no images, observations and motion samples from memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.datasets.common import frame_range, merge_events
+from vio.datasets.tracks import FeatureTracks
+from vio.geometry.lie import FloatArray
+from vio.records import BoolArray, Event, IntArray, MotionSample, Observations, Recording, StereoFrame
+
+
+@dataclass(frozen=True, slots=True)
+class SensorVariances:
+    """Noise that the recording's makers measured."""
+
+    linear: FloatArray  # (3,) (m/s)^2
+    angular: FloatArray  # (3,) (rad/s)^2
+    pixels: FloatArray  # (4,) px^2 of [ul vl ur vr]
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureDataset:
+    """Implements `vio.protocols.Dataset` over feature tracks."""
+
+    recording: Recording
+    tracks: FeatureTracks
+    motion: tuple[MotionSample, ...]  # in time order
+    present: IntArray  # (P,) numbers of the frames that events may yield, increasing
+    stale_frames: BoolArray  # (F,) more than half of the tracks that go on repeat their pixels while moving
+    variances: SensorVariances | None = None
+
+    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        """Yield events of the frames `start <= index < stop` in time order; there are no images to give.
+
+        Raises:
+            DataError: the range holds no frame.
+        """
+        chosen = frame_range(self.recording, start, stop)
+        low, high = np.searchsorted(self.present, [chosen.start, chosen.stop])
+        times_ns = self.recording.frame_times_ns
+        frames = (StereoFrame(k, int(times_ns[k]), None, None) for k in self.present[low:high].tolist())
+        return merge_events(self.recording, chosen, self.motion, frames)
+
+    def observations(self, index: int) -> Observations | None:
+        """Return the features of one frame; none were kept of a frame that events leave out."""
+        chosen = frame_range(self.recording, index, index + 1)
+        return self.tracks.at(chosen.start, int(self.recording.frame_times_ns[chosen.start]))

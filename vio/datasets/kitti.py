@@ -1,0 +1,301 @@
+"""KITTI odometry folders: the official layout, and a self-contained one with our small extras.
+
+Official: `sequences/NN/` with `image_0 image_1 calib.txt times.txt` (and `image_2 image_3` in colour), poses in
+`../../poses/NN.txt`. Self-contained: the same folder with, when present, `poses.txt`, `velocity.csv` (body velocity
+and angular rate in the IMU frame) and `T_cam0_imu.txt`.
+
+KITTI's poses and `T_cam0_imu.txt` describe camera 0. Where the colour pair is used, the left camera is camera 2, some
+6 cm beside it, and what this reader calls cam0 is the camera used: both are moved over.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.common import (
+    checked_transform,
+    clock_ns,
+    frame_range,
+    merge_events,
+    read_numbers,
+    text_lines,
+    velocity_samples,
+)
+from vio.datasets.images import (
+    UnreadableImageError,
+    load_gray,
+    pair_images,
+    prefetch,
+    refuse_other_size,
+)
+from vio.datasets.settings import DatasetSettings
+from vio.errors import CalibrationError, DataError
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.geometry.stereo import StereoCamera
+from vio.records import Event, IntArray, Observations, Recording, StereoFrame, Trajectory, VelocitySample
+from vio.trajectory_io import read_trajectory
+
+logger = logging.getLogger(__name__)
+
+VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
+_GRAY, _COLOUR = (0, 1), (2, 3)
+_RECTIFIED = 0.02  # share of the baseline by which the right camera may lie off the left one's x axis
+_NOTED_M = 1e-3  # an offset off that axis worth a word
+
+
+@dataclass(frozen=True, slots=True)
+class _Calibration:
+    camera: StereoCamera  # without image size
+    T_left_cam0: FloatArray  # (4, 4) from KITTI's camera 0 to the left camera used
+    off_axis_m: float  # distance of the right camera from the left one's x axis
+
+
+@dataclass(frozen=True, slots=True)
+class _BadFrame:
+    """A frame with an unreadable image, and why."""
+
+    index: int
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class KittiDataset:
+    """Implements `vio.protocols.Dataset` over a folder of rectified image pairs."""
+
+    recording: Recording
+    pairs: tuple[tuple[Path, Path], ...]  # left and right image of each frame
+    motion: tuple[VelocitySample, ...]  # in time order
+    measured: Path  # the image whose size is the camera's
+    settings: DatasetSettings
+
+    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        """Yield events of the frames `start <= index < stop` in time order.
+
+        A frame with an unreadable image is left out with a warning, up to `max_bad_frames` of them.
+
+        Raises:
+            DataError: the range holds no frame, images differ in size, or too many are unreadable.
+        """
+        chosen = frame_range(self.recording, start, stop)
+        frames = self._frames(chosen) if images else (self._frame(k) for k in chosen)
+        return merge_events(self.recording, chosen, self.motion, frames)
+
+    def observations(self, index: int) -> Observations | None:
+        """Return None: the recording holds images only."""
+        return None
+
+    def _frame(self, index: int) -> StereoFrame:
+        return StereoFrame(index, int(self.recording.frame_times_ns[index]), None, None)
+
+    def _frames(self, chosen: range) -> Generator[StereoFrame]:
+        bad = 0
+        loaded = prefetch(self._load, chosen, self.settings.prefetch_frames)
+        with contextlib.closing(loaded):
+            for frame in loaded:
+                if isinstance(frame, StereoFrame):
+                    yield frame
+                    continue
+                bad += 1
+                if bad > self.settings.max_bad_frames:
+                    raise DataError(
+                        f"{frame.why} ({bad} unreadable frames, dataset.max_bad_frames allows "
+                        f"{self.settings.max_bad_frames})"
+                    )
+                logger.warning("frame %d is skipped: %s", frame.index, frame.why)
+
+    def _load(self, index: int) -> StereoFrame | _BadFrame:
+        camera = self.recording.camera
+        assert camera.width is not None
+        assert camera.height is not None
+        left_path, right_path = self.pairs[index]
+        try:
+            left, right = load_gray(left_path)[0], load_gray(right_path)[0]
+        except UnreadableImageError as error:
+            return _BadFrame(index, str(error))
+        if left.shape != right.shape:
+            refuse_other_size(right, right_path, left.shape[1], left.shape[0], left_path)
+        refuse_other_size(left, left_path, camera.width, camera.height, self.measured)
+        return replace(self._frame(index), left=left, right=right)
+
+
+def read_kitti(path: Path, settings: DatasetSettings) -> KittiDataset:
+    """Read a KITTI odometry folder.
+
+    Raises:
+        DataError: files are missing, counts differ or a clock is wrong; the message names file and remedy.
+        CalibrationError: the calibration is missing or cannot be right.
+    """
+    cameras = _choose_cameras(path, settings.colour)
+    calibration = read_calibration(path / "calib.txt", cameras)
+    pairs = pair_images(*(path / f"image_{k}" for k in cameras))
+    times_ns = _read_times(path / "times.txt", path / f"image_{cameras[0]}", len(pairs))
+    measured, width, height, notes = _probe(pairs, settings.max_bad_frames)
+    motion = _read_velocity(path / "velocity.csv", times_ns)
+    T_cam0_imu = _read_extrinsics(path / "T_cam0_imu.txt")
+    if motion and T_cam0_imu is None:
+        raise CalibrationError(
+            f"{path}: velocity.csv stands without T_cam0_imu.txt, the transform from the IMU to camera 0; add it, or "
+            "take velocity.csv away to use the images alone"
+        )
+    if calibration.off_axis_m > _NOTED_M:
+        notes = (
+            *notes,
+            f"the camera of image_{cameras[1]} lies {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of "
+            f"image_{cameras[0]}; the pair is taken as rectified all the same",
+        )
+    recording = Recording(
+        kind="kitti",
+        path=path,
+        camera=replace(calibration.camera, width=width, height=height),
+        T_cam0_imu=None if T_cam0_imu is None else calibration.T_left_cam0 @ T_cam0_imu,
+        frame_times_ns=times_ns,
+        has_images=True,
+        motion=frozenset({"velocity"}) if motion else frozenset(),
+        reference=_read_reference(path, times_ns, calibration.T_left_cam0),
+        notes=notes,
+    )
+    return KittiDataset(recording, pairs, motion, measured, settings)
+
+
+def is_kitti_folder(path: Path) -> bool:
+    """Say whether a folder looks like a KITTI sequence."""
+    return (path / "image_0").is_dir() or (path / "image_2").is_dir() or (path / "calib.txt").is_file()
+
+
+def _choose_cameras(path: Path, colour: bool | None) -> tuple[int, int]:
+    wanted = [_GRAY, _COLOUR] if colour is None else [_COLOUR] if colour else [_GRAY]
+    for cameras in wanted:
+        if (path / f"image_{cameras[0]}").is_dir() and (path / f"image_{cameras[1]}").is_dir():
+            return cameras
+    looked = " or ".join(f"image_{a} with image_{b}" for a, b in wanted)
+    hint = "" if colour is None else f" (dataset.colour is {str(colour).lower()})"
+    raise DataError(f"{path}: holds no {looked}{hint}; give a KITTI odometry folder with both images of each pair")
+
+
+def read_calibration(path: Path, cameras: tuple[int, int]) -> _Calibration:
+    """Read `P0: … P1: …` (12 numbers each, other lines are let be) for a left and a right camera.
+
+    Raises:
+        CalibrationError: the file or a matrix is missing, malformed, or describes no rectified pair.
+    """
+    if not path.is_file():
+        raise CalibrationError(f"{path} is missing; it holds the projection matrices P0 and P1 of the rectified pair")
+    left, right = (_projection(path, f"P{k}") for k in cameras)
+    names = f"P{cameras[0]} and P{cameras[1]}"
+    if not np.allclose(left[:, :3], right[:, :3], rtol=1e-6):
+        raise CalibrationError(f"{path}: {names} differ in focal length or centre; the pair is not rectified")
+    K = left[:, :3]
+    offsets = [np.linalg.solve(K, P[:, 3]) for P in (left, right)]
+    x, y, z = offsets[0] - offsets[1]  # the right camera in the left camera's frame
+    if not x > 0:
+        raise CalibrationError(
+            f"{path}: {names} give a stereo baseline of {x:g} m; it must be positive (the right camera's fourth column "
+            "is -focal * baseline), so check for equal or exchanged matrices"
+        )
+    off_axis = float(np.hypot(y, z))
+    if off_axis > _RECTIFIED * x:
+        raise CalibrationError(
+            f"{path}: {names} put the right camera {off_axis:g} m off the left one's x axis; rectify"
+        )
+    camera = StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), float(x))
+    return _Calibration(camera, se3_from_parts(np.eye(3), offsets[0]), off_axis)
+
+
+def _projection(path: Path, name: str) -> FloatArray:
+    """One projection matrix (3, 4) `K [I | t]`."""
+    found = [(number, line.split(":", 1)[1]) for number, line in text_lines(path) if line.startswith(f"{name}:")]
+    if len(found) != 1:
+        raise CalibrationError(f"{path}: {len(found)} lines begin with '{name}:'; exactly one must")
+    number, values = found[0]
+    try:
+        P = np.array([float(value) for value in values.split()])
+    except ValueError as error:
+        raise CalibrationError(f"{path}, line {number}: {name} holds no number ({error})") from error
+    if P.shape != (12,) or not np.isfinite(P).all():
+        raise CalibrationError(f"{path}, line {number}: {name} holds {len(P)} values; 12 finite ones belong there")
+    P = P.reshape(3, 4)
+    K = P[:, :3]
+    if not (np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]) and K[0, 0] > 0 and K[1, 1] > 0):
+        raise CalibrationError(
+            f"{path}, line {number}: {name} is no matrix K [I | t] with positive focal lengths; check the order"
+        )
+    return P
+
+
+def _read_times(path: Path, folder: Path, count: int) -> IntArray:
+    if not path.is_file():
+        raise DataError(f"{path} is missing; it holds one time in seconds for each image")
+    seconds = read_numbers(path, 1)[:, 0]
+    if len(seconds) != count:
+        raise DataError(
+            f"{path} holds {len(seconds)} times and {folder} {count} images; there must be one time an image"
+        )
+    return clock_ns(seconds, lambda k: f"{path}, line {k + 1}")
+
+
+def _probe(pairs: tuple[tuple[Path, Path], ...], max_bad_frames: int) -> tuple[Path, int, int, tuple[str, ...]]:
+    """The first readable left image, its width, height and a note on its depth."""
+    for index, (left, _) in enumerate(pairs):
+        try:
+            image, bits = load_gray(left)
+        except UnreadableImageError:
+            if index >= max_bad_frames or index + 1 == len(pairs):
+                raise
+            continue
+        note = () if bits == 8 else (f"images have {bits} bits ({left.name}); scaled to 8 bits by 1/257",)
+        return left, image.shape[1], image.shape[0], note
+    raise DataError("no image pair")  # pair_images gives at least one
+
+
+def _read_velocity(path: Path, frame_times_ns: IntArray) -> tuple[VelocitySample, ...]:
+    if not path.is_file():
+        return ()
+    lines = text_lines(path)
+    if not lines or lines[0][1].replace(" ", "") != VELOCITY_HEADER:
+        raise DataError(f"{path}, line 1: expected the header {VELOCITY_HEADER}")
+    table = read_numbers(path, 7, separator=",", skip=1)
+    bad = ~np.isfinite(table[:, 1:]).all(axis=1)
+    if bad.any():
+        raise DataError(
+            f"{path}, line {int(np.argmax(bad)) + 2}: a velocity is not finite ({int(bad.sum())} lines in all); remove "
+            "or repair them"
+        )
+    times_ns = clock_ns(table[:, 0], lambda k: f"{path}, line {k + 2}")
+    if not len(times_ns) or times_ns[-1] < frame_times_ns[0] or times_ns[0] > frame_times_ns[-1]:
+        raise DataError(
+            f"{path}: no velocity falls into the time of the images (times.txt); use the same clock for both"
+        )
+    return velocity_samples(times_ns, table[:, 1:4], table[:, 4:])
+
+
+def _read_extrinsics(path: Path) -> FloatArray | None:
+    """`T_cam0_imu` as three or four lines of four numbers, or one line of 12."""
+    if not path.is_file():
+        return None
+    lines = text_lines(path)
+    columns = len(lines[0][1].split()) if lines else 0
+    if columns not in (4, 12) or (columns == 4 and len(lines) not in (3, 4)) or (columns == 12 and len(lines) != 1):
+        raise CalibrationError(
+            f"{path}: expected three or four lines of four numbers, the transform from IMU to camera 0"
+        )
+    return checked_transform(read_numbers(path, columns).reshape(-1, 4), str(path))
+
+
+def _read_reference(path: Path, times_ns: IntArray, T_left_cam0: FloatArray) -> Trajectory | None:
+    """Ground truth of camera 0, moved to the left camera; the world moves along, so that identity stays identity."""
+    absolute = path.absolute()
+    candidates = [path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"]
+    file = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if file is None:
+        return None
+    poses = read_trajectory(file, fmt="kitti").T_world_body
+    if len(poses) > len(times_ns):
+        raise DataError(f"{file} holds {len(poses)} poses for {len(times_ns)} images; give one line for each image")
+    moved = T_left_cam0 @ poses @ se3_inverse(T_left_cam0) if np.any(T_left_cam0 != np.eye(4)) else poses
+    return Trajectory(moved, times_ns[: len(poses)], "cam0", np.arange(len(poses)))

@@ -1,0 +1,254 @@
+"""Our own log of a run's observations and motion samples: a source of its own, replayed to the bit.
+
+One `.npz` without pickle. The rows of all frames lie one behind the other, `offsets` parts them. What the recording
+lacks (extrinsics, reference, …) is absent from the archive, never coded by a special number.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from vio.atomic import atomic_write_bytes
+from vio.datasets.common import checked_transform, read_npz
+from vio.datasets.features import FeatureDataset
+from vio.datasets.tracks import FeatureTracks
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.records import (
+    BodyFrame,
+    ImuSample,
+    IntArray,
+    Landmarks,
+    MotionSample,
+    MotionSource,
+    Observations,
+    Recording,
+    Trajectory,
+    VelocitySample,
+)
+
+FORMAT = "stereo-vio observation log"
+VERSION = 1
+_REQUIRED: dict[str, tuple[str, int]] = {  # array kinds (numpy's letters) and dimensions
+    "version": ("i", 0),
+    "source": ("U", 0),
+    "notes": ("U", 1),
+    "intrinsics": ("f", 1),
+    "image_size": ("i", 1),
+    "frame_times_ns": ("i", 1),
+    "frame_indices": ("i", 1),
+    "offsets": ("i", 1),
+    "ids": ("i", 1),
+    "z": ("f", 2),
+    "has_right": ("b", 1),
+    "stale": ("b", 1),
+    "motion_times_ns": ("i", 1),
+    "motion_is_imu": ("b", 1),
+    "motion_values": ("f", 2),
+}
+_GROUPS = {  # what must stand together
+    "reference_T_world_body": ("reference_body",),
+    "landmark_ids": ("landmark_p_world", "landmark_covariance"),
+}
+
+
+def write_observation_log(
+    path: Path,
+    recording: Recording,
+    observations: Sequence[Observations],
+    motion_samples: Sequence[MotionSample],
+) -> None:
+    """Write the observations of a run and the motion samples that it took, whole or not at all, to the bit.
+
+    Args:
+        path: the file to make; its folder must exist.
+        recording: what was run on.
+        observations: one record for each processed frame, in time order.
+        motion_samples: every sample that the estimator was given, in time order.
+
+    Raises:
+        DataError: the place cannot be written.
+        ValueError: observations disagree with the recording's frames, or are out of order.
+    """
+    frames = np.array([o.frame_index for o in observations], dtype=np.int64)
+    times_ns = np.array([o.time_ns for o in observations], dtype=np.int64)
+    if (np.diff(frames) <= 0).any() or not np.array_equal(times_ns, recording.frame_times_ns[frames]):
+        raise ValueError("the observations are not in the order of the recording's frames, or have other times")
+    camera = recording.camera
+    arrays: dict[str, np.ndarray] = {
+        "format": np.array(FORMAT),
+        "version": np.array(VERSION, dtype=np.int64),
+        "source": np.array(f"{recording.kind}:{recording.path}"),
+        "notes": np.array(recording.notes, dtype=np.str_),
+        "intrinsics": np.array([camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m], dtype=np.float64),
+        "image_size": np.array([k for k in (camera.width, camera.height) if k is not None], dtype=np.int64),
+        "frame_times_ns": recording.frame_times_ns,
+        "frame_indices": frames,
+        "offsets": np.cumsum([0, *(len(o) for o in observations)], dtype=np.int64),
+        "ids": _joined([o.ids for o in observations], np.zeros(0, dtype=np.int64)),
+        "z": _joined([o.z for o in observations], np.zeros((0, 4))),
+        "has_right": _joined([o.has_right for o in observations], np.zeros(0, dtype=np.bool_)),
+        "stale": _joined([o.stale for o in observations], np.zeros(0, dtype=np.bool_)),
+        **_motion_arrays(motion_samples),
+        **_optional_arrays(recording),
+    }
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)  # type: ignore[arg-type] # the stubs take every keyword for allow_pickle
+    atomic_write_bytes(path, stream.getvalue())
+
+
+def _joined(parts: list[np.ndarray], empty: np.ndarray) -> np.ndarray:
+    return np.concatenate([empty, *parts])
+
+
+def _motion_arrays(samples: Sequence[MotionSample]) -> dict[str, np.ndarray]:
+    values = np.zeros((len(samples), 6))
+    for row, sample in zip(values, samples, strict=True):
+        halves = (sample.gyro, sample.accel) if isinstance(sample, ImuSample) else (sample.linear, sample.angular)
+        row[:3], row[3:] = halves
+    return {
+        "motion_times_ns": np.array([sample.time_ns for sample in samples], dtype=np.int64),
+        "motion_is_imu": np.array([isinstance(sample, ImuSample) for sample in samples], dtype=np.bool_),
+        "motion_values": values,
+    }
+
+
+def _optional_arrays(recording: Recording) -> dict[str, np.ndarray]:
+    out: dict[str, np.ndarray] = {}
+    if recording.T_cam0_imu is not None:
+        out["T_cam0_imu"] = recording.T_cam0_imu
+    if (reference := recording.reference) is not None:
+        out["reference_T_world_body"] = reference.T_world_body
+        out["reference_body"] = np.array(reference.body)
+        if reference.times_ns is not None:
+            out["reference_times_ns"] = reference.times_ns
+        if reference.frame_indices is not None:
+            out["reference_frame_indices"] = reference.frame_indices
+    if (landmarks := recording.landmarks_reference) is not None:
+        out["landmark_ids"] = landmarks.ids
+        out["landmark_p_world"] = landmarks.p_world
+        out["landmark_covariance"] = landmarks.covariance
+    return out
+
+
+def is_observation_log(names: Sequence[str]) -> bool:
+    """Say whether the member names of an `.npz` are those of a log."""
+    return {"format", "version", "offsets"} <= set(names)
+
+
+def read_observation_log(path: Path) -> FeatureDataset:
+    """Read a log; frames that were not processed when it was written yield no event.
+
+    Raises:
+        DataError: no such log, made by a newer version, or inconsistent.
+    """
+    arrays = read_npz(path)
+    _check_format(arrays, path)
+    frames, offsets, times_ns = arrays["frame_indices"], arrays["offsets"], arrays["frame_times_ns"]
+    dense_offsets = offsets[np.searchsorted(frames, np.arange(len(times_ns) + 1))]
+    tracks = FeatureTracks(dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"])
+    motion = _motion_samples(arrays)
+    kinds: set[MotionSource] = {"imu" if isinstance(sample, ImuSample) else "velocity" for sample in motion}
+    recording = Recording(
+        kind="log",
+        path=path,
+        camera=_camera(arrays),
+        T_cam0_imu=_extrinsics(arrays, path),
+        frame_times_ns=times_ns,
+        has_images=False,
+        motion=frozenset(kinds),
+        reference=_reference(arrays),
+        landmarks_reference=_landmarks(arrays),
+        notes=tuple(str(note) for note in arrays["notes"]),
+    )
+    stale_share = [bool(len(o) and o.mean() > 0.5) for o in np.split(tracks.stale, dense_offsets[1:-1])]
+    return FeatureDataset(recording, tracks, motion, frames, np.array(stale_share, dtype=np.bool_))
+
+
+def _check_format(arrays: Mapping[str, np.ndarray], path: Path) -> None:
+    if "format" not in arrays or str(arrays["format"]) != FORMAT:
+        raise DataError(f"{path}: no observation log; make one with `vio run SOURCE --save-observations`")
+    if "version" in arrays and int(arrays["version"]) > VERSION:
+        raise DataError(
+            f"{path}: an observation log of version {int(arrays['version'])}, this program reads up to {VERSION}; "
+            "upgrade stereo-vio"
+        )
+    for key, (kind, dimensions) in _REQUIRED.items():
+        if key not in arrays:
+            raise DataError(f"{path}: the observation log lacks {key}; write it again")
+        if arrays[key].dtype.kind != kind or arrays[key].ndim != dimensions:
+            raise DataError(f"{path}: {key} of the observation log has type {arrays[key].dtype}, {arrays[key].ndim}-D")
+    if problem := _disagreement(arrays):
+        raise DataError(f"{path}: the observation log is inconsistent: {problem}; write it again")
+
+
+def _disagreement(arrays: Mapping[str, np.ndarray]) -> str | None:
+    """What does not fit together, in words."""
+    rows, offsets, frames = len(arrays["ids"]), arrays["offsets"], arrays["frame_indices"]
+    times_ns, samples = arrays["frame_times_ns"], len(arrays["motion_times_ns"])
+    if arrays["z"].shape != (rows, 4) or len(arrays["has_right"]) != rows or len(arrays["stale"]) != rows:
+        return f"{rows} ids, but z is {arrays['z'].shape} with {len(arrays['stale'])} stale marks"
+    if len(offsets) != len(frames) + 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) < 0).any():
+        return f"the offsets do not part {rows} rows into {len(frames)} frames"
+    if (np.diff(times_ns) <= 0).any() or (np.diff(arrays["motion_times_ns"]) < 0).any():
+        return "a clock does not increase"
+    if len(frames) and (frames[0] < 0 or frames[-1] >= len(times_ns) or (np.diff(frames) <= 0).any()):
+        return f"frame numbers do not increase within 0 to {len(times_ns) - 1}"
+    if arrays["motion_values"].shape != (samples, 6) or len(arrays["motion_is_imu"]) != samples:
+        return f"{samples} motion times, but values {arrays['motion_values'].shape}"
+    if arrays["intrinsics"].shape != (5,) or len(arrays["image_size"]) not in (0, 2):
+        return "the camera is incomplete"
+    for first, group in _GROUPS.items():
+        if first in arrays and any(key not in arrays for key in group):
+            return f"{first} stands without {' '.join(key for key in group if key not in arrays)}"
+    poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
+    stamps = [len(arrays[key]) for key in ("reference_times_ns", "reference_frame_indices") if key in arrays]
+    if poses.shape[1:] != (4, 4) or any(count != len(poses) for count in stamps):
+        return f"reference poses {poses.shape} with {stamps} times or frame numbers"
+    return None
+
+
+def _camera(arrays: Mapping[str, np.ndarray]) -> StereoCamera:
+    fu, fv, cu, cv, b = arrays["intrinsics"].tolist()
+    width, height = arrays["image_size"].tolist() or (None, None)
+    return StereoCamera(fu, fv, cu, cv, b, width, height)
+
+
+def _extrinsics(arrays: Mapping[str, np.ndarray], path: Path) -> FloatArray | None:
+    if "T_cam0_imu" not in arrays:
+        return None
+    checked_transform(arrays["T_cam0_imu"], f"{path}, T_cam0_imu")
+    return arrays["T_cam0_imu"]  # the written bits, not the mended ones
+
+
+def _motion_samples(arrays: Mapping[str, np.ndarray]) -> tuple[MotionSample, ...]:
+    times_ns: IntArray = arrays["motion_times_ns"]
+    return tuple(
+        ImuSample(t, value[:3], value[3:]) if imu else VelocitySample(t, value[:3], value[3:])
+        for t, imu, value in zip(
+            times_ns.tolist(), arrays["motion_is_imu"].tolist(), arrays["motion_values"], strict=True
+        )
+    )
+
+
+def _reference(arrays: Mapping[str, np.ndarray]) -> Trajectory | None:
+    if "reference_T_world_body" not in arrays:
+        return None
+    return Trajectory(
+        arrays["reference_T_world_body"],
+        arrays.get("reference_times_ns"),
+        cast(BodyFrame, str(arrays["reference_body"])),
+        arrays.get("reference_frame_indices"),
+    )
+
+
+def _landmarks(arrays: Mapping[str, np.ndarray]) -> Landmarks | None:
+    if "landmark_ids" not in arrays:
+        return None
+    return Landmarks(arrays["landmark_ids"], arrays["landmark_p_world"], arrays["landmark_covariance"])

@@ -1,0 +1,41 @@
+"""Settings of the readers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+from vio.errors import ConfigError
+from vio.setting import setting
+
+ExtrinsicsMode: TypeAlias = Literal["auto", "literal", "corrected"]
+RepeatsMode: TypeAlias = Literal["auto", "split", "flag", "literal"]
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetSettings:
+    """How recordings are read."""
+
+    colour: bool | None = setting(
+        None,
+        "KITTI folders: take image_2/image_3 (true) or image_0/image_1 (false); null: gray where there is any",
+    )
+    extrinsics: ExtrinsicsMode = setting(
+        "auto",
+        "ECE276A files: the translation of cam_T_imu as it stands (literal), read as the camera's position in the "
+        "IMU frame (corrected), or whichever the file's own velocities and features support (auto)",
+    )
+    repeated_tracks: RepeatsMode = setting(
+        "auto",
+        "feature files, rows that repeat old pixels while the vehicle moves: flag them and give the track a new id "
+        "(split), flag them and keep the id (flag), take them at their word (literal), or judge by the pixel motion "
+        "around them whether the track changed its point (auto)",
+    )
+    max_bad_frames: int = setting(5, "image folders: unreadable stereo frames skipped before the reader gives up")
+    prefetch_frames: int = setting(4, "image folders: stereo frames decoded ahead in a thread; 0: no thread")
+
+    def __post_init__(self) -> None:
+        if self.max_bad_frames < 0:
+            raise ConfigError(f"dataset.max_bad_frames must not be negative, got {self.max_bad_frames}")
+        if self.prefetch_frames < 0:
+            raise ConfigError(f"dataset.prefetch_frames must not be negative, got {self.prefetch_frames}")

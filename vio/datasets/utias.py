@@ -1,0 +1,154 @@
+"""UTIAS course files: KITTI drives tracked by KLT, and the Starry Night rig, as MATLAB `.mat`.
+
+Conventions, checked on the data by the tests: `p_c = C_c_v (p_v - rho_v_c_v)`, and `theta_vk_i` is the rotation vector
+of `R_i_v`, which maps the vehicle's axes to the inertial frame.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.common import checked_transform, clock_ns, velocity_samples
+from vio.datasets.features import FeatureDataset, SensorVariances
+from vio.datasets.settings import DatasetSettings
+from vio.datasets.tracks import moving_frames, settle_repeats, tracks_from_dense
+from vio.errors import CalibrationError, DataError
+from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
+from vio.geometry.stereo import StereoCamera
+from vio.records import BoolArray, IntArray, Landmarks, Recording, Trajectory
+
+KEYS = ("y_k_j", "t", "v_vk_vk_i", "w_vk_vk_i", "fu", "fv", "cu", "cv", "b", "C_c_v", "rho_v_c_v")
+
+
+def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
+    """Read a course file; velocities and poses beyond the last feature frame are left out.
+
+    Raises:
+        DataError: variables, shapes, clocks or values are wrong; the message says which and what was expected.
+        CalibrationError: the calibration cannot be right.
+    """
+    arrays = _read_mat(path)
+    features = arrays["y_k_j"]
+    if features.ndim != 3 or features.shape[0] != 4 or features.shape[1] < 2:
+        raise DataError(f"{path}: y_k_j has shape {_shape(features)}; expected 4 x T x M with at least two frames")
+    count = features.shape[1]
+    times_ns = clock_ns(_rows(arrays, "t", path, 1, count)[:, 0], lambda k: f"{path}, t[{k}]")
+    linear = _finite(_rows(arrays, "v_vk_vk_i", path, 3, count), "v_vk_vk_i", path)
+    angular = _finite(_rows(arrays, "w_vk_vk_i", path, 3, count), "w_vk_vk_i", path)
+    tracks, stale_frames, notes = settle_repeats(
+        tracks_from_dense(np.swapaxes(features, 1, 2), path), moving_frames(linear, angular), settings.repeated_tracks
+    )
+    longest = max(arrays[key].shape[1] for key in ("v_vk_vk_i", "w_vk_vk_i"))
+    if longest > count:
+        notes = (f"velocities go on for {longest} frames, features for {count}; the first {count} are read", *notes)
+    recording = Recording(
+        kind="utias",
+        path=path,
+        camera=_camera(arrays, path),
+        T_cam0_imu=_extrinsics(arrays, path),
+        frame_times_ns=times_ns,
+        has_images=False,
+        motion=frozenset({"velocity"}),
+        reference=_reference(arrays, path, times_ns),
+        landmarks_reference=_landmarks(arrays, path, features.shape[2]),
+        notes=notes,
+    )
+    motion = velocity_samples(times_ns, linear, angular)
+    return FeatureDataset(recording, tracks, motion, np.arange(count), stale_frames, _variances(arrays, path))
+
+
+def _read_mat(path: Path) -> Mapping[str, FloatArray]:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        raw = loadmat(path, mat_dtype=True)
+    except NotImplementedError as error:
+        raise DataError(f"{path}: a MATLAB 7.3 file; save it again with `save -v7`") from error
+    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError, zlib.error) as error:
+        raise DataError(f"{path}: is damaged or no MATLAB file ({error}); copy it again") from error
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+    names = [name for name in raw if not name.startswith("__")]
+    if missing := [key for key in KEYS if key not in names]:
+        raise DataError(
+            f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {' '.join(sorted(names))}"
+        )
+    arrays = {name: raw[name] for name in names if isinstance(raw[name], np.ndarray)}
+    for key in KEYS:
+        if key not in arrays or arrays[key].dtype.kind not in "fiu":
+            raise DataError(f"{path}: {key} is not an array of real numbers")
+    return {name: value.astype(np.float64) for name, value in arrays.items() if value.dtype.kind in "fiu"}
+
+
+def _shape(array: FloatArray) -> str:
+    return " x ".join(map(str, array.shape)) or "one value"
+
+
+def _rows(arrays: Mapping[str, FloatArray], key: str, path: Path, rows: int, count: int) -> FloatArray:
+    """The first `count` columns of a (rows, >= count) array, as (count, rows)."""
+    value = arrays[key]
+    if value.ndim != 2 or value.shape[0] != rows or value.shape[1] < count:
+        raise DataError(f"{path}: {key} has shape {_shape(value)}; expected {rows} x T with T at least {count}")
+    return np.ascontiguousarray(value[:, :count].T)
+
+
+def _finite(values: FloatArray, key: str, path: Path) -> FloatArray:
+    bad: BoolArray = np.asarray(~np.isfinite(values).all(axis=1))
+    if bad.any():
+        raise DataError(
+            f"{path}: {key} is not finite in {int(bad.sum())} of {len(bad)} frames, first in frame "
+            f"{int(np.argmax(bad))}; remove or repair them"
+        )
+    return values
+
+
+def _vector(arrays: Mapping[str, FloatArray], key: str, path: Path, size: int) -> FloatArray:
+    value = arrays[key].reshape(-1)
+    if len(value) != size or not np.isfinite(value).all():
+        raise DataError(f"{path}: {key} has shape {_shape(arrays[key])}; expected {size} finite value(s)")
+    return value
+
+
+def _camera(arrays: Mapping[str, FloatArray], path: Path) -> StereoCamera:
+    fu, fv, cu, cv, b = (float(_vector(arrays, key, path, 1)[0]) for key in ("fu", "fv", "cu", "cv", "b"))
+    if not b > 0:
+        raise CalibrationError(
+            f"{path}: the stereo baseline b is {b:g} m; it must be positive, so check the calibration"
+        )
+    return StereoCamera(fu, fv, cu, cv, b)
+
+
+def _extrinsics(arrays: Mapping[str, FloatArray], path: Path) -> FloatArray:
+    C, rho = arrays["C_c_v"], _vector(arrays, "rho_v_c_v", path, 3)
+    if C.shape != (3, 3):
+        raise DataError(f"{path}: C_c_v has shape {_shape(C)}; expected 3 x 3")
+    return checked_transform(np.concatenate([C, (-C @ rho)[:, None]], axis=1), f"{path}, C_c_v")
+
+
+def _reference(arrays: Mapping[str, FloatArray], path: Path, times_ns: IntArray) -> Trajectory | None:
+    if not {"r_i_vk_i", "theta_vk_i"} <= set(arrays):
+        return None
+    count = len(times_ns)
+    r = _finite(_rows(arrays, "r_i_vk_i", path, 3, count), "r_i_vk_i", path)
+    theta = _finite(_rows(arrays, "theta_vk_i", path, 3, count), "theta_vk_i", path)
+    return Trajectory(se3_from_parts(so3_exp(theta), r), times_ns, "imu", np.arange(count))
+
+
+def _landmarks(arrays: Mapping[str, FloatArray], path: Path, count: int) -> Landmarks | None:
+    if "rho_i_pj_i" not in arrays:
+        return None
+    p = _finite(_rows(arrays, "rho_i_pj_i", path, 3, count), "rho_i_pj_i", path)
+    return Landmarks(np.arange(count), p, np.zeros((count, 3, 3)))
+
+
+def _variances(arrays: Mapping[str, FloatArray], path: Path) -> SensorVariances | None:
+    if not {"v_var", "w_var", "y_var"} <= set(arrays):
+        return None
+    return SensorVariances(
+        _vector(arrays, "v_var", path, 3), _vector(arrays, "w_var", path, 3), _vector(arrays, "y_var", path, 4)
+    )
