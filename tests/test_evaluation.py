@@ -325,11 +325,13 @@ def degenerate(kind: str) -> FloatArray:
             return se3_from_parts(rotations[:2], line[:2])
         case "straight":
             return se3_from_parts(rotations, line)
+        case "stationary to rounding":
+            return se3_from_parts(rotations, 5.0 + 1e-15 * np.arange(24).reshape(8, 3) ** 2)
         case _:
             return se3_from_parts(rotations, np.full((8, 3), 5.0))
 
 
-@pytest.mark.parametrize("kind", ["one pose", "two poses", "straight", "stationary"])
+@pytest.mark.parametrize("kind", ["one pose", "two poses", "straight", "stationary", "stationary to rounding"])
 @pytest.mark.parametrize("seed", range(3))
 def test_orientations_settle_what_positions_leave_open(kind: str, seed: int) -> None:
     T_ref = degenerate(kind)
@@ -352,7 +354,7 @@ def test_sim3_along_a_line_is_defined(kind: str) -> None:
     assert found.ate_deg.max < 1e-6
 
 
-@pytest.mark.parametrize("kind", ["one pose", "stationary"])
+@pytest.mark.parametrize("kind", ["one pose", "stationary", "stationary to rounding"])
 def test_sim3_without_motion_is_refused(kind: str) -> None:
     T = degenerate(kind)
     with pytest.raises(EvaluationError, match="align with se3 or none"):

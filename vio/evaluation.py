@@ -280,7 +280,7 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
     U, d, Vt = np.linalg.svd(covariance)
     sign = np.array([1.0, 1.0, 1.0 if np.linalg.det(U @ Vt) > 0 else -1.0])
     R = (U * sign) @ Vt
-    moving = d[0] > _COLLINEAR * x_extent * y_extent
+    moving = min(x_extent, y_extent) > 0 and d[0] > _COLLINEAR * x_extent * y_extent
     if not moving:
         if mode == "sim3":
             raise EvaluationError("sim3 alignment needs two trajectories that move together; align with se3 or none")
@@ -327,9 +327,8 @@ def relative_error_distance(T_est: FloatArray, T_ref: FloatArray, delta_m: float
     first = np.arange(n)
     target = travelled + delta_m
     beyond = np.searchsorted(travelled, target, side="left")
-    before = np.searchsorted(travelled, travelled[np.maximum(beyond - 1, 0)], side="left")
-    before = np.maximum(before, first + 1)
-    gap_before = np.where(before < beyond, target - travelled[np.minimum(before, n - 1)], np.inf)
+    before = np.searchsorted(travelled, travelled[beyond - 1], side="left")  # the first of poses in one place
+    gap_before = target - travelled[before]
     gap_beyond = np.where(beyond < n, travelled[np.minimum(beyond, n - 1)] - target, np.inf)
     last = np.where(gap_before <= gap_beyond, before, beyond)
     close = np.minimum(gap_before, gap_beyond) <= RPE_DISTANCE_TOLERANCE * delta_m
