@@ -1,0 +1,281 @@
+"""One real camera: pinhole, radial-tangential or equidistant, and the stereo rig made of two of them.
+
+Pixels: u right, v down, the centre of the top-left pixel is (0, 0). Rays and points are in the camera frame
+(x right, y down, z forward).
+References: Brown, Close-range camera calibration (1971), as written by OpenCV and EuRoC with `k1 k2 p1 p2`;
+Kannala & Brandt, A generic camera model (2006), with `k1 k2 k3 k4` on the angle, as OpenCV's fisheye model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.errors import CalibrationError
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.stereo import StereoCamera
+
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
+DistortionModel: TypeAlias = Literal["pinhole", "radtan", "equidistant"]
+
+_COEFFICIENTS: dict[DistortionModel, int] = {"pinhole": 0, "radtan": 4, "equidistant": 4}
+_NEWTON_STEPS = 30
+_NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
+_RECTIFIED_TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """Intrinsics and lens distortion of one camera."""
+
+    fu: float  # focal length, pixels, along u
+    fv: float  # focal length, pixels, along v
+    cu: float  # principal point, pixels
+    cv: float  # principal point, pixels
+    width: int  # pixels
+    height: int  # pixels
+    model: DistortionModel = "pinhole"
+    coefficients: tuple[float, ...] = ()  # radtan: k1 k2 p1 p2; equidistant: k1 k2 k3 k4; pinhole: none
+
+    def __post_init__(self) -> None:
+        if self.model not in _COEFFICIENTS:
+            raise CalibrationError(f"unknown distortion model {self.model!r}; use one of {', '.join(_COEFFICIENTS)}")
+        values = (self.fu, self.fv, self.cu, self.cv, *self.coefficients)
+        if not np.all(np.isfinite(values)):
+            raise CalibrationError(f"camera intrinsics are not finite: {values}; check the calibration file")
+        if self.fu <= 0 or self.fv <= 0 or self.width <= 0 or self.height <= 0:
+            raise CalibrationError(
+                f"focal lengths and image size must be positive, got fu={self.fu:g}, fv={self.fv:g}, "
+                f"{self.width}x{self.height}"
+            )
+        expected = _COEFFICIENTS[self.model]
+        if len(self.coefficients) != expected:
+            raise CalibrationError(
+                f"the {self.model} model takes {expected} distortion coefficients, got {len(self.coefficients)}"
+            )
+
+    @property
+    def K(self) -> FloatArray:
+        """Intrinsic matrix (3, 3), pixels."""
+        return np.array([[self.fu, 0, self.cu], [0, self.fv, self.cv], [0, 0, 1]], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class StereoRig:
+    """Two real cameras rigidly mounted on a body."""
+
+    cam0: CameraModel  # left
+    cam1: CameraModel  # right
+    T_imu_cam0: FloatArray  # (4, 4) metres
+    T_imu_cam1: FloatArray  # (4, 4) metres
+
+    @property
+    def T_cam0_cam1(self) -> FloatArray:
+        """Pose (4, 4) of the right camera in the left one; its translation is the baseline."""
+        out: FloatArray = se3_inverse(self.T_imu_cam0) @ self.T_imu_cam1
+        return out
+
+
+def rectified_camera(rig: StereoRig) -> StereoCamera:
+    """Return the rectified pair that the rig is.
+
+    Raises:
+        CalibrationError: the rig is not rectified (distortion, different intrinsics, or rows not aligned).
+    """
+    a, b = rig.cam0, rig.cam1
+    T = rig.T_cam0_cam1
+    same = (a.fu, a.fv, a.cu, a.cv, a.width, a.height) == (b.fu, b.fv, b.cu, b.cv, b.width, b.height)
+    aligned = np.abs(T[:3, :3] - np.eye(3)).max() < _RECTIFIED_TOLERANCE and np.abs(T[1:3, 3]).max() < 1e-9
+    if not (a.model == b.model == "pinhole" and same and aligned):
+        raise CalibrationError("the stereo rig is not rectified; rectify its images first")
+    return StereoCamera(a.fu, a.fv, a.cu, a.cv, float(T[0, 3]), a.width, a.height)
+
+
+def rig_from_rectified(camera: StereoCamera, T_cam0_imu: npt.ArrayLike) -> StereoRig:
+    """Return the rig of two equal pinhole cameras that a rectified pair describes.
+
+    Raises:
+        CalibrationError: the image size is unknown.
+    """
+    if camera.width is None or camera.height is None:
+        raise CalibrationError("a rig needs the image size; this rectified camera has none")
+    one = CameraModel(camera.fu, camera.fv, camera.cu, camera.cv, camera.width, camera.height)
+    T_imu_cam0 = se3_inverse(T_cam0_imu)
+    T_cam0_cam1 = np.eye(4)
+    T_cam0_cam1[0, 3] = camera.baseline_m
+    return StereoRig(one, one, T_imu_cam0, T_imu_cam0 @ T_cam0_cam1)
+
+
+def project_point(camera: CameraModel, p_cam: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
+    """Pixels (..., 2) of points (..., 3) in the camera frame, and a mask (...) of those the model can image.
+
+    False in the mask: behind the camera, or beyond the angle where the distortion polynomial folds back. The pixel
+    is then finite but arbitrary. Whether a pixel lies inside the image is not looked at.
+    """
+    p = np.asarray(p_cam, dtype=np.float64)
+    if camera.model == "equidistant":
+        xy, valid = _equidistant(camera.coefficients, p)
+    else:
+        valid = np.greater(p[..., 2], 1e-9)
+        xy = p[..., :2] / np.where(valid, p[..., 2], 1.0)[..., None]
+        if camera.model == "radtan":
+            valid = valid & (np.linalg.norm(xy, axis=-1) < _radtan_max_radius(camera.coefficients))
+            xy = np.where(valid[..., None], xy, 0.0)
+            xy = _radtan(camera.coefficients, xy)
+    return xy * (camera.fu, camera.fv) + (camera.cu, camera.cv), valid
+
+
+def uv_D_p_cam(camera: CameraModel, p_cam: npt.ArrayLike) -> FloatArray:
+    """Jacobian (..., 2, 3) of `project_point` with respect to the point (pixels per metre), where it is valid."""
+    p = np.asarray(p_cam, dtype=np.float64)
+    if camera.model == "equidistant":
+        xy_D_p = _equidistant_D_p(camera.coefficients, p)
+    else:
+        depth = p[..., 2]
+        xy_D_p = np.zeros((*p.shape[:-1], 2, 3))
+        xy_D_p[..., 0, 0] = xy_D_p[..., 1, 1] = 1 / depth
+        xy_D_p[..., 0, 2], xy_D_p[..., 1, 2] = -p[..., 0] / depth**2, -p[..., 1] / depth**2
+        if camera.model == "radtan":
+            xy_D_p = _radtan_D_xy(camera.coefficients, p[..., :2] / depth[..., None]) @ xy_D_p
+    return np.array([camera.fu, camera.fv])[:, None] * xy_D_p
+
+
+def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
+    """Unit rays (..., 3) in the camera frame of pixels (..., 2), and a mask (...) of those that Newton's method found.
+
+    A pixel that no ray of the model reaches gets False and an arbitrary finite ray.
+    """
+    uv = np.asarray(uv, dtype=np.float64)
+    xy = (uv - (camera.cu, camera.cv)) / (camera.fu, camera.fv)
+    if camera.model == "equidistant":
+        return _unproject_equidistant(camera.coefficients, xy)
+    valid: BoolArray = np.asarray(np.isfinite(xy).all(axis=-1))
+    if camera.model == "radtan":
+        xy, valid = _undistort_radtan(camera.coefficients, xy)
+    ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+    return ray / np.linalg.norm(ray, axis=-1, keepdims=True), valid
+
+
+def _radtan(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
+    k1, k2, p1, p2 = coefficients
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * k2)
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
+    k1, k2, p1, p2 = coefficients
+    x, y = xy[..., 0], xy[..., 1]
+    r2 = x * x + y * y
+    radial, slope = 1 + r2 * (k1 + r2 * k2), 2 * k1 + 4 * k2 * r2
+    out = np.empty((*xy.shape[:-1], 2, 2))
+    out[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    out[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    out[..., 0, 1] = out[..., 1, 0] = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    return out
+
+
+def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
+    """Radius on the undistorted plane where the radial polynomial stops growing: the model folds back beyond it."""
+    k1, k2 = coefficients[:2]
+    roots = np.roots([5 * k2, 3 * k1, 1.0])
+    positive = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
+    return float(np.sqrt(min(positive))) if positive else np.inf
+
+
+def _undistort_radtan(coefficients: tuple[float, ...], target: FloatArray) -> tuple[FloatArray, BoolArray]:
+    xy = np.where(np.isfinite(target), target, 0.0)
+    goal = xy
+    for _ in range(_NEWTON_STEPS):
+        residual = _radtan(coefficients, xy) - goal
+        if np.abs(residual).max(initial=0.0) < _NEWTON_TOLERANCE:
+            break
+        J = _radtan_D_xy(coefficients, xy)
+        det = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
+        det = np.where(np.abs(det) < 1e-6, 1e-6, det)
+        step = np.stack(
+            [
+                J[..., 1, 1] * residual[..., 0] - J[..., 0, 1] * residual[..., 1],
+                J[..., 0, 0] * residual[..., 1] - J[..., 1, 0] * residual[..., 0],
+            ],
+            axis=-1,
+        )
+        xy = xy - np.clip(step / det[..., None], -0.5, 0.5)
+    found = np.linalg.norm(_radtan(coefficients, xy) - target, axis=-1) < 1e-8
+    radius = np.linalg.norm(xy, axis=-1)
+    return xy, np.logical_and(found, radius < _radtan_max_radius(coefficients))
+
+
+def _theta_polynomial(coefficients: tuple[float, ...], theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Distorted angle and its derivative."""
+    k1, k2, k3, k4 = coefficients
+    t2 = theta * theta
+    value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    return value, slope
+
+
+def _max_theta(coefficients: tuple[float, ...]) -> float:
+    """Angle in radians where the distorted angle stops growing, at most pi."""
+    k1, k2, k3, k4 = coefficients
+    roots = np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])
+    positive = [float(root.real) for root in roots if abs(root.imag) < 1e-9 and root.real > 0]
+    return float(min([np.pi, *np.sqrt(positive)]))
+
+
+def _equidistant(coefficients: tuple[float, ...], p: FloatArray) -> tuple[FloatArray, BoolArray]:
+    radius = np.linalg.norm(p[..., :2], axis=-1)
+    theta = np.arctan2(radius, p[..., 2])
+    valid = (theta < _max_theta(coefficients)) & (np.linalg.norm(p, axis=-1) > 1e-12)
+    theta_d, _ = _theta_polynomial(coefficients, theta)
+    near_axis = radius < 1e-12
+    scale = np.where(near_axis, 0.0, theta_d / np.where(near_axis, 1.0, radius))
+    return p[..., :2] * scale[..., None], valid
+
+
+def _equidistant_D_p(coefficients: tuple[float, ...], p: FloatArray) -> FloatArray:
+    x, y, depth = p[..., 0], p[..., 1], p[..., 2]
+    near_axis = np.hypot(x, y) < 1e-9
+    radius = np.where(near_axis, 1.0, np.hypot(x, y))
+    theta_d, theta_d_D_theta = _theta_polynomial(coefficients, np.arctan2(radius, depth))
+    square = radius**2 + depth**2
+    ex, ey = x / radius, y / radius
+    along, across = theta_d_D_theta * depth / square, theta_d / radius
+    out = np.empty((*p.shape[:-1], 2, 3))
+    out[..., 0, 0] = along * ex * ex + across * ey * ey
+    out[..., 1, 1] = along * ey * ey + across * ex * ex
+    out[..., 0, 1] = out[..., 1, 0] = (along - across) * ex * ey
+    out[..., 0, 2], out[..., 1, 2] = -theta_d_D_theta * radius / square * ex, -theta_d_D_theta * radius / square * ey
+    on_axis = np.zeros((2, 3))
+    on_axis[0, 0] = on_axis[1, 1] = 1.0
+    safe_depth = np.where(near_axis, depth, 1.0)[..., None, None]
+    return np.where(near_axis[..., None, None], on_axis / safe_depth, out)
+
+
+def _unproject_equidistant(coefficients: tuple[float, ...], xy: FloatArray) -> tuple[FloatArray, BoolArray]:
+    finite: BoolArray = np.asarray(np.isfinite(xy).all(axis=-1))
+    xy = np.where(finite[..., None], xy, 0.0)
+    theta_d = np.linalg.norm(xy, axis=-1)
+    limit = _max_theta(coefficients)
+    theta = np.minimum(theta_d, 0.9 * limit)
+    for _ in range(_NEWTON_STEPS):
+        value, slope = _theta_polynomial(coefficients, theta)
+        if np.abs(value - theta_d).max(initial=0.0) < _NEWTON_TOLERANCE:
+            break
+        theta = np.clip(theta - (value - theta_d) / np.where(np.abs(slope) < 1e-3, 1e-3, slope), 0.0, limit)
+    value, _ = _theta_polynomial(coefficients, theta)
+    valid = finite & (np.abs(value - theta_d) < 1e-8)
+    near_axis = theta_d < 1e-12
+    direction = xy / np.where(near_axis, 1.0, theta_d)[..., None]
+    ray = np.concatenate([np.sin(theta)[..., None] * direction, np.cos(theta)[..., None]], axis=-1)
+    return ray, valid

@@ -1,0 +1,1 @@
+"""A rendered stereo-inertial world with exact truth; see docs/simulation.md."""

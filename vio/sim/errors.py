@@ -1,0 +1,9 @@
+"""The simulator's own expected failure."""
+
+from __future__ import annotations
+
+from vio.errors import VioError
+
+
+class SimulationError(VioError):
+    """A scene, trajectory or setting cannot be simulated as asked."""

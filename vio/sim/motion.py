@@ -1,0 +1,508 @@
+"""Continuous motion: a B-spline for the position and a cumulative B-spline on SO(3) for the attitude.
+
+Degree 3 or 5 with uniform knots, so velocity, acceleration, angular rate and angular acceleration are analytic.
+Reference: Sommer, Usenko, Schubert, Demmel, Cremers, Efficient derivative computation for cumulative B-splines on Lie
+groups (2020): cumulative basis, and the recurrences of angular rate and acceleration.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from math import comb, factorial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import scipy.sparse
+import scipy.sparse.linalg
+
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, so3_exp, so3_log
+from vio.records import BoolArray, IntArray
+from vio.sim.errors import SimulationError
+
+logger = logging.getLogger(__name__)
+
+_NS = 1e-9
+_ROBUST_ROUNDS = 8
+_OUTLIER_SIGMAS = 5.0
+_OUTLIER_FLOOR = (0.002, 0.01)  # m, rad: smaller residuals are motion that the spline smooths, not jumps
+_ROTATION_ROUNDS = 12
+_ROTATION_TOLERANCE_RAD = 1e-10
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSpline:
+    """A body's motion: uniform B-splines of one degree, defined from `start_ns` to `end_ns`."""
+
+    start_ns: int
+    knot_s: float  # seconds between knots
+    degree: int  # 3 or 5
+    p_control: FloatArray  # (M, 3) control positions, world, m
+    R_control: FloatArray  # (M, 3, 3) control attitudes R_world_imu
+
+    @property
+    def end_ns(self) -> int:
+        """Last nanosecond at which the motion is defined."""
+        return self.start_ns + int(np.floor((len(self.p_control) - self.degree) * self.knot_s / _NS))
+
+
+@dataclass(frozen=True, slots=True)
+class MotionState:
+    """A motion at N times."""
+
+    time_ns: IntArray  # (N,)
+    T_world_imu: FloatArray  # (N, 4, 4)
+    velocity_world: FloatArray  # (N, 3) m/s
+    acceleration_world: FloatArray  # (N, 3) m/s^2, without gravity
+    angular_velocity: FloatArray  # (N, 3) rad/s, imu frame
+    angular_acceleration: FloatArray  # (N, 3) rad/s^2, imu frame
+
+
+@dataclass(frozen=True, slots=True)
+class FitReport:
+    """How far a fitted spline stays from its record."""
+
+    samples: int
+    rejected: int  # samples taken for outliers
+    position_rms_m: float  # over the samples kept
+    position_max_m: float
+    rotation_rms_rad: float
+    rotation_max_rad: float
+
+
+@lru_cache(maxsize=8)
+def _blending(degree: int) -> FloatArray:
+    """Matrix (k, k) of the uniform B-spline: row i, column j is the factor of u^j in the weight of control point i.
+
+    Reference: Qin, General matrix representations for B-splines (1998), as given by Sommer et al.
+    """
+    k = degree + 1
+    out = np.zeros((k, k))
+    for s in range(k):
+        for n in range(k):
+            total = sum((-1.0) ** (i - s) * comb(k, i - s) * float(k - 1 - i) ** (k - 1 - n) for i in range(s, k))
+            out[s, n] = comb(k - 1, n) / factorial(k - 1) * total
+    return out
+
+
+def _weights(degree: int, u: FloatArray, derivative: int) -> FloatArray:
+    """Weights (N, k) of the k control points at fractions u (N,) of a knot interval, or their derivative in u."""
+    k = degree + 1
+    powers = np.zeros((len(u), k))
+    for n in range(derivative, k):
+        powers[:, n] = factorial(n) / factorial(n - derivative) * u ** (n - derivative)
+    out: FloatArray = powers @ _blending(degree).T
+    return out
+
+
+def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, IntArray, FloatArray]:
+    """Times (N,), first control point (N,) and fraction (N,) of each."""
+    t = np.atleast_1d(np.asarray(times_ns, dtype=np.int64))
+    if len(t) and (t.min() < spline.start_ns or t.max() > spline.end_ns):
+        raise SimulationError(
+            f"the motion is defined from {spline.start_ns} to {spline.end_ns} ns; "
+            f"asked for {t.min()} to {t.max()}: shorten the request or lengthen the trajectory"
+        )
+    position = (t - spline.start_ns) * (_NS / spline.knot_s)
+    segments = len(spline.p_control) - spline.degree
+    first = np.clip(np.floor(position).astype(np.int64), 0, segments - 1)
+    return t, first, position - first
+
+
+def evaluate(spline: MotionSpline, times_ns: npt.ArrayLike) -> MotionState:
+    """Pose and its first two derivatives at times (N,) in nanoseconds.
+
+    Raises:
+        SimulationError: a time lies outside the motion.
+    """
+    t, first, u = _locate(spline, times_ns)
+    k, rate = spline.degree + 1, 1 / spline.knot_s
+    index = first[:, None] + np.arange(k)
+    weights = [_weights(spline.degree, u, derivative) * rate**derivative for derivative in range(3)]
+    p, v, a = (np.einsum("nk,nki->ni", w, spline.p_control[index]) for w in weights)
+    # Cumulative weights: the sum of the weights from j on.
+    b, b1, b2 = (np.cumsum(w[:, ::-1], axis=1)[:, ::-1] for w in weights)
+    R_control = spline.R_control[index]
+    R = R_control[:, 0]
+    omega, alpha = np.zeros((len(t), 3)), np.zeros((len(t), 3))
+    for j in range(1, k):
+        d = so3_log(np.swapaxes(R_control[:, j - 1], 1, 2) @ R_control[:, j])
+        A = so3_exp(b[:, j, None] * d)
+        R = R @ A
+        At = np.swapaxes(A, 1, 2)
+        omega = (At @ omega[..., None])[..., 0] + b1[:, j, None] * d
+        alpha = (At @ alpha[..., None])[..., 0] + b1[:, j, None] * np.cross(omega, d) + b2[:, j, None] * d
+    return MotionState(t, se3_from_parts(R, p), v, a, omega, alpha)
+
+
+def fit_spline(
+    times_ns: npt.ArrayLike,
+    T_world_imu: npt.ArrayLike,
+    *,
+    knot_s: float = 0.1,
+    degree: int = 5,
+    robust: bool = False,
+) -> tuple[MotionSpline, FitReport]:
+    """Fit a spline to poses (N, 4, 4) at strictly increasing times (N,) by least squares.
+
+    The attitude is fitted by Gauss-Newton steps: the residual rotation vectors are fitted like a position and moved
+    into the control attitudes. With `robust`, samples farther than 5 robust deviations (and 2 mm
+    or 10 mrad) are left out.
+
+    Raises:
+        DataError: times do not increase, values are not finite, or there are too few poses.
+    """
+    t, T = _check_record(times_ns, T_world_imu, degree)
+    span = (t[-1] - t[0]) * _NS
+    segments = max(1, int(np.ceil(span / knot_s - 1e-9)))
+    step = span / segments * (1 + 1e-12)
+    position = np.minimum((t - t[0]) * _NS / step, segments - 1e-9)
+    first = np.floor(position).astype(np.int64)
+    design = _design(first, position - first, segments, degree)
+    keep = np.ones(len(t), dtype=np.bool_)
+    p_control, R_control = _fit(design, T, keep, step)
+    for _ in range(_ROBUST_ROUNDS if robust else 0):
+        distance, angle = _residuals(design, p_control, R_control, T, first, degree, position)
+        good = (distance < _limit(distance[keep], _OUTLIER_FLOOR[0])) & (angle < _limit(angle[keep], _OUTLIER_FLOOR[1]))
+        if np.array_equal(good, keep):
+            break
+        keep = good
+        p_control, R_control = _fit(design, T, keep, step)
+    distance, angle = _residuals(design, p_control, R_control, T, first, degree, position)
+    spline = MotionSpline(int(t[0]), step, degree, p_control, R_control)
+    report = FitReport(
+        len(t),
+        int((~keep).sum()),
+        float(np.sqrt(np.mean(distance[keep] ** 2))),
+        float(distance[keep].max()),
+        float(np.sqrt(np.mean(angle[keep] ** 2))),
+        float(angle[keep].max()),
+    )
+    return spline, report
+
+
+def _check_record(times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike, degree: int) -> tuple[IntArray, FloatArray]:
+    if degree not in (3, 5):
+        raise SimulationError(f"spline degree must be 3 or 5, got {degree}")
+    t, T = np.asarray(times_ns, dtype=np.int64).reshape(-1), np.asarray(T_world_imu, dtype=np.float64)
+    if T.shape != (len(t), 4, 4):
+        raise DataError(f"{len(t)} times for poses of shape {T.shape}; give one 4x4 pose for each time")
+    if len(t) < 2:
+        raise DataError(f"a trajectory needs at least two poses, got {len(t)}")
+    if not np.all(np.isfinite(T)):
+        raise DataError(f"pose {int(np.argwhere(~np.isfinite(T))[0, 0])} of the trajectory is not finite; remove it")
+    if np.any(np.diff(t) <= 0):
+        i = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
+        raise DataError(
+            f"trajectory times do not increase at pose {i} ({t[i - 1]} ns, then {t[i]} ns); sort the record"
+        )
+    return t, T
+
+
+def _design(first: IntArray, u: FloatArray, segments: int, degree: int) -> scipy.sparse.csr_matrix:
+    k = degree + 1
+    rows = np.repeat(np.arange(len(first)), k)
+    columns = (first[:, None] + np.arange(k)).ravel()
+    return scipy.sparse.csr_matrix(
+        (_weights(degree, u, 0).ravel(), (rows, columns)), shape=(len(first), segments + degree)
+    )
+
+
+def _solver(design: scipy.sparse.csr_matrix, keep: BoolArray) -> tuple[scipy.sparse.csr_matrix, object]:
+    """Normal equations with a whisper of curvature penalty, which decides where a gap leaves control points free."""
+    A = design[keep]
+    m = A.shape[1]
+    curvature = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(m - 2, m))
+    normal = A.T @ A + 1e-7 * (curvature.T @ curvature) + 1e-12 * scipy.sparse.identity(m)
+    return A, scipy.sparse.linalg.splu(scipy.sparse.csc_matrix(normal))
+
+
+def _fit(design: scipy.sparse.csr_matrix, T: FloatArray, keep: BoolArray, step: float) -> tuple[FloatArray, FloatArray]:
+    A, factor = _solver(design, keep)
+    p = T[keep, :3, 3]
+    middle = p.mean(axis=0)
+    p_control = factor.solve(A.T @ (p - middle)) + middle  # type: ignore[attr-defined]
+    R = T[keep, :3, :3]
+    m, degree = design.shape[1], int(np.diff(design.indptr)[0]) - 1
+    # Start from the sample nearest to where each control point weighs most.
+    sample = np.asarray(A @ np.arange(m, dtype=np.float64)).ravel()
+    nearest = np.abs(np.interp(np.arange(m), sample, np.arange(len(sample)))).round().astype(np.int64)
+    R_control: FloatArray = R[nearest]
+    first = A.indices.reshape(-1, degree + 1)[:, 0]
+    weights = A.data.reshape(-1, degree + 1)
+    for _ in range(_ROTATION_ROUNDS):
+        residual = so3_log(np.swapaxes(_attitude(R_control, first, weights), 1, 2) @ R)
+        delta = factor.solve(A.T @ residual)  # type: ignore[attr-defined]
+        R_control = R_control @ so3_exp(delta)
+        if np.abs(delta).max() < _ROTATION_TOLERANCE_RAD:
+            break
+    return p_control, R_control
+
+
+def _attitude(R_control: FloatArray, first: IntArray, weights: FloatArray) -> FloatArray:
+    """Attitudes (N, 3, 3) of the cumulative spline from plain weights (N, k)."""
+    cumulative = np.cumsum(weights[:, ::-1], axis=1)[:, ::-1]
+    R = R_control[first]
+    for j in range(1, weights.shape[1]):
+        d = so3_log(np.swapaxes(R_control[first + j - 1], 1, 2) @ R_control[first + j])
+        R = R @ so3_exp(cumulative[:, j, None] * d)
+    return R
+
+
+def _residuals(
+    design: scipy.sparse.csr_matrix,
+    p_control: FloatArray,
+    R_control: FloatArray,
+    T: FloatArray,
+    first: IntArray,
+    degree: int,
+    position: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Distances (N,) in metres and angles (N,) in radians between spline and record."""
+    R = _attitude(R_control, first, _weights(degree, position - first, 0))
+    distance = np.linalg.norm(design @ p_control - T[:, :3, 3], axis=1)
+    return distance, np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ T[:, :3, :3]), axis=1)
+
+
+def _limit(kept: FloatArray, floor: float) -> float:
+    """Largest residual that still counts as noise."""
+    return max(floor, float(_OUTLIER_SIGMAS * 1.4826 * np.median(kept)))
+
+
+def spline_from_waypoints(
+    T_world_imu: npt.ArrayLike, interval_s: float, *, start_ns: int = 0, degree: int = 5
+) -> MotionSpline:
+    """Return the motion that passes through waypoints (N, 4, 4) at equal intervals, smoothly where left free.
+
+    Raises:
+        DataError: fewer than two waypoints, or one is not finite.
+    """
+    T = np.asarray(T_world_imu, dtype=np.float64)
+    times = start_ns + np.round(np.arange(len(T)) * (interval_s / _NS)).astype(np.int64)
+    spline, report = fit_spline(times, T, knot_s=interval_s, degree=degree)
+    logger.debug("waypoints met within %.2g m, %.2g rad", report.position_max_m, report.rotation_max_rad)
+    return spline
+
+
+def turned(spline: MotionSpline, R_body_imu: npt.ArrayLike) -> MotionSpline:
+    """Describe the motion of a body by an IMU whose axes are turned in it: `R_world_imu = R_world_body R_body_imu`."""
+    return replace(spline, R_control=spline.R_control @ np.asarray(R_body_imu, dtype=np.float64))
+
+
+# --- ready motions --------------------------------------------------------------------------------------------------
+
+
+def look_rotation(forward: npt.ArrayLike) -> FloatArray:
+    """Attitudes (..., 3, 3) of a body with x along `forward` (..., 3), y left, z as far up as possible."""
+    x = np.asarray(forward, dtype=np.float64)
+    x = x / np.linalg.norm(x, axis=-1, keepdims=True)
+    y = np.cross(np.broadcast_to([0.0, 0.0, 1.0], x.shape), x)
+    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
+    return np.stack([x, y, np.cross(x, y)], axis=-1)
+
+
+def car_loop(
+    *,
+    loop_m: tuple[float, float] = (110.0, 70.0),
+    corner_m: float = 7.0,
+    speed_mps: float = 10.0,
+    duration_s: float | None = None,
+    height_m: float = 1.65,
+    start_m: float = 0.0,
+    seed: int = 0,
+    start_ns: int = 0,
+) -> MotionSpline:
+    """Drive counter-clockwise along a rectangle with round corners, slower there, on a slightly swaying suspension.
+
+    Args:
+        loop_m: extent of the middle line along x and y, about the origin; the same as `street`'s.
+        corner_m: radius of the corners.
+        speed_mps: speed on the straights; corners are taken at up to 2.5 m/s^2 across.
+        duration_s: length of the record; None drives one loop.
+        height_m: height of the body above the ground.
+        start_m: where on the loop to start, from the middle of the lower side.
+        seed: of the small motions of the suspension and the steering.
+        start_ns: time of the first pose.
+    """
+    if corner_m <= 0 or min(loop_m) <= 2 * corner_m:
+        raise SimulationError(f"corners of {corner_m:g} m do not fit a loop of {loop_m[0]:g} x {loop_m[1]:g} m")
+    straight = np.array(loop_m) - 2 * corner_m
+    length = 2 * float(straight.sum()) + 2 * np.pi * corner_m
+    step = 0.05
+    s = np.arange(0.0, length, step)
+    curvature = np.zeros(len(s))
+    edge = straight[0] / 2
+    for side in (straight[1], straight[0], straight[1], straight[0] / 2):
+        curvature[(s >= edge) & (s < edge + np.pi / 2 * corner_m)] = 1 / corner_m
+        edge += np.pi / 2 * corner_m + side
+    speed = np.minimum(speed_mps, np.sqrt(2.5 / np.maximum(curvature, 1e-6)))
+    speed = _smooth_periodic(_braked(speed, step), 6.0 / step)
+    curvature = _smooth_periodic(curvature, 2.0 / step)
+    heading = np.cumsum(curvature) * step
+    heading *= 2 * np.pi / heading[-1]
+    xy = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1) * step, axis=0)
+    xy -= np.linspace(0, 1, len(s))[:, None] * xy[-1]  # close the loop
+    xy -= (xy.max(axis=0) + xy.min(axis=0)) / 2
+    clock = np.cumsum(step / speed)
+    duration = float(clock[-1]) if duration_s is None else duration_s
+    offset = float(np.interp(start_m % length, s, clock))
+    t = np.arange(0.0, duration + 0.05, 0.05)
+    loops, phase = np.divmod(t + offset, clock[-1])
+    where = np.interp(phase, clock, s)
+    yaw = np.interp(where, s, heading) + 2 * np.pi * loops
+    sway = _sway(t, seed, np.array([0.004, 0.006, 0.004, 0.012]), (0.3, 1.6))
+    p = np.stack([*(np.interp(where, s, xy[:, i]) for i in range(2)), height_m + sway[:, 3]], axis=1)
+    R = so3_exp(np.stack([0 * yaw, 0 * yaw, yaw + sway[:, 2]], 1)) @ so3_exp(
+        np.stack([sway[:, 0], sway[:, 1], 0 * yaw], 1)
+    )
+    times = start_ns + np.round(t / _NS).astype(np.int64)
+    return fit_spline(times, se3_from_parts(R, p), knot_s=0.2)[0]
+
+
+def _smooth_periodic(values: FloatArray, width: float) -> FloatArray:
+    """Convolve with a raised cosine `width` samples wide, around the loop."""
+    n = max(3, int(width) | 1)
+    kernel = np.hanning(n + 2)[1:-1]
+    padded = np.concatenate([values[-n:], values, values[:n]])
+    out: FloatArray = np.convolve(padded, kernel / kernel.sum(), mode="same")[n:-n]
+    return out
+
+
+def _braked(speed: FloatArray, step: float, limit_mps2: float = 2.0) -> FloatArray:
+    """Lower speeds so that neither braking nor gaining speed exceeds a limit, around the loop."""
+    square = np.concatenate([speed, speed, speed]) ** 2
+    for order in (range(1, len(square)), range(len(square) - 2, -1, -1)):
+        shift = -1 if order.step > 0 else 1
+        for i in order:
+            square[i] = min(square[i], square[i + shift] + 2 * limit_mps2 * step)
+    n = len(speed)
+    return np.sqrt(square[n : 2 * n])
+
+
+def _sway(t: FloatArray, seed: int, amplitude: FloatArray, band_hz: tuple[float, float]) -> FloatArray:
+    """Smooth random motions (N, C) of given deviations, made of sines in a frequency band."""
+    rng = np.random.default_rng([seed, 11])
+    out = np.zeros((len(t), len(amplitude)))
+    for channel, size in enumerate(amplitude):
+        frequency = rng.uniform(*band_hz, 8)
+        phase = rng.uniform(0, 2 * np.pi, 8)
+        out[:, channel] = size / 2 * np.sin(2 * np.pi * frequency * t[:, None] + phase).sum(axis=1)
+    return out
+
+
+def hand_held(
+    *,
+    centre: npt.ArrayLike = (0.0, 0.0, 1.4),
+    extent: npt.ArrayLike = (1.6, 1.1, 0.35),
+    duration_s: float = 30.0,
+    period_s: float = 12.0,
+    still_s: float = 0.0,
+    seed: int = 0,
+    start_ns: int = 0,
+) -> MotionSpline:
+    """Fly or carry the body around a room: a Lissajous path about `centre`, looking along it and about.
+
+    The IMU axes are forward, left, up; for EuRoC's rig, whose body looks along its z axis, apply
+    `turned(spline, R_FLU_EUROC_IMU)`.
+
+    Args:
+        centre: middle of the path, m.
+        extent: half of the path's size along x, y, z, m.
+        duration_s: length of the record.
+        period_s: time of one round.
+        still_s: rest at the start, for filters that want it.
+        seed: of phases and of the wandering gaze.
+        start_ns: time of the first pose.
+    """
+    t = np.arange(0.0, duration_s + 0.025, 0.025)
+    moving = np.maximum(t - still_s, 0.0)
+    phase = _eased(moving)
+    rng = np.random.default_rng([seed, 12])
+    w = 2 * np.pi / period_s
+    shift = rng.uniform(0, 2 * np.pi, 3)
+    angle = w * phase
+    p = np.asarray(centre, dtype=np.float64) + np.asarray(extent, dtype=np.float64) * np.stack(
+        [np.cos(angle + shift[0]), np.sin(angle + shift[0]), np.sin(1.7 * angle + shift[1])], axis=1
+    )
+    shake = _sway(phase, seed + 1, np.array([0.06, 0.06, 0.15, 0.012, 0.012, 0.012]), (0.1, 0.7))
+    yaw = angle + shift[0] + np.pi / 2 + 0.35 * np.sin(0.6 * angle + shift[2])
+    zero = np.zeros_like(t)
+    R = so3_exp(np.stack([zero, zero, yaw + shake[:, 2]], 1)) @ so3_exp(np.stack([shake[:, 0], shake[:, 1], zero], 1))
+    times = start_ns + np.round(t / _NS).astype(np.int64)
+    return fit_spline(times, se3_from_parts(R, p + shake[:, 3:]), knot_s=0.1)[0]
+
+
+def _eased(t: FloatArray, ramp_s: float = 2.0) -> FloatArray:
+    """Time that starts at rest: its rate grows smoothly (quintic) from 0 to 1 over the ramp."""
+    u = np.clip(t / ramp_s, 0.0, 1.0)
+    integral = u**4 * (2.5 + u * (u - 3))  # of 10 u^3 - 15 u^4 + 6 u^5
+    return ramp_s * integral + np.maximum(t - ramp_s, 0.0)
+
+
+# --- recorded motion ------------------------------------------------------------------------------------------------
+
+
+def read_tum(path: Path) -> tuple[IntArray, FloatArray]:
+    """Read a trajectory `t tx ty tz qx qy qz qw` (s, m): times (N,) in ns and poses (N, 4, 4).
+
+    Raises:
+        DataError: the file is missing, a line is not eight finite numbers, or times do not increase.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot read the trajectory {path}: {error}") from error
+    times, values = [], []
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            row = []
+        if len(row) != 8 or not np.all(np.isfinite(row)) or np.linalg.norm(row[4:]) < 1e-6:
+            raise DataError(f"{path}, line {number}: expected `t tx ty tz qx qy qz qw`, got {line[:60]!r}")
+        times.append(_nanoseconds(words[0]))
+        values.append(row[1:])
+    if len(times) < 2:
+        raise DataError(f"{path} holds {len(times)} poses; a trajectory needs at least two")
+    t = np.array(times, dtype=np.int64)
+    if np.any(np.diff(t) <= 0):
+        i = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
+        raise DataError(f"{path}: times do not increase at pose {i} ({t[i - 1]} ns, then {t[i]} ns); sort the record")
+    data = np.array(values)
+    return t, se3_from_parts(rotation_from_quat_xyzw(data[:, 3:]), data[:, :3])
+
+
+def _nanoseconds(seconds: str) -> int:
+    """Exact nanoseconds of a decimal number of seconds; a float would lose digits at Unix times."""
+    whole, _, fraction = seconds.partition(".")
+    if whole.isdigit() and fraction.isdigit():
+        return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
+    return round(float(seconds) * 1e9)
+
+
+def recorded_motion(path: Path, *, knot_s: float = 0.1, degree: int = 5) -> tuple[MotionSpline, FitReport]:
+    """Smooth a recorded ground truth (TUM file of the IMU's poses) so that it is twice differentiable.
+
+    Raises:
+        DataError: the file cannot be used; see `read_tum`.
+    """
+    times, T = read_tum(path)
+    gap_s = float(np.diff(times).max()) * _NS
+    if gap_s > 5 * knot_s:
+        logger.warning("%s has a gap of %.2f s; the motion is made up there", path, gap_s)
+    spline, report = fit_spline(times, T, knot_s=knot_s, degree=degree, robust=True)
+    logger.info(
+        "%s: spline within %.1f mm and %.2f mrad rms, %d of %d poses left out",
+        path,
+        1e3 * report.position_rms_m,
+        1e3 * report.rotation_rms_rad,
+        report.rejected,
+        report.samples,
+    )
+    return spline, report

@@ -1,0 +1,515 @@
+"""Ray-cast images of a world, and the exact map from any pixel to any other view.
+
+A ray `d` from the camera centre c meets a surface with corner p0, axes e_s, e_t and normal n (h = n . (c - p0) > 0 in
+front of it) where `w = -(n . d) / h`, the inverse distance in units of d. Texture coordinates times w and w itself are
+linear in d, so every surface is one 3x3 matrix `G` with `G d = (w U, w V, w)`: in a pinhole image, a homography. All
+tests (inside the rectangle, nearest) are linear inequalities in d; where they hold at the corners of a tile they hold
+all over it. Tiles that show one surface are shaded whole; along outlines each pixel is sampled 4x4.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.distortion import CameraModel, DistortionModel, project_point, unproject_pixel
+from vio.geometry.lie import FloatArray, se3_inverse, transform_points
+from vio.records import BoolArray, IntArray
+from vio.sim.errors import SimulationError
+from vio.sim.textures import LEVELS_PER_OCTAVE, MipTexture
+from vio.sim.world import Surfaces, World, surfaces_at
+
+Radiance: TypeAlias = npt.NDArray[np.float32]
+
+_TILE = 32  # pixels
+_COARSE = 4  # tiles along a coarse tile
+# Tiles shaded in one go; sample positions within a pixel follow the ray derivative at the middle of the run.
+_RUN: dict[DistortionModel, int] = {"pinhole": 8, "radtan": 4, "equidistant": 2}
+_EDGE_MARK, _NONE = np.int16(-1), np.int16(-2)
+_EDGE = 4  # samples along each side of a pixel on an outline
+_EMPTY = np.float32(90.0)  # gray level where no surface is hit
+_LOD_STEP = 4  # pixels between evaluations of the level of detail
+_MIN_FRONT_M = 1e-6
+_SAME_POINT = 1e-6  # relative distance within which two hits are the same point
+_CAST_ROWS = 20000  # rays times surfaces held in memory at once are limited to this many rays
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One camera, where it is, and when."""
+
+    camera: CameraModel
+    T_world_cam: FloatArray  # (4, 4)
+    time_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CameraRays:
+    """The rays of a camera's pixels, computed once."""
+
+    camera: CameraModel
+    # Rays in the camera frame, unit length for fisheye cameras and of unit depth for others.
+    centre: npt.NDArray[np.float32]  # (3, H, W) through pixel centres
+    corner: npt.NDArray[np.float32]  # (3, H + 1, W + 1) through pixel corners; [.., 0, 0] is pixel (-0.5, -0.5)
+    fine: FloatArray  # (R, C, 4, 3) rays whose cone holds each tile
+    coarse: FloatArray  # (R', C', 4, 3) the same for blocks of tiles
+
+
+@dataclass(frozen=True, slots=True)
+class Hits:
+    """Where rays meet the scene."""
+
+    surface: IntArray  # (N,) index of the surface; arbitrary where nothing is hit
+    distance: FloatArray  # (N,) along the unit ray, m
+    place: FloatArray  # (N, 2) coordinates s, t on the surface, m
+    found: BoolArray  # (N,)
+
+
+def camera_rays(camera: CameraModel) -> CameraRays:
+    """Tabulate the rays of a camera.
+
+    Raises:
+        SimulationError: the distortion model does not reach every pixel.
+    """
+    centre, found = unproject_pixel(camera, _grid(camera.width, camera.height, 0.0))
+    corner, found_corner = unproject_pixel(camera, _grid(camera.width + 1, camera.height + 1, -0.5))
+    if not (found.all() and found_corner.all()):
+        raise SimulationError("the distortion model does not reach every pixel of the image; check its coefficients")
+    if camera.model != "equidistant":
+        centre, corner = centre / centre[..., 2:], corner / corner[..., 2:]
+    return CameraRays(
+        camera,
+        np.ascontiguousarray(np.moveaxis(centre, -1, 0), dtype=np.float32),
+        np.ascontiguousarray(np.moveaxis(corner, -1, 0), dtype=np.float32),
+        _cones(corner, _TILE),
+        _cones(corner, _TILE * _COARSE),
+    )
+
+
+def _grid(width: int, height: int, start: float) -> FloatArray:
+    u, v = np.meshgrid(np.arange(width) + start, np.arange(height) + start)
+    return np.stack([u, v], axis=-1)
+
+
+def _cones(corner: FloatArray, tile: int) -> FloatArray:
+    """Four rays per tile that span a cone holding all its rays, found on a plane across its middle ray."""
+    height, width = corner.shape[0] - 1, corner.shape[1] - 1
+    rows, columns = -(-height // tile), -(-width // tile)
+    out = np.empty((rows, columns, 4, 3))
+    for r in range(rows):
+        for c in range(columns):
+            block = corner[r * tile : (r + 1) * tile + 1, c * tile : (c + 1) * tile + 1].reshape(-1, 3)
+            z = block.mean(axis=0) / np.linalg.norm(block.mean(axis=0))
+            # Align with image rows, so that the cone is tight.
+            x = block[-1] - block[0] + 1e-9 * np.array([1.0, 0, 0])
+            x = np.array([1.0, 0, 0]) - z[0] * z if abs(z[0]) < 0.9 else x - (x @ z) * z
+            x /= np.linalg.norm(x)
+            y = np.cross(z, x)
+            a, b, depth = block @ x, block @ y, block @ z
+            (a0, a1), (b0, b1) = ((float((q / depth).min()), float((q / depth).max())) for q in (a, b))
+            slack = 1e-6
+            spans = [
+                (a0 - slack, b0 - slack),
+                (a1 + slack, b0 - slack),
+                (a0 - slack, b1 + slack),
+                (a1 + slack, b1 + slack),
+            ]
+            out[r, c] = [p * x + q * y + z for p, q in spans]
+    return out
+
+
+# --- exact geometry -------------------------------------------------------------------------------------------------
+
+
+def _surface_matrices(surfaces: Surfaces, T_world_cam: FloatArray) -> tuple[FloatArray, IntArray]:
+    """Matrices G (K, 3, 3) with `G d = (w s, w t, w)` for camera-frame rays d, of the K surfaces turned this way."""
+    c, R = T_world_cam[:3, 3], T_world_cam[:3, :3]
+    from_corner = c - surfaces.origin
+    normal = surfaces.normal
+    h = np.einsum("si,si->s", normal, from_corner)
+    front = np.flatnonzero(h > _MIN_FRONT_M)
+    w = -normal[front] / h[front, None]
+    rows = []
+    for axis in (surfaces.axis_s[front], surfaces.axis_t[front]):
+        at_camera = np.einsum("si,si->s", axis, from_corner[front])
+        rows.append(axis + at_camera[:, None] * w)
+    G = np.stack([*rows, w], axis=1) @ R
+    return G, front
+
+
+def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike, *, among: IntArray | None = None) -> Hits:
+    """Intersect unit rays (N, 3) of the camera frame with the nearest surface, exactly.
+
+    Args:
+        surfaces: the scene at one time.
+        T_world_cam: pose (4, 4) of the camera.
+        rays: unit rays (N, 3), camera frame.
+        among: indices of the only surfaces to look at.
+    """
+    d = np.asarray(rays, dtype=np.float64).reshape(-1, 3)
+    G, index = _surface_matrices(surfaces, np.asarray(T_world_cam, dtype=np.float64))
+    if among is not None:
+        keep = np.isin(index, among)
+        G, index = G[keep], index[keep]
+    size = surfaces.size[index]
+    parts = [_cast_block(G, index, size, d[i : i + _CAST_ROWS]) for i in range(0, max(len(d), 1), _CAST_ROWS)]
+    return Hits(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _cast_block(
+    G: FloatArray, index: IntArray, size: FloatArray, d: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+    best = np.zeros(len(d))
+    surface = np.zeros(len(d), dtype=np.int64)
+    place = np.zeros((len(d), 2))
+    for k in range(len(index)):
+        a, b, w = G[k] @ d.T
+        hit = (w > best) & (a >= 0) & (b >= 0) & (a <= size[k, 0] * w) & (b <= size[k, 1] * w)
+        if hit.any():
+            best[hit], surface[hit] = w[hit], index[k]
+            place[hit, 0], place[hit, 1] = a[hit] / w[hit], b[hit] / w[hit]
+    found = best > 0
+    return surface, 1 / np.where(found, best, 1.0), place, found
+
+
+def surface_points(surfaces: Surfaces, surface: IntArray, place: FloatArray) -> FloatArray:
+    """World points (N, 3) of places (N, 2) on surfaces (N,)."""
+    return surfaces.origin[surface] + place[:, :1] * surfaces.axis_s[surface] + place[:, 1:] * surfaces.axis_t[surface]
+
+
+def correspondence(world: World, frame_a: View, frame_b: View, uv: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
+    """Map pixels (N, 2) of one view to another view (of the same or another camera, at the same or another time).
+
+    Exact at sub-pixel positions: the ray is intersected, nothing is interpolated. Points of moving boxes move along.
+
+    Returns:
+        Pixels (N, 2) in `frame_b`, and a mask (N,): True where the point is inside the other image and nothing is
+        in front of it. Where False the pixel is finite but may be arbitrary.
+    """
+    uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    rays, has_ray = unproject_pixel(frame_a.camera, uv)
+    hits = cast(surfaces_at(world, frame_a.time_ns), frame_a.T_world_cam, rays)
+    later = surfaces_at(world, frame_b.time_ns)
+    p_world = surface_points(later, hits.surface, hits.place)
+    uv_b, visible = observe(later, frame_b, p_world)
+    return uv_b, visible & hits.found & has_ray
+
+
+def observe(surfaces: Surfaces, view: View, p_world: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
+    """Pixels (N, 2) of world points (N, 3) on surfaces, and a mask (N,) of those inside the image and not hidden."""
+    p_cam = transform_points(se3_inverse(view.T_world_cam), np.asarray(p_world, dtype=np.float64).reshape(-1, 3))
+    uv, valid = project_point(view.camera, p_cam)
+    visible = valid & inside_image(view.camera, uv)
+    distance = np.linalg.norm(p_cam, axis=1)
+    rays = p_cam[visible] / distance[visible, None]
+    hits = cast(surfaces, view.T_world_cam, rays)
+    # A point seen from behind its surface meets either nothing at its distance or another surface in front.
+    reached = hits.found & (np.abs(hits.distance - distance[visible]) < _SAME_POINT * (1 + distance[visible]))
+    visible[visible] = reached
+    return uv, visible
+
+
+def inside_image(camera: CameraModel, uv: npt.ArrayLike, *, margin_px: float = 0.0) -> BoolArray:
+    """Mask (N,) of pixels (N, 2) between the centres of the outermost pixels, `margin_px` further in."""
+    uv = np.asarray(uv, dtype=np.float64)
+    high = np.array([camera.width - 1, camera.height - 1]) - margin_px
+    u, v = uv[..., 0], uv[..., 1]
+    return (u >= margin_px) & (v >= margin_px) & (u <= high[0]) & (v <= high[1])
+
+
+def depth_map(
+    world: World, rays: CameraRays, T_world_cam: npt.ArrayLike, time_ns: int = 0
+) -> tuple[FloatArray, IntArray]:
+    """Exact depth along the optical axis (H, W) in metres at pixel centres, and the surface seen there (H, W).
+
+    Depth is infinite where no surface is hit.
+    """
+    T = np.asarray(T_world_cam, dtype=np.float64)
+    surfaces = surfaces_at(world, time_ns)
+    height, width = rays.camera.height, rays.camera.width
+    depth, surface = np.full((height, width), np.inf), np.zeros((height, width), dtype=np.int64)
+    G, index = _surface_matrices(surfaces, T)
+    candidates = _candidates(G, surfaces.size[index], rays)
+    uv = _grid(width, height, 0.0)
+    for r, c in np.ndindex(candidates.shape[:2]):
+        rows, columns = slice(r * _TILE, (r + 1) * _TILE), slice(c * _TILE, (c + 1) * _TILE)
+        d, _ = unproject_pixel(rays.camera, uv[rows, columns].reshape(-1, 2))
+        chosen = candidates[r, c]
+        which, distance, _, found = _cast_block(G[chosen], index[chosen], surfaces.size[index[chosen]], d)
+        shape = depth[rows, columns].shape
+        depth[rows, columns] = np.where(found, distance * d[:, 2], np.inf).reshape(shape)
+        surface[rows, columns] = which.reshape(shape)
+    return depth, surface
+
+
+# --- images ---------------------------------------------------------------------------------------------------------
+
+
+def _candidates(G: FloatArray, size: FloatArray, rays: CameraRays) -> BoolArray:
+    """Surfaces (R, C, K) that may be seen in each tile; exactly one where that is certain."""
+    rows, columns = rays.fine.shape[:2]
+    coarse = _cull(G, size, rays.coarse.reshape(-1, 4, 3)).reshape(*rays.coarse.shape[:2], len(G))
+    out = np.zeros((rows, columns, len(G)), dtype=np.bool_)
+    for r, c in np.ndindex(coarse.shape[:2]):
+        chosen = np.flatnonzero(coarse[r, c])
+        block = rays.fine[r * _COARSE : (r + 1) * _COARSE, c * _COARSE : (c + 1) * _COARSE]
+        kept = _cull(G[chosen], size[chosen], block.reshape(-1, 4, 3)).reshape(*block.shape[:2], len(chosen))
+        out[r * _COARSE : (r + 1) * _COARSE, c * _COARSE : (c + 1) * _COARSE, chosen] = kept
+    return out
+
+
+def _cull(G: FloatArray, size: FloatArray, cones: FloatArray) -> BoolArray:
+    """Surfaces (B, K) that may be seen in cones (B, 4, 3) of rays: five linear inequalities at the four edges."""
+    forms = np.einsum("kij,bqj->ibqk", G, cones, optimize=True)
+    w = forms[2]
+    limits = (w, forms[0], forms[1], size[:, 0] * w - forms[0], size[:, 1] * w - forms[1])
+    possible = np.ones((len(cones), len(G)), dtype=np.bool_)
+    covers = possible.copy()
+    for limit in limits:
+        possible &= (limit >= 0).any(axis=1)
+        covers &= (limit > 0).all(axis=1)
+    nearness = np.where(covers, w.min(axis=1), -np.inf)
+    front = nearness.argmax(axis=1)
+    block = np.arange(len(cones))
+    has_cover = covers[block, front] if len(G) else np.zeros(len(cones), dtype=np.bool_)
+    behind = (w <= w[block, :, front][:, :, None]).all(axis=1)
+    behind[block, front] = False
+    return possible & ~(behind & has_cover[:, None])
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """The surfaces in front of one camera, ready to be sampled."""
+
+    G: npt.NDArray[np.float32]  # (K, 3, 3) rays to (w U, w V, w), U and V in texels
+    limit: npt.NDArray[np.float32]  # (K, 2) texels
+    textures: list[MipTexture]  # (K,)
+
+
+def render(world: World, rays: CameraRays, T_world_cam: npt.ArrayLike, time_ns: int = 0) -> Radiance:
+    """Render one image (H, W) in gray levels, linear and without any camera effect.
+
+    Every pixel is the mean of at least four filtered samples placed symmetrically about its centre.
+    """
+    surfaces = surfaces_at(world, time_ns)
+    G, index = _surface_matrices(surfaces, np.asarray(T_world_cam, dtype=np.float64))
+    candidates = _candidates(G, surfaces.size[index], rays)
+    used = np.flatnonzero(candidates.any(axis=(0, 1)))
+    textures = [world.textures[int(index[k])] for k in used]
+    texels = np.array([t.size for t in textures], dtype=np.float64).reshape(-1, 2)
+    scaled = G[used].copy()
+    scaled[:, :2] *= (texels / surfaces.size[index[used]])[:, :, None]
+    candidates = candidates[:, :, used]
+    scene = _Scene(scaled.astype(np.float32), texels.astype(np.float32), textures)
+    image = np.full((rays.camera.height, rays.camera.width), _EMPTY, dtype=np.float32)
+    edges = []
+    for r in range(candidates.shape[0]):
+        shown = _shown(scene, candidates[r], rays, r)
+        _shade_row(scene, shown, rays, r, image)
+        edges.append(np.argwhere(shown == _EDGE_MARK) + np.array([r * _TILE, 0]))
+    _shade_edges(scene, candidates, rays, np.concatenate(edges), image)
+    return image
+
+
+def _shown(scene: _Scene, candidates: BoolArray, rays: CameraRays, r: int) -> npt.NDArray[np.int16]:
+    """The surface that each pixel (h, W) of a row of tiles shows all over, _EDGE_MARK on outlines, or _NONE."""
+    rows = slice(r * _TILE, min((r + 1) * _TILE, rays.camera.height))
+    out = np.full((rows.stop - rows.start, rays.camera.width), _NONE, dtype=np.int16)
+    for c, allowed in enumerate(candidates):
+        chosen = np.flatnonzero(allowed)
+        columns = slice(c * _TILE, min((c + 1) * _TILE, rays.camera.width))
+        if len(chosen) == 1:
+            out[:, columns] = chosen[0]
+        elif len(chosen) > 1:
+            corner = rays.corner[:, rows.start : rows.stop + 1, columns.start : columns.stop + 1]
+            ids = _nearest(scene, chosen, corner.reshape(3, -1)).reshape(corner.shape[1:])
+            first = ids[:-1, :-1]
+            uniform = (first == ids[1:, :-1]) & (first == ids[:-1, 1:]) & (first == ids[1:, 1:])
+            out[:, columns] = np.where(uniform, first, _EDGE_MARK)
+    return out
+
+
+def _nearest(scene: _Scene, chosen: IntArray, d: npt.NDArray[np.float32]) -> npt.NDArray[np.int16]:
+    """The nearest (n,) of some surfaces along each ray d (3, n), or _NONE."""
+    forms = scene.G[chosen] @ d  # (m, 3, n)
+    limit = scene.limit[chosen]
+    a, b, w = forms[:, 0], forms[:, 1], forms[:, 2]
+    inside = (a >= 0) & (b >= 0) & (a <= limit[:, :1] * w) & (b <= limit[:, 1:] * w)
+    nearness = np.where(inside, w, np.float32(0))
+    best = nearness.argmax(axis=0)
+    return np.where(nearness.max(axis=0) > 0, chosen[best], _NONE).astype(np.int16)
+
+
+def _shade_row(scene: _Scene, shown: npt.NDArray[np.int16], rays: CameraRays, r: int, image: Radiance) -> None:
+    """Shade the pixels of a row of tiles that show one surface only, surface by surface in runs of columns."""
+    top = r * _TILE
+    longest = _RUN[rays.camera.model] * _TILE
+    for k in np.flatnonzero(np.bincount(shown[shown >= 0], minlength=1)):
+        mask = shown == k
+        seen = np.flatnonzero(mask.any(axis=0))
+        start = 0
+        for i in range(1, len(seen) + 1):
+            if i < len(seen) and seen[i] - seen[i - 1] <= _TILE and seen[i] - seen[start] < longest:
+                continue
+            columns = slice(int(seen[start]), int(seen[i - 1]) + 1)
+            part = mask[:, columns]
+            within = np.flatnonzero(part.any(axis=1))
+            low, high = int(within[0]), int(within[-1]) + 1
+            rows = slice(top + low, top + high)
+            np.copyto(image[rows, columns], _shade(scene, int(k), rays, rows, columns), where=part[low:high])
+            start = i
+
+
+def _samples(across: int, down: int) -> npt.NDArray[np.float32]:
+    """Sample positions (N, 2) within a pixel, the two colours of a chessboard one after the other.
+
+    The halves take their texture from neighbouring mip levels where the level of detail lies between two; each half
+    is symmetric about the pixel's centre, so the blend shifts nothing.
+    """
+    i, j = np.meshgrid(np.arange(down), np.arange(across), indexing="ij")
+    order = np.argsort((i + j).ravel() % 2, kind="stable")
+    u, v = (j.ravel()[order] + 0.5) / across - 0.5, (i.ravel()[order] + 0.5) / down - 0.5
+    return np.stack([u, v], axis=1).astype(np.float32)
+
+
+_SQUARE, _WIDE, _TALL = _samples(2, 2), _samples(4, 2), _samples(2, 4)
+_FINE = _samples(_EDGE, _EDGE)
+_STRETCHED = 2.0  # ratio of footprint sides from which the longer one gets twice the samples
+
+
+def _footprint(
+    forms: npt.NDArray[np.float32], g_u: npt.NDArray[np.float32], g_v: npt.NDArray[np.float32]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Squared length in texels of one pixel step along u and along v; forms and derivatives are (3, ...)."""
+    inverse = 1 / forms[2]
+    U, V = forms[0] * inverse, forms[1] * inverse
+    along_u = ((g_u[0] - U * g_u[2]) * inverse) ** 2 + ((g_u[1] - V * g_u[2]) * inverse) ** 2
+    along_v = ((g_v[0] - U * g_v[2]) * inverse) ** 2 + ((g_v[1] - V * g_v[2]) * inverse) ** 2
+    return along_u, along_v
+
+
+def _levels(square: npt.NDArray[np.float32], texture: MipTexture, phase: float) -> npt.NDArray[np.intp]:
+    """Mip level for a squared distance between samples, in texels."""
+    detail = np.log2(np.maximum(square, 1e-12)) * np.float32(LEVELS_PER_OCTAVE / 2)
+    return np.clip(np.floor(detail + phase), 0, len(texture.levels) - 1).astype(np.intp)
+
+
+def _shade(scene: _Scene, k: int, rays: CameraRays, rows: slice, columns: slice) -> Radiance:
+    """Texture of surface k over a block of pixels (h, w), whether or not it is seen there."""
+    d = rays.centre[:, rows, columns]
+    h, w = d.shape[1:]
+    texture, G = scene.textures[k], scene.G[k]
+    corner = rays.corner[
+        :, rows.start + h // 2 : rows.start + h // 2 + 2, columns.start + w // 2 : columns.start + w // 2 + 2
+    ]
+    g_u, g_v = G @ (corner[:, 0, 1] - corner[:, 0, 0]), G @ (corner[:, 1, 0] - corner[:, 0, 0])
+    forms = G @ d.reshape(3, -1)
+    along_u, along_v = _footprint(forms.reshape(3, h, w)[:, ::_LOD_STEP, ::_LOD_STEP], g_u, g_v)
+    middle = along_u.shape[0] // 2, along_u.shape[1] // 2
+    ratio = along_u[middle] / max(along_v[middle], 1e-30)
+    if ratio > _STRETCHED**2:
+        offsets, square = _WIDE, np.maximum(along_u / 16, along_v / 4)
+    elif ratio < 1 / _STRETCHED**2:
+        offsets, square = _TALL, np.maximum(along_u / 4, along_v / 16)
+    else:
+        offsets, square = _SQUARE, np.maximum(along_u, along_v) / 4
+    n = len(offsets)
+    moved = offsets[:, :1] * g_u + offsets[:, 1:] * g_v  # (n, 3)
+    inverse = forms[2] + moved[:, 2:]
+    np.divide(np.float32(1), inverse, out=inverse)
+    x, y = forms[0] + moved[:, :1], forms[1] + moved[:, 1:2]
+    x *= inverse
+    y *= inverse
+    for half, phase in ((slice(0, n // 2), 0.25), (slice(n // 2, n), 0.75)):
+        level = _levels(square, texture, phase)
+        if level.min() == level.max():
+            scale_x, scale_y, shift_x, shift_y = texture.levels[level.flat[0]]
+        else:
+            table = np.moveaxis(texture.levels[level], -1, 0)
+            grown = table.repeat(_LOD_STEP, axis=1).repeat(_LOD_STEP, axis=2)[:, :h, :w].reshape(4, -1)
+            scale_x, scale_y, shift_x, shift_y = grown
+        x[half] *= scale_x
+        x[half] += shift_x
+        y[half] *= scale_y
+        y[half] += shift_y
+    values = cv2.remap(
+        texture.page, x.reshape(n * h, w), y.reshape(n * h, w), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+    )
+    total = np.add.reduce(values.reshape(n, h * w), axis=0, dtype=np.float32)
+    total *= np.float32(1 / n)
+    return total.reshape(h, w)
+
+
+def _shade_edges(scene: _Scene, candidates: BoolArray, rays: CameraRays, pixels: IntArray, image: Radiance) -> None:
+    """Sample the pixels (E, 2: row, column) on outlines finely, each sample from the surface that it hits."""
+    v, u = pixels.T
+    if len(v) == 0:
+        return
+    n = len(_FINE)
+    allowed = candidates[v // _TILE, u // _TILE]
+    first = rays.corner[:, v, u]
+    du, dv = rays.corner[:, v, u + 1] - first, rays.corner[:, v + 1, u] - first  # (3, E)
+    step_u, step_v = _FINE[:, 0, None], _FINE[:, 1, None]
+    d = rays.centre[:, None, v, u] + step_u * du[:, None] + step_v * dv[:, None]  # (3, n, E)
+    best = np.zeros((n, len(v)), dtype=np.float32)
+    winner = np.full((n, len(v)), _NONE, dtype=np.int16)
+    columns = {int(k): np.flatnonzero(allowed[:, k]) for k in np.flatnonzero(allowed.any(axis=0))}
+    for k, mine in columns.items():
+        a, b, w = (scene.G[k] @ d[:, :, mine].reshape(3, -1)).reshape(3, n, -1)
+        limit = scene.limit[k]
+        before = best[:, mine]
+        hit = (w > before) & (a >= 0) & (b >= 0) & (a <= limit[0] * w) & (b <= limit[1] * w)
+        best[:, mine] = np.where(hit, w, before)
+        winner[:, mine] = np.where(hit, np.int16(k), winner[:, mine])
+    values = np.full((n, len(v)), _EMPTY, dtype=np.float32)
+    for k, mine in columns.items():
+        sample, place = np.nonzero(winner[:, mine] == k)
+        if len(sample):
+            pixel = mine[place]
+            values[sample, pixel] = _sample_points(scene, k, d[:, sample, pixel], du[:, pixel], dv[:, pixel])
+    image[v, u] = values.mean(axis=0)
+
+
+def _sample_points(
+    scene: _Scene,
+    k: int,
+    d: npt.NDArray[np.float32],
+    du: npt.NDArray[np.float32],
+    dv: npt.NDArray[np.float32],
+) -> Radiance:
+    """Texture (n,) of surface k along rays d (3, n) with pixel steps du and dv (3, n)."""
+    texture, G = scene.textures[k], scene.G[k]
+    forms = G @ d
+    along_u, along_v = _footprint(forms, G @ du, G @ dv)
+    square: npt.NDArray[np.float32] = np.maximum(along_u, along_v) / np.float32(4)
+    level = texture.levels[_levels(square, texture, 0.5)]
+    x = forms[0] / forms[2] * level[:, 0] + level[:, 2]
+    y = forms[1] / forms[2] * level[:, 1] + level[:, 3]
+    width = 1024  # cv2.remap wants an image
+    padded = np.zeros((2, -(-len(x) // width) * width), dtype=np.float32)
+    padded[0, : len(x)], padded[1, : len(x)] = x, y
+    maps = padded.reshape(2, -1, width)
+    values = cv2.remap(texture.page, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return values.reshape(-1)[: len(x)].astype(np.float32)
+
+
+def render_pair(
+    world: World,
+    rays: tuple[CameraRays, CameraRays],
+    T_world_cams: tuple[FloatArray, FloatArray],
+    time_ns: int = 0,
+    *,
+    threads: int = 2,
+) -> tuple[Radiance, Radiance]:
+    """Render both images of a stereo pair, one thread each; the result does not depend on `threads`."""
+    if threads < 2:
+        return render(world, rays[0], T_world_cams[0], time_ns), render(world, rays[1], T_world_cams[1], time_ns)
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        right = pool.submit(render, world, rays[1], T_world_cams[1], time_ns)
+        left = render(world, rays[0], T_world_cams[0], time_ns)
+        return left, right.result()

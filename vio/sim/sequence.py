@@ -1,0 +1,424 @@
+"""A simulated recording: rendered on the fly behind the `Dataset` protocol, with the truth at hand."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.errors import CalibrationError, DataError
+from vio.geometry.distortion import StereoRig, rectified_camera
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.records import (
+    Event,
+    Image,
+    ImuSample,
+    IntArray,
+    MotionSample,
+    MotionSource,
+    Observations,
+    Recording,
+    StereoFrame,
+    Trajectory,
+    VelocitySample,
+)
+from vio.sim.effects import SensorEffects, develop, exposed, smeared
+from vio.sim.errors import SimulationError
+from vio.sim.imu import ImuNoise, ImuRecord, VelocityNoise, imu_samples, read_imu_csv, simulate_imu, simulate_velocity
+from vio.sim.motion import FitReport, MotionSpline, evaluate, recorded_motion
+from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render, render_pair
+from vio.sim.world import World, check_clear, room
+
+logger = logging.getLogger(__name__)
+
+_CLEARANCE_STEP_NS = 20_000_000
+_FLOW_GRID = 16  # pixels between exact flow vectors of the cheap blur
+_WALL_MARGIN_M = 1.2  # of a room built around a recorded flight
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFaults:
+    """What goes wrong with whole frames and clocks."""
+
+    dropped: float = 0.0  # share of frames that never arrive
+    duplicated: float = 0.0  # share of frames that show the image before, under their own time
+    time_offset_ms: float = 0.0  # stamps of frames are their true times plus this; the IMU's clock is the truth
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """Everything that a simulated recording follows from; two equal ones give the same bits."""
+
+    world: World
+    rig: StereoRig
+    motion: MotionSpline
+    taken_ns: IntArray  # (F,) when the content of each frame was exposed, true time; repeats where duplicated
+    stamps_ns: IntArray  # (F,) time that each frame claims, strictly increasing
+    imu: ImuRecord | None
+    velocity: tuple[VelocitySample, ...]
+    effects: SensorEffects
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class TrueState:
+    """What a filter tries to find out, at one time."""
+
+    time_ns: int
+    T_world_imu: FloatArray  # (4, 4)
+    velocity_world: FloatArray  # (3,) m/s
+    angular_velocity: FloatArray  # (3,) rad/s, imu frame
+    gyro_bias: FloatArray | None  # (3,) rad/s; None where there is no simulated IMU
+    accel_bias: FloatArray | None  # (3,) m/s^2; None where there is no simulated IMU
+
+
+def simulate(
+    world: World,
+    rig: StereoRig,
+    motion: MotionSpline,
+    *,
+    rate_hz: float = 20.0,
+    frame_times_ns: npt.ArrayLike | None = None,
+    imu: ImuNoise | ImuRecord | None = None,
+    imu_rate_hz: float = 200.0,
+    velocity: VelocityNoise | None = None,
+    velocity_rate_hz: float | None = None,
+    effects: SensorEffects | None = None,
+    faults: FrameFaults | None = None,
+    seed: int = 0,
+) -> Simulation:
+    """Plan a recording and check that it can be made; nothing is rendered yet.
+
+    Args:
+        world: scene.
+        rig: cameras on their body, whose IMU `motion` moves.
+        motion: motion of the body.
+        rate_hz: frames per second.
+        frame_times_ns: true times (F,) of the frames in place of a fixed rate; those outside the motion are left out.
+        imu: noise of a simulated IMU, or a real record to go with the images; None: no IMU.
+        imu_rate_hz: rate of the simulated IMU.
+        velocity: noise of the paper's velocity sensor; None: no such sensor.
+        velocity_rate_hz: its rate; None: that of the frames.
+        effects: how the cameras see; None: the defaults of `SensorEffects`.
+        faults: dropped and repeated frames, clock offset.
+        seed: everything random follows from it.
+
+    Raises:
+        SimulationError: a camera would be outside the scene or in a box, or no frame is left.
+    """
+    faults = FrameFaults() if faults is None else faults
+    effects = SensorEffects() if effects is None else effects
+    times = _frame_times(motion, rate_hz, frame_times_ns, effects, faults)
+    _check_cameras(world, rig, motion, times)
+    taken, stamps = _faulty(times, faults, seed)
+    record = simulate_imu(motion, rate_hz=imu_rate_hz, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
+    samples: list[VelocitySample] = []
+    if velocity is not None:
+        samples = simulate_velocity(motion, rate_hz=velocity_rate_hz or rate_hz, noise=velocity, seed=seed)
+    return Simulation(world, rig, motion, taken, stamps, record, tuple(samples), effects, seed)
+
+
+def _frame_times(
+    motion: MotionSpline, rate_hz: float, given: npt.ArrayLike | None, effects: SensorEffects, faults: FrameFaults
+) -> IntArray:
+    """True times of all frames whose shutter and stamp lie within the motion."""
+    if given is None:
+        count = int((motion.end_ns - motion.start_ns) * 1e-9 * rate_hz) + 1
+        times = motion.start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+    else:
+        times = np.asarray(given, dtype=np.int64)
+        if np.any(np.diff(times) <= 0):
+            raise DataError("the frame times do not increase; sort them")
+    half_shutter = int(effects.blur_exposure_ms * 0.5e6) + 1 if effects.blur_exposure_ms > 0 else 0
+    offset = _offset_ns(faults)
+    inside = (times - half_shutter >= motion.start_ns) & (times + half_shutter <= motion.end_ns)
+    inside &= (times + offset >= motion.start_ns) & (times + offset <= motion.end_ns)
+    if not inside.any():
+        raise SimulationError("no frame lies within the motion; check the frame times and the length of the motion")
+    return times[inside]
+
+
+def _offset_ns(faults: FrameFaults) -> int:
+    return round(faults.time_offset_ms * 1e6)
+
+
+def _faulty(times: IntArray, faults: FrameFaults, seed: int) -> tuple[IntArray, IntArray]:
+    """Times of content and stamps of the frames that arrive; the first frame always does."""
+    rng = np.random.default_rng([seed, 41])
+    draw = rng.random((2, len(times)))
+    arrives = draw[0] >= faults.dropped
+    arrives[0] = True
+    kept, repeats = times[arrives], draw[1][arrives] < faults.duplicated
+    repeats[0] = False
+    source = np.maximum.accumulate(np.where(repeats, 0, np.arange(len(kept))))
+    return kept[source], kept + _offset_ns(faults)
+
+
+def _check_cameras(world: World, rig: StereoRig, motion: MotionSpline, times: IntArray) -> None:
+    dense = np.unique(np.concatenate([times, np.arange(times[0], times[-1], _CLEARANCE_STEP_NS)]))
+    T = evaluate(motion, dense).T_world_imu
+    for name, T_imu_cam in (("the left camera", rig.T_imu_cam0), ("the right camera", rig.T_imu_cam1)):
+        check_clear(world, (T @ T_imu_cam)[:, :3, 3], what=name)
+
+
+def true_state(simulation: Simulation, time_ns: int) -> TrueState:
+    """Return the true state at any time within the motion.
+
+    Raises:
+        SimulationError: the time lies outside the motion.
+    """
+    state = evaluate(simulation.motion, time_ns)
+    biases: list[FloatArray | None] = [None, None]
+    record = simulation.imu
+    if record is not None and record.gyro_bias is not None and record.accel_bias is not None:
+        elapsed = (record.times_ns - record.times_ns[0]).astype(np.float64)
+        at = float(time_ns - record.times_ns[0])
+        biases = [
+            np.array([np.interp(at, elapsed, b[:, i]) for i in range(3)]) for b in (record.gyro_bias, record.accel_bias)
+        ]
+    return TrueState(
+        time_ns, state.T_world_imu[0], state.velocity_world[0], state.angular_velocity[0], biases[0], biases[1]
+    )
+
+
+def views(simulation: Simulation, time_ns: int) -> tuple[View, View]:
+    """Return both cameras where they truly are at one time."""
+    T = evaluate(simulation.motion, time_ns).T_world_imu[0]
+    rig = simulation.rig
+    return View(rig.cam0, T @ rig.T_imu_cam0, time_ns), View(rig.cam1, T @ rig.T_imu_cam1, time_ns)
+
+
+class SimulatedRecording:
+    """The `Dataset` of a simulation: frames are rendered when they are asked for."""
+
+    def __init__(self, simulation: Simulation, *, threads: int = 2) -> None:
+        """Tabulate the cameras' rays.
+
+        Args:
+            simulation: what to record.
+            threads: 2 renders both cameras at once; the images do not depend on it.
+
+        Raises:
+            SimulationError: the rig's distortion does not reach every pixel.
+        """
+        self.simulation = simulation
+        self._threads = threads
+        self._rays: tuple[CameraRays, CameraRays] | None = None
+
+    @property
+    def rays(self) -> tuple[CameraRays, CameraRays]:
+        """The tabulated rays of both cameras."""
+        if self._rays is None:
+            self._rays = camera_rays(self.simulation.rig.cam0), camera_rays(self.simulation.rig.cam1)
+        return self._rays
+
+    @property
+    def recording(self) -> Recording:
+        """Calibration, times and ground truth.
+
+        Raises:
+            SimulationError: the rig is not rectified.
+        """
+        simulation = self.simulation
+        try:
+            camera = rectified_camera(simulation.rig)
+        except CalibrationError as error:
+            raise SimulationError(
+                "an unrectified rig has no rectified recording; export it as an EuRoC folder and read that"
+            ) from error
+        stamps = simulation.stamps_ns
+        motion: set[MotionSource] = set()
+        if simulation.imu is not None:
+            motion.add("imu")
+        if simulation.velocity:
+            motion.add("velocity")
+        return Recording(
+            kind="simulated",
+            path=Path(f"simulated-{simulation.world.name}-{simulation.seed}"),
+            camera=camera,
+            T_cam0_imu=se3_inverse(simulation.rig.T_imu_cam0),
+            frame_times_ns=stamps,
+            has_images=True,
+            motion=frozenset(motion),
+            reference=self.reference,
+        )
+
+    @property
+    def reference(self) -> Trajectory:
+        """True poses of the IMU at the frames' stamps."""
+        stamps = self.simulation.stamps_ns
+        poses = evaluate(self.simulation.motion, stamps).T_world_imu
+        return Trajectory(poses, stamps, "imu", np.arange(len(stamps)))
+
+    def __len__(self) -> int:
+        return len(self.simulation.stamps_ns)
+
+    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        """Yield motion samples and frames in time order; see `vio.protocols.Dataset`."""
+        stamps = self.simulation.stamps_ns
+        stop = len(stamps) if stop is None else min(stop, len(stamps))
+        if not 0 <= start < stop:
+            return
+        samples = self._motion_samples(int(stamps[start]), int(stamps[stop - 1]))
+        at = 0
+        for index in range(start, stop):
+            while at < len(samples) and samples[at].time_ns <= stamps[index]:
+                yield samples[at]
+                at += 1
+            yield self.frame(index) if images else StereoFrame(index, int(stamps[index]), None, None)
+
+    def _motion_samples(self, first_ns: int, last_ns: int) -> list[MotionSample]:
+        every: list[MotionSample] = list(self.simulation.velocity)
+        if self.simulation.imu is not None:
+            inertial: list[ImuSample] = imu_samples(self.simulation.imu)
+            every += inertial
+        return sorted((s for s in every if first_ns <= s.time_ns <= last_ns), key=lambda sample: sample.time_ns)
+
+    def observations(self, index: int) -> Observations | None:
+        """Return None: a simulated recording holds images."""
+        return None
+
+    def frame(self, index: int) -> StereoFrame:
+        """Render one frame with all effects."""
+        left, right = self.images(index)
+        return StereoFrame(index, int(self.simulation.stamps_ns[index]), left, right)
+
+    def images(self, index: int) -> tuple[Image, Image]:
+        """Render both images (H, W) of one frame with all effects."""
+        simulation = self.simulation
+        time_ns = int(simulation.taken_ns[index])
+        # A repeated frame is the same picture to the bit, so its noise follows from the frame it repeats.
+        source = int(np.searchsorted(simulation.taken_ns, time_ns))
+        left, right = self.radiance(time_ns)
+        developed = [
+            develop(image, simulation.effects, time_ns=time_ns, frame_index=source, camera=camera, seed=simulation.seed)
+            for camera, image in enumerate((left, right))
+        ]
+        return developed[0], developed[1]
+
+    def radiance(self, time_ns: int) -> tuple[Radiance, Radiance]:
+        """Render both linear images (H, W) at a true time, blurred if the effects say so."""
+        effects = self.simulation.effects
+        if effects.blur_exposure_ms <= 0:
+            sharp = views(self.simulation, time_ns)
+            poses = sharp[0].T_world_cam, sharp[1].T_world_cam
+            return render_pair(self.simulation.world, self.rays, poses, time_ns, threads=self._threads)
+        return self._blurred(0, time_ns), self._blurred(1, time_ns)
+
+    def _blurred(self, camera: int, time_ns: int) -> Radiance:
+        simulation = self.simulation
+
+        def sharp_at(t: int) -> Radiance:
+            return render(simulation.world, self.rays[camera], views(simulation, t)[camera].T_world_cam, t)
+
+        if simulation.effects.blur_exact:
+            return exposed(sharp_at, time_ns, simulation.effects)
+        half = round(simulation.effects.blur_exposure_ms * 0.5e6)
+        before, after = (self.flow(camera, time_ns, time_ns + sign * half) for sign in (-1, 1))
+        return smeared(sharp_at(time_ns), before, after, simulation.effects)
+
+    def flow(self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _FLOW_GRID) -> FloatArray:
+        """Optical flow (H, W, 2) of one camera between two true times, exact on a grid and interpolated between.
+
+        Where a grid point leaves the image its flow is still that of its surface point.
+        """
+        view, other = views(self.simulation, from_ns)[camera], views(self.simulation, to_ns)[camera]
+        width, height = view.camera.width, view.camera.height
+        u, v = np.linspace(0, width - 1, width // step_px + 2), np.linspace(0, height - 1, height // step_px + 2)
+        grid = np.stack(np.meshgrid(u, v), axis=-1)
+        there, _ = correspondence(self.simulation.world, view, other, grid.reshape(-1, 2))
+        return _dense(there.reshape(grid.shape) - grid, width, height)
+
+    def depth(self, camera: int, time_ns: int) -> tuple[FloatArray, IntArray]:
+        """Exact depth (H, W) in metres and the surface (H, W) seen by one camera at a true time."""
+        view = views(self.simulation, time_ns)[camera]
+        return depth_map(self.simulation.world, self.rays[camera], view.T_world_cam, time_ns)
+
+    def true_state(self, time_ns: int) -> TrueState:
+        """Return the true state at any time within the motion."""
+        return true_state(self.simulation, time_ns)
+
+
+def _dense(grid: FloatArray, width: int, height: int) -> FloatArray:
+    """Bilinear interpolation of a grid (R, C, 2) whose outer rows and columns lie on the image's outer pixels."""
+    rows, columns = grid.shape[:2]
+    y, x = np.linspace(0, rows - 1, height), np.linspace(0, columns - 1, width)
+    r, c = np.minimum(y.astype(int), rows - 2), np.minimum(x.astype(int), columns - 2)
+    fy, fx = (y - r)[:, None, None], (x - c)[None, :, None]
+    along = grid[r] * (1 - fy) + grid[r + 1] * fy
+    out: FloatArray = along[:, c] * (1 - fx) + along[:, c + 1] * fx
+    return out
+
+
+# --- recorded flights -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedFlight:
+    """A real flight: its smoothed motion, real image times, and the real IMU where there is one."""
+
+    motion: MotionSpline
+    fit: FitReport
+    frame_times_ns: IntArray  # (F,)
+    imu: ImuRecord | None = field(default=None)
+
+
+def read_flight(
+    groundtruth: Path, image_times: Path | None = None, imu_csv: Path | None = None, *, knot_s: float = 0.1
+) -> RecordedFlight:
+    """Read a flight recorded elsewhere, to render images along it.
+
+    Args:
+        groundtruth: TUM file of the IMU's poses.
+        image_times: one integer of nanoseconds a line; None: 20 Hz.
+        imu_csv: the real IMU record of that flight in EuRoC's form; None: none.
+        knot_s: knot spacing of the smoothing spline.
+
+    Raises:
+        DataError: a file cannot be used; the message names it.
+    """
+    motion, fit = recorded_motion(groundtruth, knot_s=knot_s)
+    if image_times is None:
+        times = np.arange(motion.start_ns, motion.end_ns, 50_000_000)
+    else:
+        times = _read_times(image_times)
+    times = times[(times >= motion.start_ns) & (times <= motion.end_ns)]
+    if len(times) == 0:
+        raise DataError(f"no image time falls into the ground truth {groundtruth}; use the same clock for both")
+    return RecordedFlight(motion, fit, times, None if imu_csv is None else read_imu_csv(imu_csv))
+
+
+def _read_times(path: Path) -> IntArray:
+    try:
+        words = path.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot read the image times {path}: {error}") from error
+    bad = next((word for word in words if not word.isdigit()), None)
+    if bad is not None:
+        raise DataError(f"{path}: expected one integer of nanoseconds a line, got {bad[:30]!r}")
+    times = np.array([int(word) for word in words], dtype=np.int64)
+    if np.any(np.diff(times) <= 0):
+        raise DataError(f"{path}: image times do not increase; sort them")
+    return times
+
+
+def room_around(
+    motion: MotionSpline, *, seed: int = 0, margin_m: float = _WALL_MARGIN_M, texel_m: float | None = None
+) -> World:
+    """Build a room that holds a motion, its furniture out of the way."""
+    times = np.arange(motion.start_ns, motion.end_ns, _CLEARANCE_STEP_NS)
+    p = evaluate(motion, times).T_world_imu[:, :3, 3]
+    low, high = p.min(axis=0) - margin_m, p.max(axis=0) + margin_m
+    area = float(np.prod((high - low)[:2]))
+    return room(
+        seed,
+        bounds=np.stack([low, high]),
+        furniture=int(np.clip(area / 3, 8, 40)),
+        pictures=int(np.clip(area / 4, 8, 30)),
+        keep_clear=p[::5],
+        texel_m=texel_m,
+    )

@@ -1,0 +1,405 @@
+"""Procedural textures with detail at every scale, and the mip chains they are sampled from.
+
+Each texture is drawn once for its surface from its own seed, at the surface's full size, so nothing repeats.
+Values are linear intensities in gray levels of a well exposed image, uint8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray
+from vio.records import Image
+from vio.sim.errors import SimulationError
+
+TextureKind: TypeAlias = Literal[
+    "wall", "bare", "floor", "ceiling", "wood", "picture", "crate", "facade", "asphalt", "sky", "skyline"
+]
+_Canvas: TypeAlias = npt.NDArray[np.float32]
+
+_GUTTER = 3  # texels of repeated border around each level, for the interpolation kernel
+_MAX_SIDE = 32000  # cv2.remap addresses its source with 16-bit integers
+_SMALLEST_LEVEL = 4
+LEVELS_PER_OCTAVE = 2
+
+
+@dataclass(frozen=True, slots=True)
+class MipTexture:
+    """A texture and its smaller copies (each 1/sqrt(2) of the one before) packed into one page."""
+
+    page: Image  # (H, W)
+    size: tuple[int, int]  # texels of level 0: along s, along t
+    levels: npt.NDArray[np.float32]  # (L, 4) scale_s, scale_t, offset_s, offset_t: level-0 texels to page pixels
+
+
+def build_mips(texture: Image) -> MipTexture:
+    """Pack a texture (H, W) and its half-octave mip levels into one page.
+
+    A level-0 coordinate U in [0, W], texel centres at the halves, lies at `scale * U + offset` of the page.
+    """
+    height, width = texture.shape
+    if width > _MAX_SIDE:
+        raise SimulationError(f"a texture of {width} texels is too wide; choose a coarser texel size")
+    levels = [texture]
+    step = 0
+    while min(levels[-1].shape) > _SMALLEST_LEVEL:
+        step += 1
+        scale = 2.0 ** (-step / LEVELS_PER_OCTAVE)
+        size = (max(1, round(width * scale)), max(1, round(height * scale)))
+        # From the level an octave up: area averaging over at least two texels each way.
+        source = levels[step - LEVELS_PER_OCTAVE] if step >= LEVELS_PER_OCTAVE else levels[0]
+        levels.append(np.ascontiguousarray(cv2.resize(source, size, interpolation=cv2.INTER_AREA)).reshape(size[::-1]))
+    return _pack(levels)
+
+
+def _pack(levels: list[Image]) -> MipTexture:
+    """Place the levels on shelves: the widest decides the page, smaller ones fill the gaps."""
+    page_width = levels[0].shape[1] + 2 * _GUTTER
+    shelves: list[list[int]] = []  # top, height, filled width
+    places: list[tuple[int, int]] = []
+    bottom = 0
+    for level in levels:
+        h, w = level.shape[0] + 2 * _GUTTER, level.shape[1] + 2 * _GUTTER
+        shelf = next((s for s in shelves if h <= s[1] and s[2] + w <= page_width), None)
+        if shelf is None:
+            shelf = [bottom, h, 0]
+            shelves.append(shelf)
+            bottom += h
+        places.append((shelf[0], shelf[2]))
+        shelf[2] += w
+    if bottom > _MAX_SIDE:
+        raise SimulationError(f"a texture page of {bottom} rows is too tall; choose a coarser texel size")
+    page = np.zeros((bottom, page_width), dtype=np.uint8)
+    rows = []
+    height, width = levels[0].shape
+    for level, (top, left) in zip(levels, places, strict=True):
+        padded = cv2.copyMakeBorder(level, _GUTTER, _GUTTER, _GUTTER, _GUTTER, cv2.BORDER_REPLICATE)
+        page[top : top + padded.shape[0], left : left + padded.shape[1]] = padded
+        rows.append(
+            (level.shape[1] / width, level.shape[0] / height, left + _GUTTER - 0.5, top + _GUTTER - 0.5),
+        )
+    return MipTexture(page, (width, height), np.array(rows, dtype=np.float32))
+
+
+def paint(kind: TextureKind, size_m: FloatArray, texel_m: float, rng: np.random.Generator) -> Image:
+    """Draw one texture (H, W) for a surface of `size_m` (along s, along t) metres."""
+    width, height = (max(8, round(float(side) / texel_m)) for side in size_m)
+    canvas = _PAINTERS[kind](width, height, 1.0 / texel_m, rng)
+    return np.clip(canvas + 0.5, 4, 251).astype(np.uint8)
+
+
+def octave_noise(
+    width: int,
+    height: int,
+    rng: np.random.Generator,
+    *,
+    coarsest_texels: float,
+    finest_texels: float = 1.0,
+    falloff: float = 0.8,
+) -> _Canvas:
+    """Zero-mean value noise (height, width) of about unit deviation, octave upon octave.
+
+    Args:
+        coarsest_texels: wavelength of the first octave.
+        finest_texels: wavelength where the octaves end.
+        falloff: amplitude of an octave relative to the one before.
+    """
+    wavelengths = [max(coarsest_texels, 1.0)]
+    while wavelengths[-1] / 2 >= max(finest_texels, 1.0):
+        wavelengths.append(wavelengths[-1] / 2)
+    noise: _Canvas | None = None
+    amplitude, power = 1.0, 0.0
+    for wavelength in wavelengths:
+        shape = (int(np.ceil(height / wavelength)) + 3, int(np.ceil(width / wavelength)) + 3)
+        fresh = (rng.random(shape, dtype=np.float32) - 0.5) * np.float32(3.4 * amplitude)
+        if noise is None:
+            noise = fresh
+        else:
+            grown = cv2.resize(noise, (2 * noise.shape[1], 2 * noise.shape[0]), interpolation=cv2.INTER_LINEAR)
+            grown = grown.astype(np.float32)[: shape[0], : shape[1]]
+            noise = grown + fresh[: grown.shape[0], : grown.shape[1]]
+        power += amplitude**2
+        amplitude *= falloff
+    assert noise is not None
+    if wavelengths[-1] > 1.0:
+        full = (round(noise.shape[1] * wavelengths[-1]), round(noise.shape[0] * wavelengths[-1]))
+        noise = cv2.resize(noise, full, interpolation=cv2.INTER_CUBIC).astype(np.float32)
+    return np.ascontiguousarray(noise[:height, :width]) / np.float32(np.sqrt(power))
+
+
+def _rectangles(
+    canvas: _Canvas, rng: np.random.Generator, count: int, side: tuple[float, float], contrast: float
+) -> None:
+    """Add axis-aligned rectangles with log-uniform sides (texels) to the canvas."""
+    height, width = canvas.shape
+    for _ in range(count):
+        w, h = np.exp(rng.uniform(np.log(max(side[0], 1.5)), np.log(max(side[1], 2.0)), 2))
+        x, y = rng.uniform(-w / 2, width), rng.uniform(-h / 2, height)
+        canvas[max(0, int(y)) : max(0, int(y + h)), max(0, int(x)) : max(0, int(x + w))] += np.float32(
+            rng.uniform(-contrast, contrast)
+        )
+
+
+def _polygons(
+    canvas: _Canvas, rng: np.random.Generator, count: int, side: tuple[float, float], contrast: float
+) -> None:
+    """Draw rotated triangles and quadrilaterals with smooth edges on the canvas."""
+    height, width = canvas.shape
+    for _ in range(count):
+        radius = np.exp(rng.uniform(np.log(max(side[0], 2.0)), np.log(max(side[1], 3.0))))
+        corners = int(rng.integers(3, 6))
+        angles = np.sort(rng.uniform(0, 2 * np.pi, corners))
+        centre = rng.uniform((0, 0), (width, height))
+        points = centre + radius * rng.uniform(0.6, 1, (corners, 1)) * np.stack([np.cos(angles), np.sin(angles)], -1)
+        low = np.clip(np.floor(points.min(0)).astype(int) - 1, 0, (width, height))
+        high = np.clip(np.ceil(points.max(0)).astype(int) + 2, 0, (width, height))
+        if np.any(high <= low):
+            continue
+        mask = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.uint8)
+        fixed = np.round((points - low) * 16).astype(np.int32)
+        cv2.fillPoly(mask, [fixed], 255, lineType=cv2.LINE_AA, shift=4)
+        region = canvas[low[1] : high[1], low[0] : high[0]]
+        region += mask.astype(np.float32) * np.float32(rng.uniform(-contrast, contrast) / 255)
+
+
+def _scatter(canvas: _Canvas, per_m: float, rng: np.random.Generator, *, density: float, contrast: float) -> None:
+    """Strew marks of every size from half a metre to a centimetre, ever more of the smaller ones."""
+    height, width = canvas.shape
+    area = width * height / per_m**2
+    for low, high, weight in ((0.15, 0.5, 1.5), (0.05, 0.15, 8.0), (0.015, 0.05, 30.0)):
+        if high * per_m < 2.5:
+            continue
+        count = min(int(area * density * weight), 12000)
+        sides = (low * per_m, high * per_m)
+        _rectangles(canvas, rng, count // 2, sides, contrast)
+        _polygons(canvas, rng, count - count // 2, (sides[0] / 2, sides[1] / 2), contrast)
+
+
+def _light(width: int, height: int, rng: np.random.Generator) -> _Canvas:
+    """Smooth illumination (height, width) about 1."""
+    grid = rng.uniform(0.8, 1.15, (3, 4)).astype(np.float32)
+    return cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC).astype(np.float32)
+
+
+def _noise(
+    width: int, height: int, per_m: float, rng: np.random.Generator, coarsest_m: float, falloff: float
+) -> _Canvas:
+    return octave_noise(width, height, rng, coarsest_texels=coarsest_m * per_m, falloff=falloff)
+
+
+def _wall(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    canvas = 128 + 30 * _noise(width, height, per_m, rng, 1.0, 0.85)
+    _scatter(canvas, per_m, rng, density=1.6, contrast=60)
+    for _ in range(int(width * height / per_m**2 / 3)):
+        _poster(canvas, per_m, rng)
+    return canvas * _light(width, height, rng)
+
+
+def _poster(canvas: _Canvas, per_m: float, rng: np.random.Generator) -> None:
+    """Hang one sheet with its own content on a wall."""
+    height, width = canvas.shape
+    w, h = (int(x) for x in rng.uniform(0.3, 0.9, 2) * per_m)
+    if w < 12 or h < 12 or w >= width or h >= height:
+        return
+    x, y = int(rng.integers(0, width - w)), int(rng.integers(0, height - h))
+    canvas[y : y + h, x : x + w] = _picture(w, h, per_m, rng)
+
+
+def _bare(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    return np.full((height, width), 150.0, dtype=np.float32)
+
+
+def _picture(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    canvas = rng.uniform(70, 180) + 35 * _noise(width, height, per_m, rng, 0.4, 0.9)
+    canvas = np.ascontiguousarray(canvas, dtype=np.float32)
+    _polygons(canvas, rng, 14, (0.08 * width, 0.3 * width), 90)
+    _rectangles(canvas, rng, 12, (0.03 * width, 0.3 * width), 80)
+    _polygons(canvas, rng, 40, (0.01 * width, 0.06 * width), 100)
+    frame = max(1, round(0.02 * per_m))
+    shade = rng.choice([25.0, 60.0, 215.0])
+    canvas[:frame], canvas[-frame:], canvas[:, :frame], canvas[:, -frame:] = shade, shade, shade, shade
+    return canvas
+
+
+def _floor(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """Planks of changing length and shade under rugs and marks."""
+    canvas = 110 + 22 * _noise(width, height, per_m, rng, 2.0, 0.9)
+    plank = 0.14 * per_m
+    for row in range(int(height / plank) + 1):
+        top, bottom = round(row * plank), round((row + 1) * plank)
+        x = -rng.uniform(0, 1.5) * per_m
+        while x < width:
+            length = rng.uniform(0.6, 1.9) * per_m
+            left, right = max(0, round(x)), max(0, round(x + length))
+            canvas[top:bottom, left:right] += np.float32(rng.uniform(-26, 26))
+            canvas[top:bottom, left : left + max(1, round(0.005 * per_m))] -= 45
+            x += length
+        canvas[top : top + max(1, round(0.005 * per_m))] -= 40
+    _scatter(canvas, per_m, rng, density=0.9, contrast=45)
+    return canvas * _light(width, height, rng)
+
+
+def _ceiling(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    canvas = 150 + 22 * _noise(width, height, per_m, rng, 1.5, 0.85)
+    _scatter(canvas, per_m, rng, density=0.6, contrast=40)
+    return canvas * _light(width, height, rng)
+
+
+def _wood(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """Grain: noise stretched along s, with knots, labels and handles."""
+    stretched = octave_noise(max(8, width // 6), height, rng, coarsest_texels=0.15 * per_m, falloff=0.9)
+    grain = cv2.resize(stretched, (width, height), interpolation=cv2.INTER_CUBIC)
+    canvas = rng.uniform(80, 150) + 24 * grain + 16 * _noise(width, height, per_m, rng, 0.3, 0.95)
+    canvas = np.ascontiguousarray(canvas, dtype=np.float32)
+    _scatter(canvas, per_m, rng, density=3.5, contrast=60)
+    return _edged(canvas, per_m, rng)
+
+
+def _crate(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    canvas = rng.uniform(85, 165) + 32 * _noise(width, height, per_m, rng, 0.5, 0.9)
+    canvas = np.ascontiguousarray(canvas, dtype=np.float32)
+    side = min(width, height)
+    _rectangles(canvas, rng, 10, (0.1 * side, 0.5 * side), 55)
+    _scatter(canvas, per_m, rng, density=4.0, contrast=70)
+    return _edged(canvas, per_m, rng)
+
+
+def _edged(canvas: _Canvas, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """Darken a thin rim, so that boxes stand out from one another."""
+    rim = max(1, round(0.012 * per_m))
+    for edge in (canvas[:rim], canvas[-rim:], canvas[:, :rim], canvas[:, -rim:]):
+        edge *= 0.45
+    return canvas * np.float32(rng.uniform(0.75, 1.15))
+
+
+def _facade(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """A house front: masonry, window rows with differing content, a door, signs, stains."""
+    canvas = rng.uniform(95, 160) + 20 * _noise(width, height, per_m, rng, 3.0, 0.88)
+    canvas = np.ascontiguousarray(canvas, dtype=np.float32)
+    course = rng.uniform(0.25, 0.4) * per_m
+    for row in range(int(height / course) + 1):
+        top, bottom = round(row * course), round((row + 1) * course)
+        x = -rng.uniform(0, 1) * per_m
+        while x < width:
+            length = rng.uniform(0.4, 1.1) * per_m
+            canvas[top:bottom, max(0, round(x)) : max(0, round(x + length))] += np.float32(rng.uniform(-14, 14))
+            x += length
+    _scatter(canvas, per_m, rng, density=0.35, contrast=40)
+    storey, bay = rng.uniform(2.6, 3.3) * per_m, rng.uniform(1.7, 2.8) * per_m
+    wide, tall = rng.uniform(0.45, 0.65) * bay, rng.uniform(0.45, 0.6) * storey
+    for floor in range(int(height / storey)):
+        for column in range(int(width / bay)):
+            centre = np.array([(column + 0.5) * bay, height - (floor + 0.55) * storey])
+            centre += rng.normal(0, 0.04, 2) * per_m
+            size = np.array([wide, tall]) * rng.uniform(0.9, 1.1, 2)
+            if rng.random() < 0.93:
+                _window(canvas, centre, size, per_m, rng)
+    for _ in range(int(width / per_m / 3) + 1):
+        w, h = rng.uniform(0.6, 2.5) * per_m, rng.uniform(0.3, 0.9) * per_m
+        x, y = rng.uniform(0, max(1, width - w)), rng.uniform(height * 0.35, height - h)
+        _panel(canvas, (x, y, w, h), per_m, rng)
+    return canvas * _light(width, height, rng)
+
+
+def _window(canvas: _Canvas, centre: FloatArray, size: FloatArray, per_m: float, rng: np.random.Generator) -> None:
+    x, y = centre - size / 2
+    w, h = size
+    rim = 0.09 * per_m
+    _fill(canvas, (x - rim, y - rim, w + 2 * rim, h + 2 * rim), rng.choice([200.0, 60.0, 175.0]))
+    _panel(canvas, (x, y, w, h), per_m, rng, dark=True)
+    if rng.random() < 0.7:
+        _fill(canvas, (x + w / 2 - rim / 3, y, 2 * rim / 3, h), 190.0)
+    if rng.random() < 0.7:
+        _fill(canvas, (x, y + h * rng.uniform(0.3, 0.6), w, 2 * rim / 3), 190.0)
+    _fill(canvas, (x - 1.6 * rim, y + h + rim, w + 3.2 * rim, rim), rng.uniform(150, 225))
+
+
+def _panel(
+    canvas: _Canvas,
+    box: tuple[float, float, float, float],
+    per_m: float,
+    rng: np.random.Generator,
+    *,
+    dark: bool = False,
+) -> None:
+    """Fill a box (x, y, width, height in texels) with content of its own: a pane, a sign, a shutter."""
+    region = _region(canvas, box)
+    if region.size == 0:
+        return
+    h, w = region.shape
+    fresh = octave_noise(w, h, rng, coarsest_texels=0.5 * per_m, falloff=0.85)
+    region[:] = rng.uniform(35, 80) + 14 * fresh if dark else rng.uniform(60, 200) + 22 * fresh
+    _rectangles(region, rng, 7, (0.08 * w, 0.6 * w), 45)
+    _polygons(region, rng, 4, (0.04 * w, 0.25 * w), 60)
+
+
+def _region(canvas: _Canvas, box: tuple[float, float, float, float]) -> _Canvas:
+    x, y, w, h = box
+    return canvas[max(0, round(y)) : max(0, round(y + h)), max(0, round(x)) : max(0, round(x + w))]
+
+
+def _fill(canvas: _Canvas, box: tuple[float, float, float, float], value: float) -> None:
+    _region(canvas, box)[:] = value
+
+
+def _asphalt(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """Road: grain, mended patches, cracks, worn paint, lids."""
+    canvas = 95 + 24 * _noise(width, height, per_m, rng, 4.0, 0.92)
+    canvas = np.ascontiguousarray(canvas, dtype=np.float32)
+    area = width * height / per_m**2
+    _rectangles(canvas, rng, int(area / 12), (0.4 * per_m, 3.0 * per_m), 22)
+    _polygons(canvas, rng, int(area / 3), (0.05 * per_m, 0.4 * per_m), 45)
+    _polygons(canvas, rng, min(int(area * 2.5), 12000), (0.02 * per_m, 0.08 * per_m), 70)
+    for _ in range(int(area / 8)):
+        steps = rng.normal(0, 0.35, (12, 2)).cumsum(axis=0) * per_m
+        points = rng.uniform((0, 0), (width, height)) + steps
+        dark = float(rng.uniform(25, 55))
+        cv2.polylines(
+            canvas, [np.round(points * 16).astype(np.int32)], False, dark, max(1, round(0.02 * per_m)), shift=4
+        )
+    for _ in range(int(area / 25)):
+        x, y = rng.uniform((0, 0), (width, height))
+        _fill(canvas, (x, y, rng.uniform(0.12, 2.0) * per_m, rng.uniform(0.1, 0.5) * per_m), rng.uniform(150, 220))
+    return canvas
+
+
+def _sky(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    clouds = octave_noise(width, height, rng, coarsest_texels=width / 5, falloff=0.6)
+    return np.asarray(205 + 22 * clouds, dtype=np.float32)
+
+
+def _skyline(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """Far hills and towers under a plain sky; t runs downwards."""
+    canvas = np.asarray(210 + 8 * octave_noise(width, height, rng, coarsest_texels=height / 2, falloff=0.6))
+    ridge = np.interp(np.arange(width), np.linspace(0, width, 40), height * rng.uniform(0.6, 0.8, 40))
+    hill = np.arange(height)[:, None] > ridge[None]
+    canvas[hill] = (120 + 25 * octave_noise(width, height, rng, coarsest_texels=height / 3, falloff=0.85))[hill]
+    for _ in range(60):
+        w, h = rng.uniform(0.006, 0.03) * width, rng.uniform(0.15, 0.5) * height
+        x = rng.uniform(0, width - w)
+        box = (x, height * 0.95 - h, w, h)
+        _fill(canvas, box, rng.uniform(60, 150))
+        region = _region(canvas, box)
+        _rectangles(region, rng, 60, (0.03 * w, 0.15 * w), 60)
+    return canvas.astype(np.float32)
+
+
+_PAINTERS: dict[TextureKind, Callable[[int, int, float, np.random.Generator], _Canvas]] = {
+    "wall": _wall,
+    "bare": _bare,
+    "floor": _floor,
+    "ceiling": _ceiling,
+    "wood": _wood,
+    "picture": _picture,
+    "crate": _crate,
+    "facade": _facade,
+    "asphalt": _asphalt,
+    "sky": _sky,
+    "skyline": _skyline,
+}

@@ -1,0 +1,492 @@
+"""Seeded scenes of textured rectangles and boxes: a room, a street canyon around a block, a corridor with a bare wall.
+
+World frame: z up, metres. A surface is a rectangle seen from its front: s runs right, t down, both in metres from
+the upper left corner (`origin`). Surfaces are one-sided; boxes show their outsides.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
+from vio.records import IntArray
+from vio.sim.errors import SimulationError
+from vio.sim.textures import MipTexture, TextureKind, build_mips, paint
+
+SceneName: TypeAlias = Literal["room", "street", "corridor"]
+ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_object (4, 4)
+
+_FACES: dict[str, tuple[int, int]] = {
+    "+x": (0, 1),
+    "-x": (0, -1),
+    "+y": (1, 1),
+    "-y": (1, -1),
+    "+z": (2, 1),
+    "-z": (2, -1),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Patch:
+    """One textured rectangle of an object, as a scene lists it."""
+
+    origin: FloatArray  # (3,) upper left corner, object frame, m
+    axis_s: FloatArray  # (3,) unit, right as seen from the front
+    axis_t: FloatArray  # (3,) unit, down as seen from the front
+    size: FloatArray  # (2,) m along s and t
+    kind: TextureKind
+    texel_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Solid:
+    """A box that no camera may be in."""
+
+    T_world_box: FloatArray  # (4, 4) to the centre
+    half_size: FloatArray  # (3,) m
+
+
+@dataclass(frozen=True, slots=True)
+class MovingBox:
+    """A textured box that moves on its own."""
+
+    size: FloatArray  # (3,) m
+    motion: ObjectMotion  # pose of its centre over time
+    kind: TextureKind = "crate"
+    texel_m: float = 0.004
+
+
+@dataclass(frozen=True, slots=True)
+class Surfaces:
+    """All rectangles of a world at one time, as arrays."""
+
+    origin: FloatArray  # (S, 3) world, m
+    axis_s: FloatArray  # (S, 3)
+    axis_t: FloatArray  # (S, 3)
+    size: FloatArray  # (S, 2) m
+    mover: IntArray  # (S,) 0: the fixed scene; k: the k-th moving box, from 1
+
+    @property
+    def normal(self) -> FloatArray:
+        """Unit normals (S, 3) towards the side from which the rectangle is seen."""
+        return np.cross(self.axis_t, self.axis_s)
+
+
+class TextureStore:
+    """The textures of a world, each painted from its own seed when it is first asked for."""
+
+    def __init__(self, patches: Sequence[Patch], seed: int) -> None:
+        self._patches = tuple(patches)
+        self._seed = seed
+        self._painted: dict[int, MipTexture] = {}
+        self._lock = threading.Lock()
+
+    def __getitem__(self, surface: int) -> MipTexture:
+        """Return the texture of one surface."""
+        found = self._painted.get(surface)
+        if found is None:
+            with self._lock:
+                found = self._painted.get(surface)
+                if found is None:
+                    patch = self._patches[surface]
+                    rng = np.random.default_rng([self._seed, surface])
+                    found = build_mips(paint(patch.kind, patch.size, patch.texel_m, rng))
+                    self._painted[surface] = found
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A scene: its surfaces, their textures, and where a camera may be."""
+
+    name: str
+    surfaces: Surfaces  # moving boxes in their own frames; `surfaces_at` places them
+    textures: TextureStore
+    solids: tuple[Solid, ...]
+    bounds: FloatArray  # (2, 3) lower and upper corner of the space a camera may be in, m
+    movers: tuple[MovingBox, ...] = ()
+
+
+def surfaces_at(world: World, time_ns: int) -> Surfaces:
+    """Return all surfaces where they are at one time."""
+    if not world.movers:
+        return world.surfaces
+    fixed = world.surfaces
+    origin, axis_s, axis_t = fixed.origin.copy(), fixed.axis_s.copy(), fixed.axis_t.copy()
+    for number, box in enumerate(world.movers, start=1):
+        mine = fixed.mover == number
+        T = box.motion(time_ns)
+        origin[mine] = fixed.origin[mine] @ T[:3, :3].T + T[:3, 3]
+        axis_s[mine], axis_t[mine] = fixed.axis_s[mine] @ T[:3, :3].T, fixed.axis_t[mine] @ T[:3, :3].T
+    return replace(fixed, origin=origin, axis_s=axis_s, axis_t=axis_t)
+
+
+def check_clear(world: World, positions: npt.ArrayLike, *, margin_m: float = 0.05, what: str = "the camera") -> None:
+    """Make sure that positions (N, 3) lie inside the scene and in no box.
+
+    Raises:
+        SimulationError: the first offending position, and where it is.
+    """
+    p = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
+    outside = ((p < world.bounds[0] + margin_m) | (p > world.bounds[1] - margin_m)).any(axis=1) | ~np.isfinite(p).all(1)
+    if outside.any():
+        i = int(np.flatnonzero(outside)[0])
+        raise SimulationError(
+            f"{what} leaves the {world.name} at position {i} of {len(p)}, ({_metres(p[i])}) m; it "
+            f"spans ({_metres(world.bounds[0])}) to ({_metres(world.bounds[1])}) m: "
+            "choose a larger scene or another trajectory"
+        )
+    for number, solid in enumerate(world.solids):
+        local = (p - solid.T_world_box[:3, 3]) @ solid.T_world_box[:3, :3]
+        inside = (np.abs(local) < solid.half_size + margin_m).all(axis=1)
+        if inside.any():
+            i = int(np.flatnonzero(inside)[0])
+            raise SimulationError(
+                f"{what} is inside box {number} of the {world.name} at position {i} of {len(p)}, ({_metres(p[i])}) m; "
+                "choose another seed or trajectory, or pass the positions as keep_clear"
+            )
+
+
+def _metres(p: FloatArray) -> str:
+    return ", ".join(f"{x:.2f}" for x in p)
+
+
+def room(
+    seed: int = 0,
+    *,
+    bounds: npt.ArrayLike = ((-4.0, -3.0, 0.0), (4.0, 3.0, 2.8)),
+    furniture: int = 12,
+    pictures: int = 10,
+    keep_clear: npt.ArrayLike | None = None,
+    bare_walls: tuple[str, ...] = (),
+    moving: Sequence[MovingBox] = (),
+    texel_m: float | None = None,
+) -> World:
+    """Build an indoor room with furniture boxes on the floor and framed pictures on the walls.
+
+    Args:
+        seed: everything random follows from it.
+        bounds: lower and upper corner (2, 3) of the room, metres.
+        furniture: boxes to place; fewer where there is no space.
+        pictures: thin boxes on the walls.
+        keep_clear: positions (N, 3) from which furniture stays 0.6 m away; None keeps the middle of the room free.
+        bare_walls: sides without texture, of "+x" "-x" "+y" "-y".
+        moving: boxes that move.
+        texel_m: texture resolution; None chooses 2.5 mm, coarser in halls.
+    """
+    box = _bounds(bounds)
+    rng = np.random.default_rng([seed, 1])
+    texel = (
+        texel_m if texel_m is not None else max(0.0025, 0.0025 * float(np.prod(box[1, :2] - box[0, :2]) / 60) ** 0.5)
+    )
+    patches = _shell(box, bare_walls, texel)
+    clear = _default_clear(box) if keep_clear is None else np.asarray(keep_clear, dtype=np.float64).reshape(-1, 3)
+    solids: list[Solid] = []
+    scale = float(np.clip((box[1, 2] - box[0, 2]) / 2.8, 0.7, 2.5))
+    for _ in range(furniture):
+        solid = _place_furniture(box, clear, solids, rng, scale)
+        if solid is not None:
+            solids.append(solid)
+            patches += _box_patches(solid, rng.choice(["wood", "crate"]), texel, hidden=("-z",))
+            top = _stack(solid, rng, scale)
+            if top is not None and _is_clear(top, clear, 0.6):
+                solids.append(top)
+                patches += _box_patches(top, "crate", texel, hidden=("-z",))
+    for _ in range(pictures):
+        picture = _hang_picture(box, rng, scale, bare_walls)
+        if picture is not None and _is_clear(picture, clear, 0.3):
+            patches += _box_patches(picture, "picture", texel)
+            solids.append(picture)
+    return _build("room", patches, solids, box, seed, moving)
+
+
+def corridor(
+    seed: int = 0,
+    *,
+    length_m: float = 30.0,
+    width_m: float = 2.6,
+    height_m: float = 2.7,
+    bare_walls: tuple[str, ...] = ("+y",),
+    moving: Sequence[MovingBox] = (),
+    texel_m: float = 0.003,
+) -> World:
+    """Build a corridor along x whose left wall (`bare_walls`) is bare, with cupboards along the right one."""
+    box = np.array([[0.0, -width_m / 2, 0.0], [length_m, width_m / 2, height_m]])
+    rng = np.random.default_rng([seed, 2])
+    patches = _shell(box, bare_walls, texel_m)
+    solids: list[Solid] = []
+    x = rng.uniform(2.0, 4.0)
+    while x < length_m - 2:
+        size = rng.uniform((0.5, 0.25, 0.6), (1.2, 0.4, 1.9))
+        solid = Solid(_pose((x, -width_m / 2 + size[1] / 2, size[2] / 2), 0.0), size / 2)
+        solids.append(solid)
+        patches += _box_patches(solid, rng.choice(["wood", "crate"]), texel_m, hidden=("-z",))
+        x += rng.uniform(2.0, 4.5)
+    for _ in range(int(length_m / 2.5)):
+        picture = _hang_picture(box, rng, 0.8, bare_walls)
+        if picture is not None:
+            patches += _box_patches(picture, "picture", texel_m)
+            solids.append(picture)
+    return _build("corridor", patches, solids, box, seed, moving)
+
+
+def street(
+    seed: int = 0,
+    *,
+    loop_m: tuple[float, float] = (110.0, 70.0),
+    width_m: float = 15.0,
+    parked: int = 36,
+    moving: Sequence[MovingBox] = (),
+    texel_m: float = 0.015,
+) -> World:
+    """Build a street around a block of houses, house fronts at both sides, parked boxes, poles, a far skyline.
+
+    The middle of the street is a rectangle of `loop_m` (along x, along y) about the origin, so a car loop along it
+    is about twice their sum long.
+    """
+    rng = np.random.default_rng([seed, 3])
+    half = np.array(loop_m) / 2
+    if min(loop_m) < 2.5 * width_m:
+        raise SimulationError(f"a street {width_m:g} m wide needs loop_m of at least {2.5 * width_m:g} m each way")
+    inner, outer = half - width_m / 2, half + width_m / 2
+    patches: list[Patch] = []
+    solids: list[Solid] = []
+    for solid in [*_house_row(inner, rng, outwards=True), *_house_row(outer, rng, outwards=False)]:
+        solids.append(solid)
+        patches += _box_patches(solid, "facade", texel_m, hidden=("-z", "+z"))
+    patches += _road(inner, outer, 0.8 * texel_m)
+    for solid in _roadside(half, width_m, parked, rng):
+        solids.append(solid)
+        patches += _box_patches(solid, "crate", 0.6 * texel_m, hidden=("-z",))
+    reach = float(max(outer)) + 250.0
+    patches += _far_box(reach)
+    bounds = np.array([[-outer[0], -outer[1], 0.0], [outer[0], outer[1], 40.0]])
+    solids.append(Solid(_pose((0.0, 0.0, 10.0), 0.0), np.array([inner[0] - 3.0, inner[1] - 3.0, 10.0])))
+    return _build("street", patches, solids, bounds, seed, moving)
+
+
+def _bounds(bounds: npt.ArrayLike) -> FloatArray:
+    box = np.asarray(bounds, dtype=np.float64)
+    if box.shape != (2, 3) or not np.all(np.isfinite(box)) or np.any(box[1] - box[0] < 0.5):
+        raise SimulationError("scene bounds must be a lower and an upper corner (2, 3) at least 0.5 m apart each way")
+    return box
+
+
+def _build(
+    name: str, patches: list[Patch], solids: list[Solid], bounds: FloatArray, seed: int, moving: Sequence[MovingBox]
+) -> World:
+    mover = [0] * len(patches)
+    every = list(patches)
+    for number, box in enumerate(moving, start=1):
+        faces = _box_patches(Solid(np.eye(4), np.asarray(box.size) / 2), box.kind, box.texel_m)
+        every += faces
+        mover += [number] * len(faces)
+    surfaces = Surfaces(
+        np.array([p.origin for p in every]),
+        np.array([p.axis_s for p in every]),
+        np.array([p.axis_t for p in every]),
+        np.array([p.size for p in every]),
+        np.array(mover, dtype=np.int64),
+    )
+    return World(name, surfaces, TextureStore(every, seed), tuple(solids), bounds, tuple(moving))
+
+
+def _pose(centre: npt.ArrayLike, yaw: float) -> FloatArray:
+    return se3_from_parts(so3_exp([0.0, 0.0, yaw]), centre)
+
+
+def _rectangle(
+    centre: FloatArray, normal: FloatArray, down: FloatArray, size: FloatArray, kind: TextureKind, texel_m: float
+) -> Patch:
+    """Return the rectangle with the given middle, seen against `normal` with `down` pointing down."""
+    right = np.cross(normal, down)
+    origin = centre - right * size[0] / 2 - down * size[1] / 2
+    return Patch(origin, right, down, np.asarray(size, dtype=np.float64), kind, texel_m)
+
+
+def _axis_rectangles(
+    T: FloatArray, half: FloatArray, kinds: dict[str, TextureKind], texel_m: float, *, inwards: bool
+) -> list[Patch]:
+    """Faces of a box, seen from inside or from outside."""
+    out = []
+    for face, kind in kinds.items():
+        axis, sign = _FACES[face]
+        side = np.zeros(3)
+        side[axis] = sign
+        down = np.array([0.0, -1.0, 0.0]) if axis == 2 else np.array([0.0, 0.0, -1.0])
+        across = 1 - axis if axis != 2 else 0
+        size = 2 * np.array([half[across], half[1] if axis == 2 else half[2]])
+        patch = _rectangle(side * half[axis], -side if inwards else side, down, size, kind, texel_m)
+        R, t = T[:3, :3], T[:3, 3]
+        out.append(replace(patch, origin=R @ patch.origin + t, axis_s=R @ patch.axis_s, axis_t=R @ patch.axis_t))
+    return out
+
+
+def _box_patches(solid: Solid, kind: TextureKind, texel_m: float, *, hidden: tuple[str, ...] = ()) -> list[Patch]:
+    kinds = {face: kind for face in _FACES if face not in hidden}
+    return _axis_rectangles(solid.T_world_box, solid.half_size, kinds, texel_m, inwards=False)
+
+
+def _shell(box: FloatArray, bare_walls: tuple[str, ...], texel_m: float) -> list[Patch]:
+    unknown = set(bare_walls) - set(_FACES)
+    if unknown:
+        raise SimulationError(f"unknown walls {sorted(unknown)}; use some of {', '.join(_FACES)}")
+    kinds: dict[str, TextureKind] = dict.fromkeys(("+x", "-x", "+y", "-y"), "wall")
+    kinds |= {"-z": "floor", "+z": "ceiling"}
+    kinds |= dict.fromkeys(bare_walls, "bare")
+    return _axis_rectangles(_pose((box[0] + box[1]) / 2, 0.0), (box[1] - box[0]) / 2, kinds, texel_m, inwards=True)
+
+
+def _default_clear(box: FloatArray) -> FloatArray:
+    """An ellipse of positions at mid height that leaves the rim of the room to furniture."""
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    middle, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
+    ring = np.stack([np.cos(angle) * half[0], np.sin(angle) * half[1], 0 * angle], axis=1)
+    return np.concatenate([middle + ring * radius for radius in (0.0, 0.2, 0.4, 0.55)])
+
+
+def _is_clear(solid: Solid, positions: FloatArray, distance_m: float) -> bool:
+    local = (positions - solid.T_world_box[:3, 3]) @ solid.T_world_box[:3, :3]
+    gap = np.linalg.norm(np.maximum(np.abs(local) - solid.half_size, 0.0), axis=1)
+    return bool(gap.min(initial=np.inf) > distance_m)
+
+
+def _overlaps(a: Solid, others: Sequence[Solid]) -> bool:
+    """Whether bounding circles on the floor intersect."""
+    radius = float(np.linalg.norm(a.half_size[:2]))
+    return any(
+        np.linalg.norm(a.T_world_box[:2, 3] - b.T_world_box[:2, 3]) < 0.8 * (radius + np.linalg.norm(b.half_size[:2]))
+        for b in others
+    )
+
+
+def _place_furniture(
+    box: FloatArray, clear: FloatArray, solids: Sequence[Solid], rng: np.random.Generator, scale: float
+) -> Solid | None:
+    """Find a free place on the floor; None after many attempts."""
+    for _ in range(60):
+        size = rng.uniform((0.35, 0.35, 0.35), (1.1, 0.9, 1.5)) * scale
+        size = np.minimum(size, 0.6 * (box[1] - box[0]))
+        reach = np.linalg.norm(size[:2]) / 2 + 0.02
+        if np.any(box[1, :2] - box[0, :2] < 2 * reach):
+            continue
+        xy = rng.uniform(box[0, :2] + reach, box[1, :2] - reach)
+        solid = Solid(_pose((*xy, box[0, 2] + size[2] / 2), rng.uniform(-np.pi, np.pi)), size / 2)
+        if _is_clear(solid, clear, 0.6) and not _overlaps(solid, solids):
+            return solid
+    return None
+
+
+def _stack(below: Solid, rng: np.random.Generator, scale: float) -> Solid | None:
+    """Put a smaller box on top, half of the time."""
+    if rng.random() < 0.5 or below.half_size[2] > 0.55 * scale:
+        return None
+    size = 2 * below.half_size * rng.uniform((0.4, 0.4, 0.4), (0.75, 0.75, 0.9))
+    centre = below.T_world_box[:3, 3] + np.array([0, 0, below.half_size[2] + size[2] / 2])
+    yaw = np.arctan2(below.T_world_box[1, 0], below.T_world_box[0, 0]) + rng.uniform(-0.4, 0.4)
+    return Solid(_pose(centre, yaw), size / 2)
+
+
+def _hang_picture(box: FloatArray, rng: np.random.Generator, scale: float, bare_walls: tuple[str, ...]) -> Solid | None:
+    """Hang a thin framed box on a wall that has texture; None where it would not fit."""
+    walls = [face for face in ("+x", "-x", "+y", "-y") if face not in bare_walls]
+    if not walls:
+        return None
+    axis, sign = _FACES[walls[int(rng.integers(len(walls)))]]
+    along = 1 - axis
+    width, height, thick = rng.uniform(0.4, 1.1) * scale, rng.uniform(0.4, 0.9) * scale, 0.04
+    low, high = box[0] + 0.15, box[1] - 0.15
+    if high[along] - low[along] < width or high[2] - low[2] < height:
+        return None
+    centre = np.zeros(3)
+    centre[along] = rng.uniform(low[along] + width / 2, high[along] - width / 2)
+    centre[2] = rng.uniform(low[2] + height / 2, high[2] - height / 2)
+    centre[axis] = box[1, axis] - thick / 2 if sign > 0 else box[0, axis] + thick / 2
+    half = np.zeros(3)
+    half[axis], half[along], half[2] = thick / 2, width / 2, height / 2
+    return Solid(_pose(centre, 0.0), half)
+
+
+def _house_row(rim: FloatArray, rng: np.random.Generator, *, outwards: bool) -> list[Solid]:
+    """Houses along a rectangle of half size `rim`: inside it facing out, or outside it facing in."""
+    houses = []
+    depth = 8.0
+    for axis in (0, 1):
+        for sign in (-1, 1):
+            extent = rim[axis] + (0.0 if outwards else depth)
+            x = -extent
+            while x < extent - 3:
+                width = min(rng.uniform(9.0, 18.0), extent - x)
+                if extent - x - width < 5:
+                    width = extent - x
+                height, setback = rng.uniform(7.0, 16.0), rng.uniform(0.1, 1.2)
+                across = rim[1 - axis] + (-(setback + depth / 2) if outwards else setback + depth / 2)
+                centre, half = np.zeros(3), np.zeros(3)
+                centre[axis], centre[1 - axis], centre[2] = x + width / 2, sign * across, height / 2
+                half[axis], half[1 - axis], half[2] = width / 2, depth / 2, height / 2
+                houses.append(Solid(_pose(centre, 0.0), half))
+                x += width + (rng.uniform(1.5, 5.0) if rng.random() < 0.3 else 0.0)
+    return houses
+
+
+def _road(inner: FloatArray, outer: FloatArray, texel_m: float) -> list[Patch]:
+    """Four strips around the block, reaching under the house fronts, above one coarse plain."""
+    low, high = inner - 2.0, outer + 2.0
+    up, down = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])
+    out = []
+    for sign in (-1, 1):
+        x, y = sign * (low[0] + high[0]) / 2, sign * (low[1] + high[1]) / 2
+        long_size, short_size = np.array([2 * high[0], high[1] - low[1]]), np.array([high[0] - low[0], 2 * low[1]])
+        out.append(_rectangle(np.array([0.0, y, 0.0]), up, down, long_size, "asphalt", texel_m))
+        out.append(_rectangle(np.array([x, 0.0, 0.0]), up, down, short_size, "asphalt", texel_m))
+    plain = np.array([2 * (max(high) + 250.0)] * 2)
+    out.append(_rectangle(np.array([0.0, 0.0, -0.05]), up, down, plain, "asphalt", 0.25))
+    return out
+
+
+def _roadside(half: FloatArray, width_m: float, parked: int, rng: np.random.Generator) -> list[Solid]:
+    """Parked boxes the size of cars and vans, and poles, at both sides of the middle line."""
+    out: list[Solid] = []
+    perimeter = 4 * float(half.sum())
+    for number in range(parked + parked // 2):
+        is_pole = number >= parked
+        for _ in range(20):
+            place = rng.uniform(0, perimeter)
+            point, heading = _on_rectangle(half, place)
+            side = rng.choice([-1.0, 1.0]) * (width_m / 2 - (0.7 if is_pole else rng.uniform(1.5, 1.9)))
+            normal = np.array([-np.sin(heading), np.cos(heading)])
+            size = (
+                np.array([0.22, 0.22, rng.uniform(3, 6)]) if is_pole else rng.uniform((3.4, 1.6, 1.3), (5.2, 2.0, 2.4))
+            )
+            yaw = heading + rng.normal(0, 0.03)
+            solid = Solid(_pose((*(point + side * normal), size[2] / 2), yaw), size / 2)
+            if not _overlaps(solid, out):
+                out.append(solid)
+                break
+    return out
+
+
+def _on_rectangle(half: FloatArray, s: float) -> tuple[FloatArray, float]:
+    """Point and heading at arc length s along a rectangle, counter-clockwise."""
+    sides = [(np.array([-1, -1]), np.array([1, 0])), (np.array([1, -1]), np.array([0, 1]))]
+    sides += [(np.array([1, 1]), np.array([-1, 0])), (np.array([-1, 1]), np.array([0, -1]))]
+    for start, direction in sides:
+        length = 2 * float(np.abs(direction) @ half)
+        if s <= length:
+            return start * half + direction * s, float(np.arctan2(direction[1], direction[0]))
+        s -= length
+    return -half, 0.0
+
+
+def _far_box(reach: float) -> list[Patch]:
+    """A closed box of skyline and sky, so that every ray ends somewhere."""
+    kinds: dict[str, TextureKind] = dict.fromkeys(("+x", "-x", "+y", "-y"), "skyline")
+    T, half = _pose((0.0, 0.0, 40.0), 0.0), np.array([reach, reach, 50.0])
+    sky: dict[str, TextureKind] = {"+z": "sky"}
+    return _axis_rectangles(T, half, kinds, 0.2, inwards=True) + _axis_rectangles(T, half, sky, 0.5, inwards=True)
