@@ -22,7 +22,7 @@ from vio.records import Image
 Warp: TypeAlias = Literal["shift", "row", "affine"]
 _PARAMETERS: dict[Warp, int] = {"shift": 4, "row": 6, "affine": 8}
 
-_DONE_PX = 0.005
+_DONE_PX = 0.03  # the last step is taken; what then remains is a small fraction of it
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: weakly textured directions move slowly instead of wildly
@@ -69,12 +69,11 @@ def align(
     used = template.basis[:, :size]
     normal = (used @ used.transpose(0, 2, 1)).astype(np.float64)
     diagonal = np.einsum("nii->ni", normal)
-    inverse = np.linalg.inv(normal + (_DAMPING * diagonal + 1e-6)[:, :, None] * np.eye(size))
+    solver = np.linalg.inv(normal + (_DAMPING * diagonal + 1e-6)[:, :, None] * np.eye(size)).astype(np.float32) @ used
     active = np.arange(n)
     for _ in range(iterations):
         view = warped_patches(image, warp[active], radius).reshape(len(active), -1, 1)
-        moment = (used[active] @ view).astype(np.float64)
-        fit = (inverse[active] @ moment)[:, :, 0]
+        fit = (solver[active] @ view)[:, :, 0].astype(np.float64)
         # The image under the current warp is gain * template(step(x)) + offset, so the step is undone.
         fit /= np.maximum(fit[:, 2:3], 0.1)
         step = np.tile(np.eye(3), (len(active), 1, 1))

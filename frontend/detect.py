@@ -16,9 +16,8 @@ Response = npt.NDArray[np.float32]
 
 _BLOCK_PX = 5
 _GRADIENT_PX = 3
-# cornerMinEigenVal sums squared Sobel derivatives over the block and scales them so that a ramp of one gray level a
-# pixel over the whole block gives this eigenvalue.
-_UNIT_RAMP = (1.0 / 255.0) ** 2 / _BLOCK_PX
+# cornerMinEigenVal takes gray levels as fractions of 255 and makes the Sobel derivative twice the gradient.
+_EIGENVALUE_OF_UNIT_GRADIENT = (2.0 / 255.0) ** 2
 
 
 def feature_spacing(width: int, height: int, settings: KltSettings) -> float:
@@ -51,7 +50,7 @@ def corner_response(image: Image) -> Response:
     Unit: squared gray levels per squared pixel. Reference: Shi & Tomasi, Good features to track, CVPR (1994).
     """
     response = cv2.cornerMinEigenVal(image, _BLOCK_PX, ksize=_GRADIENT_PX)
-    return np.asarray(response, dtype=np.float32) / np.float32(_UNIT_RAMP)
+    return np.asarray(response, dtype=np.float32) / np.float32(_EIGENVALUE_OF_UNIT_GRADIENT)
 
 
 def local_maxima(response: Response, occupied: FloatArray, distance: int, border: int, least: float) -> IntArray:

@@ -27,8 +27,9 @@ _SWAP_FEW = 0.3  # share of matches below which a frame is suspicious
 _SWAP_MANY = 0.4  # share of matches in the mirrored images that proves the swap
 _SWAP_MIN_POINTS = 20
 _LK_EPSILON_PX = 0.01
-_ALIGN_ITERATIONS = 8
+_ALIGN_ITERATIONS = 4
 _ALIGN_MAX_PX = 2.5
+_ANCHOR_LOST = 0.5  # correlation with its anchor below which a feature is taken for another
 _LK_MIN_EIGENVALUE = 1e-4
 
 
@@ -105,6 +106,11 @@ class KltFrontend:
         self._memory: _Memory | None = None
         self._next_id = 0
         self._suspicious = 0  # frames in a row that look swapped
+
+    @property
+    def settings(self) -> KltSettings:
+        """The settings in effect."""
+        return self._settings
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Track, match and detect in one rectified stereo pair; frames come in time order.
@@ -217,8 +223,8 @@ class KltFrontend:
         """Align the features with their anchors; return the survivors, as they were and as they are.
 
         Lucas-Kanade steps add up to a drift; the anchor does not drift. Features that Lucas-Kanade lost are looked
-        for where the consensus motion puts them. Features that were found, but look too different from their anchor,
-        stay where they were found and get a new anchor.
+        for where the consensus motion puts them. Features that were found, but look somewhat different from their
+        anchor, stay where they were found and get a new one; those that look altogether different are dropped.
         """
         settings = self._settings
         start, tried, scale = found.copy(), seen.copy(), np.ones(len(old))
@@ -244,7 +250,7 @@ class KltFrontend:
         if motion is not None:
             error = pixel_errors(self._camera, motion.T_curr_prev, p[rows], place)
             good &= ~valid[rows] | (error <= settings.consensus_px)
-        kept = good | seen[rows]
+        kept = good | (seen[rows] & (score >= _ANCHOR_LOST))
         rows, warp, place, size, good = rows[kept], warp[kept], place[kept], size[kept], good[kept]
         place[~good] = found[rows[~good]]
         renew = np.flatnonzero(~good | (np.abs(np.log(np.maximum(size, 1e-3))) > np.log(settings.max_anchor_scale)))
@@ -348,13 +354,12 @@ class KltFrontend:
         known = np.flatnonzero(valid & seen)
         expected = self._expected_motion(memory, prior, seconds)
         R_prior = None if prior is None else prior.R_cam_prev
-        if prior is not None and R_prior is None:
+        T_prior = None
+        if prior is not None:
             _, a, b = np.intersect1d(old.ids[known], prior.ids, assume_unique=True, return_indices=True)
-            fitted = fit_motion(camera, p[known[a]], prior.z[b, :2], expected, settings)
-            if fitted is not None:
-                expected, R_prior = fitted, fitted[:3, :3]
+            T_prior = fit_motion(camera, p[known[a]], prior.z[b, :2], expected, settings)
         rng = np.random.default_rng((settings.seed, frame_index))
-        motion = rigid_consensus(camera, p[known], found[known], expected, R_prior, rng, settings)
+        motion = rigid_consensus(camera, p[known], found[known], expected, R_prior, T_prior, rng, settings)
         if motion is None:
             return seen, None
         keep = seen.copy()

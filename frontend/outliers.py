@@ -125,13 +125,15 @@ def rigid_consensus(
     pixels: FloatArray,
     expected: FloatArray,
     R_prior: FloatArray | None,
+    T_prior: FloatArray | None,
     rng: np.random.Generator,
     settings: KltSettings,
 ) -> Consensus | None:
     """Find the motion that most static points follow.
 
     A large moving object can win the vote. Where a rotation is predicted from outside (`R_prior`) and the vote turns
-    away from it, the best motion with that rotation is preferred, provided enough points support it.
+    away from it, the best motion with that rotation is preferred; where a whole motion is predicted (`T_prior`), the
+    motion nearest to it is. Either needs a share of the vote's own support.
 
     Args:
         camera: rectified camera.
@@ -139,6 +141,7 @@ def rigid_consensus(
         pixels: left pixels (N, 2) of the same points in the current frame.
         expected: motion (4, 4) to start from, `T_curr_prev`.
         R_prior: predicted rotation (3, 3) from the previous to the current cam0 frame, or None.
+        T_prior: predicted motion (4, 4) `T_curr_prev`, or None.
         rng: source of the samples; the same state gives the same result to the bit.
         settings: thresholds.
 
@@ -149,19 +152,30 @@ def rigid_consensus(
         return None
     starts = [expected, np.eye(4)]
     if R_prior is not None:
-        starts.insert(0, se3_from_parts(R_prior, expected[:3, 3]))
+        starts.append(se3_from_parts(R_prior, expected[:3, 3]))
+    if T_prior is not None:
+        starts.append(T_prior)
     T, inliers = _search(camera, p_prev, pixels, np.stack(starts), rng, settings, slice(0, 6))
-    if R_prior is not None:
-        turn_deg = float(np.degrees(np.linalg.norm(so3_log(T[:3, :3] @ R_prior.T))))
-        if turn_deg > settings.prior_max_deviation_deg:
-            fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
-            T_prior, kept = _search(camera, p_prev, pixels, fixed, rng, settings, slice(0, 3))
-            if kept.sum() >= max(_MIN_POINTS, settings.prior_min_support * inliers.sum()):
-                T = _refine(camera, T_prior, p_prev[kept], pixels[kept], settings.consensus_px / 2, slice(0, 6))
-                inliers = pixel_errors(camera, T, p_prev, pixels) <= settings.consensus_px
+    near_prior: list[FloatArray] = []
+    if T_prior is not None:
+        near_prior.append(_refine(camera, T_prior, p_prev, pixels, settings.consensus_px, slice(0, 6)))
+    if R_prior is not None and _turn_deg(T, R_prior) > settings.prior_max_deviation_deg:
+        fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
+        near_prior.append(_search(camera, p_prev, pixels, fixed, rng, settings, slice(0, 3))[0])
+    for T_near in near_prior:
+        kept = pixel_errors(camera, T_near, p_prev, pixels) <= settings.consensus_px
+        if kept.sum() >= max(_MIN_POINTS, settings.prior_min_support * inliers.sum()):
+            T = _refine(camera, T_near, p_prev[kept], pixels[kept], settings.consensus_px / 2, slice(0, 6))
+            inliers = pixel_errors(camera, T, p_prev, pixels) <= settings.consensus_px
+            break
     if inliers.sum() < max(_MIN_POINTS, _MIN_SHARE * len(inliers)):
         return None
     return Consensus(T, inliers)
+
+
+def _turn_deg(T: FloatArray, R: FloatArray) -> float:
+    """Angle between the rotations of a motion (4, 4) and of a prediction (3, 3)."""
+    return float(np.degrees(np.linalg.norm(so3_log(T[:3, :3] @ R.T))))
 
 
 def epipolar_distance(

@@ -45,14 +45,21 @@ def warped_patches(image: Image, warp: npt.NDArray[np.float64], radius: int) -> 
     Pixels outside the image repeat its border.
     """
     height, width = image.shape
-    offset = np.arange(-radius, radius + 1, dtype=np.float64)
-    A = warp[:, :2, :, None, None]
-    u, v = np.moveaxis(A[:, :, 0] * offset[None, :] + A[:, :, 1] * offset[:, None] + A[:, :, 2], 1, 0)
-    u, v = np.clip(u, 0.0, width - 1.001), np.clip(v, 0.0, height - 1.001)
-    iu, iv = u.astype(np.int64), v.astype(np.int64)
-    a, b = (u - iu).astype(np.float32), (v - iv).astype(np.float32)
-    flat, index = image.reshape(-1), iv * width + iu
-    top, bottom = flat[index].astype(np.float32), flat[index + width].astype(np.float32)
-    top += a * (flat[index + 1] - top)
-    bottom += a * (flat[index + width + 1] - bottom)
-    return top + b * (bottom - top)
+    offset = np.arange(-radius, radius + 1, dtype=np.float32)
+    A = warp[:, :2].astype(np.float32)[..., None, None]
+    u = A[:, 0, 0] * offset + (A[:, 0, 1] * offset[:, None] + A[:, 0, 2])
+    v = A[:, 1, 0] * offset + (A[:, 1, 1] * offset[:, None] + A[:, 1, 2])
+    np.clip(u, 0.0, width - 1.01, out=u)
+    np.clip(v, 0.0, height - 1.01, out=v)
+    iu, iv = u.astype(np.int32), v.astype(np.int32)
+    u -= iu
+    v -= iv
+    index = iv * np.int32(width) + iu
+    flat = image.reshape(-1)
+    top, bottom = flat.take(index).astype(np.float32), flat.take(index + np.int32(width)).astype(np.float32)
+    top += u * (flat.take(index + np.int32(1)) - top)
+    bottom += u * (flat.take(index + np.int32(width + 1)) - bottom)
+    bottom -= top
+    bottom *= v
+    bottom += top
+    return bottom

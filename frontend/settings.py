@@ -16,7 +16,7 @@ class KltSettings:
     cell_features: int = setting(4, "features wanted in one grid cell; the cell size follows from it")
     min_distance: float = setting(0.3, "least distance between features, over the spacing of a uniform grid of them")
     min_gradient: float = setting(
-        8.0, "least gradient of a corner in its weakest direction, root mean square over 5x5 pixels", unit="gray/px"
+        1.8, "least gradient of a corner in its weakest direction, root mean square over 5x5 pixels", unit="gray/px"
     )
     spare_corners: float = setting(
         1.0, "corners tried beyond the missing ones, over their number; those with a right match are kept first"
@@ -36,9 +36,9 @@ class KltSettings:
         1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"
     )
     prior_min_support: float = setting(
-        0.4, "share of a distrusted consensus' inliers that the predicted rotation needs to replace it"
+        0.4, "share of the consensus' inliers that the predicted motion needs to replace it"
     )
-    anchor_radius_px: int = setting(7, "half side of the patch that a feature is aligned with for life", unit="px")
+    anchor_radius_px: int = setting(6, "half side of the patch that a feature is aligned with for life", unit="px")
     min_anchor_correlation: float = setting(
         0.8, "smallest normalised correlation with that patch; below, it is renewed"
     )

@@ -25,8 +25,8 @@ _COARSE_RADIUS = 4  # pixels of the half-resolution image
 _NEAR_PX = 3  # half width of the search around a predicted or coarse disparity
 _BACK_PX = 6  # half width of the search back in the left image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
-_SHIFT_ITERATIONS = 4
-_WARP_ITERATIONS = 6
+_SHIFT_ITERATIONS = 2
+_WARP_ITERATIONS = 4
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
 _ALIGN_MAX_PX = 2.0  # a fit that moves further than this has left its peak
 

@@ -1,0 +1,317 @@
+"""The KLT front end on images whose truth is known, on broken images, and on a real drive."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from frontend.detect import cell_index, grid_shape, min_distance_px
+from frontend.klt import KltFrontend
+from frontend.outliers import fit_motion
+from frontend.settings import KltSettings
+from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray, se3_inverse, se3_log
+from vio.geometry.stereo import StereoCamera, triangulate
+from vio.records import FrontendOutput, StereoFrame, TrackPrior
+
+SETTINGS = KltSettings(target_features=200)
+POSES = flight(6)
+FRAMES = [stereo_frame(k, pose) for k, pose in enumerate(POSES)]
+
+
+def run(frames: list[StereoFrame], settings: KltSettings = SETTINGS) -> list[FrontendOutput]:
+    frontend = KltFrontend(CAMERA, settings)
+    return [frontend.process(frame) for frame in frames]
+
+
+@pytest.fixture(scope="module")
+def outputs() -> list[FrontendOutput]:
+    return run(FRAMES)
+
+
+def common(a: FrontendOutput, b: FrontendOutput) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 4) of the features that both outputs hold."""
+    _, i, j = np.intersect1d(a.observations.ids, b.observations.ids, return_indices=True)
+    return a.observations.z[i], b.observations.z[j]
+
+
+def test_temporal_tracks_are_accurate_to_a_twentieth_of_a_pixel(outputs: list[FrontendOutput]) -> None:
+    errors = []
+    for k in range(len(POSES) - 1):
+        before, after = common(outputs[k], outputs[k + 1])
+        expected = truth(SLANTED, POSES[k], before[:, :2], POSES[k + 1])
+        errors.append(np.linalg.norm(after[:, :2] - expected[:, :2], axis=1))
+    error = np.concatenate(errors)
+    assert len(error) > 700
+    assert np.median(error) < 0.05
+    assert np.mean(error > 1.0) < 0.005
+
+
+def test_tracks_do_not_drift_over_five_frames(outputs: list[FrontendOutput]) -> None:
+    first, last = common(outputs[0], outputs[5])
+    expected = truth(SLANTED, POSES[0], first[:, :2], POSES[5])
+    assert len(first) > 100
+    assert np.median(np.linalg.norm(last[:, :2] - expected[:, :2], axis=1)) < 0.08
+
+
+def test_disparities_are_accurate_and_unbiased(outputs: list[FrontendOutput]) -> None:
+    errors = []
+    for pose, output in zip(POSES, outputs, strict=True):
+        seen = output.observations.take(output.observations.has_right)
+        expected = truth(SLANTED, pose, seen.z[:, :2], pose)
+        errors.append(seen.z[:, 2:] - expected[:, 2:])
+    error = np.concatenate(errors)
+    assert np.median(np.abs(error[:, 0])) < 0.04
+    assert abs(np.median(error[:, 0])) < 0.01
+    assert np.percentile(np.abs(error[:, 0]), 95) < 0.15
+    assert np.median(np.abs(error[:, 1])) < 0.04
+
+
+def test_most_features_are_kept_and_the_counts_add_up(outputs: list[FrontendOutput]) -> None:
+    assert outputs[0].tracked == 0
+    for output in outputs:
+        assert len(output.observations) == output.tracked + output.detected
+        assert output.matched == output.observations.has_right.sum()
+        assert output.matched > 0.7 * SETTINGS.target_features
+        assert len(output.observations) <= SETTINGS.target_features
+    assert all(output.tracked > 0.8 * SETTINGS.target_features for output in outputs[1:])
+    assert {"prepare", "track", "reject", "align", "detect", "stereo"} <= set(outputs[-1].stages_ms)
+
+
+def test_disparity_is_positive_wherever_there_is_a_right_pixel(outputs: list[FrontendOutput]) -> None:
+    for output in outputs:
+        z = output.observations.z[output.observations.has_right]
+        assert (z[:, 0] - z[:, 2] > 0).all()
+        assert (np.abs(z[:, 1] - z[:, 3]) <= SETTINGS.max_epipolar_px).all()
+
+
+def test_two_runs_agree_to_the_bit(outputs: list[FrontendOutput]) -> None:
+    for a, b in zip(outputs, run(FRAMES), strict=True):
+        np.testing.assert_array_equal(a.observations.ids, b.observations.ids)
+        np.testing.assert_array_equal(a.observations.z, b.observations.z)
+        np.testing.assert_array_equal(a.observations.has_right, b.observations.has_right)
+
+
+def test_ids_are_never_reused() -> None:
+    """A black frame kills every track; what is found afterwards is new, even where the picture is the same."""
+    black = np.zeros_like(FRAMES[0].left)
+    frames = [FRAMES[0], FRAMES[1], StereoFrame(2, 100_000_000, black, black), replace(FRAMES[1], index=3)]
+    frames[3] = replace(frames[3], time_ns=150_000_000)
+    outputs = run(frames)
+    assert len(outputs[2].observations) == 0
+    early = np.concatenate([output.observations.ids for output in outputs[:2]])
+    assert len(outputs[3].observations) > 100
+    assert outputs[3].observations.ids.min() > early.max()
+
+
+@pytest.mark.parametrize("level", [0, 255])
+def test_images_without_contrast_give_no_features(level: int) -> None:
+    flat = np.full((300, 480), level, dtype=np.uint8)
+    for output in run([StereoFrame(k, k * 50_000_000, flat, flat) for k in range(3)]):
+        assert len(output.observations) == 0
+        assert output.observations.z.shape == (0, 4)
+
+
+def test_noise_alone_gives_no_tracks() -> None:
+    """Corners of noise differ from frame to frame and from left to right."""
+    rng = np.random.default_rng(1)
+    frames = [StereoFrame(k, k * 50_000_000, *rng.integers(0, 255, (2, 300, 480), dtype=np.uint8)) for k in range(3)]
+    for output in run(frames)[1:]:
+        assert output.tracked < 5
+        assert output.matched < 5
+
+
+def test_features_keep_their_distance_and_fill_the_grid(outputs: list[FrontendOutput]) -> None:
+    shape = grid_shape(480, 300, SETTINGS)
+    for output in outputs:
+        left = output.observations.z[:, :2]
+        gap = np.abs(left[:, None] - left[None]).max(axis=2)
+        np.fill_diagonal(gap, np.inf)
+        assert gap.min() >= 0.5 * min_distance_px(480, 300, SETTINGS)
+        held = np.bincount(cell_index(left, 480, 300, shape), minlength=shape[0] * shape[1])
+        assert held.max() <= 3 * SETTINGS.cell_features
+        assert np.mean(held > 0) > 0.85
+
+
+def test_features_without_a_right_view_stay_as_left_only_rows_for_a_while() -> None:
+    """The right camera goes blind; tracks go on in the left image, for the configured number of frames."""
+    settings = replace(SETTINGS, max_left_only_frames=2)
+    gray = np.full_like(FRAMES[0].right, 128)
+    frames = [FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:5])]
+    outputs = run(frames, settings)
+    first = outputs[0].observations.ids[outputs[0].observations.has_right]
+    alive = [np.isin(first, output.observations.ids).mean() for output in outputs]
+    assert alive[1] > 0.85
+    assert alive[2] > 0.75
+    assert alive[3] == 0.0
+    assert not outputs[1].observations.has_right.any()
+
+
+def test_tracks_hidden_by_a_passing_board_are_dropped() -> None:
+    """A board with another texture covers a part of the next frame."""
+    board = view(Wall(np.array([0.0, 0.0, 1.0]), 2.0, seed=9), POSES[1])
+    left, right = FRAMES[1].left, FRAMES[1].right
+    assert left is not None
+    assert right is not None
+    left, right = left.copy(), right.copy()
+    left[60:220, 150:330] = eight_bit(board, 90)[60:220, 150:330]
+    right[60:220, 120:300] = eight_bit(board, 91)[60:220, 150:330]
+    outputs = run([FRAMES[0], replace(FRAMES[1], left=left, right=right)])
+    before, _ = common(*outputs)
+    expected = truth(SLANTED, POSES[0], before[:, :2], POSES[1])[:, :2]
+    margin = 8
+    hidden = (np.abs(expected[:, 0] - 239.5) < 90 - margin) & (np.abs(expected[:, 1] - 139.5) < 80 - margin)
+    started = outputs[0].observations.z[:, :2]
+    behind = (np.abs(started[:, 0] - 239.5) < 70) & (np.abs(started[:, 1] - 139.5) < 60)
+    assert behind.sum() > 15
+    assert hidden.sum() <= 1
+
+
+def test_a_prior_bridges_a_jump_that_tracking_alone_cannot() -> None:
+    """Between the two frames the camera turns by 12 degrees, about 64 pixels."""
+    first, second = POSES[0], POSES[0].copy()
+    angle = np.radians(12.0)
+    second[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    frames = [stereo_frame(0, first), stereo_frame(1, second)]
+    settings = replace(SETTINGS, pyramid_levels=1)
+    blind = run(frames, settings)[1]
+    frontend = KltFrontend(CAMERA, settings)
+    seen = frontend.process(frames[0]).observations
+    z = truth(SLANTED, first, seen.z[:, :2], second) + np.random.default_rng(0).normal(0, 2, (len(seen), 4))
+    by_pixels = frontend.process(frames[1], TrackPrior(seen.ids, z))
+    frontend = KltFrontend(CAMERA, settings)
+    frontend.process(frames[0])
+    nothing = TrackPrior(np.zeros(0, dtype=np.int64), np.zeros((0, 4)), (se3_inverse(second) @ first)[:3, :3])
+    by_rotation = frontend.process(frames[1], nothing)
+    assert blind.tracked < 0.3 * len(seen)
+    for output in (by_pixels, by_rotation):
+        assert output.tracked > 0.6 * len(seen)
+        before, after = common(FrontendOutput(seen, 0, 0, 0), output)
+        error = np.linalg.norm(after[:, :2] - truth(SLANTED, first, before[:, :2], second)[:, :2], axis=1)
+        assert np.median(error) < 0.08
+
+
+def test_swapped_images_are_named() -> None:
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    swapped = [replace(frame, left=frame.right, right=frame.left) for frame in FRAMES]
+    for frame in swapped[:2]:
+        assert frontend.process(frame).matched < 30
+    with pytest.raises(DataError, match="frame 2: left and right images look swapped"):
+        frontend.process(swapped[2])
+
+
+def test_a_right_image_of_something_else_is_not_called_swapped() -> None:
+    other = [eight_bit(view(Wall(SLANTED.normal, SLANTED.offset, seed=77), right_of(pose)), 50) for pose in POSES[:5]]
+    outputs = run([replace(frame, right=image) for frame, image in zip(FRAMES[:5], other, strict=True)])
+    assert max(output.matched for output in outputs) < 20
+
+
+def test_swapped_images_of_a_real_drive_are_named(data_dir: Path) -> None:
+    camera, frames, _ = kitti(data_dir / "kitti_06_head", 3)
+    frontend = KltFrontend(camera)
+    swapped = [replace(frame, left=frame.right, right=frame.left) for frame in frames]
+    frontend.process(swapped[0])
+    frontend.process(swapped[1])
+    with pytest.raises(DataError, match="look swapped"):
+        frontend.process(swapped[2])
+
+
+def test_wrong_images_are_refused_with_a_reason() -> None:
+    image = np.zeros((300, 480), dtype=np.uint8)
+    cases = [
+        (StereoFrame(4, 0, None, None), "frame 4 has no images"),
+        (StereoFrame(4, 0, image, None), "frame 4 has no images"),
+        (StereoFrame(4, 0, image[:, :400], image[:, :400]), "400x300, but the calibration is for 480x300"),
+        (StereoFrame(4, 0, image, image[:200]), "right image is 480x200"),
+        (StereoFrame(4, 0, np.zeros((300, 480, 3), dtype=np.uint8), image), "8-bit gray"),
+        (StereoFrame(4, 0, image.astype(np.uint16), image), "8-bit gray"),  # type: ignore[arg-type]
+    ]
+    for frame, message in cases:
+        with pytest.raises(DataError, match=message):
+            KltFrontend(CAMERA, SETTINGS).process(frame)
+
+
+def test_without_a_stated_size_the_first_frame_sets_it() -> None:
+    frontend = KltFrontend(replace(CAMERA, width=None, height=None), SETTINGS)
+    frontend.process(FRAMES[0])
+    small = np.zeros((200, 480), dtype=np.uint8)
+    with pytest.raises(DataError, match="one size"):
+        frontend.process(StereoFrame(1, 50_000_000, small, small))
+
+
+def test_a_darker_right_camera_changes_little() -> None:
+    """Different gain left and right, as in EuRoC V2_03: the patches are normalised."""
+    dark = []
+    for frame in FRAMES[:3]:
+        assert frame.right is not None
+        dark.append(replace(frame, right=(0.6 * frame.right.astype(np.float64) + 5).astype(np.uint8)))
+    for pose, output in zip(POSES[:3], run(dark), strict=True):
+        seen = output.observations.take(output.observations.has_right)
+        assert output.matched > 0.7 * SETTINGS.target_features
+        error = seen.z[:, 2] - truth(SLANTED, pose, seen.z[:, :2], pose)[:, 2]
+        assert np.median(np.abs(error)) < 0.05
+
+
+def test_the_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutput]) -> None:
+    """A reader may reuse its buffer."""
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    assert FRAMES[0].left is not None
+    assert FRAMES[0].right is not None
+    left, right = FRAMES[0].left.copy(), FRAMES[0].right.copy()
+    frontend.process(StereoFrame(0, 0, left, right))
+    left[:], right[:] = 0, 0
+    np.testing.assert_array_equal(frontend.process(FRAMES[1]).observations.z, outputs[1].observations.z)
+
+
+def kitti(folder: Path, count: int) -> tuple[StereoCamera, list[StereoFrame], FloatArray]:
+    """Camera, frames and cam0 poses of the first frames of a folder in KITTI odometry layout."""
+    rows = [line.split() for line in (folder / "calib.txt").read_text().splitlines() if line.strip()]
+    P0, P1 = (np.array(row[1:13], dtype=np.float64).reshape(3, 4) for row in rows[:2])
+    frames = []
+    for k in range(count):
+        images = [cv2.imread(str(folder / f"image_{i}" / f"{k:06d}.png"), cv2.IMREAD_GRAYSCALE) for i in (0, 1)]
+        frames.append(StereoFrame(k, k * 100_000_000, *(np.asarray(image, dtype=np.uint8) for image in images)))
+    assert frames[0].left is not None
+    height, width = frames[0].left.shape
+    camera = StereoCamera(P0[0, 0], P0[1, 1], P0[0, 2], P0[1, 2], -P1[0, 3] / P0[0, 0], width, height)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3] = np.loadtxt(folder / "poses.txt")[:count].reshape(-1, 3, 4)
+    return camera, frames, poses
+
+
+def test_real_drive_moves_as_the_ground_truth_says(data_dir: Path) -> None:
+    """Stereo points of one frame, moved by one rigid motion a pair, must meet the tracks of the next frame.
+
+    The motion is fitted to the tracks and then compared with the ground truth, because the true poses of this drive
+    (GPS and inertial, sampled out of step with the camera) jump by up to 50 mm a frame themselves.
+    """
+    camera, frames, poses = kitti(data_dir / "kitti_0039", 8)
+    frontend = KltFrontend(camera)
+    outputs = [frontend.process(frame) for frame in frames]
+    assert min(output.matched for output in outputs) >= 200
+    fitted, raw = [], []
+    for k in range(len(frames) - 1):
+        a, b = outputs[k], outputs[k + 1]
+        before, after = common(replace(a, observations=a.observations.take(a.observations.has_right)), b)
+        p, valid = triangulate(camera, before)
+        assert valid.all()
+        T_true = se3_inverse(poses[k + 1]) @ poses[k]
+        T = fit_motion(camera, p, after[:, :2], T_true, frontend.settings)
+        assert T is not None
+        difference = se3_log(T @ se3_inverse(T_true))
+        assert np.linalg.norm(difference[:3]) < 0.08
+        assert np.degrees(np.linalg.norm(difference[3:])) < 0.1
+        for motion, errors in ((T, fitted), (T_true, raw)):
+            q = p @ motion[:3, :3].T + motion[:3, 3]
+            uv = np.stack(
+                [camera.fu * q[:, 0] / q[:, 2] + camera.cu, camera.fv * q[:, 1] / q[:, 2] + camera.cv], axis=1
+            )
+            errors.append(np.linalg.norm(uv - after[:, :2], axis=1))
+    assert np.median(np.concatenate(fitted)) < 0.35
+    assert np.percentile(np.concatenate(fitted), 95) < 1.5
+    assert np.median(np.concatenate(raw)) < 1.2
