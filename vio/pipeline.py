@@ -212,7 +212,7 @@ class _DeadReckoning:
     """The paper's first result: prediction alone, beside the filter."""
 
     def __init__(self, recording: Recording, config: Config, T_cam0_body: FloatArray) -> None:
-        settings = replace(config.vislam, mode="dead_reckoning")
+        settings = replace(config.vislam, mode="dead_reckoning", motion_model="input")
         self._filter = Vislam(recording.camera, T_cam0_body, settings, motion_sensor=True)
         self.poses: list[FloatArray] = []
 

@@ -114,9 +114,16 @@ def _draw_error(
     axes.set_ylim(bottom=0)
 
 
+def _binned(seconds: FloatArray, values: FloatArray, bins: int = 250) -> tuple[FloatArray, FloatArray]:
+    """Medians over equal groups of frames, so that a thousand frames still show as a curve."""
+    groups = np.array_split(np.arange(len(seconds)), min(bins, len(seconds)))
+    return np.array([seconds[g].mean() for g in groups]), np.array([np.median(values[g]) for g in groups])
+
+
 def _draw_counts(axes: Any, seconds: FloatArray, result: RunResult) -> None:
     for name, colour in (("matched", _LANDMARKS), ("selected", _DEAD_RECKONING), ("used", _ESTIMATE)):
-        axes.plot(seconds, [getattr(f, name) for f in result.frames], color=colour, lw=1.2, label=name)
+        counts = np.array([getattr(f, name) for f in result.frames])
+        axes.plot(*_binned(seconds, counts), color=colour, lw=1.2, label=name)
     axes.set_ylabel("features")
     axes.set_ylim(bottom=0)
     axes.set_xlim(0, max(float(seconds[-1]), 1e-3))
@@ -126,10 +133,11 @@ def _draw_counts(axes: Any, seconds: FloatArray, result: RunResult) -> None:
 
 def _draw_time(axes: Any, seconds: FloatArray, result: RunResult) -> None:
     stages = ("read", "frontend", "select", "filter")
-    values = [[getattr(f, f"{stage}_ms") for f in result.frames] for stage in stages]
-    axes.stackplot(
-        seconds, values, labels=stages, colors=("#c9d1d9", "#6aa2d8", "#e8b04b", "#1f5fbf"), linewidth=0, step="mid"
-    )
+    values = []
+    for stage in stages:
+        times, medians = _binned(seconds, np.array([getattr(f, f"{stage}_ms") for f in result.frames]))
+        values.append(medians)
+    axes.stackplot(times, values, labels=stages, colors=("#c9d1d9", "#6aa2d8", "#e8b04b", "#1f5fbf"), linewidth=0)
     axes.set_ylabel("time (ms)")
     axes.set_xlabel("time in the recording (s)")
     axes.set_xlim(0, max(float(seconds[-1]), 1e-3))

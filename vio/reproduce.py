@@ -25,6 +25,7 @@ from vio.trajectory_io import read_trajectory
 # The paper's letters: W = diag(.5, .5, .5, .05, .05, .05) and V = 15 I, both taken as variances, no gate, landmarks
 # taken as known in the pose update, the input held from one frame to the next, repeated pixels taken as they are.
 PAPER = VislamSettings(
+    motion_model="input",
     noise="literal",
     input_at="start",
     pixel_sigma_px=float(np.sqrt(15.0)),

@@ -19,8 +19,8 @@ from vio._version import __version__
 from vio.atomic import atomic_folder
 from vio.config import to_yaml
 from vio.errors import DataError, EvaluationError
-from vio.evaluation import KITTI_LENGTHS_M, Evaluation, evaluate, path_length_m
-from vio.geometry.lie import FloatArray, se3_inverse
+from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
+from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.pipeline import FrameLog, RunResult
 from vio.records import Landmarks, Trajectory
 from vio.trajectory_io import read_trajectory, write_kitti, write_tum
@@ -125,7 +125,25 @@ def metrics_of(
         "r_err_deg_per_100m": None if scores is None else scores["r_err_deg_per_100m"],
         "evaluation": scores,
         "dead_reckoning": None if dead_reckoning is None else dead_reckoning.as_dict(),
+        "landmark_error": landmark_error(result, evaluation),
         "T_cam0_imu": result.T_cam0_body.tolist(),
+    }
+
+
+def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str, Any] | None:
+    """Compare the map with surveyed landmarks, after the alignment of the trajectory; None where there are none."""
+    truth = result.recording.landmarks_reference
+    if truth is None or evaluation is None:
+        return None
+    _, own, theirs = np.intersect1d(result.landmarks.ids, truth.ids, return_indices=True)
+    if len(own) == 0:
+        return None
+    aligned = transform_points(evaluation.T_ref_est, evaluation.scale * result.landmarks.p_world[own])
+    errors_m = np.linalg.norm(aligned - truth.p_world[theirs], axis=1)
+    return {
+        "matched": len(own),
+        "surveyed": len(truth.ids),
+        **{f"{name}_m": value for name, value in asdict(error_statistics(errors_m)).items()},
     }
 
 

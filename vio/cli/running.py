@@ -128,7 +128,10 @@ def report(metrics: dict[str, Any], *, as_json: bool) -> None:
         rows.append(("ATE", f"{metrics['ate_m']:.3f} m after SE(3) alignment{beside}"))
     if metrics["t_err_percent"] is not None:
         rows.append(("drift", f"{metrics['t_err_percent']:.2f} %, {metrics['r_err_deg_per_100m']:.3f} deg/100 m"))
+    if metrics["landmark_error"] is not None:
+        score = metrics["landmark_error"]
+        rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
     rows.append(("results", metrics["out"]))
     rows.append(("picture", str(Path(metrics["out"]) / "trajectory.png")))
     for name, value in rows:
-        print(f"{name:<9} {value}")
+        print(f"{name:<10} {value}")

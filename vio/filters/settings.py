@@ -15,26 +15,33 @@ class VislamSettings:
     mode: Literal["slam", "mapping", "dead_reckoning"] = setting(
         "slam", "what runs: pose and landmark updates, landmark updates along the predicted pose, or prediction alone"
     )
+    motion_model: Literal["twist", "input"] = setting(
+        "twist",
+        "what carries the pose: 'twist' keeps the body twist as a state that drifts and that velocities, if any, "
+        "measure; 'input' is the paper's, which takes each measured velocity as the truth plus W",
+    )
     noise: Literal["consistent", "literal"] = setting(
         "consistent",
-        "how W is read: 'consistent' adds (sigma * step)^2 per step; 'literal' adds the paper's numbers as variances",
+        "model 'input', how W is read: 'consistent' adds (sigma * step)^2 per step; 'literal' adds the paper's numbers "
+        "as variances",
+    )
+    input_at: Literal["midpoint", "start", "end"] = setting(
+        "midpoint",
+        "model 'input': which input carries the pose from one frame to the next; the paper holds the one at the start",
     )
     linear_velocity_sigma_mps: float = setting(0.5, "noise of the measured body velocity", unit="m/s")
     angular_rate_sigma_radps: float = setting(0.05, "noise of the measured angular rate", unit="rad/s")
-    input_at: Literal["midpoint", "start", "end"] = setting(
-        "midpoint", "which input carries the pose from one frame to the next; the paper holds the one at the start"
+    acceleration_density: float = setting(
+        1.0, "model 'twist': spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)"
     )
-    acceleration_sigma_mps2: float = setting(
-        3.0, "without a motion sensor: how much the body velocity may change", unit="m/s^2"
+    angular_acceleration_density: float = setting(
+        0.1, "model 'twist': spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)"
     )
-    angular_acceleration_sigma_radps2: float = setting(
-        1.0, "without a motion sensor: how much the angular rate may change", unit="rad/s^2"
+    start_velocity_sigma_mps: float = setting(10.0, "model 'twist': unknown velocity at the start", unit="m/s")
+    start_rate_sigma_radps: float = setting(1.0, "model 'twist': unknown rate at the start", unit="rad/s")
+    pixel_sigma_px: float = setting(
+        2.0, "noise of one pixel coordinate, V is its square; also stands in for covariances not kept", unit="px"
     )
-    start_velocity_sigma_mps: float = setting(
-        10.0, "without a motion sensor: unknown velocity at the start", unit="m/s"
-    )
-    start_rate_sigma_radps: float = setting(1.0, "without a motion sensor: unknown rate at the start", unit="rad/s")
-    pixel_sigma_px: float = setting(1.0, "noise of one pixel coordinate; V is its square", unit="px")
     gate_probability: float | None = setting(
         0.95, "observations outside this chi-square quantile are rejected; null keeps all, as the paper does"
     )

@@ -171,6 +171,23 @@ def se3_adjoint(T: npt.ArrayLike) -> FloatArray:
     return out
 
 
+def se3_left_jacobian(xi: npt.ArrayLike) -> FloatArray:
+    """Left Jacobian of SE(3), (..., 6, 6): exp(xi + d) = exp(J d) exp(xi) to first order in d.
+
+    Summed as a power series in the curly hat, which converges for every twist; fit for one step of motion, where a
+    few terms suffice. Reference: Barfoot (2017), equation 7.83.
+    """
+    curly = se3_curly_hat(xi)
+    term = np.broadcast_to(np.eye(6), curly.shape)
+    total = term.copy()
+    for n in range(2, 60):
+        term = term @ curly / n
+        total += term
+        if np.abs(term).max(initial=0.0) < 1e-16:
+            break
+    return total
+
+
 def circledot(p: npt.ArrayLike) -> FloatArray:
     """The paper's operator on points (..., 3): (..., 4, 6) with `hat(xi) [p; 1] = circledot(p) xi`."""
     p = np.asarray(p, dtype=np.float64)
