@@ -120,7 +120,8 @@ class KltFrontend:
             prior: predicted pixels by id and predicted rotation since the previous frame, where the filter has them.
 
         Raises:
-            DataError: the frame has no images, images of a wrong size or type, or left and right look swapped.
+            DataError: the frame has no images, images of a wrong size or type, or a time not after the last one's; or
+                left and right look swapped.
         """
         watch = _Stopwatch()
         left_image, right_image = self._images(frame)
@@ -132,7 +133,7 @@ class KltFrontend:
         disparity = np.zeros(0)
         motion: Consensus | None = None
         if memory is not None and len(memory.tracks):
-            seconds = max(1, frame.time_ns - memory.time_ns) * 1e-9
+            seconds = (frame.time_ns - memory.time_ns) * 1e-9
             found, seen = self._flow_all(memory, left_image, prior, seconds)
             watch.lap("track")
             seen, motion = self._consensus(memory, found, seen, prior, seconds, frame.index)
@@ -175,6 +176,11 @@ class KltFrontend:
                 "use the precomputed front end, or a recording with images"
             )
         camera, memory = self._camera, self._memory
+        if memory is not None and frame.time_ns <= memory.time_ns:
+            raise DataError(
+                f"frame {frame.index} is not later than frame {memory.index} ({frame.time_ns} ns after "
+                f"{memory.time_ns} ns); sort the frames by time"
+            )
         known = (camera.height, camera.width)
         for name, image in (("left", frame.left), ("right", frame.right)):
             if image.ndim != 2 or image.dtype != np.uint8:
@@ -213,7 +219,7 @@ class KltFrontend:
         guess, informed = self._predict(memory, prior, seconds)
         found, good = self._flow_both_ways(memory.image, image, old.left, guess)
         retry = np.flatnonzero(~good & informed)
-        if len(retry):  # the prediction was wrong: start once more from where the feature was
+        if 2 * len(retry) > len(old):  # the prediction as a whole was wrong: start from where the features were
             found[retry], good[retry] = self._flow_both_ways(memory.image, image, old.left[retry], old.left[retry])
         return found, good
 
@@ -408,8 +414,10 @@ class KltFrontend:
 
 def _apart(points: FloatArray, distance: float) -> BoolArray:
     """Mask (N,) of points (N, 2) without an earlier point closer than `distance` in the maximum norm."""
-    near = np.abs(points[:, None, :] - points[None, :, :]).max(axis=2) < distance
-    return ~np.tril(near, -1).any(axis=1)
+    u, v = points[:, 0], points[:, 1]
+    near = (np.abs(u[:, None] - u) < distance) & (np.abs(v[:, None] - v) < distance)
+    alone: BoolArray = ~np.tril(near, -1).any(axis=1)
+    return alone
 
 
 def _joined(a: _Tracks, b: _Tracks) -> _Tracks:

@@ -30,7 +30,7 @@ class KltSettings:
         "start of the search where the filter predicts nothing: old pixel, pixel velocity, or last camera motion",
     )
     max_forward_backward_px: float = setting(0.5, "largest error after tracking there and back", unit="px")
-    consensus_px: float = setting(1.5, "largest distance from where the consensus motion puts a feature", unit="px")
+    consensus_px: float = setting(1.0, "largest distance from where the consensus motion puts a feature", unit="px")
     consensus_samples: int = setting(96, "random minimal sets tried for the consensus motion")
     prior_max_deviation_deg: float = setting(
         1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"

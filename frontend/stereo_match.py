@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 
 from frontend.align import FLAT_RMS, align, cut_patches, shift_warps, templates
 from frontend.patches import inside, integer_patches
@@ -25,8 +24,7 @@ _COARSE_RADIUS = 4  # pixels of the half-resolution image
 _NEAR_PX = 3  # half width of the search around a predicted or coarse disparity
 _BACK_PX = 6  # half width of the search back in the left image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
-_SHIFT_ITERATIONS = 2
-_WARP_ITERATIONS = 4
+_ALIGN_ITERATIONS = 6
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
 _ALIGN_MAX_PX = 2.0  # a fit that moves further than this has left its peak
 
@@ -71,14 +69,24 @@ def row_correlation(
     padded = np.asarray(cv2.copyMakeBorder(target, 0, 0, pad_left, pad_right, cv2.BORDER_REPLICATE), dtype=np.uint8)
     corner = np.stack([first_column + pad_left - radius, centres[:, 1] - radius], axis=1)
     strip = integer_patches(padded, corner, side, count + side - 1)
-    product = np.einsum("nhkw,nhw->nk", sliding_window_view(strip, side, axis=2), template)
-    total = sliding_window_view(strip.sum(axis=1), side, axis=1).sum(axis=-1)
-    square = sliding_window_view(np.einsum("nhk,nhk->nk", strip, strip), side, axis=1).sum(axis=-1)
+    product = np.zeros((len(centres), count), dtype=np.float32)
+    for column in range(side):
+        product += np.einsum("nhk,nh->nk", strip[:, :, column : column + count], template[:, :, column])
+    total = _window_sums(strip.sum(axis=1), side)
+    square = _window_sums(np.einsum("nhk,nhk->nk", strip, strip), side)
     target_norm = np.sqrt(np.maximum(square - total * total / side**2, 0.0))
     flat = FLAT_RMS * side
     good = (norm[:, None] > flat) & (target_norm > flat) & (columns >= radius) & (columns < width - radius)
     score = np.where(good, product / np.where(good, norm[:, None] * target_norm, 1.0), -1.0)
     return score.astype(np.float32)
+
+
+def _window_sums(values: npt.NDArray[np.float32], side: int) -> FloatArray:
+    """Sums (N, K - side + 1) of `side` neighbouring values (N, K); exact for whole numbers."""
+    running = np.cumsum(values, axis=1, dtype=np.float64)
+    sums = running[:, side - 1 :].copy()
+    sums[:, 1:] -= running[:, :-side]
+    return sums
 
 
 def _best(score: npt.NDArray[np.float32]) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -137,8 +145,7 @@ def match_rows(
         return StereoMatch(place, valid)
     start = points[found] + np.stack([shift[found], np.zeros(len(found))], axis=1)
     template = templates(cut_patches(left.full, points[found], radius))
-    warp, _ = align(template, right.full, shift_warps(start), "shift", _SHIFT_ITERATIONS)
-    warp, score[found] = align(template, right.full, warp, "row", _WARP_ITERATIONS)
+    warp, score[found] = align(template, right.full, shift_warps(start), "row", _ALIGN_ITERATIONS)
     place[found] = warp[:, :2, 2]
     on_peak = (np.abs(place[found] - start).max(axis=1) <= _ALIGN_MAX_PX) & (
         np.abs(warp[:, 0, :2] - [1.0, 0.0]).max(axis=1) <= _MAX_STRETCH

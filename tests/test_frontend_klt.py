@@ -244,6 +244,13 @@ def test_without_a_stated_size_the_first_frame_sets_it() -> None:
         frontend.process(StereoFrame(1, 50_000_000, small, small))
 
 
+def test_frames_must_come_in_time_order() -> None:
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    frontend.process(FRAMES[1])
+    with pytest.raises(DataError, match="frame 0 is not later than frame 1"):
+        frontend.process(FRAMES[0])
+
+
 def test_a_darker_right_camera_changes_little() -> None:
     """Different gain left and right, as in EuRoC V2_03: the patches are normalised."""
     dark = []
