@@ -168,13 +168,14 @@ def read_npz(path: Path) -> Mapping[str, np.ndarray]:
         DataError: the file is missing, damaged, no archive, or holds pickled objects.
     """
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise DataError(f"{path}: one array, not an .npz archive of named arrays")
+        loaded = np.load(path, allow_pickle=False)
+        if not isinstance(loaded, np.lib.npyio.NpzFile):
+            raise DataError(f"{path}: one array, not an .npz archive of named arrays")
+        with loaded as archive:
             return {key: archive[key] for key in archive.files}
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError) as error:
         why = "holds pickled objects" if "pickle" in str(error) else "is damaged or no .npz archive"
         remedy = "save it again as plain numeric arrays with numpy.savez" if "pickle" in str(error) else "copy it again"
-        raise DataError(f"{path}: {why} ({error}); {remedy}") from error
+        raise DataError(f"{path}: {why} ({' '.join(str(error).split())}); {remedy}") from error
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}") from error

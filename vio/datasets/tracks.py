@@ -4,6 +4,11 @@ A tracker that repeats old pixels does one of two things. Either it went on from
 row alone is wrong; or it took the old pixels for positions in the new image and went on from there, and then the
 track has left its point for good: whatever lies at that pixel in the new image is what it shows from now on. The two
 differ in how far the pixels jump after the repeat: two steps of ordinary motion, or one.
+
+The ECE276A files do the second (0027.npz against ground truth, 91 stale frames t: repeated rows fit frames t and t + 1
+as one point to 0.25 px in u and 0.32 px in v, as good as any, and miss the point of frame t - 1 by 6.2 px). A stale
+frame thus has good features and no link to the past. Rows are flagged by default and keep their ids, because a gate
+may still use those that hardly changed; a filter that triangulates over many frames should end such a track.
 """
 
 from __future__ import annotations
@@ -164,7 +169,7 @@ def _jump(tracks: FeatureTracks, previous: IntArray, carried: BoolArray) -> floa
 def settle_repeats(
     tracks: FeatureTracks, moving: BoolArray, mode: RepeatsMode
 ) -> tuple[FeatureTracks, BoolArray, tuple[str, ...]]:
-    """Flag repeated rows, give tracks that changed their point a new id from there on, and say so.
+    """Flag repeated rows, on request give their tracks a new id from there on, and say so.
 
     Returns:
         The tracks, the mask (F,) of stale frames, and notes for the user.
@@ -179,10 +184,12 @@ def settle_repeats(
     )
     if mode == "literal":
         return tracks, found.frames, (f"{note}; taken at their word as asked",)
-    if mode == "flag" or (mode == "auto" and found.jump is not None and found.jump > _JUMP_BETWEEN):
+    if mode == "split":
+        return split_ids(marked), found.frames, (f"{note}; they are flagged, and their tracks go on under new ids",)
+    if found.jump is None or found.jump > _JUMP_BETWEEN:
         return marked, found.frames, (f"{note}; they are flagged",)
-    why = "" if found.jump is None else f" (afterwards pixels move {found.jump:.2f} steps, not 2: the points changed)"
-    return split_ids(marked), found.frames, (f"{note}; they are flagged and their tracks go on under new ids{why}",)
+    why = f"pixels move {found.jump:.2f} steps afterwards, not 2, so these tracks go on at other points of the scene"
+    return marked, found.frames, (f"{note}; they are flagged ({why}; dataset.repeated_tracks=split renames them)",)
 
 
 def split_ids(tracks: FeatureTracks) -> FeatureTracks:

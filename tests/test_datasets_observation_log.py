@@ -1,0 +1,230 @@
+"""The observation log: replay to the bit, atomic writing, versions and damage."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.dataset_makers import CAMERA, T_CAM0_IMU, ece276a_arrays, make_drive, make_npz
+from vio.datasets import open_dataset
+from vio.datasets.common import read_npz
+from vio.datasets.observation_log import FORMAT, read_observation_log, write_observation_log
+from vio.errors import CalibrationError, DataError
+from vio.geometry.stereo import StereoCamera
+from vio.records import (
+    ImuSample,
+    Landmarks,
+    MotionSample,
+    Observations,
+    Recording,
+    StereoFrame,
+    Trajectory,
+    VelocitySample,
+)
+
+finite = st.floats(allow_nan=False, width=64)
+triple = st.tuples(finite, finite, finite).map(np.array)
+
+
+@st.composite
+def logs(draw: st.DrawFn) -> tuple[Recording, list[Observations], list[MotionSample]]:
+    """A recording, what was seen in some of its frames, and the samples in between."""
+    count = draw(st.integers(1, 6))
+    times = np.cumsum(draw(st.lists(st.integers(1, 2**40), min_size=count, max_size=count)))
+    seen = sorted(draw(st.sets(st.integers(0, count - 1))))
+    observed = []
+    for k in seen:
+        n = draw(st.integers(0, 4))
+        ids = draw(st.lists(st.integers(0, 2**62), min_size=n, max_size=n, unique=True))
+        z = draw(st.lists(finite, min_size=4 * n, max_size=4 * n))
+        flags = np.array(draw(st.lists(st.booleans(), min_size=2 * n, max_size=2 * n)), dtype=np.bool_)
+        observed.append(
+            Observations(
+                k, int(times[k]), np.array(ids, dtype=np.int64), np.array(z).reshape(n, 4), flags[:n], flags[n:]
+            )
+        )
+    ticks = sorted(draw(st.lists(st.integers(int(times[0]), int(times[-1])), max_size=5)))
+    maker = st.sampled_from([ImuSample, VelocitySample])
+    samples = [draw(maker)(t, draw(triple), draw(triple)) for t in ticks]
+    size = draw(st.sampled_from([(None, None), (640, 480)]))
+    reference = draw(
+        st.sampled_from(
+            [
+                None,
+                Trajectory(np.tile(T_CAM0_IMU, (3, 1, 1)), None, "cam0"),
+                Trajectory(np.tile(T_CAM0_IMU, (2, 1, 1)), np.array([5, 7]), "imu", np.array([0, 3])),
+            ]
+        )
+    )
+    landmarks = draw(st.sampled_from([None, Landmarks(np.array([4]), np.ones((1, 3)), np.zeros((1, 3, 3)))]))
+    recording = Recording(
+        kind="made",
+        path=Path("somewhere"),
+        camera=StereoCamera(700.1, 710.0, 600.0, 180.0, 0.54, *size),
+        T_cam0_imu=draw(st.sampled_from([None, T_CAM0_IMU])),
+        frame_times_ns=times.astype(np.int64),
+        has_images=True,
+        motion=frozenset(),
+        reference=reference,
+        landmarks_reference=landmarks,
+        notes=draw(st.sampled_from([(), ("one", "two\u00e9")])),
+    )
+    return recording, observed, samples
+
+
+def _same_bits(a: object, b: object) -> bool:
+    if a is None or b is None:
+        return a is b
+    first, second = np.asarray(a), np.asarray(b)
+    return first.dtype == second.dtype and first.shape == second.shape and first.tobytes() == second.tobytes()
+
+
+@settings(deadline=None)
+@given(logs())
+def test_round_trip_keeps_every_bit(
+    tmp_path_factory: pytest.TempPathFactory, log: tuple[Recording, list[Observations], list[MotionSample]]
+) -> None:
+    recording, observed, samples = log
+    path = tmp_path_factory.mktemp("log") / "run.npz"
+    write_observation_log(path, recording, observed, samples)
+    dataset = open_dataset(path)
+    read = dataset.recording
+    assert (read.kind, read.has_images, read.camera, read.notes) == ("log", False, recording.camera, recording.notes)
+    assert read.motion == {"imu" if isinstance(sample, ImuSample) else "velocity" for sample in samples}
+    assert _same_bits(read.frame_times_ns, recording.frame_times_ns)
+    assert _same_bits(read.T_cam0_imu, recording.T_cam0_imu)
+    for name in ("reference", "landmarks_reference"):
+        ours, theirs = getattr(read, name), getattr(recording, name)
+        assert (ours is None) == (theirs is None)
+        for field in () if ours is None else type(ours).__slots__:
+            a, b = getattr(ours, field), getattr(theirs, field)
+            assert a == b if isinstance(a, str) else _same_bits(a, b)
+
+    events = list(dataset.events())
+    frames = [event for event in events if isinstance(event, StereoFrame)]
+    assert [frame.index for frame in frames] == [o.frame_index for o in observed]
+    for expected in observed:
+        found = dataset.observations(expected.frame_index)
+        assert found is not None
+        assert (found.frame_index, found.time_ns) == (expected.frame_index, expected.time_ns)
+        for field in ("ids", "z", "has_right", "stale"):
+            assert _same_bits(getattr(found, field), getattr(expected, field))
+    replayed = [event for event in events if not isinstance(event, StereoFrame)]
+    assert [type(sample) for sample in replayed] == [type(sample) for sample in samples]
+    for a, b in zip(replayed, samples, strict=True):
+        assert a.time_ns == b.time_ns
+        for field in ("gyro", "accel") if isinstance(a, ImuSample) else ("linear", "angular"):
+            assert _same_bits(getattr(a, field), getattr(b, field))
+
+
+def _recording(count: int = 3) -> Recording:
+    times = np.arange(count) * 100
+    return Recording("made", Path("x"), CAMERA, None, times, False, frozenset(), None)
+
+
+def _seen(k: int, time_ns: int) -> Observations:
+    return Observations(k, time_ns, np.array([7]), np.array([[3.0, 2, 1, 2]]), np.array([True]), np.array([False]))
+
+
+def test_a_left_eye_feature_keeps_its_arbitrary_right_pixels(tmp_path: Path) -> None:
+    z = np.array([[1.0, 2.0, np.nan, -0.0]])
+    seen = Observations(1, 100, np.array([3]), z, np.array([False]), np.array([True]))
+    write_observation_log(tmp_path / "a.npz", _recording(), [seen], [])
+    found = read_observation_log(tmp_path / "a.npz").observations(1)
+    assert found is not None
+    assert found.z.tobytes() == z.tobytes()
+
+
+def test_frames_that_were_not_processed_yield_no_event_and_no_features(tmp_path: Path) -> None:
+    write_observation_log(tmp_path / "a.npz", _recording(), [_seen(2, 200)], [])
+    dataset = read_observation_log(tmp_path / "a.npz")
+    assert [frame.time_ns for frame in dataset.events()] == [200]
+    empty = dataset.observations(0)
+    assert empty is not None
+    assert len(empty) == 0
+    assert dataset.observations(2) is not None
+
+
+def test_the_bytes_do_not_depend_on_when_they_are_written(tmp_path: Path) -> None:
+    for name in ("a.npz", "b.npz"):
+        write_observation_log(tmp_path / name, _recording(), [_seen(2, 200)], [])
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_course_file_replays_through_the_log(tmp_path: Path) -> None:
+    source = open_dataset(make_npz(tmp_path / "course.npz", ece276a_arrays(make_drive(6))))
+    observed = [o for o in (source.observations(k) for k in range(6)) if o is not None]
+    samples = [event for event in source.events() if isinstance(event, VelocitySample)]
+    write_observation_log(tmp_path / "run.npz", source.recording, observed, samples)
+    replay = open_dataset(f"log:{tmp_path / 'run.npz'}")
+    for a, b in zip(source.events(), replay.events(), strict=True):
+        assert (type(a), a.time_ns) == (type(b), b.time_ns)
+        if isinstance(a, VelocitySample) and isinstance(b, VelocitySample):
+            assert _same_bits(a.linear, b.linear)
+            assert _same_bits(a.angular, b.angular)
+
+
+@pytest.mark.parametrize("observed", [[_seen(2, 200), _seen(1, 100)], [_seen(1, 100), _seen(1, 100)], [_seen(1, 101)]])
+def test_observations_of_another_recording_are_refused(observed: list[Observations], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not in the order of the recording's frames"):
+        write_observation_log(tmp_path / "a.npz", _recording(), observed, [])
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_unwritable_place_is_named_and_nothing_is_left(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"cannot write .*nowhere.a\.npz"):
+        write_observation_log(tmp_path / "nowhere" / "a.npz", _recording(), [], [])
+    assert list(tmp_path.iterdir()) == []
+
+
+def _spoiled(tmp_path: Path, **changes: object) -> Path:
+    write_observation_log(tmp_path / "good.npz", _recording(), [_seen(0, 0), _seen(2, 200)], [])
+    arrays = {**read_npz(tmp_path / "good.npz"), **{k: np.asarray(v) for k, v in changes.items() if v is not None}}
+    return make_npz(
+        tmp_path / "bad.npz", {k: v for k, v in arrays.items() if k not in changes or changes[k] is not None}
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"format": "else"}, "no observation log"),
+        ({"version": 2}, "an observation log of version 2, this program reads up to 1; upgrade"),
+        ({"z": None}, "the observation log lacks z"),
+        ({"z": np.zeros((2, 4), dtype=np.int64)}, "z of the observation log has type int64"),
+        ({"z": np.zeros((3, 4))}, "inconsistent: 2 ids, but z is"),
+        ({"offsets": [0, 2, 1]}, "the offsets do not part 2 rows into 2 frames"),
+        ({"frame_indices": [0, 3]}, "frame numbers do not increase within 0 to 2"),
+        ({"frame_times_ns": [0, 0, 200]}, "a clock does not increase"),
+        ({"motion_values": np.zeros((1, 6))}, "0 motion times"),
+        ({"image_size": [640]}, "the camera is incomplete"),
+        ({"landmark_ids": [1]}, "landmark_ids stands without landmark_p_world"),
+        ({"reference_T_world_body": np.zeros((2, 4)), "reference_body": "imu"}, "reference poses"),
+    ],
+)
+def test_spoiled_log_is_refused(changes: dict[str, object], message: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=message) as caught:
+        read_observation_log(_spoiled(tmp_path, **changes))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"intrinsics": [700.0, 700, 0, 0, 0]}, "baseline must be positive"),
+        ({"T_cam0_imu": np.diag([1.0, 2, 1, 1])}, "T_cam0_imu: not a rotation"),
+    ],
+)
+def test_spoiled_calibration_is_refused(changes: dict[str, object], message: str, tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=message):
+        read_observation_log(_spoiled(tmp_path, **changes))
+
+
+def test_format_name_is_what_is_written(tmp_path: Path) -> None:
+    write_observation_log(tmp_path / "a.npz", _recording(), [], [])
+    arrays = read_npz(tmp_path / "a.npz")
+    assert (str(arrays["format"]), int(arrays["version"])) == (FORMAT, 1)
