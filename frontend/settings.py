@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 from vio.setting import setting
@@ -59,5 +60,8 @@ class FrontendSettings:
 
     name: Literal["auto", "klt", "precomputed"] = setting(
         "auto", "auto: klt where the recording has images, precomputed where it has features only"
+    )
+    features: Path | None = setting(
+        None, "observation log or feature file to take in place of the recording's own, for the precomputed front end"
     )
     klt: KltSettings = field(default_factory=KltSettings, metadata={"doc": "corner tracking", "unit": ""})

@@ -128,8 +128,9 @@ def run(
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
 
-    frontend = frontend or _build_frontend(dataset, config)
-    selector = selector or _build_selector(dataset, config)
+    features = _feature_source(dataset, config)
+    frontend = frontend or _build_frontend(features, config)
+    selector = selector or _build_selector(features, config)
     backend = backend or Vislam(recording.camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
     viewer = viewer or NullViewer()
     dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
@@ -224,20 +225,32 @@ class _DeadReckoning:
         self.poses.append(self._filter.estimate().T_world_imu)
 
 
-def _build_frontend(dataset: Dataset, config: Config) -> Frontend:
+def _feature_source(dataset: Dataset, config: Config) -> Dataset:
+    """The recording itself, or the file of features that takes the place of its images."""
+    if config.frontend.features is None:
+        return dataset
+    if config.frontend.name not in ("auto", "precomputed"):
+        raise ConfigError(f"frontend.features is given, but frontend.name is {config.frontend.name}; use precomputed")
+    from vio.datasets import open_dataset
+
+    return open_dataset(config.frontend.features, config.dataset)
+
+
+def _build_frontend(features: Dataset, config: Config) -> Frontend:
     from frontend import build_frontend
 
-    return build_frontend(config.frontend.name, dataset.recording.camera, config.frontend, dataset)
+    name = config.frontend.name if config.frontend.features is None else "precomputed"
+    return build_frontend(name, features.recording.camera, config.frontend, features)
 
 
-def _build_selector(dataset: Dataset, config: Config) -> Selector:
-    recording = dataset.recording
+def _build_selector(features: Dataset, config: Config) -> Selector:
+    recording = features.recording
     indices = range(len(recording.frame_times_ns))
-    precomputed = dataset.observations(0) is not None
+    precomputed = features.observations(0) is not None
     camera = recording.camera
 
     def whole_record() -> list[Observations]:
-        return [o for o in map(dataset.observations, indices) if o is not None]
+        return [o for o in map(features.observations, indices) if o is not None]
 
     return build_selector(
         config.selector,
@@ -247,7 +260,8 @@ def _build_selector(dataset: Dataset, config: Config) -> Selector:
 
 
 def _needs_images(dataset: Dataset, config: Config) -> bool:
-    return dataset.recording.has_images and config.frontend.name != "precomputed"
+    front = config.frontend
+    return dataset.recording.has_images and front.name != "precomputed" and front.features is None
 
 
 def _frame_log(

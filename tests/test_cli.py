@@ -1,0 +1,287 @@
+"""The command line as a stranger uses it: the contract of its output, and every way to go wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.dataset_makers import ece276a_arrays, make_drive, make_kitti, make_npz
+from vio.cli import main
+from vio.trajectory_io import read_trajectory
+
+CONTRACT = ("out", "frames", "path_length_m", "ms_per_frame", "ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    return make_npz(tmp_path / "drive.npz", ece276a_arrays(make_drive(40)))
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Path:
+    from tests.dataset_makers import T_CAM0_IMU
+    from vio.geometry.lie import se3_inverse
+
+    cam0 = make_drive(40).T_world_imu @ se3_inverse(T_CAM0_IMU)
+    path = tmp_path / "truth.txt"
+    np.savetxt(path, (se3_inverse(cam0[0]) @ cam0)[:, :3].reshape(-1, 12))
+    return path
+
+
+def _json(capsys: pytest.CaptureFixture[str], *argv: str) -> Any:
+    assert main([*argv, "--json"]) == 0
+    out = capsys.readouterr().out
+    assert out.count("\n") == 1, "one object, nothing else, on stdout"
+    return json.loads(out)
+
+
+def _error(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    assert main(list(argv)) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: ")
+    assert captured.err.count("\n") == 1, captured.err
+    return captured.err
+
+
+def test_run_prints_the_contract(
+    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    metrics = _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"), "--reference", str(truth))
+    assert set(CONTRACT) <= set(metrics)
+    assert metrics["frames"] == 40
+    assert metrics["ate_m"] < 0.05
+    assert metrics["rpe"]["trans_rmse_m"] < 0.05
+    assert metrics["t_err_percent"] is None  # a drive of 23 m has no segment of 100 m
+    assert metrics["motion"] == "velocity"
+    assert Path(metrics["out"], "trajectory.png").stat().st_size > 10_000
+
+
+def test_run_without_reference_prints_null(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    metrics = _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"), "--motion", "none")
+    assert [metrics[key] for key in ("ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")] == [None] * 4
+    assert metrics["motion"] == "none"
+
+
+def test_reference_of_cam0_leaks_no_lever_arm(
+    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The filter estimates the IMU, a KITTI reference describes cam0, a metre away: turning would show."""
+    out = str(tmp_path / "out")
+    metrics = _json(capsys, "run", str(recording), "--reference", str(truth), "--out", out)
+    assert metrics["evaluation"]["body"] == "cam0"
+    assert metrics["evaluation"]["ate_deg"] < 0.5
+    same = _json(capsys, "eval", out, str(truth))
+    assert same["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)
+    plain = _json(capsys, "eval", str(Path(out, "trajectory.kitti")), str(truth))
+    assert plain["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-4)
+
+
+def test_frames_of_a_part_meet_their_own_reference(
+    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    args = ("run", str(recording), "--reference", str(truth), "--out", str(tmp_path / "out"))
+    metrics = _json(capsys, *args, "--start", "10", "--stop", "30")
+    assert metrics["frames"] == 20
+    assert (metrics["first_frame"], metrics["last_frame"]) == (10, 29)
+    assert metrics["ate_m"] < 0.05
+
+
+def test_a_shorter_reference_scores_the_frames_it_covers(
+    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    short = tmp_path / "short.txt"
+    short.write_text("".join(truth.read_text().splitlines(keepends=True)[:25]))
+    metrics = _json(capsys, "run", str(recording), "--reference", str(short), "--out", str(tmp_path / "out"))
+    assert metrics["evaluation"]["matched"] == 25
+
+
+def test_saved_observations_replay_to_the_bit(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second, third = (tmp_path / name for name in ("first", "second", "third"))
+    _json(capsys, "run", str(recording), "--save-observations", "--out", str(first))
+    _json(capsys, "run", str(first / "observations.npz"), "--out", str(second))
+    assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
+    _json(
+        capsys,
+        *("run", str(recording), "--frontend", "precomputed", "--out", str(third)),
+        *("--set", f"frontend.features={first / 'observations.npz'}"),
+    )
+    assert (first / "trajectory.tum").read_bytes() == (third / "trajectory.tum").read_bytes()
+
+
+def test_effective_configuration_reproduces_the_run(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    _json(capsys, "run", str(recording), "--set", "selector.name=visibility", "--motion", "none", "--out", str(first))
+    _json(capsys, "run", str(recording), "--config", str(first / "config.yaml"), "--out", str(second))
+    assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
+
+
+def test_runs_without_out_number_themselves(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    outs = [_json(capsys, "run", str(recording))["out"] for _ in range(2)]
+    assert outs == [str(Path("runs/drive")), str(Path("runs/drive-2"))]
+
+
+def test_people_get_lines_and_the_picture_is_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(recording), "--out", str(tmp_path / "out")]) == 0
+    out = capsys.readouterr().out
+    assert str(tmp_path / "out" / "trajectory.png") in out
+    assert "ms a frame" in out
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["run", "{tmp}/nothing"], "does not exist"),
+        (["run", "{tmp}/empty"], "is empty"),
+        (["run", "kity:{rec}"], "did you mean 'kitti'"),
+        (["run", "{rec}", "--reference", "{tmp}/none.txt"], "none.txt"),
+        (["run", "{rec}", "--config", "{tmp}/none.yaml"], "none.yaml"),
+        (["run", "{rec}", "--set", "vislam.pixel_sigma=1"], "did you mean 'vislam.pixel_sigma_px'"),
+        (["run", "{rec}", "--motion", "imu"], "no model for --motion imu"),
+        (["run", "{rec}", "--motion", "magic"], "motion is one of"),
+        (["run", "{rec}", "--backend", "magic"], "backend is one of"),
+        (["run", "{rec}", "--frontend", "klt"], "no images"),
+        (["run", "{rec}", "--frontend", "magic"], "frontend.name is one of"),
+        (["run", "{rec}", "--start", "400"], "past the last frame"),
+        (["run", "{rec}", "--start", "5", "--stop", "5"], "no range"),
+        (["run", "{rec}", "--set", "vislam.iterations=0"], "at least 1"),
+        (["run", "{rec}", "--out", "{tmp}/thesis"], "no run of ours"),
+        (["run", "{rec}", "--out", "{rec}"], "is a file"),
+        (["eval", "{tmp}/none.tum", "{tmp}/none.txt"], "none.tum"),
+        (["eval", "{tmp}/empty", "{tmp}/none.txt"], "no run folder"),
+        (["reproduce", "{tmp}/none.npz"], "does not exist"),
+    ],
+)
+def test_mistakes_cost_one_line_and_leave_nothing(
+    argv: list[str], message: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.txt").write_text("years of work")
+    argv = [part.format(tmp=tmp_path, rec=recording) for part in argv]
+    if argv[0] == "run" and "--out" not in argv:
+        argv += ["--out", str(tmp_path / "out")]
+    before = sorted(tmp_path.rglob("*"))
+    assert message in _error(capsys, *argv)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_truncated_image_is_named_and_skipped_up_to_a_limit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = make_kitti(tmp_path / "kitti", frames=6)
+    image = folder / "image_1" / "000003.png"
+    image.write_bytes(image.read_bytes()[:-20])
+    run = ("run", str(folder), "--out", str(tmp_path / "out"))
+    assert _json(capsys, *run)["frames"] == 5
+    assert "000003.png" in caplog.text
+    assert "000003.png" in _error(capsys, *run, "--set", "dataset.max_bad_frames=0")
+
+
+def test_interrupted_run_leaves_nothing(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*args: object, **kwargs: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vio.plotting.plot_run", stop)
+    assert main(["run", str(recording), "--out", str(tmp_path / "deep" / "out")]) == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert not (tmp_path / "deep").exists()
+
+
+def test_wrong_usage_is_2() -> None:
+    for argv in ([], ["fly"], ["run"], ["run", "x", "--start", "one"], ["run", "x", "--lengths", "a,b"], ["eval", "x"]):
+        with pytest.raises(SystemExit) as stop:
+            main(argv)
+        assert stop.value.code == 2
+
+
+def test_config_shows_every_setting_with_unit_and_default(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "--show"]) == 0
+    out = capsys.readouterr().out
+    assert "vislam.pixel_sigma_px = 2 px" in out
+    assert "frontend.klt.window_px" in out
+    assert "one of: consistent, literal" in out
+
+
+def test_config_prints_what_a_run_would_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "--set", "vislam.iterations=7"]) == 0
+    path = tmp_path / "all.yaml"
+    path.write_text(capsys.readouterr().out)
+    assert main(["config", "--config", str(path)]) == 0
+    assert "iterations: 7" in capsys.readouterr().out
+
+
+def test_eval_aligns_as_asked(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from dataclasses import replace
+
+    from vio.trajectory_io import write_tum
+
+    _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))
+    estimate = tmp_path / "out" / "trajectory.tum"
+    trajectory = read_trajectory(estimate)
+    poses = trajectory.T_world_body.copy()
+    poses[:, :3, 3] *= 1.1
+    larger = tmp_path / "larger.tum"
+    write_tum(larger, replace(trajectory, T_world_body=poses))
+    scores = {
+        mode: _json(capsys, "eval", str(estimate), str(larger), "--align", mode) for mode in ("se3", "sim3", "none")
+    }
+    assert scores["sim3"]["ate_m"] < 1e-6
+    assert scores["sim3"]["scale"] == pytest.approx(1.1)
+    assert scores["se3"]["ate_m"] < scores["none"]["ate_m"]
+    assert scores["se3"]["ate_m"] > 0.1
+    assert main(["eval", str(estimate), str(larger), "--lengths", "5,10"]) == 0
+    assert "t_err_percent" in capsys.readouterr().out
+
+
+def test_every_file_we_write_opens_in_evo(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from evo.tools import file_interface
+
+    out = Path(_json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))["out"])
+    for name in ("trajectory.tum", "dead_reckoning.tum"):
+        assert file_interface.read_tum_trajectory_file(str(out / name)).num_poses == 40
+    assert file_interface.read_kitti_poses_file(str(out / "trajectory.kitti")).num_poses == 40
+
+
+def test_reproduce_writes_a_table_and_a_figure(
+    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tables = _json(capsys, "reproduce", f"{recording}={truth}", "--out", str(tmp_path / "table"))
+    rows = {row["name"]: row for row in tables[0]["rows"]}
+    assert rows["dead reckoning"]["ate_m"] == pytest.approx(rows["mapping only"]["ate_m"])
+    assert rows["recommended"]["ate_m"] < 0.05
+    assert {f.name for f in (tmp_path / "table" / "drive").iterdir()} == {"table.md", "table.json", "trajectories.png"}
+    assert "| recommended |" in (tmp_path / "table" / "drive" / "table.md").read_text()
+
+
+def test_the_module_runs_as_a_process(recording: Path, tmp_path: Path) -> None:
+    """Logs go to stderr, so that stdout is JSON alone."""
+    argv = [sys.executable, "-m", "vio", "run", str(recording), "--out", str(tmp_path / "out"), "--json"]
+    done = subprocess.run(argv, capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout)["frames"] == 40
+
+
+@pytest.mark.skipif(shutil.which("head") is None, reason="needs head")
+def test_a_closed_pipe_is_no_error() -> None:
+    done = subprocess.run(
+        f"{sys.executable} -m vio config --show | head -n 1", shell=True, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
