@@ -416,8 +416,7 @@ def _apart(points: FloatArray, distance: float) -> BoolArray:
     """Mask (N,) of points (N, 2) without an earlier point closer than `distance` in the maximum norm."""
     u, v = points[:, 0], points[:, 1]
     near = (np.abs(u[:, None] - u) < distance) & (np.abs(v[:, None] - v) < distance)
-    alone: BoolArray = ~np.tril(near, -1).any(axis=1)
-    return alone
+    return np.asarray(~np.tril(near, -1).any(axis=1), dtype=np.bool_)
 
 
 def _joined(a: _Tracks, b: _Tracks) -> _Tracks:
