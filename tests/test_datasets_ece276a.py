@@ -150,7 +150,8 @@ def with_stale_frame(drive: Drive, t: int, *, changed: bool) -> FloatArray:
 def test_stale_frames_are_flagged(changed: bool, tmp_path: Path) -> None:
     drive = make_drive(14, yaw_rate=0.1)
     features = with_stale_frame(drive, 7, changed=changed)
-    dataset = read_ece276a(make_npz(tmp_path / "a.npz", {**ece276a_arrays(drive), "features": features}), DEFAULT)
+    path = make_npz(tmp_path / "a.npz", {**ece276a_arrays(drive), "features": features})
+    dataset = read_ece276a(path, DatasetSettings(repeated_tracks="flag"))
     assert np.flatnonzero(dataset.stale_frames).tolist() == [7]
     for t in range(14):
         observed = dataset.observations(t)
@@ -161,14 +162,16 @@ def test_stale_frames_are_flagged(changed: bool, tmp_path: Path) -> None:
         assert observed.stale.any() == (t == 7)
     note = dataset.recording.notes[-1]
     assert note.startswith("1 of 14 feature frames are stale")
-    assert ("go on at other points of the scene" in note) == changed
+    judged = read_ece276a(path, DEFAULT)
+    assert ("they show other points of the scene" in judged.recording.notes[-1]) == changed
+    assert np.array_equal(judged.tracks.ids, dataset.tracks.ids) == (not changed)
 
 
 def test_split_gives_every_track_a_new_id_from_its_stale_row_on(tmp_path: Path) -> None:
     drive = make_drive(14, yaw_rate=0.1)
     arrays = {**ece276a_arrays(drive), "features": with_stale_frame(drive, 7, changed=True)}
     path = make_npz(tmp_path / "a.npz", arrays)
-    whole = read_ece276a(path, DEFAULT).tracks
+    whole = read_ece276a(path, DatasetSettings(repeated_tracks="flag")).tracks
     split = read_ece276a(path, DatasetSettings(repeated_tracks="split")).tracks
     np.testing.assert_array_equal(split.z, whole.z)
     np.testing.assert_array_equal(split.stale, whole.stale)
@@ -298,7 +301,7 @@ def test_newer_calibration_must_be_a_rectified_pair(key: str, value: FloatArray,
 
 @pytest.fixture(scope="module")
 def drive_0027(data_dir: Path) -> FeatureDataset:
-    return read_ece276a(data_dir / "ece276a" / "0027.npz", DEFAULT)
+    return read_ece276a(data_dir / "ece276a" / "0027.npz", DatasetSettings(repeated_tracks="flag"))
 
 
 def test_published_file_0027(drive_0027: FeatureDataset) -> None:
@@ -314,6 +317,7 @@ def test_published_file_0027(drive_0027: FeatureDataset) -> None:
     assert int(drive_0027.tracks.stale.sum()) == 4196
     assert np.flatnonzero(drive_0027.stale_frames)[:4].tolist() == [14, 27, 30, 38]
     assert [note.split(" ")[0] for note in recording.notes] == ["the", "91"]
+    assert "pixels move 1.09 steps afterwards" in recording.notes[1]
 
 
 def test_the_second_published_file(data_dir: Path) -> None:
@@ -322,6 +326,8 @@ def test_the_second_published_file(data_dir: Path) -> None:
     assert dataset.recording.T_cam0_imu is not None
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, 3], [-0.3141, 0.7195, -1.0891], atol=1e-4)
     assert any("corrected to t = -R t" in note for note in dataset.recording.notes)
+    assert any("go on under new ids (pixels move 1.05 steps" in note for note in dataset.recording.notes)
+    assert len(np.unique(dataset.tracks.ids)) == 3220 + 3100  # one more for each stale row
 
 
 @pytest.mark.parametrize("name", ["0027", "0022"])

@@ -9,7 +9,7 @@ from vio.errors import ConfigError
 from vio.setting import setting
 
 ExtrinsicsMode: TypeAlias = Literal["auto", "literal", "corrected"]
-RepeatsMode: TypeAlias = Literal["flag", "split", "literal"]
+RepeatsMode: TypeAlias = Literal["auto", "split", "flag", "literal"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,9 +26,10 @@ class DatasetSettings:
         "IMU frame (corrected), or whichever the file's own velocities and features support (auto)",
     )
     repeated_tracks: RepeatsMode = setting(
-        "flag",
-        "feature files, rows that repeat old pixels while the vehicle moves: mark them stale (flag), mark them and "
-        "rename the track from there on, as it shows another point (split), or take them at their word (literal)",
+        "auto",
+        "feature files, rows that repeat old pixels while the vehicle moves: mark them stale and give the track a new "
+        "id from there on (split), mark them and keep the id (flag), take them at their word (literal), or judge by "
+        "the motion of the pixels afterwards whether the track changed its point (auto: split if so, else flag)",
     )
     max_bad_frames: int = setting(5, "image folders: unreadable stereo frames skipped before the reader gives up")
     prefetch_frames: int = setting(4, "image folders: stereo frames decoded ahead in a thread; 0: no thread")

@@ -7,8 +7,7 @@ differ in how far the pixels jump after the repeat: two steps of ordinary motion
 
 The ECE276A files do the second (0027.npz against ground truth, 91 stale frames t: repeated rows fit frames t and t + 1
 as one point to 0.25 px in u and 0.32 px in v, as good as any, and miss the point of frame t - 1 by 6.2 px). A stale
-frame thus has good features and no link to the past. Rows are flagged by default and keep their ids, because a gate
-may still use those that hardly changed; a filter that triangulates over many frames should end such a track.
+frame thus has good features and no link to the past, and its tracks get new ids there.
 """
 
 from __future__ import annotations
@@ -169,7 +168,7 @@ def _jump(tracks: FeatureTracks, previous: IntArray, carried: BoolArray) -> floa
 def settle_repeats(
     tracks: FeatureTracks, moving: BoolArray, mode: RepeatsMode
 ) -> tuple[FeatureTracks, BoolArray, tuple[str, ...]]:
-    """Flag repeated rows, on request give their tracks a new id from there on, and say so.
+    """Flag repeated rows, give tracks that changed their point a new id from there on, and say so.
 
     Returns:
         The tracks, the mask (F,) of stale frames, and notes for the user.
@@ -184,12 +183,12 @@ def settle_repeats(
     )
     if mode == "literal":
         return tracks, found.frames, (f"{note}; taken at their word as asked",)
-    if mode == "split":
-        return split_ids(marked), found.frames, (f"{note}; they are flagged, and their tracks go on under new ids",)
-    if found.jump is None or found.jump > _JUMP_BETWEEN:
-        return marked, found.frames, (f"{note}; they are flagged",)
-    why = f"pixels move {found.jump:.2f} steps afterwards, not 2, so these tracks go on at other points of the scene"
-    return marked, found.frames, (f"{note}; they are flagged ({why}; dataset.repeated_tracks=split renames them)",)
+    jump = "" if found.jump is None else f" (pixels move {found.jump:.2f} steps afterwards"
+    changed = found.jump is not None and found.jump < _JUMP_BETWEEN
+    if mode == "flag" or (mode == "auto" and not changed):
+        return marked, found.frames, (f"{note}; they are flagged{jump and jump + ')'}",)
+    why = jump and jump + (", not 2: they show other points of the scene)" if changed else ")")
+    return split_ids(marked), found.frames, (f"{note}; they are flagged, and their tracks go on under new ids{why}",)
 
 
 def split_ids(tracks: FeatureTracks) -> FeatureTracks:
