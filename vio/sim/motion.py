@@ -310,7 +310,7 @@ def car_loop(
     corner_m: float = 7.0,
     speed_mps: float = 10.0,
     duration_s: float | None = None,
-    height_m: float = 1.65,
+    height_m: float = 0.93,
     start_m: float = 0.0,
     seed: int = 0,
     start_ns: int = 0,
@@ -322,7 +322,7 @@ def car_loop(
         corner_m: radius of the corners.
         speed_mps: speed on the straights; corners are taken at up to 2.5 m/s^2 across.
         duration_s: length of the record; None drives one loop.
-        height_m: height of the body above the ground.
+        height_m: height of the body above the ground; 0.93 puts `kitti_like_rig`'s cameras at 1.65.
         start_m: where on the loop to start, from the middle of the lower side.
         seed: of the small motions of the suspension and the steering.
         start_ns: time of the first pose.

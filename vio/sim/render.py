@@ -4,12 +4,13 @@ A ray `d` from the camera centre c meets a surface with corner p0, axes e_s, e_t
 front of it) where `w = -(n . d) / h`, the inverse distance in units of d. Texture coordinates times w and w itself are
 linear in d, so every surface is one 3x3 matrix `G` with `G d = (w U, w V, w)`: in a pinhole image, a homography. All
 tests (inside the rectangle, nearest) are linear inequalities in d; where they hold at the corners of a tile they hold
-all over it. Tiles that show one surface are shaded whole; along outlines each pixel is sampled 4x4.
+all over it. Tiles that show one surface are shaded whole; along outlines each pixel
+is sampled at eight places of its own.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -31,12 +32,11 @@ _COARSE = 4  # tiles along a coarse tile
 # Tiles shaded in one go; sample positions within a pixel follow the ray derivative at the middle of the run.
 _RUN: dict[DistortionModel, int] = {"pinhole": 8, "radtan": 4, "equidistant": 2}
 _EDGE_MARK, _NONE = np.int16(-1), np.int16(-2)
-_EDGE = 4  # samples along each side of a pixel on an outline
 _EMPTY = np.float32(90.0)  # gray level where no surface is hit
 _LOD_STEP = 4  # pixels between evaluations of the level of detail
 _MIN_FRONT_M = 1e-6
 _SAME_POINT = 1e-6  # relative distance within which two hits are the same point
-_CAST_ROWS = 20000  # rays times surfaces held in memory at once are limited to this many rays
+_CAST_PAIRS = 400_000  # rays times surfaces held in memory at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,24 +157,28 @@ def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike, *,
         keep = np.isin(index, among)
         G, index = G[keep], index[keep]
     size = surfaces.size[index]
-    parts = [_cast_block(G, index, size, d[i : i + _CAST_ROWS]) for i in range(0, max(len(d), 1), _CAST_ROWS)]
+    rows = max(1, _CAST_PAIRS // max(1, len(index)))
+    parts = [_cast_block(G, index, size, d[i : i + rows]) for i in range(0, max(len(d), 1), rows)]
     return Hits(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 def _cast_block(
     G: FloatArray, index: IntArray, size: FloatArray, d: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
-    best = np.zeros(len(d))
-    surface = np.zeros(len(d), dtype=np.int64)
-    place = np.zeros((len(d), 2))
-    for k in range(len(index)):
-        a, b, w = G[k] @ d.T
-        hit = (w > best) & (a >= 0) & (b >= 0) & (a <= size[k, 0] * w) & (b <= size[k, 1] * w)
-        if hit.any():
-            best[hit], surface[hit] = w[hit], index[k]
-            place[hit, 0], place[hit, 1] = a[hit] / w[hit], b[hit] / w[hit]
-    found = best > 0
-    return surface, 1 / np.where(found, best, 1.0), place, found
+    if len(index) == 0:
+        nothing = np.zeros(len(d), dtype=np.int64)
+        return nothing, np.ones(len(d)), np.zeros((len(d), 2)), nothing.astype(np.bool_)
+    forms = G @ d.T  # (K, 3, N)
+    a, b, w = forms[:, 0], forms[:, 1], forms[:, 2]
+    inside = (w > 0) & (a >= 0) & (b >= 0) & (a <= size[:, :1] * w) & (b <= size[:, 1:] * w)
+    nearness = np.where(inside, w, 0.0)
+    best = nearness.argmax(axis=0)
+    each = np.arange(len(d))
+    nearest = nearness[best, each]
+    found = nearest > 0
+    scale = 1 / np.where(found, nearest, 1.0)
+    place = np.stack([a[best, each], b[best, each]], axis=1) * scale[:, None]
+    return index[best], scale, place, found
 
 
 def surface_points(surfaces: Surfaces, surface: IntArray, place: FloatArray) -> FloatArray:
@@ -310,7 +314,7 @@ def render(world: World, rays: CameraRays, T_world_cam: npt.ArrayLike, time_ns: 
     edges = []
     for r in range(candidates.shape[0]):
         shown = _shown(scene, candidates[r], rays, r)
-        _shade_row(scene, shown, rays, r, image)
+        _shade_row(scene, shown, candidates[r], rays, r, image)
         edges.append(np.argwhere(shown == _EDGE_MARK) + np.array([r * _TILE, 0]))
     _shade_edges(scene, candidates, rays, np.concatenate(edges), image)
     return image
@@ -345,24 +349,34 @@ def _nearest(scene: _Scene, chosen: IntArray, d: npt.NDArray[np.float32]) -> npt
     return np.where(nearness.max(axis=0) > 0, chosen[best], _NONE).astype(np.int16)
 
 
-def _shade_row(scene: _Scene, shown: npt.NDArray[np.int16], rays: CameraRays, r: int, image: Radiance) -> None:
+def _shade_row(
+    scene: _Scene, shown: npt.NDArray[np.int16], candidates: BoolArray, rays: CameraRays, r: int, image: Radiance
+) -> None:
     """Shade the pixels of a row of tiles that show one surface only, surface by surface in runs of columns."""
     top = r * _TILE
     longest = _RUN[rays.camera.model] * _TILE
     for k in np.flatnonzero(np.bincount(shown[shown >= 0], minlength=1)):
-        mask = shown == k
-        seen = np.flatnonzero(mask.any(axis=0))
-        start = 0
-        for i in range(1, len(seen) + 1):
-            if i < len(seen) and seen[i] - seen[i - 1] <= _TILE and seen[i] - seen[start] < longest:
-                continue
-            columns = slice(int(seen[start]), int(seen[i - 1]) + 1)
-            part = mask[:, columns]
+        tiles = np.flatnonzero(candidates[:, k])
+        left, right = int(tiles[0]) * _TILE, (int(tiles[-1]) + 1) * _TILE
+        mask = shown[:, left:right] == k
+        for first, last in _runs(np.flatnonzero(mask.any(axis=0)), longest):
+            columns, part = slice(left + first, left + last), mask[:, first:last]
             within = np.flatnonzero(part.any(axis=1))
+            if len(within) == 0:
+                continue
             low, high = int(within[0]), int(within[-1]) + 1
             rows = slice(top + low, top + high)
             np.copyto(image[rows, columns], _shade(scene, int(k), rays, rows, columns), where=part[low:high])
-            start = i
+
+
+def _runs(seen: npt.NDArray[np.intp], longest: int) -> Iterator[tuple[int, int]]:
+    """Intervals [first, last) that hold all columns seen, without wide gaps and none longer than `longest`."""
+    cuts = np.flatnonzero(np.diff(seen) > _TILE) + 1
+    for part in np.split(seen, cuts):
+        first, end = int(part[0]), int(part[-1]) + 1
+        pieces = -(-(end - first) // longest)
+        for piece in range(pieces):
+            yield first + piece * (end - first) // pieces, first + (piece + 1) * (end - first) // pieces
 
 
 def _samples(across: int, down: int) -> npt.NDArray[np.float32]:
@@ -378,7 +392,9 @@ def _samples(across: int, down: int) -> npt.NDArray[np.float32]:
 
 
 _SQUARE, _WIDE, _TALL = _samples(2, 2), _samples(4, 2), _samples(2, 4)
-_FINE = _samples(_EDGE, _EDGE)
+# Eight queens that stay in place under half a turn: eight different heights and widths, symmetric about the centre.
+_QUEENS = (2, 4, 1, 7, 0, 6, 3, 5)
+_FINE = np.array([((i + 0.5) / 8 - 0.5, (j + 0.5) / 8 - 0.5) for i, j in enumerate(_QUEENS)], dtype=np.float32)
 _STRETCHED = 2.0  # ratio of footprint sides from which the longer one gets twice the samples
 
 
@@ -438,7 +454,7 @@ def _shade(scene: _Scene, k: int, rays: CameraRays, rows: slice, columns: slice)
         y[half] *= scale_y
         y[half] += shift_y
     values = cv2.remap(
-        texture.page, x.reshape(n * h, w), y.reshape(n * h, w), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+        texture.page, x.reshape(n * h, w), y.reshape(n * h, w), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     total = np.add.reduce(values.reshape(n, h * w), axis=0, dtype=np.float32)
     total *= np.float32(1 / n)
@@ -486,7 +502,7 @@ def _sample_points(
     texture, G = scene.textures[k], scene.G[k]
     forms = G @ d
     along_u, along_v = _footprint(forms, G @ du, G @ dv)
-    square: npt.NDArray[np.float32] = np.maximum(along_u, along_v) / np.float32(4)
+    square = np.asarray(np.maximum(along_u, along_v) / 4, dtype=np.float32)
     level = texture.levels[_levels(square, texture, 0.5)]
     x = forms[0] / forms[2] * level[:, 0] + level[:, 2]
     y = forms[1] / forms[2] * level[:, 1] + level[:, 3]
@@ -494,22 +510,5 @@ def _sample_points(
     padded = np.zeros((2, -(-len(x) // width) * width), dtype=np.float32)
     padded[0, : len(x)], padded[1, : len(x)] = x, y
     maps = padded.reshape(2, -1, width)
-    values = cv2.remap(texture.page, maps[0], maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    values = cv2.remap(texture.page, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return values.reshape(-1)[: len(x)].astype(np.float32)
-
-
-def render_pair(
-    world: World,
-    rays: tuple[CameraRays, CameraRays],
-    T_world_cams: tuple[FloatArray, FloatArray],
-    time_ns: int = 0,
-    *,
-    threads: int = 2,
-) -> tuple[Radiance, Radiance]:
-    """Render both images of a stereo pair, one thread each; the result does not depend on `threads`."""
-    if threads < 2:
-        return render(world, rays[0], T_world_cams[0], time_ns), render(world, rays[1], T_world_cams[1], time_ns)
-    with ThreadPoolExecutor(max_workers=1) as pool:
-        right = pool.submit(render, world, rays[1], T_world_cams[1], time_ns)
-        left = render(world, rays[0], T_world_cams[0], time_ns)
-        return left, right.result()

@@ -32,7 +32,7 @@ def small_rig(width: int = 640, height: int = 360) -> StereoRig:
 def kitti_like_rig(width: int = 1242) -> StereoRig:
     """Rectified rig like KITTI's gray pair (1242x375, 0.537 m), scaled to any width.
 
-    The IMU lies behind and above the left camera, its axes forward, left, up.
+    The IMU lies behind, below and to the left of the left camera, its axes forward, left, up.
     Reference: Geiger et al., Vision meets robotics: the KITTI dataset (2013).
     """
     scale = width / 1242
@@ -46,7 +46,7 @@ def kitti_like_rig(width: int = 1242) -> StereoRig:
         width,
         round(375 * scale),
     )
-    return rig_from_rectified(camera, _forward_T_cam0_imu((1.0891, 0.3141, -0.7195)))
+    return rig_from_rectified(camera, _forward_T_cam0_imu((1.0891, -0.3141, 0.7195)))
 
 
 def euroc_like_rig() -> StereoRig:

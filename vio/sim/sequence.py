@@ -30,7 +30,7 @@ from vio.sim.effects import SensorEffects, develop, exposed, smeared
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ImuNoise, ImuRecord, VelocityNoise, imu_samples, read_imu_csv, simulate_imu, simulate_velocity
 from vio.sim.motion import FitReport, MotionSpline, evaluate, recorded_motion
-from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render, render_pair
+from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
 from vio.sim.world import World, check_clear, room
 
 logger = logging.getLogger(__name__)
@@ -195,23 +195,18 @@ def views(simulation: Simulation, time_ns: int) -> tuple[View, View]:
 class SimulatedRecording:
     """The `Dataset` of a simulation: frames are rendered when they are asked for."""
 
-    def __init__(self, simulation: Simulation, *, threads: int = 2) -> None:
-        """Tabulate the cameras' rays.
-
-        Args:
-            simulation: what to record.
-            threads: 2 renders both cameras at once; the images do not depend on it.
-
-        Raises:
-            SimulationError: the rig's distortion does not reach every pixel.
-        """
+    def __init__(self, simulation: Simulation) -> None:
+        """Take a plan; nothing is rendered before it is asked for."""
         self.simulation = simulation
-        self._threads = threads
         self._rays: tuple[CameraRays, CameraRays] | None = None
 
     @property
     def rays(self) -> tuple[CameraRays, CameraRays]:
-        """The tabulated rays of both cameras."""
+        """The tabulated rays of both cameras.
+
+        Raises:
+            SimulationError: the rig's distortion does not reach every pixel.
+        """
         if self._rays is None:
             self._rays = camera_rays(self.simulation.rig.cam0), camera_rays(self.simulation.rig.cam1)
         return self._rays
@@ -304,22 +299,20 @@ class SimulatedRecording:
         """Render both linear images (H, W) at a true time, blurred if the effects say so."""
         effects = self.simulation.effects
         if effects.blur_exposure_ms <= 0:
-            sharp = views(self.simulation, time_ns)
-            poses = sharp[0].T_world_cam, sharp[1].T_world_cam
-            return render_pair(self.simulation.world, self.rays, poses, time_ns, threads=self._threads)
+            return self._sharp(0, time_ns), self._sharp(1, time_ns)
         return self._blurred(0, time_ns), self._blurred(1, time_ns)
 
+    def _sharp(self, camera: int, time_ns: int) -> Radiance:
+        view = views(self.simulation, time_ns)[camera]
+        return render(self.simulation.world, self.rays[camera], view.T_world_cam, time_ns)
+
     def _blurred(self, camera: int, time_ns: int) -> Radiance:
-        simulation = self.simulation
-
-        def sharp_at(t: int) -> Radiance:
-            return render(simulation.world, self.rays[camera], views(simulation, t)[camera].T_world_cam, t)
-
-        if simulation.effects.blur_exact:
-            return exposed(sharp_at, time_ns, simulation.effects)
-        half = round(simulation.effects.blur_exposure_ms * 0.5e6)
+        effects = self.simulation.effects
+        if effects.blur_exact:
+            return exposed(lambda t: self._sharp(camera, t), time_ns, effects)
+        half = round(effects.blur_exposure_ms * 0.5e6)
         before, after = (self.flow(camera, time_ns, time_ns + sign * half) for sign in (-1, 1))
-        return smeared(sharp_at(time_ns), before, after, simulation.effects)
+        return smeared(self._sharp(camera, time_ns), before, after, effects)
 
     def flow(self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _FLOW_GRID) -> FloatArray:
         """Optical flow (H, W, 2) of one camera between two true times, exact on a grid and interpolated between.

@@ -22,6 +22,8 @@ from vio.sim.textures import MipTexture, TextureKind, build_mips, paint
 SceneName: TypeAlias = Literal["room", "street", "corridor"]
 ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_object (4, 4)
 
+_ONWARD_M = 80.0  # how far the streets run on beyond the block
+_CORNER_FREE_M = 13.0  # no parked box this close to a corner, which cars cut
 _FACES: dict[str, tuple[int, int]] = {
     "+x": (0, 1),
     "-x": (0, -1),
@@ -257,7 +259,7 @@ def street(
     inner, outer = half - width_m / 2, half + width_m / 2
     patches: list[Patch] = []
     solids: list[Solid] = []
-    for solid in [*_house_row(inner, rng, outwards=True), *_house_row(outer, rng, outwards=False)]:
+    for solid in [*_house_row(inner, width_m, rng, outwards=True), *_house_row(outer, width_m, rng, outwards=False)]:
         solids.append(solid)
         patches += _box_patches(solid, "facade", texel_m, hidden=("-z", "+z"))
     patches += _road(inner, outer, 0.8 * texel_m)
@@ -413,13 +415,14 @@ def _hang_picture(box: FloatArray, rng: np.random.Generator, scale: float, bare_
     return Solid(_pose(centre, 0.0), half)
 
 
-def _house_row(rim: FloatArray, rng: np.random.Generator, *, outwards: bool) -> list[Solid]:
+def _house_row(rim: FloatArray, width_m: float, rng: np.random.Generator, *, outwards: bool) -> list[Solid]:
     """Houses along a rectangle of half size `rim`: inside it facing out, or outside it facing in."""
     houses = []
     depth = 8.0
     for axis in (0, 1):
         for sign in (-1, 1):
-            extent = rim[axis] + (0.0 if outwards else depth)
+            # The streets along x run on beyond the block, towards the skyline.
+            extent = rim[axis] if outwards else (rim[0] + _ONWARD_M if axis == 0 else rim[1] - width_m)
             x = -extent
             while x < extent - 3:
                 width = min(rng.uniform(9.0, 18.0), extent - x)
@@ -445,6 +448,10 @@ def _road(inner: FloatArray, outer: FloatArray, texel_m: float) -> list[Patch]:
         long_size, short_size = np.array([2 * high[0], high[1] - low[1]]), np.array([high[0] - low[0], 2 * low[1]])
         out.append(_rectangle(np.array([0.0, y, 0.0]), up, down, long_size, "asphalt", texel_m))
         out.append(_rectangle(np.array([x, 0.0, 0.0]), up, down, short_size, "asphalt", texel_m))
+        for other in (-1, 1):
+            size = np.array([_ONWARD_M, high[1] - low[1]])
+            middle = np.array([other * (high[0] + _ONWARD_M / 2), y, 0.0])
+            out.append(_rectangle(middle, up, down, size, "asphalt", 2 * texel_m))
     plain = np.array([2 * (max(high) + 250.0)] * 2)
     out.append(_rectangle(np.array([0.0, 0.0, -0.05]), up, down, plain, "asphalt", 0.25))
     return out
@@ -458,7 +465,9 @@ def _roadside(half: FloatArray, width_m: float, parked: int, rng: np.random.Gene
         is_pole = number >= parked
         for _ in range(20):
             place = rng.uniform(0, perimeter)
-            point, heading = _on_rectangle(half, place)
+            point, heading, to_corner = _on_rectangle(half, place)
+            if to_corner < _CORNER_FREE_M:
+                continue
             side = rng.choice([-1.0, 1.0]) * (width_m / 2 - (0.7 if is_pole else rng.uniform(1.5, 1.9)))
             normal = np.array([-np.sin(heading), np.cos(heading)])
             size = (
@@ -472,16 +481,17 @@ def _roadside(half: FloatArray, width_m: float, parked: int, rng: np.random.Gene
     return out
 
 
-def _on_rectangle(half: FloatArray, s: float) -> tuple[FloatArray, float]:
-    """Point and heading at arc length s along a rectangle, counter-clockwise."""
+def _on_rectangle(half: FloatArray, s: float) -> tuple[FloatArray, float, float]:
+    """Point, heading and distance to the nearest corner at arc length s along a rectangle, counter-clockwise."""
     sides = [(np.array([-1, -1]), np.array([1, 0])), (np.array([1, -1]), np.array([0, 1]))]
     sides += [(np.array([1, 1]), np.array([-1, 0])), (np.array([-1, 1]), np.array([0, -1]))]
     for start, direction in sides:
         length = 2 * float(np.abs(direction) @ half)
         if s <= length:
-            return start * half + direction * s, float(np.arctan2(direction[1], direction[0]))
+            heading = float(np.arctan2(direction[1], direction[0]))
+            return start * half + direction * s, heading, min(s, length - s)
         s -= length
-    return -half, 0.0
+    return -half, 0.0, 0.0
 
 
 def _far_box(reach: float) -> list[Patch]:
