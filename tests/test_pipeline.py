@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -146,6 +147,33 @@ def test_the_viewer_sees_each_frame_and_is_closed_even_after_an_error() -> None:
         run(FakeDrive(), Config(), viewer=viewer)
     assert viewer.frames == 7
     assert viewer.closed
+
+
+def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
+    """Standing still, the map is complete after the first frame; only poses and log rows may be added."""
+    import tracemalloc
+
+    class Standing(FakeDrive):
+        def observations(self, index: int) -> Observations | None:
+            seen = super().observations(0)
+            return None if seen is None else replace(seen, frame_index=index, time_ns=index * STEP_NS)
+
+    class Watch:
+        sizes: ClassVar[list[int]] = []
+
+        def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+            self.sizes.append(tracemalloc.get_traced_memory()[0])
+
+        def close(self) -> None:
+            pass
+
+    tracemalloc.start()
+    try:
+        run(Standing(frames=400), load_config(None, ["motion=none"]), viewer=Watch())
+    finally:
+        tracemalloc.stop()
+    growth = (Watch.sizes[399] - Watch.sizes[199]) / 200
+    assert growth < 4096, f"{growth:.0f} bytes a frame"
 
 
 @pytest.mark.parametrize(

@@ -21,11 +21,13 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.cli.running import process, report
+    from vio.cli.running import check_out, process, rendering, report
     from vio.config import load_config
     from vio.sim.demo import write_demo_recording
 
-    recording = write_demo_recording(args.out / "recording")
+    check_out(args.out / "run")
+    with rendering("rendering the street") as progress:
+        recording = write_demo_recording(args.out / "street", progress)
     metrics = process(str(recording), load_config(), out=args.out / "run")
     report(metrics, as_json=args.json)
     return 0

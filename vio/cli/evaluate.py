@@ -43,9 +43,12 @@ def execute(args: argparse.Namespace) -> int:
     estimate, T_cam0_imu = read_run(args.estimate)
     reference, other = read_run(args.reference)
     if args.extrinsics is not None:
-        from vio.datasets.kitti import read_transform
+        from vio.datasets.kitti import read_extrinsics
+        from vio.errors import DataError
 
-        T_cam0_imu = read_transform(args.extrinsics)
+        T_cam0_imu = read_extrinsics(args.extrinsics)
+        if T_cam0_imu is None:
+            raise DataError(f"{args.extrinsics} does not exist; give a file with T_cam0_imu, 3 or 4 rows of 4 numbers")
     result = evaluate(
         estimate,
         reference,

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,20 +26,33 @@ from vio.trajectory_io import read_trajectory
 log = logging.getLogger(__name__)
 
 
+def _bar(*, rate: bool) -> Progress:
+    """A progress bar on stderr, silent where stderr is no terminal."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        *([TextColumn("{task.fields[rate]}")] if rate else []),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=not sys.stderr.isatty(),
+    )
+
+
+@contextmanager
+def rendering(label: str) -> Iterator[Callable[[int, int], None]]:
+    """Give a function that shows `(done, total)` as a progress bar."""
+    with _bar(rate=False) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
 class ProgressViewer:
     """A progress bar on stderr with frames per second; silent where stderr is no terminal."""
 
     def __init__(self, frames: int, label: str) -> None:
-        self._progress = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=Console(stderr=True),
-            disable=not sys.stderr.isatty(),
-        )
+        self._progress = _bar(rate=True)
         self._task = self._progress.add_task(label, total=frames, rate="")
         self._progress.start()
 

@@ -137,7 +137,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> KittiDataset:
     times_ns = _read_times(path / "times.txt", path / f"image_{cameras[0]}", len(pairs))
     measured, width, height, notes = _probe(pairs, settings.max_bad_frames)
     motion = _read_velocity(path / "velocity.csv", times_ns)
-    T_cam0_imu = _read_extrinsics(path / "T_cam0_imu.txt")
+    T_cam0_imu = read_extrinsics(path / "T_cam0_imu.txt")
     if motion and T_cam0_imu is None:
         raise CalibrationError(
             f"{path}: velocity.csv stands without T_cam0_imu.txt, the transform from the IMU to camera 0; add it, or "
@@ -274,7 +274,7 @@ def _read_velocity(path: Path, frame_times_ns: IntArray) -> tuple[VelocitySample
     return velocity_samples(times_ns, table[:, 1:4], table[:, 4:])
 
 
-def _read_extrinsics(path: Path) -> FloatArray | None:
+def read_extrinsics(path: Path) -> FloatArray | None:
     """`T_cam0_imu` as three or four lines of four numbers, or one line of 12."""
     if not path.is_file():
         return None
