@@ -26,6 +26,7 @@ _Canvas: TypeAlias = npt.NDArray[np.float32]
 _GUTTER = 3  # texels of repeated border around each level, for the interpolation kernel
 _MAX_SIDE = 32000  # cv2.remap addresses its source with 16-bit integers
 _SMALLEST_LEVEL = 4
+_MOST_MARKS = 6000  # of one kind on one surface
 LEVELS_PER_OCTAVE = 2
 
 
@@ -137,35 +138,36 @@ def _rectangles(
     canvas: _Canvas, rng: np.random.Generator, count: int, side: tuple[float, float], contrast: float
 ) -> None:
     """Add axis-aligned rectangles with log-uniform sides (texels) to the canvas."""
-    height, width = canvas.shape
-    for _ in range(count):
-        w, h = np.exp(rng.uniform(np.log(max(side[0], 1.5)), np.log(max(side[1], 2.0)), 2))
-        x, y = rng.uniform(-w / 2, width), rng.uniform(-h / 2, height)
-        canvas[max(0, int(y)) : max(0, int(y + h)), max(0, int(x)) : max(0, int(x + w))] += np.float32(
-            rng.uniform(-contrast, contrast)
-        )
+    size = np.exp(rng.uniform(np.log(max(side[0], 1.5)), np.log(max(side[1], 2.0)), (count, 2)))
+    extent = np.array(canvas.shape[::-1])
+    low = -size / 2 + rng.random((count, 2)) * (extent + size / 2)
+    change = rng.uniform(-contrast, contrast, count).astype(np.float32)
+    box = np.maximum(np.hstack([low, low + size]), 0).astype(np.int64).tolist()
+    for (x0, y0, x1, y1), delta in zip(box, change, strict=True):
+        canvas[y0:y1, x0:x1] += delta
 
 
 def _polygons(
     canvas: _Canvas, rng: np.random.Generator, count: int, side: tuple[float, float], contrast: float
 ) -> None:
-    """Draw rotated triangles and quadrilaterals with smooth edges on the canvas."""
-    height, width = canvas.shape
-    for _ in range(count):
-        radius = np.exp(rng.uniform(np.log(max(side[0], 2.0)), np.log(max(side[1], 3.0))))
-        corners = int(rng.integers(3, 6))
-        angles = np.sort(rng.uniform(0, 2 * np.pi, corners))
-        centre = rng.uniform((0, 0), (width, height))
-        points = centre + radius * rng.uniform(0.6, 1, (corners, 1)) * np.stack([np.cos(angles), np.sin(angles)], -1)
-        low = np.clip(np.floor(points.min(0)).astype(int) - 1, 0, (width, height))
-        high = np.clip(np.ceil(points.max(0)).astype(int) + 2, 0, (width, height))
-        if np.any(high <= low):
+    """Add rotated polygons of three to five corners with smooth edges to the canvas."""
+    radius = np.exp(rng.uniform(np.log(max(side[0], 2.0)), np.log(max(side[1], 3.0)), (count, 1)))
+    angle = np.sort(rng.uniform(0, 2 * np.pi, (count, 5)), axis=1)
+    reach = radius * rng.uniform(0.6, 1, (count, 5))
+    extent = np.array(canvas.shape[::-1])
+    centre = rng.random((count, 1, 2)) * extent
+    points = centre + reach[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    low = np.clip(np.floor(points.min(axis=1)) - 1, 0, extent).astype(np.int64)
+    high = np.clip(np.ceil(points.max(axis=1)) + 2, 0, extent).astype(np.int64)
+    fixed = np.round((points - low[:, None]) * 16).astype(np.int32)
+    corners = rng.integers(3, 6, count).tolist()
+    change = (rng.uniform(-contrast, contrast, count) / 255).astype(np.float32)
+    for i, (x0, y0, x1, y1) in enumerate(np.hstack([low, high]).tolist()):
+        if x1 <= x0 or y1 <= y0:
             continue
-        mask = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.uint8)
-        fixed = np.round((points - low) * 16).astype(np.int32)
-        cv2.fillPoly(mask, [fixed], 255, lineType=cv2.LINE_AA, shift=4)
-        region = canvas[low[1] : high[1], low[0] : high[0]]
-        region += mask.astype(np.float32) * np.float32(rng.uniform(-contrast, contrast) / 255)
+        mask = np.zeros((y1 - y0, x1 - x0), dtype=np.uint8)
+        cv2.fillPoly(mask, [fixed[i, : corners[i]]], 255, lineType=cv2.LINE_AA, shift=4)
+        canvas[y0:y1, x0:x1] += mask * change[i]
 
 
 def _scatter(canvas: _Canvas, per_m: float, rng: np.random.Generator, *, density: float, contrast: float) -> None:
@@ -175,7 +177,7 @@ def _scatter(canvas: _Canvas, per_m: float, rng: np.random.Generator, *, density
     for low, high, weight in ((0.15, 0.5, 1.5), (0.05, 0.15, 8.0), (0.015, 0.05, 30.0)):
         if high * per_m < 2.5:
             continue
-        count = min(int(area * density * weight), 12000)
+        count = min(int(area * density * weight), 2 * _MOST_MARKS)
         sides = (low * per_m, high * per_m)
         _rectangles(canvas, rng, count // 2, sides, contrast)
         _polygons(canvas, rng, count - count // 2, (sides[0] / 2, sides[1] / 2), contrast)
@@ -353,17 +355,18 @@ def _asphalt(width: int, height: int, per_m: float, rng: np.random.Generator) ->
     canvas = 95 + 24 * _noise(width, height, per_m, rng, 4.0, 0.92)
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
     area = width * height / per_m**2
-    _rectangles(canvas, rng, int(area / 12), (0.4 * per_m, 3.0 * per_m), 22)
-    _polygons(canvas, rng, int(area / 3), (0.05 * per_m, 0.4 * per_m), 45)
-    _polygons(canvas, rng, min(int(area * 2.5), 12000), (0.02 * per_m, 0.08 * per_m), 70)
-    for _ in range(int(area / 8)):
+    _rectangles(canvas, rng, min(int(area / 12), _MOST_MARKS), (0.4 * per_m, 3.0 * per_m), 22)
+    _polygons(canvas, rng, min(int(area / 3), _MOST_MARKS), (0.05 * per_m, 0.4 * per_m), 45)
+    if 0.08 * per_m > 2:
+        _polygons(canvas, rng, min(int(area * 2.5), 2 * _MOST_MARKS), (0.02 * per_m, 0.08 * per_m), 70)
+    for _ in range(min(int(area / 8), _MOST_MARKS)):
         steps = rng.normal(0, 0.35, (12, 2)).cumsum(axis=0) * per_m
         points = rng.uniform((0, 0), (width, height)) + steps
         dark = float(rng.uniform(25, 55))
         cv2.polylines(
             canvas, [np.round(points * 16).astype(np.int32)], False, dark, max(1, round(0.02 * per_m)), shift=4
         )
-    for _ in range(int(area / 25)):
+    for _ in range(min(int(area / 25), _MOST_MARKS)):
         x, y = rng.uniform((0, 0), (width, height))
         _fill(canvas, (x, y, rng.uniform(0.12, 2.0) * per_m, rng.uniform(0.1, 0.5) * per_m), rng.uniform(150, 220))
     return canvas

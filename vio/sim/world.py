@@ -259,9 +259,11 @@ def street(
     inner, outer = half - width_m / 2, half + width_m / 2
     patches: list[Patch] = []
     solids: list[Solid] = []
-    for solid in [*_house_row(inner, width_m, rng, outwards=True), *_house_row(outer, width_m, rng, outwards=False)]:
+    houses = [*_house_row(inner, width_m, rng, outwards=True), *_house_row(outer, width_m, rng, outwards=False)]
+    for solid, back in houses:
         solids.append(solid)
-        patches += _box_patches(solid, "facade", texel_m, hidden=("-z", "+z"))
+        onward = bool(abs(solid.T_world_box[0, 3]) > outer[0] + 10)
+        patches += _box_patches(solid, "facade", (2 if onward else 1) * texel_m, hidden=("-z", "+z", back))
     patches += _road(inner, outer, 0.8 * texel_m)
     for solid in _roadside(half, width_m, parked, rng):
         solids.append(solid)
@@ -415,8 +417,8 @@ def _hang_picture(box: FloatArray, rng: np.random.Generator, scale: float, bare_
     return Solid(_pose(centre, 0.0), half)
 
 
-def _house_row(rim: FloatArray, width_m: float, rng: np.random.Generator, *, outwards: bool) -> list[Solid]:
-    """Houses along a rectangle of half size `rim`: inside it facing out, or outside it facing in."""
+def _house_row(rim: FloatArray, width_m: float, rng: np.random.Generator, *, outwards: bool) -> list[tuple[Solid, str]]:
+    """Houses along a rectangle of half size `rim`, each with its unseen face: inside it facing out, or around it."""
     houses = []
     depth = 8.0
     for axis in (0, 1):
@@ -433,7 +435,8 @@ def _house_row(rim: FloatArray, width_m: float, rng: np.random.Generator, *, out
                 centre, half = np.zeros(3), np.zeros(3)
                 centre[axis], centre[1 - axis], centre[2] = x + width / 2, sign * across, height / 2
                 half[axis], half[1 - axis], half[2] = width / 2, depth / 2, height / 2
-                houses.append(Solid(_pose(centre, 0.0), half))
+                back = ("-" if (sign > 0) == outwards else "+") + "xy"[1 - axis]
+                houses.append((Solid(_pose(centre, 0.0), half), back))
                 x += width + (rng.uniform(1.5, 5.0) if rng.random() < 0.3 else 0.0)
     return houses
 
