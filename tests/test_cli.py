@@ -216,7 +216,7 @@ def test_wrong_usage_is_2() -> None:
 def test_config_shows_every_setting_with_unit_and_default(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["config", "--show"]) == 0
     out = capsys.readouterr().out
-    assert "vislam.pixel_sigma_px = 2 px" in out
+    assert "vislam.pixel_sigma_px = 0.75 px" in out
     assert "frontend.klt.window_px" in out
     assert "one of: consistent, literal" in out
 

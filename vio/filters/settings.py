@@ -39,9 +39,7 @@ class VislamSettings:
     )
     start_velocity_sigma_mps: float = setting(10.0, "model 'twist': unknown velocity at the start", unit="m/s")
     start_rate_sigma_radps: float = setting(1.0, "model 'twist': unknown rate at the start", unit="rad/s")
-    pixel_sigma_px: float = setting(
-        2.0, "noise of one pixel coordinate, V is its square; also stands in for covariances not kept", unit="px"
-    )
+    pixel_sigma_px: float = setting(0.75, "noise of one pixel coordinate; V is its square, 15 in the paper", unit="px")
     gate_probability: float | None = setting(
         0.95, "observations outside this chi-square quantile are rejected; null keeps all, as the paper does"
     )
