@@ -1,0 +1,397 @@
+"""Effects do what they say, recordings are honest, the oracle's statistics are right, exported folders read back."""
+
+from __future__ import annotations
+
+import csv
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from vio.datasets.kitti import read_kitti
+from vio.datasets.settings import DatasetSettings
+from vio.errors import DataError, VioError
+from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_inverse, transform_points
+from vio.geometry.stereo import project
+from vio.records import FrontendOutput, ImuSample, StereoFrame, VelocitySample
+from vio.sim.effects import CLEAN, SensorEffects, develop, exposed
+from vio.sim.errors import SimulationError
+from vio.sim.export import export_euroc, export_kitti
+from vio.sim.imu import ImuNoise, VelocityNoise
+from vio.sim.motion import hand_held, turned
+from vio.sim.oracle import OracleFrontend, OracleSettings
+from vio.sim.render import Radiance, correspondence
+from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_like_rig, small_rig
+from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate, views
+from vio.sim.world import World, corridor, room
+
+RIG = small_rig(192, 120)
+MOTION = hand_held(duration_s=4.0)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return room(1, texel_m=0.008)
+
+
+@pytest.fixture(scope="module")
+def plain(world: World) -> Simulation:
+    return simulate(world, RIG, MOTION, rate_hz=10.0, imu=ImuNoise(), velocity=VelocityNoise(), effects=CLEAN)
+
+
+def _recording(plain: Simulation, effects: SensorEffects) -> SimulatedRecording:
+    return SimulatedRecording(replace(plain, effects=effects))
+
+
+# --- effects --------------------------------------------------------------------------------------------------------
+
+
+GRAY: Radiance = np.full((80, 100), 100.0, dtype=np.float32)
+
+
+def _developed(effects: SensorEffects, *, camera: int = 0, time_ns: int = 0, frame: int = 0) -> FloatArray:
+    image = develop(GRAY, effects, time_ns=time_ns, frame_index=frame, camera=camera, seed=1)
+    return image.astype(np.float64)
+
+
+def test_exposure_and_gain_scale_the_signal() -> None:
+    assert np.all(_developed(CLEAN) == 100)
+    assert np.all(_developed(replace(CLEAN, exposure=0.05)) == 5)
+    uneven = replace(CLEAN, exposure=1.2, right_gain=0.5)
+    assert np.all(_developed(uneven) == 120)
+    assert np.all(_developed(uneven, camera=1) == 60)
+    swinging = replace(CLEAN, exposure_swing=0.4, exposure_period_s=4.0)
+    assert np.all(_developed(swinging, time_ns=1_000_000_000) == 140)
+    assert np.all(_developed(swinging, time_ns=3_000_000_000) == 60)
+
+
+def test_vignetting_darkens_the_corners_only() -> None:
+    image = _developed(replace(CLEAN, vignetting=0.6))
+    assert image[0, 0] == image[-1, -1] == 40
+    assert image[40, 50] >= 99
+
+
+def test_gamma_lifts_the_shadows() -> None:
+    expected = round(255 * (100 / 255) ** (1 / 2.2))
+    assert np.all(_developed(replace(CLEAN, gamma=2.2)) == expected)
+
+
+def test_noise_has_the_deviation_it_claims() -> None:
+    read = _developed(replace(CLEAN, read_noise=3.0))
+    assert read.std() == pytest.approx(np.hypot(3.0, 12**-0.5), rel=0.03)
+    assert read.mean() == pytest.approx(100, abs=0.2)
+    electrons = 100 / 255 * 5000
+    photon = _developed(replace(CLEAN, full_well=5000.0))
+    assert photon.std() == pytest.approx(np.hypot(100 / np.sqrt(electrons), 12**-0.5), rel=0.03)
+    same, other = _developed(replace(CLEAN, read_noise=3.0)), _developed(replace(CLEAN, read_noise=3.0), frame=1)
+    assert np.array_equal(same, read)
+    assert not np.array_equal(other, read)
+    right = _developed(replace(CLEAN, read_noise=3.0), camera=1)
+    assert abs(np.corrcoef(read.ravel(), right.ravel())[0, 1]) < 0.05
+
+
+def test_senseless_effects_are_refused() -> None:
+    for wrong in ({"gamma": 0.0}, {"vignetting": 1.5}, {"read_noise": -1.0}, {"exposure": -0.1}):
+        with pytest.raises(SimulationError):
+            SensorEffects(**wrong)
+
+
+def test_exact_blur_is_the_mean_of_sub_exposures() -> None:
+    def render_at(time_ns: int) -> Radiance:
+        return np.full((2, 2), time_ns * 1e-6, dtype=np.float32)
+
+    blurred = exposed(render_at, 50_000_000, SensorEffects(blur_exposure_ms=10.0, blur_samples=5))
+    np.testing.assert_allclose(blurred, 50.0, atol=1e-4)  # symmetric about the frame's time
+
+
+def test_motion_blur_smears_along_the_motion_and_the_cheap_one_agrees(plain: Simulation) -> None:
+    time_ns = 2_000_000_000
+    sharp, cheap, exact = (
+        _recording(plain, effects).radiance(time_ns)[0]
+        for effects in (
+            CLEAN,
+            replace(CLEAN, blur_exposure_ms=30.0, blur_samples=9),
+            replace(CLEAN, blur_exposure_ms=30.0, blur_samples=9, blur_exact=True),
+        )
+    )
+    contrast = [cv2.Laplacian(image, cv2.CV_32F).std() for image in (sharp, cheap, exact)]
+    assert contrast[2] < 0.8 * contrast[0]
+    assert np.abs(cheap - exact).mean() < 0.35 * np.abs(sharp - exact).mean()
+
+
+def test_flow_is_the_exact_map(plain: Simulation) -> None:
+    recording = SimulatedRecording(plain)
+    start, end = 1_000_000_000, 1_100_000_000
+    flow = recording.flow(0, start, end, step_px=4)
+    assert flow.shape == (120, 192, 2)
+    u, v = np.meshgrid(np.arange(0, 192, 5), np.arange(0, 120, 5))
+    uv = np.stack([u, v], axis=-1).reshape(-1, 2)
+    there, visible = correspondence(plain.world, views(plain, start)[0], views(plain, end)[0], uv)
+    error = np.linalg.norm(flow[v.ravel(), u.ravel()] - (there - uv), axis=1)[visible]
+    assert np.median(np.linalg.norm((there - uv)[visible], axis=1)) > 2
+    assert np.median(error) < 0.02
+    assert np.mean(error > 0.5) < 0.1  # where the grid straddles an outline
+
+
+# --- recordings -----------------------------------------------------------------------------------------------------
+
+
+def test_events_come_in_order_with_truth(plain: Simulation) -> None:
+    recording = SimulatedRecording(plain)
+    events = list(recording.events(3, 6, images=False))
+    times = [event.time_ns for event in events]
+    assert times == sorted(times)
+    frames = [event for event in events if isinstance(event, StereoFrame)]
+    assert [frame.index for frame in frames] == [3, 4, 5]
+    assert times[0] == 300_000_000
+    assert isinstance(events[-1], StereoFrame)
+    assert sum(isinstance(event, ImuSample) for event in events) == 41
+    assert sum(isinstance(event, VelocitySample) for event in events) == 3
+    assert recording.recording.motion == {"imu", "velocity"}
+    reference = recording.recording.reference
+    assert reference is not None
+    state = recording.true_state(400_000_000)
+    np.testing.assert_allclose(state.T_world_imu, reference.T_world_body[4], atol=1e-12)
+    later = recording.true_state(400_100_000)
+    speed = (later.T_world_imu - state.T_world_imu)[:3, 3] / 1e-4
+    np.testing.assert_allclose(speed, state.velocity_world, atol=1e-3)
+    assert state.gyro_bias is not None
+    assert np.linalg.norm(state.gyro_bias) > 0
+
+
+def test_frames_are_the_same_bits_again(plain: Simulation) -> None:
+    noisy = replace(plain, effects=SensorEffects(read_noise=2.0, full_well=8000.0))
+    first, again = SimulatedRecording(noisy).frame(5), SimulatedRecording(noisy).frame(5)
+    assert first.left is not None
+    assert first.left.dtype == np.uint8
+    assert first.left.shape == (120, 192)
+    assert np.array_equal(first.left, again.left)  # type: ignore[arg-type]
+    assert np.array_equal(first.right, again.right)  # type: ignore[arg-type]
+
+
+def test_dropped_and_repeated_frames_and_clock_offset(world: World) -> None:
+    faults = FrameFaults(dropped=0.2, duplicated=0.2, time_offset_ms=7.0)
+    whole = simulate(world, RIG, MOTION, rate_hz=40.0)
+    faulty = simulate(world, RIG, MOTION, rate_hz=40.0, faults=faults, seed=2)
+    expected = 0.8 * len(whole.stamps_ns)
+    assert abs(len(faulty.stamps_ns) - expected) < 4 * np.sqrt(0.2 * expected)
+    assert np.all(np.diff(faulty.stamps_ns) > 0)
+    lag = faulty.stamps_ns - faulty.taken_ns
+    repeated = np.flatnonzero(lag > 7_000_000)
+    assert set(np.unique(lag[lag <= 7_000_000])) == {7_000_000}
+    assert 0.1 < len(repeated) / len(lag) < 0.3
+    k = int(repeated[0])
+    recording = SimulatedRecording(replace(faulty, effects=SensorEffects(read_noise=3.0)))
+    assert np.array_equal(recording.images(k)[0], recording.images(k - 1)[0])
+    assert not np.array_equal(recording.images(k + 1 if k + 1 not in repeated else k - 2)[0], recording.images(k)[0])
+
+
+def test_a_dark_corridor_is_dark() -> None:
+    sim = simulate(
+        corridor(1, texel_m=0.02),
+        RIG,
+        hand_held(centre=(6.0, 0.2, 1.4), extent=(1.5, 0.4, 0.2), duration_s=2.0),
+        effects=SensorEffects(exposure=0.03),
+    )
+    left, _ = SimulatedRecording(sim).images(3)
+    assert left.mean() < 8
+
+
+def test_a_real_flight_goes_with_rendered_images(data_dir: Path) -> None:
+    folder = data_dir / "euroc_real_imu" / "V1_02"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}")
+    flight = read_flight(folder / "groundtruth_tum.txt", folder / "image_timestamps_ns.txt", folder / "imu0.csv")
+    simulation = simulate(
+        room_around(flight.motion, texel_m=0.02),
+        euroc_like_rig(),
+        flight.motion,
+        frame_times_ns=flight.frame_times_ns,
+        imu=flight.imu,
+    )
+    assert len(simulation.stamps_ns) > 1600
+    assert simulation.imu is flight.imu
+    recording = SimulatedRecording(simulation)
+    assert recording.true_state(int(simulation.stamps_ns[5])).gyro_bias is None
+    with pytest.raises(SimulationError, match="unrectified rig"):
+        _ = recording.recording
+
+
+def test_image_times_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    gt, times = tmp_path / "gt.txt", tmp_path / "times.txt"
+    gt.write_text("".join(f"{k * 0.1:.1f} {k} 0 0 0 0 0 1\n" for k in range(20)))
+    times.write_text("5000000000\n6000000000\n")
+    with pytest.raises(DataError, match="no image time falls into the ground truth"):
+        read_flight(gt, times)
+    times.write_text("100\nabc\n")
+    with pytest.raises(DataError, match="expected one integer"):
+        read_flight(gt, times)
+
+
+# --- oracle ---------------------------------------------------------------------------------------------------------
+
+
+def _run(oracle: OracleFrontend, simulation: Simulation) -> list[FrontendOutput]:
+    return [oracle.process(StereoFrame(i, int(t), None, None)) for i, t in enumerate(simulation.stamps_ns)]
+
+
+def test_perfect_observations_are_projections_of_the_points(plain: Simulation) -> None:
+    oracle = OracleFrontend(plain, OracleSettings(max_features=60, sigma_px=0.0))
+    camera = SimulatedRecording(plain).recording.camera
+    for index, output in enumerate(_run(oracle, plain)):
+        seen = output.observations
+        time_ns = int(plain.taken_ns[index])
+        T_cam0_world = se3_inverse(views(plain, time_ns)[0].T_world_cam)
+        expected = project(camera, transform_points(T_cam0_world, oracle.points(seen.ids, time_ns)))
+        np.testing.assert_allclose(seen.z, expected, atol=1e-7)
+        assert len(seen) > 55
+        assert output.tracked + output.detected == len(seen)
+
+
+def test_oracle_noise_outliers_and_ids(plain: Simulation) -> None:
+    settings = OracleSettings(max_features=80, sigma_px=0.7, outlier_fraction=0.1, left_only_fraction=0.2)
+    oracle = OracleFrontend(plain, settings, seed=3)
+    outputs = _run(oracle, plain)
+    residuals, wrong, gone, last = [], [], set(), set[int]()
+    for index, output in enumerate(outputs):
+        seen = output.observations
+        now = set(seen.ids.tolist())
+        assert not now & gone, "an id came back"
+        gone |= last - now
+        last = now
+        wrong.append(oracle.outliers(index))
+        residuals.append(seen.z - oracle.exact(index))
+    outlier, residual = np.concatenate(wrong), np.concatenate(residuals)
+    assert outlier.mean() == pytest.approx(0.1, abs=0.02)
+    assert residual[~outlier].std() == pytest.approx(0.7, rel=0.03)
+    assert np.abs(residual[~outlier].mean(axis=0)).max() < 0.06
+    assert np.linalg.norm(residual[outlier][:, 2:], axis=1).min() > 5 - 4 * 0.7
+    has_right = np.concatenate([output.observations.has_right for output in outputs])
+    assert has_right.mean() == pytest.approx(0.8, abs=0.03)
+    again = _run(OracleFrontend(plain, settings, seed=3), plain)
+    assert all(np.array_equal(a.observations.z, b.observations.z) for a, b in zip(outputs, again, strict=True))
+    other = _run(OracleFrontend(plain, settings, seed=4), plain)
+    assert not np.array_equal(outputs[0].observations.z, other[0].observations.z)
+
+
+def test_oracle_spreads_features_and_limits_their_age(plain: Simulation) -> None:
+    oracle = OracleFrontend(plain, OracleSettings(max_features=48, max_track_length=5))
+    ages: dict[int, int] = {}
+    for output in _run(oracle, plain):
+        for feature in output.observations.ids.tolist():
+            ages[feature] = ages.get(feature, 0) + 1
+        uv = output.observations.z[:, :2]
+        halves = [np.mean(uv[:, 0] < 96), np.mean(uv[:, 1] < 60)]
+        assert min(halves) > 0.2
+        assert max(halves) < 0.8
+    assert max(ages.values()) == 5
+    assert np.median(list(ages.values())) >= 4
+
+
+def test_oracle_needs_a_rectified_rig(world: World) -> None:
+    motion = turned(hand_held(duration_s=1.0), R_FLU_EUROC_IMU)
+    with pytest.raises(SimulationError, match="rectified"):
+        OracleFrontend(simulate(world, euroc_like_rig(), motion))
+
+
+# --- export ---------------------------------------------------------------------------------------------------------
+
+
+def _short(plain: Simulation, frames: int = 3) -> SimulatedRecording:
+    return SimulatedRecording(replace(plain, taken_ns=plain.taken_ns[:frames], stamps_ns=plain.stamps_ns[:frames]))
+
+
+def test_a_kitti_folder_reads_back(plain: Simulation, tmp_path: Path) -> None:
+    recording = _short(plain)
+    done: list[tuple[int, int]] = []
+    export_kitti(recording, tmp_path / "out", progress=lambda k, n: done.append((k, n)))
+    assert done == [(1, 3), (2, 3), (3, 3)]
+    dataset = read_kitti(tmp_path / "out", DatasetSettings())
+    mine, read = recording.recording, dataset.recording
+    assert (read.camera.fu, read.camera.cu, read.camera.width) == (mine.camera.fu, mine.camera.cu, 192)
+    assert read.camera.baseline_m == pytest.approx(mine.camera.baseline_m)
+    np.testing.assert_allclose(read.T_cam0_imu, mine.T_cam0_imu, atol=1e-12)
+    assert read.reference is not None
+    truth = recording.reference.in_cam0(se3_inverse(RIG.T_imu_cam0)).T_world_body
+    np.testing.assert_allclose(read.reference.T_world_body, se3_inverse(truth[0]) @ truth, atol=1e-9)
+    events = list(dataset.events())
+    frames = [event for event in events if isinstance(event, StereoFrame)]
+    velocities = [event for event in events if isinstance(event, VelocitySample)]
+    for frame in frames:
+        left, right = recording.images(frame.index)
+        assert np.array_equal(frame.left, left)  # type: ignore[arg-type]
+        assert np.array_equal(frame.right, right)  # type: ignore[arg-type]
+    assert len(velocities) == 3
+    np.testing.assert_allclose(velocities[1].linear, plain.velocity[1].linear)
+
+
+def test_an_euroc_folder_reads_back(world: World, tmp_path: Path) -> None:
+    motion = turned(hand_held(duration_s=1.0, start_ns=1_403_715_524_907_143_219), R_FLU_EUROC_IMU)
+    rig = euroc_like_rig()
+    simulation = simulate(world, rig, motion, rate_hz=2.0, imu=ImuNoise())
+    recording = SimulatedRecording(simulation)
+    export_euroc(recording, tmp_path / "out")
+    mav = tmp_path / "out" / "mav0"
+    for name, camera, T in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
+        text = (mav / name / "sensor.yaml").read_text().replace("%YAML:1.0", "")
+        sensor = yaml.safe_load(text)
+        np.testing.assert_array_equal(np.reshape(sensor["T_BS"]["data"], (4, 4)), T)
+        assert sensor["intrinsics"] == [camera.fu, camera.fv, camera.cu, camera.cv]
+        assert tuple(sensor["distortion_coefficients"]) == camera.coefficients
+        assert sensor["distortion_model"] == "radial-tangential"
+        assert sensor["resolution"] == [752, 480]
+        rows = list(csv.reader((mav / name / "data.csv").read_text().splitlines()[1:]))
+        assert [int(row[0]) for row in rows] == simulation.stamps_ns.tolist()
+        image = cv2.imread(str(mav / name / "data" / rows[1][1]), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(image, recording.images(1)[int(name[-1])])
+    imu = np.loadtxt(mav / "imu0" / "data.csv", delimiter=",", comments="#", usecols=range(1, 7))
+    assert simulation.imu is not None
+    np.testing.assert_array_equal(imu, np.hstack([simulation.imu.gyro, simulation.imu.accel]))
+    state = np.loadtxt(mav / "state_groundtruth_estimate0" / "data.csv", delimiter=",", comments="#")
+    assert state.shape[1] == 17
+    truth = recording.true_state(motion.start_ns)
+    np.testing.assert_allclose(state[0, 1:4], truth.T_world_imu[:3, 3])
+    np.testing.assert_allclose(rotation_from_quat_xyzw(state[0, [5, 6, 7, 4]]), truth.T_world_imu[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(state[0, 8:11], truth.velocity_world, atol=1e-12)
+    np.testing.assert_allclose(state[0, 11:14], truth.gyro_bias)
+
+
+def test_folders_appear_whole_or_not_at_all(plain: Simulation, tmp_path: Path) -> None:
+    class Interrupted(Exception):  # noqa: N818
+        pass
+
+    def stop(done: int, _: int) -> None:
+        if done == 2:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        export_kitti(_short(plain), tmp_path / "out", progress=stop)
+    assert list(tmp_path.iterdir()) == []
+    export_kitti(_short(plain, 1), tmp_path / "out")
+    with pytest.raises(VioError, match="exists already"):
+        export_kitti(_short(plain, 1), tmp_path / "out")
+    export_kitti(_short(plain, 2), tmp_path / "out", replace=True)
+    assert len(list((tmp_path / "out" / "image_0").iterdir())) == 2
+
+
+def test_targets_that_cannot_be_written_are_named(plain: Simulation, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(VioError, match="cannot write"):
+        export_kitti(_short(plain, 1), tmp_path / "file" / "out")
+    if os.geteuid() != 0:
+        (tmp_path / "locked").mkdir(mode=0o500)
+        with pytest.raises(VioError, match="cannot write"):
+            export_kitti(_short(plain, 1), tmp_path / "locked" / "out")
+
+
+def test_exports_say_what_they_need(world: World, tmp_path: Path) -> None:
+    with pytest.raises(SimulationError, match="needs an IMU"):
+        export_euroc(SimulatedRecording(simulate(world, RIG, MOTION)), tmp_path / "a")
+    motion = turned(hand_held(duration_s=1.0), R_FLU_EUROC_IMU)
+    with pytest.raises(SimulationError, match="rectified rig"):
+        export_kitti(SimulatedRecording(simulate(world, euroc_like_rig(), motion)), tmp_path / "b")
+    assert list(tmp_path.iterdir()) == []
