@@ -349,3 +349,21 @@ def test_the_map_grows_without_losing_a_landmark() -> None:
     kept = filt.landmarks()
     assert sorted(kept.ids) == list(range(900))
     assert np.isfinite(kept.p_world).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_garbage_ends_in_an_error_of_ours_or_in_numbers(seed: int) -> None:
+    """Features that jump about at random, with gaps: never a NaN passed on, never a foreign exception."""
+    rng = np.random.default_rng(seed)
+    filt = Vislam(CAMERA, T_CAM0_IMU, VislamSettings(), motion_sensor=False)
+    for k in range(120):
+        n = int(rng.integers(0, 6))
+        z = np.column_stack([rng.uniform(100, 1200, n), rng.uniform(0, 375, n), np.zeros((n, 2))])
+        z[:, 2], z[:, 3] = z[:, 0] - rng.uniform(1, 90, n), z[:, 1]
+        try:
+            filt.update(observations(k, k * 7 * TAU_NS, rng.permutation(12)[:n], z))
+        except EstimationError as error:
+            assert f"frame {k}" in str(error)
+            return
+        assert np.isfinite(filt.estimate().T_world_imu).all()
+        assert np.isfinite(filt.estimate().covariance).all()

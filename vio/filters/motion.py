@@ -155,8 +155,8 @@ class DriftingTwist:
         return state.corrected(K @ residual, IKH @ Sigma @ IKH.T + K @ self._sensor @ K.T)
 
     def released(self, state: PoseState, tau_s: float) -> PoseState:
-        """Return the state with as much doubt about the last step's twist as at the start."""
-        start = np.diag(self._start)
+        """Return the state with at least as much doubt about the last step's twist as at the start."""
+        start = np.diag(np.maximum(self._start - np.diag(state.Sigma)[6:], 0.0))
         doubt = np.block([[start * tau_s**2, -start * tau_s], [-start * tau_s, start]])
         return replace(state, Sigma=state.Sigma + doubt)
 

@@ -36,6 +36,7 @@ from vio.records import (
 log = logging.getLogger(__name__)
 
 _MIN_DEPTH_M = 0.3
+_MIN_FEATURES = 3  # fewer points leave a pose undetermined, and a single wrong one would steer it
 
 
 def z_D_landmark(camera: StereoCamera, T_cam0_imu: FloatArray, U: FloatArray, m: FloatArray) -> FloatArray:
@@ -211,6 +212,10 @@ class Vislam:
             nis_per_dof=nis_per_dof,
         )
 
+    def _lost(self, frame_index: int) -> str:
+        remedy = "" if self._settings.motion_model == "input" else "; give it velocities, or stop before that frame"
+        return f"vislam diverged at frame {frame_index}: too few features for too long, or too many wrong ones{remedy}"
+
     def estimate(self) -> Estimate:
         """Return the pose at the time of the last frame."""
         U, twist = self._state.U, self._state.twist
@@ -237,7 +242,8 @@ class Vislam:
         m, P = self._map.m[slots], self._map.P[slots]
         residual, nis = self._innovation(z, m, P)
         accepted: BoolArray = nis <= self._gate
-        if 2 * accepted.sum() < len(z) and isinstance(self._motion, DriftingTwist):
+        outvoted = len(z) >= _MIN_FEATURES and 2 * accepted.sum() < len(z)
+        if outvoted and isinstance(self._motion, DriftingTwist):
             # When most features contradict the motion model, it is the model that is wrong.
             self._state = self._motion.released(self._state, step_s)
             residual, nis = self._innovation(z, m, P)
@@ -249,7 +255,7 @@ class Vislam:
         nis_per_dof = float(nis[accepted].mean() / 4)
         m, P, z, slots = m[accepted], P[accepted], z[accepted], slots[accepted]
 
-        if self._settings.mode == "slam":
+        if self._settings.mode == "slam" and len(z) >= _MIN_FEATURES:
             self._pose_update(z, m, P)
         H_m = z_D_landmark(camera, T_cam0_imu, self._state.U, m)
         residual = z - project(camera, transform_points(T_cam0_imu @ self._state.U, m))
