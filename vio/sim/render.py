@@ -27,10 +27,10 @@ from vio.sim.world import Surfaces, World, surfaces_at
 
 Radiance: TypeAlias = npt.NDArray[np.float32]
 
-_TILE = 32  # pixels
-_COARSE = 4  # tiles along a coarse tile
+_TILE = 64  # pixels
+_COARSE = 2  # tiles along a coarse tile
 # Tiles shaded in one go; sample positions within a pixel follow the ray derivative at the middle of the run.
-_RUN: dict[DistortionModel, int] = {"pinhole": 8, "radtan": 4, "equidistant": 2}
+_RUN: dict[DistortionModel, int] = {"pinhole": 4, "radtan": 2, "equidistant": 1}
 _EDGE_MARK, _NONE = np.int16(-1), np.int16(-2)
 _EMPTY = np.float32(90.0)  # gray level where no surface is hit
 _LOD_STEP = 4  # pixels between evaluations of the level of detail
