@@ -21,6 +21,18 @@ def _kitti(path: Path, settings: DatasetSettings) -> Dataset:
     return read_kitti(path, settings)
 
 
+def _euroc(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.euroc import read_euroc
+
+    return read_euroc(path, settings)
+
+
+def _kitti_raw(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.kitti_raw import read_kitti_raw
+
+    return read_kitti_raw(path, settings)
+
+
 def _ece276a(path: Path, settings: DatasetSettings) -> Dataset:
     from vio.datasets.ece276a import read_ece276a
 
@@ -41,12 +53,15 @@ def _log(path: Path, settings: DatasetSettings) -> Dataset:
 
 READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
     "kitti": _kitti,
+    "kitti_raw": _kitti_raw,
+    "euroc": _euroc,
     "ece276a": _ece276a,
     "utias": _utias,
     "log": _log,
 }
 _LOOKED_FOR = (
-    "a KITTI folder (image_0 image_1 calib.txt times.txt), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
+    "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
+    "(mav0), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
 )
 
 
@@ -94,7 +109,9 @@ def _detect(path: Path) -> str:
 
 
 def _folder_kind(path: Path) -> str | None:
+    from vio.datasets.euroc import is_euroc_folder
     from vio.datasets.kitti import is_kitti_folder
+    from vio.datasets.kitti_raw import is_kitti_raw_folder
 
     try:
         names = sorted(child.name for child in path.iterdir())
@@ -104,6 +121,10 @@ def _folder_kind(path: Path) -> str | None:
         raise DataError(f"{path} is empty; give {_LOOKED_FOR}")
     if is_kitti_folder(path):
         return "kitti"
+    if is_kitti_raw_folder(path):
+        return "kitti_raw"
+    if is_euroc_folder(path):
+        return "euroc"
     if "sequences" in names:
         raise DataError(f"{path} holds several KITTI sequences; name one of them, such as {path / 'sequences' / '00'}")
     return None

@@ -2,7 +2,7 @@
 
 Pixels: u right, v down, the centre of the top-left pixel is (0, 0). Rays and points are in the camera frame
 (x right, y down, z forward).
-References: Brown, Close-range camera calibration (1971), as written by OpenCV and EuRoC with `k1 k2 p1 p2`;
+References: Brown, Close-range camera calibration (1971), as written by OpenCV, EuRoC and KITTI with `k1 k2 p1 p2 [k3]`;
 Kannala & Brandt, A generic camera model (2006), with `k1 k2 k3 k4` on the angle, as OpenCV's fisheye model.
 """
 
@@ -21,7 +21,7 @@ from vio.geometry.stereo import StereoCamera
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 DistortionModel: TypeAlias = Literal["pinhole", "radtan", "equidistant"]
 
-_COEFFICIENTS: dict[DistortionModel, int] = {"pinhole": 0, "radtan": 4, "equidistant": 4}
+_COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
 _RECTIFIED_TOLERANCE = 1e-9
@@ -38,7 +38,7 @@ class CameraModel:
     width: int  # pixels
     height: int  # pixels
     model: DistortionModel = "pinhole"
-    coefficients: tuple[float, ...] = ()  # radtan: k1 k2 p1 p2; equidistant: k1 k2 k3 k4; pinhole: none
+    coefficients: tuple[float, ...] = ()  # radtan: k1 k2 p1 p2 [k3]; equidistant: k1 k2 k3 k4; pinhole: none
 
     def __post_init__(self) -> None:
         if self.model not in _COEFFICIENTS:
@@ -52,9 +52,10 @@ class CameraModel:
                 f"{self.width}x{self.height}"
             )
         expected = _COEFFICIENTS[self.model]
-        if len(self.coefficients) != expected:
+        if len(self.coefficients) not in expected:
             raise CalibrationError(
-                f"the {self.model} model takes {expected} distortion coefficients, got {len(self.coefficients)}"
+                f"the {self.model} model takes {expected[0]} distortion coefficients"
+                f"{''.join(f' or {n}' for n in expected[1:])}, got {len(self.coefficients)}"
             )
 
     @property
@@ -159,11 +160,17 @@ def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray,
     return ray / np.linalg.norm(ray, axis=-1, keepdims=True), valid
 
 
+def _five(coefficients: tuple[float, ...]) -> tuple[float, float, float, float, float]:
+    """The radial-tangential coefficients k1 k2 p1 p2 k3; a k3 that is not given is zero."""
+    k1, k2, p1, p2 = coefficients[:4]
+    return k1, k2, p1, p2, coefficients[4] if len(coefficients) == 5 else 0.0
+
+
 def _radtan(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
-    k1, k2, p1, p2 = coefficients
+    k1, k2, p1, p2, k3 = _five(coefficients)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * k2)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     return np.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -174,10 +181,10 @@ def _radtan(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
 
 
 def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
-    k1, k2, p1, p2 = coefficients
+    k1, k2, p1, p2, k3 = _five(coefficients)
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
-    radial, slope = 1 + r2 * (k1 + r2 * k2), 2 * k1 + 4 * k2 * r2
+    radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * k1 + r2 * (4 * k2 + r2 * 6 * k3)
     out = np.empty((*xy.shape[:-1], 2, 2))
     out[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     out[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
@@ -187,8 +194,8 @@ def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
 
 def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
     """Radius on the undistorted plane where the radial polynomial stops growing: the model folds back beyond it."""
-    k1, k2 = coefficients[:2]
-    roots = np.roots([5 * k2, 3 * k1, 1.0])
+    k1, k2, _, _, k3 = _five(coefficients)
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     positive = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
     return float(np.sqrt(min(positive))) if positive else np.inf
 

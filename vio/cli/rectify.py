@@ -1,0 +1,98 @@
+"""`vio rectify`: a folder of raw stereo images in, one of rectified images out."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+MARKER = "rectification.json"
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "rectify",
+        help="write a rectified folder",
+        description="Rectify the images of an EuRoC folder (written as an EuRoC folder with pinhole cameras, the same "
+        "IMU and ground truth) or of an unrectified KITTI raw drive (written as a KITTI odometry folder). `vio run` "
+        "needs no such folder, it rectifies as it reads; other programs may.",
+    )
+    parser.add_argument("source", metavar="SOURCE", help="an EuRoC folder or a KITTI raw drive, or kind:path")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, whole or not at all")
+    parser.add_argument(
+        "--interpolation",
+        choices=("linear", "cubic", "lanczos4"),
+        default="linear",
+        help="between pixels (default linear, as vio run does it)",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(execute=execute)
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    import json
+    import logging
+
+    from vio.atomic import atomic_folder
+    from vio.datasets import DatasetSettings, open_dataset
+    from vio.datasets.euroc import write_rectified_euroc
+    from vio.datasets.kitti_raw import write_rectified_kitti
+    from vio.datasets.rectified import RectifiedDataset, refuse_rectified
+    from vio.errors import DataError
+
+    dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation))
+    recording = dataset.recording
+    for note in recording.notes:
+        logging.getLogger(__name__).warning("%s", note)
+    writers = {"euroc": write_rectified_euroc, "kitti_raw": write_rectified_kitti}
+    if not isinstance(dataset, RectifiedDataset):
+        raise DataError(
+            f"{recording.path} is of kind {recording.kind}, which is rectified already: there is nothing to do; the "
+            f"kinds that may need it are {', '.join(writers)}"
+        )
+    refuse_rectified(dataset)
+    camera = recording.camera
+    facts = {
+        "kind": recording.kind,
+        "source": recording.path.absolute().name,
+        "interpolation": dataset.settings.interpolation,
+        "width": camera.width,
+        "height": camera.height,
+        "focal_px": camera.fu,
+        "baseline_m": camera.baseline_m,
+    }
+    with atomic_folder(args.out, replace=True, marker=MARKER) as folder:
+        with _bar(len(recording.frame_times_ns), recording.path.name) as advance:
+            frames = writers[recording.kind](dataset, folder, advance)
+        facts["frames"] = frames
+        (folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8", newline="\n")
+    if args.json:
+        print(json.dumps({"out": str(args.out), **facts}))
+        return 0
+    rows = (
+        ("folder", str(args.out)),
+        ("frames", f"{frames}"),
+        ("size", f"{camera.width} x {camera.height}"),
+        ("focal", f"{camera.fu:.4f} px"),
+        ("baseline", f"{camera.baseline_m:.6f} m"),
+    )
+    for name, value in rows:
+        print(f"{name:<10} {value}")
+    return 0
+
+
+@contextlib.contextmanager
+def _bar(frames: int, label: str) -> Iterator[Callable[[], None]]:
+    """A progress bar on stderr; silent where stderr is no terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
+        task = progress.add_task(label, total=frames)
+        yield lambda: progress.advance(task)

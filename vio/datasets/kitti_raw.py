@@ -1,0 +1,348 @@
+"""KITTI raw drives: gray images of cameras 00 and 01 with KITTI's three calibration files.
+
+`DRIVE/image_00/data/0000000000.png`, `DRIVE/image_01/data/…`, and `calib_cam_to_cam.txt calib_velo_to_cam.txt
+calib_imu_to_velo.txt` in the drive or a folder above it, as KITTI lays them out by date. The drives named `_extract`
+are unrectified: they are rectified as they are read, with rotations of our own (`R_rect_00` and `P_rect_00` belong to
+KITTI's). The drives named `_sync` are rectified already, and taken with `P_rect_00`, `P_rect_01` and `R_rect_00`; the
+size of the images tells one from the other.
+
+In KITTI's files `R_0k`, `T_0k` map coordinates of camera 0 to camera k. The IMU's record (`oxts`) is not read.
+Reference: Geiger et al., Vision meets robotics: the KITTI dataset (2013).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.common import NS_PER_S, checked_transform, text_lines
+from vio.datasets.images import UnreadableImageError, load_gray, pair_images
+from vio.datasets.rectified import RectifiedDataset, Rectifier, make_rectifier, write_frames
+from vio.datasets.settings import DatasetSettings
+from vio.errors import CalibrationError, DataError
+from vio.geometry.distortion import CameraModel, StereoRig
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.records import IntArray, Recording, StereoFrame
+
+CAMERAS = "calib_cam_to_cam.txt"
+VELO = "calib_velo_to_cam.txt"
+IMU = "calib_imu_to_velo.txt"
+_FRAME_NS = 100_000_000
+_MAX_PARENTS = 3
+_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+
+
+@dataclass(frozen=True, slots=True)
+class KittiRawCalibration:
+    """The calibration of the gray pair, raw and as KITTI rectified it."""
+
+    cam0: CameraModel  # raw
+    cam1: CameraModel  # raw
+    T_cam1_cam0: FloatArray  # (4, 4) between the raw cameras
+    rect0: CameraModel  # of the rectified images, pinhole
+    rect1: CameraModel
+    T_rect1_rect0: FloatArray  # (4, 4)
+    R_rect_cam0: FloatArray  # (3, 3) from the raw to the rectified left camera
+    R_rect_cam1: FloatArray  # (3, 3)
+
+
+def is_kitti_raw_folder(path: Path) -> bool:
+    """Say whether a folder looks like a drive of KITTI raw."""
+    return (path / "image_00").is_dir()
+
+
+def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
+    """Read the gray pair of a KITTI raw drive.
+
+    Raises:
+        DataError: images are missing, counts differ or a clock is wrong; the message names file and remedy.
+        CalibrationError: the calibration is missing or cannot be right.
+    """
+    for name in ("image_00", "image_01"):
+        if not (path / name / "data").is_dir():
+            raise DataError(
+                f"{path}: holds no {name}/data; give a KITTI raw drive with image_00/data and image_01/data"
+            )
+    pairs = pair_images(path / "image_00" / "data", path / "image_01" / "data")
+    calibration_path = _find(path, CAMERAS)
+    if calibration_path is None:
+        raise CalibrationError(
+            f"{path}: {CAMERAS} is neither there nor in the folders above; copy KITTI's calibration of that day there"
+        )
+    calibration = read_cam_to_cam(calibration_path)
+    T_cam0_imu, imu_notes = _read_imu_pose(path)
+    numbers = _frame_numbers(pairs)
+    times_ns, time_notes = _read_times(path / "image_00" / "timestamps.txt", numbers)
+    rectifier = _rectifier(calibration, T_cam0_imu, pairs, settings, calibration_path)
+    recording = Recording(
+        kind="kitti_raw",
+        path=path,
+        camera=rectifier.camera,
+        T_cam0_imu=None if T_cam0_imu is None else rectifier.T_rect0_imu,
+        frame_times_ns=times_ns,
+        has_images=True,
+        motion=frozenset(),
+        reference=None,
+        notes=(*time_notes, *imu_notes),
+    )
+    return RectifiedDataset(recording, pairs, (), rectifier, (calibration_path, calibration_path), settings)
+
+
+def _find(path: Path, name: str) -> Path | None:
+    """A calibration file in a folder or in those above it."""
+    absolute = path.absolute()
+    folders = [absolute, *absolute.parents[:_MAX_PARENTS]]
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+
+
+def _rectifier(
+    calibration: KittiRawCalibration,
+    T_cam0_imu: FloatArray | None,
+    pairs: tuple[tuple[Path, Path], ...],
+    settings: DatasetSettings,
+    where: Path,
+) -> Rectifier:
+    """Rectify raw images; pass those through that KITTI has rectified, which their size betrays."""
+    c = calibration
+    T_imu_cam0 = np.eye(4) if T_cam0_imu is None else se3_inverse(T_cam0_imu)
+    raw, rectified = (c.cam0.width, c.cam0.height), (c.rect0.width, c.rect0.height)
+    size = _image_size(pairs, settings.max_bad_frames)
+    if size == rectified and raw != rectified:
+        T_imu_rect0 = T_imu_cam0 @ se3_from_parts(c.R_rect_cam0.T, np.zeros(3))
+        rig = StereoRig(c.rect0, c.rect1, T_imu_rect0, T_imu_rect0 @ se3_inverse(c.T_rect1_rect0))
+    elif size == raw:
+        rig = StereoRig(c.cam0, c.cam1, T_imu_cam0, T_imu_cam0 @ se3_inverse(c.T_cam1_cam0))
+    else:
+        raise DataError(
+            f"{pairs[0][0].parent}: images are {size[0]} x {size[1]} pixels but {where} is for {raw[0]} x {raw[1]} "
+            f"(raw) or {rectified[0]} x {rectified[1]} (rectified); give the calibration of these images"
+        )
+    return make_rectifier(rig, settings.interpolation, where)
+
+
+def _image_size(pairs: tuple[tuple[Path, Path], ...], max_bad_frames: int) -> tuple[int, int]:
+    """Width and height of the first readable left image."""
+    for index, (left, _) in enumerate(pairs):
+        try:
+            image, _ = load_gray(left)
+        except UnreadableImageError:
+            if index >= max_bad_frames or index + 1 == len(pairs):
+                raise
+            continue
+        return image.shape[1], image.shape[0]
+    raise DataError("no image pair")  # pair_images gives at least one
+
+
+# --- calibration ----------------------------------------------------------------------------------------------------
+
+
+def read_cam_to_cam(path: Path) -> KittiRawCalibration:
+    """Read the gray pair's entries of `calib_cam_to_cam.txt`.
+
+    Raises:
+        CalibrationError: an entry is missing, malformed or impossible.
+    """
+    entries = _read_entries(path)
+    raw, rect = [], []
+    for k in ("00", "01"):
+        width, height = _entry(entries, f"S_{k}", 2, path)
+        K = _entry(entries, f"K_{k}", 9, path)
+        D = _entry(entries, f"D_{k}", 5, path)
+        raw.append(_camera(K.reshape(3, 3), width, height, tuple(D.tolist()), f"{path}, camera {k}"))
+        width, height = _entry(entries, f"S_rect_{k}", 2, path)
+        P = _entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4)
+        rect.append(_camera(P[:, :3], width, height, (), f"{path}, P_rect_{k}"))
+    offsets = [
+        np.linalg.solve(P[:, :3], P[:, 3])
+        for P in (_entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4) for k in ("00", "01"))
+    ]
+    return KittiRawCalibration(
+        cam0=raw[0],
+        cam1=raw[1],
+        T_cam1_cam0=_rigid(entries, "01", path) @ se3_inverse(_rigid(entries, "00", path)),
+        rect0=rect[0],
+        rect1=rect[1],
+        T_rect1_rect0=se3_from_parts(np.eye(3), offsets[1] - offsets[0]),
+        R_rect_cam0=_rotation(entries, "R_rect_00", path),
+        R_rect_cam1=_rotation(entries, "R_rect_01", path),
+    )
+
+
+def _camera(K: FloatArray, width: float, height: float, coefficients: tuple[float, ...], where: str) -> CameraModel:
+    if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=1e-9):
+        raise CalibrationError(f"{where}: no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1]; check the order")
+    try:
+        return CameraModel(
+            float(K[0, 0]),
+            float(K[1, 1]),
+            float(K[0, 2]),
+            float(K[1, 2]),
+            int(width),
+            int(height),
+            "radtan" if coefficients else "pinhole",
+            coefficients,
+        )
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from error
+
+
+def _rigid(entries: Mapping[str, str], k: str, path: Path) -> FloatArray:
+    """`R_k T_k`: from the coordinates of camera 0 to those of camera k."""
+    R, t = _entry(entries, f"R_{k}", 9, path).reshape(3, 3), _entry(entries, f"T_{k}", 3, path)
+    return checked_transform(np.column_stack([R, t]), f"{path}, R_{k}")
+
+
+def _rotation(entries: Mapping[str, str], name: str, path: Path) -> FloatArray:
+    R = _entry(entries, name, 9, path).reshape(3, 3)
+    return checked_transform(np.column_stack([R, np.zeros(3)]), f"{path}, {name}")[:3, :3]
+
+
+def _read_imu_pose(path: Path) -> tuple[FloatArray | None, tuple[str, ...]]:
+    """`T_cam0_imu` (4, 4) of the raw camera 0, by way of the laser scanner; None where a file is missing."""
+    velo, imu = _find(path, VELO), _find(path, IMU)
+    if velo is None or imu is None:
+        lacking = " and ".join(name for name, found in ((VELO, velo), (IMU, imu)) if found is None)
+        return None, (f"{path}: {lacking} not found; the pose of the IMU is unknown, and poses describe the camera",)
+    T_cam0_velo, T_velo_imu = (_read_rigid(file) for file in (velo, imu))
+    return T_cam0_velo @ T_velo_imu, ()
+
+
+def _read_rigid(path: Path) -> FloatArray:
+    entries = _read_entries(path)
+    R, t = _entry(entries, "R", 9, path).reshape(3, 3), _entry(entries, "T", 3, path)
+    return checked_transform(np.column_stack([R, t]), f"{path}, R")
+
+
+def _read_entries(path: Path) -> dict[str, str]:
+    """The lines `name: values`.
+
+    Raises:
+        CalibrationError: a line is of another form, or a name occurs twice.
+    """
+    entries: dict[str, str] = {}
+    for number, line in text_lines(path):
+        name, colon, values = line.partition(":")
+        if not line.strip():
+            continue
+        if not colon or name in entries:
+            what = "repeats an entry" if colon else "is not of the form 'name: values'"
+            raise CalibrationError(f"{path}, line {number}: {what} ({line[:40]!r}); copy the calibration again")
+        entries[name] = values
+    return entries
+
+
+def _entry(entries: Mapping[str, str], name: str, count: int, path: Path) -> FloatArray:
+    if name not in entries:
+        raise CalibrationError(f"{path}: has no entry {name}; copy the calibration again")
+    try:
+        values = np.array([float(value) for value in entries[name].split()])
+    except ValueError as error:
+        raise CalibrationError(f"{path}: {name} holds no number ({error}); copy the calibration again") from error
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise CalibrationError(f"{path}: {name} holds {len(values)} values where {count} finite ones belong")
+    return values
+
+
+# --- clock ----------------------------------------------------------------------------------------------------------
+
+
+def _frame_numbers(pairs: tuple[tuple[Path, Path], ...]) -> IntArray:
+    """The numbers (F,) that the images are named by."""
+    bad = next((left for left, _ in pairs if not left.stem.isdecimal()), None)
+    if bad is not None:
+        raise DataError(f"{bad}: an image of KITTI raw is named by its frame number (0000000000.png); rename it")
+    numbers = np.array([int(left.stem) for left, _ in pairs], dtype=np.int64)
+    if (np.diff(numbers) <= 0).any():
+        k = int(np.argmax(np.diff(numbers) <= 0))
+        raise DataError(
+            f"{pairs[k + 1][0]}: its frame number does not increase after {pairs[k][0].name}; name all images with the "
+            "same number of digits"
+        )
+    return numbers
+
+
+def _read_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...]]:
+    """Times (F,) of the images, and a note where they had to be made up."""
+    if not path.is_file():
+        note = f"{path} is missing; times follow from the frame numbers at 10 Hz"
+        return numbers * _FRAME_NS, (note,)
+    lines = text_lines(path)
+    if len(lines) == len(numbers):
+        rows = list(range(len(numbers)))
+    elif numbers[-1] < len(lines):
+        rows = numbers.tolist()
+    else:
+        raise DataError(
+            f"{path} holds {len(lines)} times for {len(numbers)} images up to number {numbers[-1]}; there must be one "
+            "line an image, or one for each frame of the drive"
+        )
+    times = [_parse_time(lines[row][1], path, lines[row][0]) for row in rows]
+    for k in range(1, len(times)):
+        if times[k] <= times[k - 1]:
+            what = "repeats" if times[k] == times[k - 1] else "runs backwards"
+            raise DataError(f"{path}, line {lines[rows[k]][0]}: the clock {what}; remove or reorder that entry")
+    return np.array(times, dtype=np.int64), ()
+
+
+def _parse_time(text: str, path: Path, number: int) -> int:
+    """Nanoseconds since 1970 of '2011-09-26 14:02:25.951199337', taken as UTC."""
+    whole, _, fraction = text.strip().partition(".")
+    try:
+        since = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc) - _EPOCH
+        if fraction and not (fraction.isdecimal() and len(fraction) <= 9):
+            raise ValueError(fraction)
+    except ValueError as error:
+        raise DataError(
+            f"{path}, line {number}: {text.strip()[:40]!r} is no time of the form '2011-09-26 14:02:25.951199337'"
+        ) from error
+    return since // timedelta(seconds=1) * NS_PER_S + int(fraction.ljust(9, "0") or 0)
+
+
+# --- writing --------------------------------------------------------------------------------------------------------
+
+
+def write_rectified_kitti(dataset: RectifiedDataset, out: Path, progress: Callable[[], None]) -> int:
+    """Write a drive as a KITTI odometry folder: `image_0 image_1 calib.txt times.txt` and `T_cam0_imu.txt`.
+
+    Args:
+        dataset: an unrectified drive.
+        out: an existing, empty folder.
+        progress: called after each frame.
+
+    Returns:
+        The number of frames written.
+
+    Raises:
+        DataError: too many images are unreadable.
+    """
+    folders = [out / name for name in ("image_0", "image_1")]
+    for folder in folders:
+        folder.mkdir()
+
+    def name(frame: StereoFrame, count: int) -> tuple[Path, Path]:
+        return folders[0] / f"{count:06d}.png", folders[1] / f"{count:06d}.png"
+
+    times_ns = write_frames(dataset, name, progress)
+    camera, T_cam0_imu = dataset.recording.camera, dataset.recording.T_cam0_imu
+    P0 = np.column_stack([camera.K, np.zeros(3)])
+    P1 = P0.copy()
+    P1[0, 3] = -camera.fu * camera.baseline_m
+    _write(out / "calib.txt", [f"P{k}: {_numbers(P)}" for k, P in enumerate((P0, P1))])
+    elapsed = (times_ns - times_ns[0]).tolist()
+    _write(out / "times.txt", [f"{t // NS_PER_S}.{t % NS_PER_S:09d}" for t in elapsed])
+    if T_cam0_imu is not None:
+        _write(out / "T_cam0_imu.txt", [_numbers(row) for row in T_cam0_imu])
+    return len(times_ns)
+
+
+def _numbers(values: FloatArray) -> str:
+    """All digits, so that reading gives back the same bits."""
+    return " ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
