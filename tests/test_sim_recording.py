@@ -22,12 +22,12 @@ from vio.sim.effects import CLEAN, SensorEffects, develop, exposed
 from vio.sim.errors import SimulationError
 from vio.sim.export import export_euroc, export_kitti
 from vio.sim.imu import ImuNoise, VelocityNoise
-from vio.sim.motion import hand_held, turned
+from vio.sim.motion import car_loop, hand_held, turned
 from vio.sim.oracle import OracleFrontend, OracleSettings
 from vio.sim.render import Radiance, correspondence
-from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_like_rig, small_rig
+from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_like_rig, kitti_like_rig, small_rig
 from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate, views
-from vio.sim.world import World, corridor, room
+from vio.sim.world import World, corridor, room, street
 
 RIG = small_rig(192, 120)
 MOTION = hand_held(duration_s=4.0)
@@ -395,3 +395,18 @@ def test_exports_say_what_they_need(world: World, tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match="rectified rig"):
         export_kitti(SimulatedRecording(simulate(world, euroc_like_rig(), motion)), tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_documented_example_runs() -> None:
+    text = (Path(__file__).resolve().parent.parent / "docs" / "simulation.md").read_text(encoding="utf-8")
+    scope: dict[str, object] = {}
+    exec(text.split("```python\n")[1].split("```")[0], scope)
+    assert np.asarray(scope["visible"]).all()
+    assert scope["left"].shape == (180, 320)  # type: ignore[attr-defined]
+    assert len(scope["seen"]) > 90  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_ready_scenes_leave_room_for_ready_motions(seed: int) -> None:
+    simulate(room(seed), small_rig(), hand_held(seed=seed))
+    simulate(street(seed), kitti_like_rig(), car_loop(seed=seed), rate_hz=10.0)
