@@ -195,9 +195,10 @@ def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
 def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
     """Radius on the undistorted plane where the radial polynomial stops growing: the model folds back beyond it."""
     k1, k2, _, _, k3 = _five(coefficients)
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
-    positive = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 0]
-    return float(np.sqrt(min(positive))) if positive else np.inf
+    # In 1/r^2 the polynomial is monic, so that no coefficient is too small to divide by.
+    roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+    inverse = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 1e-12]
+    return float(1 / np.sqrt(max(inverse))) if inverse else np.inf
 
 
 def _undistort_radtan(coefficients: tuple[float, ...], target: FloatArray) -> tuple[FloatArray, BoolArray]:

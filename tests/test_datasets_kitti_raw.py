@@ -1,0 +1,297 @@
+"""KITTI raw drives: the calibration means what KITTI's own images show, clocks are exact, every flaw is named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.euroc_maker import KITTI_RIG, RECT_SIZE, T_CAM0_VELO, T_VELO_IMU, make_kitti_raw
+from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.images import load_gray
+from vio.datasets.kitti_raw import KittiRawCalibration, read_cam_to_cam, read_kitti_raw
+from vio.datasets.rectified import RectifiedDataset
+from vio.errors import CalibrationError, DataError
+from vio.geometry.distortion import CameraModel, StereoRig, project_point
+from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_log
+from vio.geometry.rectify import rectify, rectifying_rotations
+from vio.records import StereoFrame
+
+
+def _read(path: Path) -> RectifiedDataset:
+    return read_kitti_raw(path, DatasetSettings())
+
+
+def _frames(dataset: RectifiedDataset) -> list[StereoFrame]:
+    return [event for event in dataset.events() if isinstance(event, StereoFrame)]
+
+
+@pytest.mark.parametrize("above", [False, True], ids=["calibration beside", "calibration above"])
+def test_calibration_is_read(above: bool, tmp_path: Path) -> None:
+    path = make_kitti_raw(tmp_path, above=above)
+    recording = open_dataset(path).recording
+    expected = rectify(replace(KITTI_RIG, T_imu_cam0=np.eye(4), T_imu_cam1=KITTI_RIG.T_cam0_cam1))
+    assert recording.kind == "kitti_raw"
+    assert recording.motion == frozenset()
+    assert recording.reference is None
+    assert recording.camera.fu == pytest.approx(expected.camera.fu, rel=1e-9)
+    assert recording.camera.baseline_m == pytest.approx(expected.camera.baseline_m, rel=1e-9)
+    assert (recording.camera.width, recording.camera.height) == (64, 48)
+    assert recording.T_cam0_imu is not None
+    np.testing.assert_allclose(recording.T_cam0_imu, expected.T_rect0_imu @ T_CAM0_VELO @ T_VELO_IMU, atol=1e-9)
+    assert open_dataset(f"kitti_raw:{path}").recording.camera == recording.camera
+
+
+def test_frames_are_rectified_as_opencv_would(tmp_path: Path) -> None:
+    dataset = _read(make_kitti_raw(tmp_path))
+    camera, rig = dataset.recording.camera, dataset.rectifier.rig
+    for frame in _frames(dataset):
+        for image, path, model, R in zip(
+            (frame.left, frame.right),
+            dataset.pairs[frame.index],
+            (rig.cam0, rig.cam1),
+            rectifying_rotations(rig)[:2],
+            strict=True,
+        ):
+            assert image is not None
+            D = np.array([model.coefficients])
+            maps = cv2.initUndistortRectifyMap(model.K, D, R, camera.K, (64, 48), cv2.CV_32FC1)
+            expected = cv2.remap(load_gray(path)[0], *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            difference = np.abs(image.astype(int) - expected.astype(int))
+            assert difference.max() <= 3
+            assert (difference > 1).mean() < 0.002
+
+
+def test_images_that_kitti_rectified_are_passed_through(tmp_path: Path) -> None:
+    dataset = _read(make_kitti_raw(tmp_path, rectified=True))
+    camera = dataset.recording.camera
+    assert (camera.fu, camera.cu, camera.cv) == (38.0, 27.0, 19.0)
+    assert camera.baseline_m == pytest.approx(0.11, abs=1e-9)
+    assert (camera.width, camera.height) == RECT_SIZE
+    assert dataset.recording.T_cam0_imu is not None
+    R_rect = so3_exp([0.004, 0.01, -0.002])
+    expected = (R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, :3], R_rect @ (T_CAM0_VELO @ T_VELO_IMU)[:3, 3])
+    np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, :3], expected[0], atol=1e-9)
+    np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, 3], expected[1], atol=1e-9)
+    for frame in _frames(dataset):
+        np.testing.assert_array_equal(frame.left, load_gray(dataset.pairs[frame.index][0])[0])
+
+
+def test_without_the_laser_scanner_the_body_is_the_camera(tmp_path: Path) -> None:
+    make_kitti_raw(tmp_path)
+    (tmp_path / "calib_imu_to_velo.txt").unlink()
+    recording = _read(tmp_path).recording
+    assert recording.T_cam0_imu is None
+    assert any("calib_imu_to_velo.txt not found" in note for note in recording.notes)
+
+
+# --- clock ----------------------------------------------------------------------------------------------------------
+
+
+def test_times_follow_from_frame_numbers_where_there_are_none(tmp_path: Path) -> None:
+    recording = _read(make_kitti_raw(tmp_path, [7, 8, 10])).recording
+    assert recording.frame_times_ns.tolist() == [700_000_000, 800_000_000, 1_000_000_000]
+    assert "timestamps.txt is missing; times follow from the frame numbers at 10 Hz" in recording.notes[0]
+
+
+def _stamp(k: int) -> str:
+    return f"2011-09-26 14:02:{25 + k // 10}.{k % 10}51199337"
+
+
+@pytest.mark.parametrize(("lines", "rows"), [(3, [0, 1, 2]), (12, [7, 8, 10])], ids=["an image", "whole drive"])
+def test_timestamps_are_read_to_the_nanosecond(lines: int, rows: list[int], tmp_path: Path) -> None:
+    path = make_kitti_raw(tmp_path, [7, 8, 10])
+    (path / "image_00" / "timestamps.txt").write_text("".join(f"{_stamp(k)}\n" for k in range(lines)))
+    recording = _read(path).recording
+    assert recording.notes == ()
+    first = 1317045745_051199337  # 2011-09-26 14:02:25.051199337 UTC
+    assert recording.frame_times_ns.tolist() == [first + 100_000_000 * k for k in rows]
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------
+
+Spoil = Callable[[Path], object]
+
+
+def _entry(name: str, values: str | None) -> Spoil:
+    def spoil(folder: Path) -> None:
+        path = folder / "calib_cam_to_cam.txt"
+        text, count = re.subn(
+            rf"^{name}:.*\n", "" if values is None else f"{name}: {values}\n", path.read_text(), flags=re.M
+        )
+        assert count == 1
+        path.write_text(text)
+
+    return spoil
+
+
+def _times(*lines: str) -> Spoil:
+    return lambda folder: (folder / "image_00" / "timestamps.txt").write_text("\n".join(lines) + "\n")
+
+
+BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
+    "no right camera": (
+        lambda d: (d / "image_01").rename(d / "image_03"),
+        DataError,
+        "holds no image_01/data; give a KITTI raw drive",
+    ),
+    "counts differ": (
+        lambda d: (d / "image_01/data/0000000101.png").unlink(),
+        DataError,
+        r"holds 4 images and .* 3: .*0000000101.png is missing",
+    ),
+    "no calibration": (
+        lambda d: (d / "calib_cam_to_cam.txt").unlink(),
+        CalibrationError,
+        "calib_cam_to_cam.txt is neither there nor in the folders above",
+    ),
+    "no K": (_entry("K_01", None), CalibrationError, "calib_cam_to_cam.txt: has no entry K_01"),
+    "short D": (_entry("D_00", "-0.3 0.2 0 0"), CalibrationError, "D_00 holds 4 values where 5 finite ones belong"),
+    "NaN in T": (_entry("T_01", "-0.5 nan 0"), CalibrationError, "T_01 holds 3 values where 3 finite ones belong"),
+    "text": (_entry("T_01", "-0.5 a 0"), CalibrationError, "T_01 holds no number"),
+    "no matrix": (_entry("K_00", "1 2 3 4 5 6 7 8 9"), CalibrationError, "camera 00: no intrinsic matrix"),
+    "negative focal": (
+        _entry("K_00", "-40 0 31 0 40 24 0 0 1"),
+        CalibrationError,
+        "camera 00: focal lengths and image size must be positive",
+    ),
+    "mirrored": (_entry("R_01", "1 0 0 0 1 0 0 0 -1"), CalibrationError, "R_01: not a rotation but a reflection"),
+    "swapped": (_entry("T_01", "0.11 0 0"), CalibrationError, "cam_to_cam.txt: .*the cameras may be swapped"),
+    "no baseline": (_entry("T_01", "0 0 0"), CalibrationError, "the baseline is zero"),
+    "twice": (
+        lambda d: (d / "calib_cam_to_cam.txt").write_text((d / "calib_cam_to_cam.txt").read_text() * 2),
+        CalibrationError,
+        "repeats an entry",
+    ),
+    "no form": (
+        lambda d: (d / "calib_velo_to_cam.txt").write_text("1 0 0\n"),
+        CalibrationError,
+        r"calib_velo_to_cam.txt, line 1: is not of the form 'name: values'",
+    ),
+    "another size": (
+        _entry("S_00", "100 80"),
+        DataError,
+        r"images are 64 x 48 pixels but .* is for 100 x 80 \(raw\) or 56 x 40 \(rectified\)",
+    ),
+    "names": (
+        lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/b.png") for k in (0, 1)],
+        DataError,
+        "b.png: an image of KITTI raw is named by its frame number",
+    ),
+    "digits": (
+        lambda d: [(d / f"image_0{k}/data/0000000100.png").rename(d / f"image_0{k}/data/99.png") for k in (0, 1)],
+        DataError,
+        "99.png: its frame number does not increase after 0000000103.png",
+    ),
+    "too few times": (_times(_stamp(0), _stamp(1)), DataError, "holds 2 times for 4 images up to number 103"),
+    "times repeat": (
+        _times(_stamp(0), _stamp(1), _stamp(1), _stamp(2)),
+        DataError,
+        "timestamps.txt, line 3: the clock repeats",
+    ),
+    "times backwards": (
+        _times(_stamp(0), _stamp(2), _stamp(1), _stamp(3)),
+        DataError,
+        "timestamps.txt, line 3: the clock runs backwards",
+    ),
+    "no times": (
+        _times(_stamp(0), "yesterday", _stamp(1), _stamp(3)),
+        DataError,
+        "line 2: 'yesterday' is no time of the form",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_drives_are_refused_in_one_line(case: str, tmp_path: Path) -> None:
+    spoil, kind, message = BAD[case]
+    spoil(make_kitti_raw(tmp_path))
+    with pytest.raises(kind, match=message) as caught:
+        open_dataset(tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+# --- the real drive -------------------------------------------------------------------------------------------------
+
+
+def _real(data_dir: Path) -> tuple[RectifiedDataset, KittiRawCalibration]:
+    folder = data_dir / "kitti_0039_unrectified"
+    return _read(folder), read_cam_to_cam(folder / "calib_cam_to_cam.txt")
+
+
+def test_real_rectification_agrees_with_kittis_but_for_a_turn_about_the_baseline(data_dir: Path) -> None:
+    dataset, published = _real(data_dir)
+    R_rect_cam0, R_rect_cam1, baseline_m = rectifying_rotations(dataset.rectifier.rig)
+    turns = []
+    for ours, theirs in ((R_rect_cam0, published.R_rect_cam0), (R_rect_cam1, published.R_rect_cam1)):
+        np.testing.assert_allclose(ours[0], theirs[0], atol=2e-6)  # KITTI prints seven digits
+        turns.append(so3_log(ours @ theirs.T))
+    np.testing.assert_allclose(turns[0], turns[1], atol=5e-6)
+    assert np.degrees(np.linalg.norm(turns[0])) < 0.5
+    assert baseline_m == pytest.approx(-published.T_rect1_rect0[0, 3], abs=2e-5)
+
+
+def _kitti_maps(model: CameraModel, rect: CameraModel, R: FloatArray) -> tuple[np.ndarray, np.ndarray]:
+    v, u = np.mgrid[0 : rect.height, 0 : rect.width]
+    rays = np.stack([(u - rect.cu) / rect.fu, (v - rect.cv) / rect.fv, np.ones(u.shape)], axis=-1)
+    uv, valid = project_point(model, rays @ R)
+    assert valid.all()
+    return uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
+
+
+def test_the_lens_model_reproduces_kittis_own_rectified_image(data_dir: Path) -> None:
+    """Frame 100 of the drive is image 76 of the rectified clip: equal to rounding, so order and signs are KITTI's."""
+    dataset, published = _real(data_dir)
+    models = (
+        (published.cam0, published.rect0, published.R_rect_cam0),
+        (published.cam1, published.rect1, published.R_rect_cam1),
+    )
+    for k, (raw_path, parts) in enumerate(zip(dataset.pairs[0], models, strict=True)):
+        ours = cv2.remap(load_gray(raw_path)[0], *_kitti_maps(*parts), cv2.INTER_LINEAR)
+        theirs = load_gray(data_dir / "kitti_0039" / f"image_{k}" / "000076.png")[0]
+        difference = (ours.astype(float) - theirs)[10:-10, 10:-10]
+        assert np.sqrt(np.mean(difference**2)) < 0.4
+
+
+def test_real_extrinsics_agree_with_the_odometry_folder(data_dir: Path) -> None:
+    """`T_cam0_imu` of the rectified clip is R_rect_00 T_cam0_velo T_velo_imu; ours differs by the known turn alone."""
+    dataset, published = _real(data_dir)
+    other = open_dataset(data_dir / "kitti_0039").recording.T_cam0_imu
+    assert other is not None
+    assert dataset.recording.T_cam0_imu is not None
+    R_rect_cam0 = rectifying_rotations(dataset.rectifier.rig)[0]
+    expected = R_rect_cam0 @ published.R_rect_cam0.T @ other[:3]
+    np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3], expected, atol=1e-4)
+
+
+def test_real_rows_are_as_good_as_kittis_own(data_dir: Path) -> None:
+    """KITTI's calibration of that day leaves rows half a pixel apart, in its own rectified images as in ours."""
+    from tools.check_rectification import match_sift
+
+    dataset, _ = _real(data_dir)
+    clip = open_dataset(data_dir / "kitti_0039")
+    medians = []
+    for source, index in ((dataset, 0), (clip, 76)):
+        frame = next(e for e in source.events(index, index + 1) if isinstance(e, StereoFrame))
+        assert frame.left is not None
+        assert frame.right is not None
+        pl, pr = match_sift(frame.left, frame.right)
+        assert len(pl) > 200
+        medians.append(np.median(np.abs(pl[:, 1] - pr[:, 1])) / source.recording.camera.fv)
+    ours, theirs = np.array(medians) * 721.5377  # at KITTI's focal length
+    assert ours < 1.1 * theirs
+    assert ours < 0.5
+
+
+def test_a_rig_of_the_real_files_is_consistent(data_dir: Path) -> None:
+    """The right camera seen through `R_01 T_01` lies where `P_rect_01` puts it."""
+    dataset, published = _real(data_dir)
+    rig: StereoRig = dataset.rectifier.rig
+    np.testing.assert_allclose(rig.T_cam0_cam1, se3_inverse(published.T_cam1_cam0), atol=1e-12)
+    in_rect0 = published.R_rect_cam0 @ rig.T_cam0_cam1[:3, 3]
+    np.testing.assert_allclose(in_rect0, -published.T_rect1_rect0[:3, 3], atol=2e-5)

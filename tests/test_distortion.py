@@ -1,0 +1,87 @@
+"""The radial-tangential model with its optional third radial coefficient, against OpenCV and itself."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.numerics import numeric_jacobian
+from vio.errors import CalibrationError
+from vio.geometry.distortion import CameraModel, project_point, unproject_pixel, uv_D_p_cam
+
+# Camera 00 of KITTI's 2011_09_26.
+KITTI = CameraModel(
+    984.2439,
+    980.8141,
+    690.0,
+    233.1966,
+    1392,
+    512,
+    "radtan",
+    (-0.3728755, 0.2037299, 2.219027e-3, 1.383707e-3, -0.07233722),
+)
+
+
+def _points(n: int = 200) -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return np.column_stack([rng.uniform(-0.75, 0.75, n), rng.uniform(-0.3, 0.3, n), np.ones(n)]) * rng.uniform(
+        1, 40, (n, 1)
+    )
+
+
+def test_five_coefficients_project_as_opencv_does() -> None:
+    points = _points()
+    expected, _ = cv2.projectPoints(points[:, None], np.zeros(3), np.zeros(3), KITTI.K, np.array(KITTI.coefficients))
+    uv, valid = project_point(KITTI, points)
+    assert valid.all()
+    np.testing.assert_allclose(uv, expected[:, 0], atol=1e-9)
+
+
+def test_a_third_coefficient_of_zero_changes_nothing() -> None:
+    four = CameraModel(400, 401, 320, 240, 640, 480, "radtan", (-0.28, 0.07, 2e-4, 2e-5))
+    five = CameraModel(400, 401, 320, 240, 640, 480, "radtan", (-0.28, 0.07, 2e-4, 2e-5, 0.0))
+    for a, b in zip(project_point(four, _points()), project_point(five, _points()), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_jacobian_with_five_coefficients() -> None:
+    for p in _points(20):
+        np.testing.assert_allclose(
+            uv_D_p_cam(KITTI, p), numeric_jacobian(lambda x: project_point(KITTI, x)[0], p), rtol=1e-6, atol=1e-5
+        )
+
+
+def test_every_pixel_of_kitti_has_a_ray_that_comes_back() -> None:
+    v, u = np.mgrid[0:512:16, 0:1392:16]
+    uv = np.stack([u, v], axis=-1).astype(np.float64)
+    ray, valid = unproject_pixel(KITTI, uv)
+    assert valid.all()
+    np.testing.assert_allclose(np.linalg.norm(ray, axis=-1), 1, atol=1e-12)
+    back, seen = project_point(KITTI, ray)
+    assert seen.all()
+    np.testing.assert_allclose(back, uv, atol=1e-7)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.tuples(st.floats(-0.6, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)))
+def test_points_are_valid_up_to_where_the_polynomial_turns(k: tuple[float, float, float]) -> None:
+    """Brute force: walk outwards along the u axis until the distorted radius stops growing."""
+    k1, k2, k3 = k
+    camera = CameraModel(1.0, 1.0, 0.0, 0.0, 2, 2, "radtan", (k1, k2, 0.0, 0.0, k3))
+    r = np.arange(1, 3000) * 1e-3
+    _, valid = project_point(camera, np.column_stack([r, 0 * r, np.ones_like(r)]))
+    slope = 1 + 3 * k1 * r**2 + 5 * k2 * r**4 + 7 * k3 * r**6
+    growing = np.logical_and.accumulate(slope > 0)
+    doubtful = slope < 0.01
+    assert valid[: int(np.argmax(doubtful)) if doubtful.any() else None].all()
+    if not growing.all():
+        assert not valid[int(np.argmin(growing)) + 2 :].any()
+
+
+@pytest.mark.parametrize("count", [1, 3, 6, 8])
+def test_other_numbers_of_coefficients_are_refused(count: int) -> None:
+    with pytest.raises(CalibrationError, match=f"takes 4 distortion coefficients or 5, got {count}"):
+        CameraModel(400, 400, 320, 240, 640, 480, "radtan", (0.01,) * count)
