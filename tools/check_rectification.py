@@ -362,7 +362,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--interpolation", choices=get_args(Interpolation), default=DatasetSettings().interpolation)
     parser.add_argument("--moments", type=int, default=12, help="rendered times (tracking, resampling; default 12)")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    args = parser.parse_args(argv)
+    args = parser.parse_intermixed_args(argv)
     if args.check == "rows" and not args.folders:
         parser.error("rows needs at least one recording")
     cv2.setNumThreads(1)
