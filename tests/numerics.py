@@ -15,6 +15,7 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 TESTED_JACOBIANS = {
     "vio.filters.vislam.z_D_landmark",
     "vio.filters.vislam.z_D_xi",
+    "vio.geometry.distortion.uv_D_p_cam",
     "vio.geometry.stereo.p_cam_D_z",
     "vio.geometry.stereo.z_D_p_cam",
 }

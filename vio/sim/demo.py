@@ -1,4 +1,4 @@
-"""The recording of `vio demo`: twelve seconds of a drive through a rendered street, with the paper's noisy velocities."""
+"""The recording of `vio demo`: a drive through a rendered street, with the paper's noisy velocities."""
 
 from __future__ import annotations
 

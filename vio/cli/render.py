@@ -1,0 +1,216 @@
+"""`vio render`: a named scene and a trajectory in, a EuRoC or KITTI folder with known truth out."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vio.sim.scenarios import Conditions, Scenario
+
+_EFFECTS = "clean exposure gain gain-high blur noise dark bare-wall moving dropped duplicated time-offset"
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "render",
+        help="render a recording with known truth",
+        description="Render a stereo-inertial recording with ground truth, along a ready or a recorded trajectory, and "
+        "write it as an EuRoC or KITTI folder that any odometry system can read.",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, whole or not at all")
+    parser.add_argument(
+        "--scene",
+        choices=("room", "street", "corridor"),
+        default="room",
+        help="what is seen (default room; one is built around a recorded trajectory)",
+    )
+    parser.add_argument(
+        "--trajectory",
+        default="handheld",
+        metavar="T",
+        help="handheld (default), car, a TUM file of the IMU's poses, or the folder of a recorded flight with "
+        "groundtruth_tum.txt and, used where they exist, image_timestamps_ns.txt and imu0.csv",
+    )
+    parser.add_argument("--frame-times", type=Path, metavar="F", help="frames of a recorded trajectory: ns, one a line")
+    parser.add_argument(
+        "--imu", metavar="F", help="simulated, none, or EuRoC's csv of a recorded one (default: the flight's own)"
+    )
+    parser.add_argument(
+        "--velocity",
+        choices=("none", "paper", "exact"),
+        help="body velocity in KITTI folders (default there: paper, which is 0.5 m/s and 0.05 rad/s of noise)",
+    )
+    parser.add_argument(
+        "--rig",
+        choices=("euroc", "euroc-rectified", "kitti", "fisheye", "small"),
+        help="cameras and where they sit on the IMU (default: euroc-rectified for handheld, kitti for car, euroc, "
+        "which is unrectified, for a recorded trajectory)",
+    )
+    parser.add_argument("--width", type=int, metavar="PX", help="image width, the field of view kept")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="frames a second (default 20; 10 for car)")
+    parser.add_argument("--duration", type=float, metavar="S", help="length (default 30 s, or the whole flight)")
+    parser.add_argument("--effects", metavar="NAME,…", default="", help=f"of {_EFFECTS}")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="a.b=c",
+        help="one value of effects, faults or imu_noise, such as effects.blur_exposure_ms=20; may be repeated",
+    )
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="everything random follows from it")
+    parser.add_argument("--format", choices=("euroc", "kitti"), help="of the folder (default kitti for that rig)")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default up to 2); the images are the same")
+    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    parser.set_defaults(execute=execute)
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    import time
+
+    from vio.cli.running import rendering
+    from vio.errors import ConfigError
+    from vio.sim.export import export_euroc, export_kitti
+    from vio.sim.scenarios import ParallelRecording, plan, usual_workers
+    from vio.sim.sequence import SimulatedRecording
+    from vio.threads import one_blas_thread
+
+    if args.workers is not None and not 1 <= args.workers <= 64:
+        raise ConfigError(f"--workers takes 1 to 64 processes, got {args.workers}")
+    scenario, form = scenario_from(args)
+    start = time.perf_counter()
+    simulation = plan(scenario)
+    frames = len(simulation.stamps_ns)
+    workers = usual_workers(frames) if args.workers is None else args.workers
+
+    def write(recording: SimulatedRecording) -> None:
+        with rendering(f"rendering the {scenario.scene}") as progress:
+            if form == "kitti":
+                export_kitti(recording, args.out, replace=True, progress=progress)
+            else:
+                noise = scenario.conditions.imu_noise
+                export_euroc(recording, args.out, replace=True, noise=noise, progress=progress)
+
+    with one_blas_thread():
+        if workers == 1:
+            write(SimulatedRecording(simulation))
+        else:
+            with ParallelRecording(scenario, workers=workers, simulation=simulation) as recording:
+                write(recording)
+    seconds = time.perf_counter() - start
+    camera = simulation.rig.cam0
+    span_ns = int(simulation.stamps_ns[-1] - simulation.stamps_ns[0])
+    summary = {
+        "out": str(args.out),
+        "format": form,
+        "scene": scenario.scene,
+        "trajectory": args.trajectory,
+        "rig": scenario.rig,
+        "camera": camera.model,
+        "frames": frames,
+        "duration_s": span_ns * 1e-9,
+        "width": camera.width,
+        "height": camera.height,
+        "imu": "recorded" if isinstance(scenario.imu, Path) else scenario.imu,
+        "seed": scenario.seed,
+        "workers": workers,
+        "seconds": round(seconds, 2),
+        "pairs_per_s": round(frames / seconds, 2),
+        "bytes": sum(path.stat().st_size for path in args.out.rglob("*") if path.is_file()),
+    }
+    _report(summary, as_json=args.json)
+    return 0
+
+
+def _report(summary: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        import json
+
+        print(json.dumps(summary))
+        return
+    rows = (
+        ("scene", f"{summary['scene']}, trajectory {summary['trajectory']}, seed {summary['seed']}"),
+        ("cameras", f"{summary['rig']} ({summary['camera']}), {summary['width']} x {summary['height']}"),
+        ("frames", f"{summary['frames']} over {summary['duration_s']:.2f} s, IMU {summary['imu']}"),
+        ("time", f"{summary['seconds']:.1f} s, {summary['pairs_per_s']:.1f} pairs/s, processes: {summary['workers']}"),
+        ("folder", f"{summary['out']} ({summary['format']}, {summary['bytes'] / 1e6:.1f} MB)"),
+    )
+    for name, value in rows:
+        print(f"{name:<10} {value}")
+
+
+def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
+    """Turn the arguments into a scenario and the form of the folder.
+
+    Raises:
+        VioError: arguments contradict each other, or name what does not exist.
+    """
+    from vio.errors import ConfigError
+    from vio.sim.scenarios import READY_MOTIONS, Scenario, flight_files
+
+    car = args.trajectory == "car"
+    trajectory: Any = args.trajectory
+    frame_times, imu = args.frame_times, args.imu
+    if args.frame_times is not None and args.rate is not None:
+        raise ConfigError("--frame-times and --rate exclude each other; give one of them")
+    if trajectory not in READY_MOTIONS:
+        trajectory = Path(trajectory)
+        if trajectory.is_dir():
+            trajectory, own_times, own_imu = flight_files(trajectory)
+            frame_times = own_times if frame_times is None and args.rate is None else frame_times
+            imu = own_imu if imu is None else imu
+        elif not trajectory.exists():
+            raise ConfigError(
+                f"--trajectory {trajectory}: there is no such file; give {', '.join(READY_MOTIONS)}, a TUM file or the "
+                "folder of a recorded flight"
+            )
+    rig: Any = args.rig or ("euroc" if isinstance(trajectory, Path) else "kitti" if car else "euroc-rectified")
+    form = args.format or ("kitti" if rig == "kitti" else "euroc")
+    if form == "euroc" and imu == "none":
+        raise ConfigError("an EuRoC folder needs an IMU; give --imu simulated or a record, or --format kitti")
+    if form == "euroc" and args.velocity not in (None, "none"):
+        raise ConfigError("an EuRoC folder has no place for body velocities; give --format kitti")
+    if form == "kitti" and args.imu not in (None, "none"):
+        raise ConfigError("a KITTI folder has no place for an IMU; give --format euroc")
+    if form == "kitti":
+        imu = "none"
+    scenario = Scenario(
+        scene=args.scene,
+        trajectory=trajectory,
+        frame_times=frame_times,
+        imu=imu if imu in ("simulated", "none") else "simulated" if imu is None else Path(imu),
+        velocity=args.velocity or ("paper" if form == "kitti" else "none"),
+        rig=rig,
+        width=args.width,
+        rate_hz=(10.0 if car else 20.0) if args.rate is None else args.rate,
+        duration_s=args.duration,
+        conditions=_conditions(args),
+        seed=args.seed,
+    )
+    return scenario, form
+
+
+def _conditions(args: argparse.Namespace) -> Conditions:
+    """The named effects, then single values."""
+    import yaml
+
+    from vio.config import merge
+    from vio.errors import ConfigError
+    from vio.sim.scenarios import conditions_of
+
+    conditions = conditions_of([name.strip() for name in args.effects.split(",") if name.strip()])
+    for override in args.set:
+        key, equals, text = override.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set takes key=value, got '{override}'; for example --set effects.gamma=2.2")
+        try:
+            nested = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--set {override}: the value is not valid YAML") from error
+        for part in reversed(key.strip().split(".")):
+            nested = {part: nested}
+        conditions = merge(conditions, nested, where=f"--set {override}")
+    return conditions

@@ -1,0 +1,397 @@
+"""Ready recordings by name: scene, trajectory, rig and effects become one plan, the same in every process."""
+
+from __future__ import annotations
+
+import functools
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, TypeAlias, get_args
+
+import cv2
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from vio.errors import DataError
+from vio.geometry.distortion import CameraModel, StereoRig
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
+from vio.records import Image, IntArray
+from vio.sim.effects import CLEAN, SensorEffects
+from vio.sim.errors import SimulationError
+from vio.sim.imu import ImuNoise, ImuRecord, VelocityNoise
+from vio.sim.motion import MotionSpline, car_loop, evaluate, hand_held, look_rotation, spline_from_waypoints, turned
+from vio.sim.rigs import (
+    R_FLU_EUROC_IMU,
+    euroc_like_rig,
+    euroc_rectified_rig,
+    fisheye_rig,
+    kitti_like_rig,
+    small_rig,
+)
+from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
+from vio.sim.world import MovingBox, SceneName, World, corridor, room, street
+
+ReadyMotion: TypeAlias = Literal["handheld", "car"]
+RigName: TypeAlias = Literal["euroc", "euroc-rectified", "kitti", "fisheye", "small"]
+VelocityName: TypeAlias = Literal["none", "paper", "exact"]
+
+RIGS: dict[str, Callable[[], StereoRig]] = {
+    "euroc": euroc_like_rig,
+    "euroc-rectified": euroc_rectified_rig,
+    "kitti": kitti_like_rig,
+    "fisheye": fisheye_rig,
+    "small": small_rig,
+}
+_EUROC_AXES = ("euroc", "euroc-rectified")  # rigs whose IMU axes are up, right, forward
+_MARGIN_S = 0.25  # of motion before the first and after the last frame, for shutters and clock offsets
+_AHEAD = 3  # frames in flight for each process
+_LEAD_M = 14.0  # to the car ahead
+_WALL_GAP_M = 0.4  # from a wall to the middle of a box that moves along it
+_NS = 1e9
+
+FLIGHT_FILES = ("groundtruth_tum.txt", "image_timestamps_ns.txt", "imu0.csv")
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What makes a recording hard; the defaults are a well-lit scene and a good camera."""
+
+    effects: SensorEffects = field(default_factory=SensorEffects)
+    faults: FrameFaults = field(default_factory=FrameFaults)
+    imu_noise: ImuNoise = field(default_factory=ImuNoise)  # of the simulated IMU
+    bare_wall: bool = False  # two walls without texture
+    moving: bool = False  # boxes that move on their own
+
+
+def _seen(**values: Any) -> Callable[[Conditions], Conditions]:
+    return lambda conditions: replace(conditions, effects=replace(conditions.effects, **values))
+
+
+def _faulty(**values: float) -> Callable[[Conditions], Conditions]:
+    return lambda conditions: replace(conditions, faults=replace(conditions.faults, **values))
+
+
+EFFECTS: dict[str, Callable[[Conditions], Conditions]] = {
+    "clean": lambda conditions: replace(conditions, effects=CLEAN),
+    "exposure": _seen(exposure_swing=0.3),
+    "gain": _seen(right_gain=0.6),
+    "gain-high": _seen(right_gain=1.6),
+    "blur": _seen(blur_exposure_ms=15.0),
+    "noise": _seen(read_noise=5.0, full_well=5000.0),
+    "dark": _seen(exposure=0.06, read_noise=1.5, full_well=10000.0),
+    "bare-wall": lambda conditions: replace(conditions, bare_wall=True),
+    "moving": lambda conditions: replace(conditions, moving=True),
+    "dropped": _faulty(dropped=0.1),
+    "duplicated": _faulty(duplicated=0.1),
+    "time-offset": _faulty(time_offset_ms=20.0),
+}
+
+
+def conditions_of(names: Sequence[str]) -> Conditions:
+    """Return the conditions that effects called by name make together, applied in order.
+
+    Raises:
+        SimulationError: there is no effect of that name.
+    """
+    conditions = Conditions()
+    for name in names:
+        if name not in EFFECTS:
+            raise SimulationError(f"there is no effect {name!r}; choose from {', '.join(EFFECTS)}")
+        conditions = EFFECTS[name](conditions)
+    return conditions
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """A recording to make, in words; everything in it follows from these and travels to other processes."""
+
+    scene: SceneName = "room"  # along a recorded trajectory a room is built around it
+    trajectory: ReadyMotion | Path = "handheld"  # or a TUM file of the IMU's poses
+    frame_times: Path | None = None  # one integer of nanoseconds a line; None: a fixed rate
+    imu: Literal["simulated", "none"] | Path = "simulated"  # or a recorded one, EuRoC's csv
+    velocity: VelocityName = "none"  # the paper's body velocity sensor
+    rig: RigName = "euroc-rectified"
+    width: int | None = None  # px; None: that of the rig
+    rate_hz: float = 20.0
+    duration_s: float | None = None  # None: 30 s, or all of a recorded trajectory
+    conditions: Conditions = field(default_factory=Conditions)
+    seed: int = 0
+
+
+def plan(scenario: Scenario) -> Simulation:
+    """Build scene, motion and sensors, and check that the recording can be made; nothing is rendered yet.
+
+    Raises:
+        SimulationError: a value makes no sense, or a camera would be outside the scene or in a box.
+        DataError: a recorded file cannot be used; the message names it.
+    """
+    _check(scenario)
+    rig = scaled(RIGS[scenario.rig](), scenario.width)
+    motion, times, record = _recorded(scenario) if isinstance(scenario.trajectory, Path) else _ready(scenario)
+    imu: ImuNoise | ImuRecord | None = record
+    if scenario.imu == "simulated":
+        imu = scenario.conditions.imu_noise
+    velocity = {"none": None, "paper": VelocityNoise(), "exact": VelocityNoise(0.0, 0.0)}[scenario.velocity]
+    return simulate(
+        _world(scenario, motion),
+        rig,
+        motion,
+        rate_hz=scenario.rate_hz,
+        frame_times_ns=times,
+        imu=imu,
+        velocity=velocity,
+        effects=scenario.conditions.effects,
+        faults=scenario.conditions.faults,
+        seed=scenario.seed,
+    )
+
+
+def _check(scenario: Scenario) -> None:
+    faults = scenario.conditions.faults
+    if not (0 <= faults.dropped < 1 and 0 <= faults.duplicated < 1):
+        raise SimulationError("faults.dropped and faults.duplicated are shares of the frames, from 0 to below 1")
+    if scenario.width is not None and not 64 <= scenario.width <= 8192:
+        raise SimulationError(f"images {scenario.width} px wide cannot be made; choose a width from 64 to 8192")
+    if not 0 < scenario.rate_hz <= 1000:
+        raise SimulationError(f"{scenario.rate_hz:g} frames a second cannot be made; choose a rate up to 1000")
+    if scenario.duration_s is not None and not 0 < scenario.duration_s <= 36000:
+        raise SimulationError(f"a recording of {scenario.duration_s:g} s cannot be made; choose up to 36000 s")
+    if scenario.seed < 0:
+        raise SimulationError(f"the seed must not be negative, got {scenario.seed}")
+    if scenario.conditions.bare_wall and scenario.scene == "street":
+        raise SimulationError("a street has no bare walls; use that effect in a room or a corridor")
+
+
+def scaled(rig: StereoRig, width: int | None) -> StereoRig:
+    """Return the rig with images of another width and the same field of view; None: unchanged."""
+    if width is None or width == rig.cam0.width:
+        return rig
+
+    def resized(camera: CameraModel) -> CameraModel:
+        factor = width / camera.width
+        return replace(
+            camera,
+            fu=camera.fu * factor,
+            fv=camera.fv * factor,
+            cu=(camera.cu + 0.5) * factor - 0.5,
+            cv=(camera.cv + 0.5) * factor - 0.5,
+            width=width,
+            height=round(camera.height * factor),
+        )
+
+    return replace(rig, cam0=resized(rig.cam0), cam1=resized(rig.cam1))
+
+
+# --- motion ---------------------------------------------------------------------------------------------------------
+
+
+def _recorded(scenario: Scenario) -> tuple[MotionSpline, IntArray, ImuRecord | None]:
+    assert isinstance(scenario.trajectory, Path)
+    csv = scenario.imu if isinstance(scenario.imu, Path) else None
+    flight = read_flight(scenario.trajectory, scenario.frame_times, csv)
+    motion, times = flight.motion, flight.frame_times_ns
+    if scenario.frame_times is None:
+        times = _regular(motion.start_ns, (motion.end_ns - motion.start_ns) / _NS, scenario.rate_hz)
+    if scenario.duration_s is not None:
+        times = times[times < times[0] + round(scenario.duration_s * _NS)]
+    if flight.imu is not None and (flight.imu.times_ns[0] > times[0] or flight.imu.times_ns[-1] < times[-1]):
+        raise DataError(
+            f"{csv} does not span the frames ({times[0]} to {times[-1]} ns, the IMU {flight.imu.times_ns[0]} to "
+            f"{flight.imu.times_ns[-1]} ns); use files of one flight and one clock"
+        )
+    return motion, times, flight.imu
+
+
+def _ready(scenario: Scenario) -> tuple[MotionSpline, IntArray, None]:
+    if scenario.frame_times is not None:
+        raise SimulationError("frame times go with a recorded trajectory; give a rate instead")
+    if isinstance(scenario.imu, Path):
+        raise SimulationError("a recorded IMU goes with its own recorded trajectory; simulate one instead")
+    duration_s = 30.0 if scenario.duration_s is None else scenario.duration_s
+    motion = _motion(scenario, duration_s + 2 * _MARGIN_S)
+    if scenario.rig in _EUROC_AXES:
+        motion = turned(motion, R_FLU_EUROC_IMU)
+    times = _regular(motion.start_ns + round(_MARGIN_S * _NS), duration_s, scenario.rate_hz)
+    return motion, times, None
+
+
+def _motion(scenario: Scenario, duration_s: float) -> MotionSpline:
+    if scenario.trajectory == "car":
+        return car_loop(duration_s=duration_s, seed=scenario.seed)
+    if scenario.scene == "corridor":
+        return _walk(duration_s, scenario.seed)
+    centre = (0.0, -35.0, 1.5) if scenario.scene == "street" else (0.0, 0.0, 1.4)
+    return hand_held(centre=centre, duration_s=duration_s, seed=scenario.seed)
+
+
+def _walk(duration_s: float, seed: int) -> MotionSpline:
+    """Walk up and down the corridor, turning round near its ends, with an unsteady hand."""
+    interval_s = 0.5
+    t = np.arange(0.0, duration_s + interval_s, interval_s)
+    rng = np.random.default_rng([seed, 13])
+    phase = 0.5 + t * (1.2 / 12.5)  # 1.2 m/s in the middle
+    x, y = 15.0 - 12.5 * np.cos(phase), 0.15 + 0.1 * np.sin(0.7 * t)
+    yaw = np.pi / 2 * (1 - np.tanh(4 * np.sin(phase)))
+    R = look_rotation(np.stack([np.cos(yaw), np.sin(yaw), np.zeros_like(t)], axis=1))
+    T = se3_from_parts(R, np.stack([x, y, np.full_like(t, 1.5)], axis=1))
+    shake = rng.standard_normal((len(t), 6)) * [0.015, 0.015, 0.015, 0.04, 0.04, 0.08]
+    return spline_from_waypoints(T @ se3_exp(shake), interval_s)
+
+
+def _regular(start_ns: int, duration_s: float, rate_hz: float) -> IntArray:
+    count = max(1, int(duration_s * rate_hz + 1e-6))
+    times: IntArray = start_ns + np.round(np.arange(count) * (_NS / rate_hz)).astype(np.int64)
+    return times
+
+
+# --- scenes ---------------------------------------------------------------------------------------------------------
+
+
+def _world(scenario: Scenario, motion: MotionSpline) -> World:
+    hard, seed = scenario.conditions, scenario.seed
+    if scenario.scene == "street":
+        return street(seed, moving=_traffic(motion, seed) if hard.moving else ())
+    if scenario.scene == "corridor":
+        lane = np.array([[3.0, 0.95, 1.1], [27.0, 0.95, 1.1]])
+        moving = (_patrol(lane, motion.start_ns, 25.0),) if hard.moving else ()
+        return corridor(seed, bare_walls=("+y", "-y") if hard.bare_wall else ("+y",), moving=moving)
+    walls = ("+x", "+y") if hard.bare_wall else ()
+    if not isinstance(scenario.trajectory, Path):
+        plain = room(seed)
+        return room(seed, bare_walls=walls, moving=_visitors(plain, motion) if hard.moving else ())
+    around = room_around(motion, seed=seed)
+    if not (walls or hard.moving):
+        return around
+    times = np.arange(motion.start_ns, motion.end_ns, 100_000_000)
+    return room(
+        seed,
+        bounds=around.bounds,
+        furniture=20,
+        pictures=20,
+        keep_clear=evaluate(motion, times).T_world_imu[:, :3, 3],
+        bare_walls=walls,
+        moving=_visitors(around, motion) if hard.moving else (),
+    )
+
+
+def _visitors(world: World, motion: MotionSpline) -> tuple[MovingBox, ...]:
+    """Boxes that glide up and down along the four walls, where neither ready motions nor flights go."""
+    low, high = world.bounds[0] + _WALL_GAP_M, world.bounds[1] - _WALL_GAP_M
+    z = (world.bounds[0, 2] + world.bounds[1, 2]) / 2
+    corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+    lanes = [np.array([[*corners[i], z], [*corners[(i + 1) % 4], z]]) for i in range(4)]
+    return tuple(_patrol(lane, motion.start_ns, 8.0 + i) for i, lane in enumerate(lanes))
+
+
+def _patrol(lane: FloatArray, start_ns: int, period_s: float) -> MovingBox:
+    """A box that swings between the two ends (2, 3) of a lane."""
+
+    def pose(time_ns: int) -> FloatArray:
+        along = 0.5 - 0.5 * np.cos(2 * np.pi * (time_ns - start_ns) / _NS / period_s)
+        return se3_from_parts(np.eye(3), lane[0] + along * (lane[1] - lane[0]))
+
+    return MovingBox(np.array([0.45, 0.45, 0.6]), pose)
+
+
+def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
+    """A car ahead in the same lane, and one that comes towards it on the inner lane again and again."""
+    seconds = (motion.end_ns - motion.start_ns) / _NS
+    ahead = car_loop(duration_s=seconds, start_m=_LEAD_M, height_m=0.85, seed=seed, start_ns=motion.start_ns)
+    inner = car_loop(loop_m=(103.6, 63.6), corner_m=5.0, height_m=0.85, seed=seed + 1)
+    loop_ns = inner.end_ns - inner.start_ns
+
+    def leading(time_ns: int) -> FloatArray:
+        return evaluate(ahead, int(np.clip(time_ns, ahead.start_ns, ahead.end_ns))).T_world_imu[0]
+
+    def oncoming(time_ns: int) -> FloatArray:
+        return evaluate(inner, inner.end_ns - (time_ns - motion.start_ns) % loop_ns).T_world_imu[0]
+
+    size = np.array([4.2, 1.8, 1.5])
+    return MovingBox(size, leading, texel_m=0.01), MovingBox(size, oncoming, texel_m=0.01)
+
+
+# --- rendering in several processes ---------------------------------------------------------------------------------
+
+
+class ParallelRecording(SimulatedRecording):
+    """A scenario's recording whose images are made ahead by other processes; the bits are those of one process.
+
+    Use it as a context manager, and ask for frames in order. Every process plans the scenario for itself, from the
+    same seed.
+    """
+
+    def __init__(self, scenario: Scenario, *, workers: int, simulation: Simulation | None = None) -> None:
+        """Start up to `workers` processes when the first image is asked for."""
+        super().__init__(plan(scenario) if simulation is None else simulation)
+        self._scenario = scenario
+        self._workers = workers
+        self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
+        self._waiting: dict[int, Future[tuple[Image, Image]]] = {}
+
+    def __enter__(self) -> ParallelRecording:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def images(self, index: int) -> tuple[Image, Image]:
+        """Return both images (H, W) of one frame with all effects, and have the next ones made.
+
+        Raises:
+            SimulationError: a process ended unexpectedly.
+        """
+        try:
+            for ahead in range(index, min(index + _AHEAD * self._workers, len(self))):
+                if ahead not in self._waiting:
+                    self._waiting[ahead] = self._pool.submit(_render_pair, self._scenario, ahead)
+            return self._waiting.pop(index).result()
+        except BrokenProcessPool as error:
+            raise SimulationError(
+                "a rendering process ended unexpectedly, perhaps for lack of memory; render in one process"
+            ) from error
+
+
+def usual_workers(frames: int) -> int:
+    """Processes worth starting: one for short recordings, which are done before a second one is up."""
+    return min(2, os.cpu_count() or 1) if frames >= 100 else 1
+
+
+def _start_worker() -> None:
+    """One thread each; the interrupt of a user is for the main process, which ends the others."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(limits=1, user_api="blas")
+    cv2.setNumThreads(1)
+
+
+@functools.lru_cache(maxsize=1)
+def _opened(scenario: Scenario) -> SimulatedRecording:
+    return SimulatedRecording(plan(scenario))
+
+
+def _render_pair(scenario: Scenario, index: int) -> tuple[Image, Image]:
+    return _opened(scenario).images(index)
+
+
+def flight_files(folder: Path) -> tuple[Path, Path | None, Path | None]:
+    """Ground truth, image times and IMU of a recorded flight's folder; the latter two where they exist.
+
+    Raises:
+        DataError: the folder holds no ground truth.
+    """
+    truth, times, imu = (folder / name for name in FLIGHT_FILES)
+    if not truth.is_file():
+        raise DataError(f"{folder} holds no {FLIGHT_FILES[0]}; give the folder of a recorded flight, or a TUM file")
+    return truth, times if times.is_file() else None, imu if imu.is_file() else None
+
+
+SCENES: tuple[str, ...] = get_args(SceneName)
+READY_MOTIONS: tuple[str, ...] = get_args(ReadyMotion)
