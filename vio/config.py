@@ -20,11 +20,11 @@ import yaml
 from frontend.settings import FrontendSettings
 from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError
-from vio.filters.settings import VislamSettings
+from vio.filters.settings import MsckfSettings, VislamSettings
 from vio.selectors import SelectorSettings
 from vio.setting import setting
 
-BackendName = Literal["vislam"]
+BackendName = Literal["vislam", "msckf"]
 MotionName = Literal["auto", "imu", "velocity", "none"]
 
 _Section = TypeVar("_Section")
@@ -44,6 +44,7 @@ class Config:
     frontend: FrontendSettings = field(default_factory=FrontendSettings)
     selector: SelectorSettings = field(default_factory=SelectorSettings)
     vislam: VislamSettings = field(default_factory=VislamSettings)
+    msckf: MsckfSettings = field(default_factory=MsckfSettings)
 
 
 def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:

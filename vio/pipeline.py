@@ -32,7 +32,8 @@ from vio.selectors import build_selector
 
 log = logging.getLogger(__name__)
 
-_TAKES: dict[str, tuple[MotionSource, ...]] = {"vislam": ("velocity",)}
+# Motion sources that a back end has a model for, the best first.
+_TAKES: dict[str, tuple[MotionSource, ...]] = {"vislam": ("velocity",), "msckf": ("imu", "velocity")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +132,7 @@ def run(
     features = _feature_source(dataset, config)
     frontend = frontend or _build_frontend(features, config)
     selector = selector or _build_selector(features, config)
-    backend = backend or Vislam(recording.camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
+    backend = backend or _build_backend(recording, config, motion, T_cam0_body)
     viewer = viewer or NullViewer()
     dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
 
@@ -257,6 +258,16 @@ def _build_selector(features: Dataset, config: Config) -> Selector:
         image_size=None if camera.width is None or camera.height is None else (camera.width, camera.height),
         whole_record=whole_record if precomputed else None,
     )
+
+
+def _build_backend(
+    recording: Recording, config: Config, motion: MotionSource | None, T_cam0_body: FloatArray
+) -> Backend:
+    if config.backend == "msckf":
+        from vio.filters.msckf import Msckf
+
+        return Msckf(recording.camera, T_cam0_body, config.msckf, motion=motion)
+    return Vislam(recording.camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
 
 
 def _needs_images(dataset: Dataset, config: Config) -> bool:

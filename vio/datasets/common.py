@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts
-from vio.records import Event, IntArray, MotionSample, Recording, StereoFrame, VelocitySample
+from vio.records import Event, ImuSample, IntArray, MotionSample, Recording, StereoFrame, VelocitySample
 
 NS_PER_S = 10**9
 _ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I that is still read as rounding
@@ -106,6 +106,8 @@ def merge_events(
 ) -> Iterator[Event]:
     """Yield the motion samples and frames of a range in time order, a sample before a frame of the same time.
 
+    Raw IMU begins a second before the first frame, so that an estimator can see gravity before it sees an image.
+
     Args:
         recording: names the frames' times.
         chosen: frame numbers.
@@ -113,7 +115,8 @@ def merge_events(
         frames: the frames of the range, in time order; some may be missing. Closed at the end.
     """
     first_ns, last_ns = (int(recording.frame_times_ns[k]) for k in (chosen[0], chosen[-1]))
-    samples = iter([sample for sample in motion if first_ns <= sample.time_ns <= last_ns])
+    begins = {ImuSample: first_ns - NS_PER_S, VelocitySample: first_ns}
+    samples = iter([sample for sample in motion if begins[type(sample)] <= sample.time_ns <= last_ns])
     waiting = next(samples, None)
     with contextlib.closing(frames):
         for frame in frames:

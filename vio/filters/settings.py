@@ -57,3 +57,38 @@ class VislamSettings:
     max_landmark_distance_m: float = setting(
         150.0, "observations farther away are neither initialised nor used", unit="m"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class MsckfSettings:
+    """The sliding-window filter (docs/math.md, section 3)."""
+
+    clones: int = setting(11, "poses kept in the window")
+    max_landmarks: int = setting(30, "long-lived landmarks kept in the state")
+    max_features: int = setting(150, "tracks without a landmark of their own that enter one update")
+    iterations: int = setting(2, "Gauss-Newton steps over the window a frame")
+    pixel_sigma_px: float = setting(0.5, "noise of one pixel coordinate at the start; then estimated", unit="px")
+    pixel_sigma_min_px: float = setting(0.1, "the estimated noise stays above this", unit="px")
+    pixel_sigma_max_px: float = setting(2.0, "the estimated noise stays below this", unit="px")
+    gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected")
+    max_distance: float = setting(400.0, "tracks farther away than this many baselines are not used")
+    gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2")
+    gyro_noise_density: float = setting(2.0e-4, "gyro white noise", unit="rad/s/sqrt(Hz)")
+    accel_noise_density: float = setting(2.5e-3, "accelerometer white noise", unit="m/s^2/sqrt(Hz)")
+    gyro_bias_walk: float = setting(2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)")
+    accel_bias_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)")
+    start_tilt_sigma_deg: float = setting(8.0, "doubt of the first roll and pitch", unit="deg")
+    start_velocity_sigma_mps: float = setting(10.0, "doubt of the first velocity", unit="m/s")
+    start_rate_sigma_radps: float = setting(1.0, "without IMU: doubt of the first angular rate", unit="rad/s")
+    gyro_bias_sigma_radps: float = setting(0.1, "doubt of the first gyro bias", unit="rad/s")
+    accel_bias_sigma_mps2: float = setting(0.3, "doubt of the first accelerometer bias", unit="m/s^2")
+    linear_velocity_sigma_mps: float = setting(0.5, "noise of a measured body velocity", unit="m/s")
+    angular_rate_sigma_radps: float = setting(0.05, "noise of a measured angular rate", unit="rad/s")
+    rate_bias_sigma_radps: float = setting(0.02, "doubt of the bias of a measured angular rate", unit="rad/s")
+    rate_bias_walk: float = setting(1.0e-4, "random walk of that bias", unit="rad/s/sqrt(s)")
+    acceleration_density: float = setting(
+        1.0, "without IMU: spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)"
+    )
+    angular_acceleration_density: float = setting(
+        0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)"
+    )

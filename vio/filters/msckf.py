@@ -1,0 +1,392 @@
+"""The sliding-window filter: right-invariant, multi-state constrained, with long-lived landmarks.
+
+A frame's work: predict; clone the pose; Gauss-Newton over the whole window with all that is seen, which gives the
+estimate; then commit for good what ends here (tracks that were lost, tracks that leave the window) and forget the
+oldest clone. Tracks that go on are linearised anew in every frame and committed once. The prior is kept in
+right-invariant errors, whose unobservable directions (global position and yaw) are the same whatever the estimate, so
+relinearising gains no information along them.
+References: Mourikis & Roumeliotis (2007); Sun et al. (2018); Wu et al., An invariant-EKF VINS algorithm for improving
+consistency (2017); Barrau & Bonnabel (2017).
+"""
+
+from __future__ import annotations
+
+import logging
+from functools import lru_cache
+
+import numpy as np
+from scipy.stats import chi2
+
+from vio.errors import ConfigError, EstimationError
+from vio.filters.multiview import (
+    Residuals,
+    TrackInformation,
+    eliminate_points,
+    residuals,
+    track_information,
+    triangulate_tracks,
+)
+from vio.filters.navigation import DIM, ImuMotion, TwistMotion
+from vio.filters.settings import MsckfSettings
+from vio.filters.tracks import TrackTable, latest_pixels
+from vio.filters.window import Window, posterior
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_hat, transform_points
+from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
+from vio.records import (
+    BoolArray,
+    Estimate,
+    ImuSample,
+    IntArray,
+    Landmarks,
+    MotionSample,
+    MotionSource,
+    Observations,
+    UpdateReport,
+    VelocitySample,
+)
+
+log = logging.getLogger(__name__)
+
+_CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
+_NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
+_MIN_TRACKS_FOR_NOISE = 15
+_MAX_WAIT_FRAMES = 20
+
+
+class _Tracks:
+    """The tracks of one linearisation."""
+
+    def __init__(self, rows: IntArray, p_world: FloatArray, at: Residuals, information: TrackInformation) -> None:
+        self.rows, self.p_world, self.at, self.information = rows, p_world, at, information
+
+
+class Msckf:
+    """The sliding-window filter as a back end."""
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        T_cam0_imu: FloatArray,
+        settings: MsckfSettings,
+        *,
+        motion: MotionSource | None,
+    ) -> None:
+        """Start without any belief; the first frame begins it.
+
+        Args:
+            camera: the rectified stereo camera.
+            T_cam0_imu: extrinsics (4, 4).
+            settings: the filter's section of the configuration.
+            motion: which motion samples will come; None: images alone.
+
+        Raises:
+            ConfigError: a value is out of range.
+        """
+        if settings.clones < 3 or settings.iterations < 1 or settings.max_features < 1 or settings.max_landmarks < 0:
+            raise ConfigError("msckf: clones must be at least 3, iterations and max_features 1, max_landmarks 0")
+        self._camera, self._T_cam0_imu, self._settings = camera, np.asarray(T_cam0_imu, dtype=np.float64), settings
+        self._source = motion
+        self._motion: ImuMotion | TwistMotion = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
+        self._window: Window | None = None
+        self._tracks = TrackTable(settings.clones + 1)
+        self._time_ns = 0
+        self._waited = 0
+        self._sigma2 = settings.pixel_sigma_px**2
+        self._output: FloatArray = np.zeros((DIM, DIM))
+
+    def propagate(self, sample: MotionSample) -> None:
+        """Take a motion sample.
+
+        Raises:
+            ConfigError: the sample is not of the kind that was announced.
+        """
+        expected = {"imu": ImuSample, "velocity": VelocitySample}.get(self._source or "")
+        if expected is None or not isinstance(sample, expected):
+            raise ConfigError(f"msckf was built for motion {self._source or 'none'}, got a {type(sample).__name__}")
+        self._motion.take(sample)
+        if isinstance(sample, VelocitySample) and self._window is not None:
+            self._advance(sample.time_ns)
+            self._measure()
+
+    def update(self, observations: Observations) -> UpdateReport:
+        """Predict to the time of the frame and take in its observations.
+
+        Raises:
+            EstimationError: the motion samples do not cover the step, or the filter diverged.
+        """
+        seen = observations.take(~observations.stale)
+        if self._window is None:
+            if not self._motion.ready:
+                return self._wait(observations)
+            nav, P = self._motion.start(observations.time_ns)
+            self._window, self._time_ns = Window(self._motion, nav, P), observations.time_ns
+            self._measure()
+        else:
+            self._advance(observations.time_ns)
+        window = self._window
+        window.add_clone(observations.frame_index, observations.time_ns)
+        try:
+            report = self._use(window, seen)
+        except np.linalg.LinAlgError as error:
+            raise EstimationError(self._lost(observations.frame_index)) from error
+        if not np.isfinite(window.P).all() or not np.isfinite(window.nav.T_world_imu).all():
+            raise EstimationError(self._lost(observations.frame_index))
+        return report
+
+    def estimate(self) -> Estimate:
+        """Return the belief at the time of the last event."""
+        if self._window is None:
+            return Estimate(self._time_ns, np.eye(4), np.eye(6))
+        window = self._window
+        T = window.nav.T_world_imu
+        # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
+        A = se3_adjoint(se3_inverse(T))
+        return Estimate(
+            self._time_ns,
+            T,
+            A @ self._output[:6, :6] @ A.T,
+            velocity_world=self._motion.velocity_world(window.nav),
+            gyro_bias=window.nav.gyro_bias,
+            accel_bias=window.nav.accel_bias,
+        )
+
+    def landmarks(self) -> Landmarks:
+        """Return the long-lived landmarks in the state."""
+        window = self._started()
+        first, n = window.first_landmark, len(window.landmarks)
+        blocks = [window.P[first + 3 * k : first + 3 * k + 3, first + 3 * k : first + 3 * k + 3] for k in range(n)]
+        covariance = np.array(blocks) if n else np.zeros((0, 3, 3))
+        return Landmarks(window.landmark_ids.copy(), window.landmarks.copy(), covariance)
+
+    @property
+    def pixel_sigma_px(self) -> float:
+        """The pixel noise as estimated from the residuals."""
+        return float(np.sqrt(self._sigma2))
+
+    def _wait(self, observations: Observations) -> UpdateReport:
+        """Let a frame pass that comes before the first motion sample.
+
+        Raises:
+            EstimationError: too many frames have passed.
+        """
+        self._waited += 1
+        if self._waited > _MAX_WAIT_FRAMES:
+            raise EstimationError(
+                f"{self._waited} frames without an IMU sample; check that IMU and camera share a clock, or use --motion none"
+            )
+        self._time_ns = observations.time_ns
+        return UpdateReport(0, 0, 0, 0, None, None)
+
+    def _started(self) -> Window:
+        if self._window is None:
+            raise EstimationError("msckf has not seen a frame yet")
+        return self._window
+
+    def _lost(self, frame_index: int) -> str:
+        return f"msckf diverged at frame {frame_index}: too few features for too long, or too many wrong ones"
+
+    def _advance(self, time_ns: int) -> None:
+        if time_ns > self._time_ns:
+            window = self._started()
+            window.propagate(self._motion.advance(window.nav, self._time_ns, time_ns))
+        self._time_ns = time_ns
+
+    def _measure(self) -> None:
+        window = self._started()
+        measurement = self._motion.measurement(window.nav)
+        if measurement is not None:
+            window.measure(measurement)
+
+    def _use(self, window: Window, seen: Observations) -> UpdateReport:
+        """Everything that a frame's observations do."""
+        z, weight, found = latest_pixels(seen, window.landmark_ids)
+        window.keep_landmarks(found)
+        z, weight = z[found], weight[found]
+        self._tracks.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
+
+        innovation = None
+        for step in range(self._settings.iterations):
+            tracks = self._linearise(window)
+            if step == 0:
+                innovation = _newest_innovation(tracks.at)
+            everything = np.ones(len(tracks.rows), dtype=np.bool_)
+            A, b = self._information(window, tracks, everything, z, weight)
+            _, shift = posterior(window.P, A, b + A @ window.offset)
+            window.relinearise(shift - window.offset)
+
+        tracks = self._linearise(window)
+        good, nis = self._gate(tracks.at)
+        self._follow_noise(tracks.at, nis)
+        report = self._commit(window, tracks, good, z, weight)
+        return UpdateReport(
+            used=int(good.sum()) + len(z),
+            gated=int((~good).sum()),
+            initialised=report,
+            landmarks=len(window.landmarks),
+            innovation_median_px=innovation,
+            nis_per_dof=float(np.median(nis)) if len(nis) else None,
+        )
+
+    def _linearise(self, window: Window) -> _Tracks:
+        """Triangulate the tracks that say something of the poses, and linearise them at the present estimate."""
+        s, camera = self._settings, self._camera
+        rows = self._tracks.rows()
+        seen = self._tracks.seen(rows)
+        length = seen.sum(axis=1)
+        newest = len(window.clones) - 1
+        rows, seen, length = rows[length >= 2], seen[length >= 2], length[length >= 2]
+        if len(rows) > s.max_features:
+            # What ends now has its last chance; then the longest.
+            ends = ~seen[:, newest] | seen[:, 0]
+            best = np.lexsort((self._tracks.ids(rows), -length, ~ends))[: s.max_features]
+            rows = rows[np.sort(best)]
+        views = self._tracks.views(rows, newest + 1)
+        T = window.T_cam0_world(self._T_cam0_imu)
+        p, valid = triangulate_tracks(camera, T, views, s.max_distance * camera.baseline_m)
+        at = residuals(camera, T, p, views)
+        keep = valid & at.ahead
+        at = Residuals(at.r[keep], at.z_D_p[keep], at.ahead[keep])
+        information = track_information(at, p[keep], self._robust_weights(at))
+        return _Tracks(rows[keep], p[keep], at, information)
+
+    def _robust_weights(self, at: Residuals) -> FloatArray:
+        """Cauchy weights (F, N) of all views; the scale is each clone's own, as a predicted pose is off as a whole."""
+        squares = np.sum(at.r**2, axis=2)
+        used = np.any(at.z_D_p != 0, axis=(2, 3))
+        weights = np.zeros(squares.shape)
+        for n in range(squares.shape[1]):
+            of_clone = squares[used[:, n], n]
+            if len(of_clone):
+                scale2 = max(self._sigma2, float(np.median(of_clone)) / 3.36)  # 3.36: median of chi-square, 4 degrees
+                weights[:, n] = used[:, n] / (1 + squares[:, n] / (4 * scale2 * _CAUCHY**2))
+        return weights
+
+    def _information(
+        self, window: Window, tracks: _Tracks, chosen: BoolArray, z: FloatArray, weight: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
+        D = len(window.P)
+        A, b = np.zeros((D, D)), np.zeros(D)
+        clones = slice(DIM, window.first_landmark)
+        if chosen.any():
+            A[clones, clones], b[clones] = eliminate_points(tracks.information, chosen)
+        self._add_landmarks(window, z, weight, A, b)
+        return A / self._sigma2, b / self._sigma2
+
+    def _add_landmarks(self, window: Window, z: FloatArray, weight: FloatArray, A: FloatArray, b: FloatArray) -> None:
+        """Add the landmarks' pixels in the newest clone: `dz = J (xi_f - xi_rho)`, as the anchor is that clone."""
+        if not len(z):
+            return
+        J, r, _ = self._landmark_residuals(window, z, weight)
+        scale2 = max(self._sigma2, float(np.median(np.sum(r**2, axis=1))) / 3.36)
+        w = 1 / (1 + np.sum(r**2, axis=1) / (4 * scale2 * _CAUCHY**2))
+        C = np.einsum("k,kai,kaj->kij", w, J, J)
+        g = np.einsum("k,kai,ka->ki", w, J, r)
+        rho = slice(
+            window.clone_rows(len(window.clones) - 1).start, window.clone_rows(len(window.clones) - 1).start + 3
+        )
+        A[rho, rho] += C.sum(axis=0)
+        b[rho] -= g.sum(axis=0)
+        for k in range(len(z)):
+            own = slice(window.first_landmark + 3 * k, window.first_landmark + 3 * k + 3)
+            A[own, own] += C[k]
+            A[own, rho] -= C[k]
+            A[rho, own] -= C[k]
+            b[own] += g[k]
+
+    def _landmark_residuals(
+        self, window: Window, z: FloatArray, weight: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Jacobian (K, 4, 3), residuals (K, 4) of the landmarks in the newest clone, and which lie ahead of it."""
+        T = window.T_cam0_world(self._T_cam0_imu)[-1]
+        p_cam = transform_points(T, window.landmarks)
+        ahead = p_cam[:, 2] > 0.5 * self._camera.baseline_m
+        p_cam = np.where(ahead[:, None], p_cam, [0.0, 0.0, 1.0])
+        usable = weight * ahead[:, None]
+        r = np.where(usable > 0, z - project(self._camera, p_cam), 0.0)
+        return (z_D_p_cam(self._camera, p_cam) @ T[:3, :3]) * usable[..., None], r, ahead
+
+    def _gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
+        """Which tracks (F,) pass the chi-square gate, and their squared residual over its degrees of freedom (F,)."""
+        dof = 2 * np.any(at.z_D_p[..., :2, :] != 0, axis=(2, 3)).sum(1) + 2 * np.any(
+            at.z_D_p[..., 2:, :] != 0, axis=(2, 3)
+        ).sum(1)
+        dof = np.maximum(dof - 3, 1)
+        squares = np.sum(at.r**2, axis=(1, 2)) / self._sigma2
+        limit = _chi2_table(self._settings.gate_probability)[np.minimum(dof, 199)]
+        return squares <= limit, squares / dof
+
+    def _follow_noise(self, at: Residuals, nis: FloatArray) -> None:
+        """Let the pixel noise follow the median of the squared residuals, robustly and slowly."""
+        if len(nis) < _MIN_TRACKS_FOR_NOISE:
+            return
+        s = self._settings
+        # The median of chi-square over its degrees of freedom is below one; 0.85 is right for 4 to 8 degrees.
+        ratio = float(np.clip(np.median(nis) / 0.85, 0.25, 4.0))
+        self._sigma2 = float(
+            np.clip(self._sigma2 * ratio**_NOISE_GAIN, s.pixel_sigma_min_px**2, s.pixel_sigma_max_px**2)
+        )
+
+    def _commit(self, window: Window, tracks: _Tracks, good: BoolArray, z: FloatArray, weight: FloatArray) -> int:
+        """Commit what ends in this frame, keep the output covariance, make room; return how many landmarks are new."""
+        newest = len(window.clones) - 1
+        full = len(window.clones) > self._settings.clones
+        seen = self._tracks.seen(tracks.rows)
+        lost, leaving = ~seen[:, newest], seen[:, 0] & full
+        ending = lost | leaving
+        A, b = self._information(window, tracks, ending & good, z, weight)
+        window.commit(A, b)
+
+        going_on = good & ~ending
+        A_on = np.zeros_like(A)
+        clones = slice(DIM, window.first_landmark)
+        if going_on.any():
+            A_on[clones, clones] = eliminate_points(tracks.information, going_on)[0] / self._sigma2
+            self._output = posterior(window.P, A_on, np.zeros(len(A)))[0][:DIM, :DIM]
+        else:
+            self._output = window.P[:DIM, :DIM].copy()
+
+        promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
+        self._tracks.remove(tracks.rows[promoted])
+        ended = ending.copy()
+        ended[promoted] = False
+        all_rows = self._tracks.rows()
+        gone = ~self._tracks.seen(all_rows)[:, newest]
+        self._tracks.forget_views(tracks.rows[ended & ~lost])
+        self._tracks.remove(all_rows[gone])
+        if full:
+            window.drop_oldest_clone()
+            self._tracks.shift()
+        return len(promoted)
+
+    def _promote(self, window: Window, tracks: _Tracks, candidates: BoolArray) -> IntArray:
+        """Make landmarks of the longest tracks that leave the window; return which of the tracks (indices)."""
+        room = self._settings.max_landmarks - len(window.landmarks)
+        chosen = np.flatnonzero(candidates)
+        if room <= 0 or not len(chosen):
+            return np.zeros(0, dtype=np.int64)
+        info = tracks.information
+        # The best known points first: smallest largest standard deviation.
+        worst = 1 / np.linalg.eigvalsh(info.C[chosen])[:, 0]
+        chosen = chosen[np.lexsort((self._tracks.ids(tracks.rows[chosen]), worst))[:room]]
+        C_inverse = np.linalg.inv(info.C[chosen])
+        p = tracks.p_world[chosen]
+        A = np.zeros((len(chosen), 3, len(window.P)))
+        A[:, :, DIM : window.first_landmark] = -C_inverse @ np.swapaxes(info.G[chosen], 1, 2)
+        rotation = window.clone_rows(len(window.clones) - 1).start + 3
+        A[:, :, rotation : rotation + 3] += so3_hat(p)
+        ids = self._tracks.ids(tracks.rows[chosen])
+        window.add_landmarks(ids, p, A.reshape(-1, len(window.P)), self._sigma2 * C_inverse)
+        return chosen
+
+
+@lru_cache(maxsize=8)
+def _chi2_table(probability: float) -> FloatArray:
+    """Quantiles of chi-square for 0 to 199 degrees of freedom."""
+    return np.concatenate([[0.0], chi2.ppf(probability, np.arange(1, 200))])
+
+
+def _newest_innovation(at: Residuals) -> float | None:
+    """Median absolute residual in the newest clone before it is corrected, pixels."""
+    r, used = at.r[:, -1], np.any(at.z_D_p[:, -1] != 0, axis=2)
+    return float(np.median(np.abs(r[used]))) if used.any() else None

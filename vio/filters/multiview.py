@@ -1,0 +1,159 @@
+"""Many tracks over many clones at once: triangulation, residuals, and the information they hold about the poses.
+
+Shapes: F tracks, N clones. A track's landmark is a point of the world; its error is taken out of the problem exactly
+(Schur complement, the same as projecting onto the left null space of its Jacobian, a test shows), so tracks need no
+place in the state. Equation numbers (M1) … are those of docs/math.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, so3_hat
+from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
+from vio.records import BoolArray
+
+_MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
+_TRIANGULATION_STEPS = 4
+_FARTHEST = 1e6  # baselines; keeps numbers finite
+
+
+@dataclass(frozen=True, slots=True)
+class Views:
+    """What F tracks showed in N clones."""
+
+    z: FloatArray  # (F, N, 4) pixels [ul vl ur vr]; arbitrary where unseen
+    weight: FloatArray  # (F, N, 4) 1 for a pixel coordinate that was measured, 0 else
+
+    def take(self, index: BoolArray) -> Views:
+        """Return the tracks of a mask (F,)."""
+        return Views(self.z[index], self.weight[index])
+
+
+@dataclass(frozen=True, slots=True)
+class Residuals:
+    """Residuals of tracks at given poses and points, and their Jacobians."""
+
+    r: FloatArray  # (F, N, 4) pixels, zero where unseen
+    z_D_p: FloatArray  # (F, N, 4, 3) with respect to the point in the world frame, zero where unseen
+    ahead: BoolArray  # (F,) the point lies in front of every camera that saw it
+
+
+def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views) -> Residuals:
+    """Compare predicted with seen pixels, equation (M1).
+
+    Args:
+        camera: rectified pair.
+        T_cam0_world: (N, 4, 4).
+        p_world: (F, 3).
+        views: what was seen.
+    """
+    R, t = T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]
+    p_cam = np.einsum("nij,fj->fni", R, p_world) + t
+    seen = views.weight.any(axis=2)
+    ok = p_cam[..., 2] > _MIN_DEPTH * camera.baseline_m
+    safe = np.where((ok & seen)[..., None], p_cam, [0.0, 0.0, 1.0])
+    r = np.where(views.weight > 0, views.z - project(camera, safe), 0.0)
+    J = (z_D_p_cam(camera, safe) @ R) * views.weight[..., None]
+    usable = seen & ok
+    r = np.where(usable[..., None], r, 0.0)
+    J = np.where(usable[..., None, None], J, 0.0)
+    return Residuals(r, J, (ok | ~seen).all(axis=1))
+
+
+def triangulate_tracks(
+    camera: StereoCamera, T_cam0_world: FloatArray, views: Views, max_distance_m: float
+) -> tuple[FloatArray, BoolArray]:
+    """Points (F, 3) in the world from all views, and a mask (F,) of those that are determined.
+
+    The start is the stereo view with the largest disparity; a few damped Gauss-Newton steps on all pixels follow. A
+    track without any stereo view, or whose point lies behind a camera or too far, is not determined.
+
+    Args:
+        camera: rectified pair.
+        T_cam0_world: (N, 4, 4).
+        views: what was seen.
+        max_distance_m: farther points give False.
+    """
+    stereo = views.weight[..., 2] > 0
+    disparity = np.where(stereo, views.z[..., 0] - views.z[..., 2], -np.inf)
+    best = np.argmax(disparity, axis=1)
+    rows = np.arange(len(best))
+    start, valid = triangulate(camera, np.where(stereo[rows, best][:, None], views.z[rows, best], 0.0))
+    T = T_cam0_world[best]
+    p = np.einsum("fji,fj->fi", T[:, :3, :3], start - T[:, :3, 3])
+    damping = 1e-9
+    for _ in range(_TRIANGULATION_STEPS):
+        at = residuals(camera, T_cam0_world, p, views)
+        C = np.einsum("fnki,fnkj->fij", at.z_D_p, at.z_D_p)
+        g = np.einsum("fnki,fnk->fi", at.z_D_p, at.r)
+        C += (damping + 1e-6 * np.trace(C, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+        step = np.linalg.solve(C, g[..., None])[..., 0]
+        reach = np.linalg.norm(step, axis=1) / (0.5 * np.maximum(np.linalg.norm(start, axis=1), 1e-6))
+        p = p + step / np.maximum(reach, 1.0)[:, None]
+        p = np.clip(p, -_FARTHEST * camera.baseline_m, _FARTHEST * camera.baseline_m)
+    depth = np.einsum("fj,fj->f", T[:, 2, :3], p) + T[:, 2, 3]
+    return p, valid & (depth > _MIN_DEPTH * camera.baseline_m) & (depth < max_distance_m)
+
+
+@dataclass(frozen=True, slots=True)
+class TrackInformation:
+    """What tracks say of the clones once their points are eliminated; pixel noise is one pixel here."""
+
+    G: FloatArray  # (F, 6N, 3) cross information of clones and point
+    C: FloatArray  # (F, 3, 3) information of the point
+    diagonal: FloatArray  # (F, N, 6, 6) information of each clone before the point is eliminated
+    gradient: FloatArray  # (F, 6N) before the point is eliminated
+    point_gradient: FloatArray  # (F, 3)
+
+
+def track_information(at: Residuals, p_world: FloatArray, weight: FloatArray) -> TrackInformation:
+    """Collect the normal equations of tracks, equations (M2) and (M3).
+
+    With the right-invariant error of clone i, `dz_i = J_i B xi_i + J_i dp`, where `B = [-I, p^]` is the same for all
+    clones: the error of the point is measured from the rotated estimate, so a common rotation of all clones about
+    the world's axes leaves every residual alone, whatever the estimates.
+
+    Args:
+        at: residuals and Jacobians.
+        p_world: points (F, 3).
+        weight: (F, N) robust weight of each view.
+    """
+    J = at.z_D_p
+    C_i = np.einsum("fn,fnki,fnkj->fnij", weight, J, J)
+    g_i = np.einsum("fn,fnki,fnk->fni", weight, J, at.r)
+    B = point_lever(p_world)
+    F, N = J.shape[:2]
+    G = np.einsum("fai,fnab->fnib", B, C_i).reshape(F, 6 * N, 3)
+    diagonal = np.einsum("fai,fnab,fbj->fnij", B, C_i, B)
+    gradient = np.einsum("fai,fna->fni", B, g_i).reshape(F, 6 * N)
+    return TrackInformation(G, C_i.sum(axis=1), diagonal, gradient, g_i.sum(axis=1))
+
+
+def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Information matrix (6N, 6N) and vector (6N,) about the clones of the chosen tracks, equation (M4).
+
+    `sum_f blkdiag(D_f) - G_f C_f^-1 G_f'`: exact elimination of each point.
+    """
+    N = info.diagonal.shape[1]
+    C = info.C[chosen]
+    L = np.linalg.cholesky(np.linalg.inv(C))
+    V = info.G[chosen] @ L  # (F, 6N, 3)
+    flat = np.swapaxes(V, 1, 2).reshape(-1, 6 * N)
+    A = -flat.T @ flat
+    blocks = info.diagonal[chosen].sum(axis=0)
+    for i in range(N):
+        A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += blocks[i]
+    b = info.gradient[chosen].sum(axis=0)
+    b -= np.einsum("fik,fk->i", V, np.einsum("fik,fi->fk", L, info.point_gradient[chosen]))
+    return A, b
+
+
+def point_lever(p_world: FloatArray) -> FloatArray:
+    """`B = [-I, p^]` (F, 3, 6): how a clone's error `[rho; phi]` moves a point as that clone sees it."""
+    B = np.zeros((len(p_world), 3, 6))
+    B[:, :, :3] = -np.eye(3)
+    B[:, :, 3:] = so3_hat(p_world)
+    return B

@@ -1,0 +1,297 @@
+"""Motion models of the sliding-window filter: raw IMU, or a body twist that drifts.
+
+Both carry a navigation state with a 15-dimensional error whose first six entries are the pose's `[rho; phi]`,
+right-invariant: `T_world_imu = exp(xi) T_hat`. The rest is `[xi_v; gyro bias; accel bias]` for the IMU, with
+`v = exp(phi) v_hat + xi_v`, and `[twist; gyro bias]` for the twist. Equation numbers are those of docs/math.md.
+References: Barrau & Bonnabel, The invariant extended Kalman filter as a stable observer (2017); Hartley et al.,
+Contact-aided invariant extended Kalman filtering for robot state estimation (2020).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.errors import EstimationError
+from vio.filters.settings import MsckfSettings
+from vio.geometry.lie import (
+    FloatArray,
+    se3_adjoint,
+    se3_exp,
+    se3_from_parts,
+    se3_left_jacobian,
+    so3_exp,
+    so3_hat,
+    so3_left_jacobian,
+)
+from vio.records import ImuSample, MotionSample, VelocitySample
+
+DIM = 15  # error dimensions of the navigation state
+_MAX_GAP_S = 0.5  # a longer silence of the IMU is an error, not an interval to integrate over
+
+
+@dataclass(frozen=True, slots=True)
+class NavState:
+    """Where the body is and how it moves."""
+
+    T_world_imu: FloatArray  # (4, 4)
+    velocity: FloatArray  # (3,) IMU model: world frame; twist model: body frame; m/s
+    rate: FloatArray  # (3,) twist model: body frame, rad/s; IMU model: unused, zero
+    gyro_bias: FloatArray  # (3,) rad/s
+    accel_bias: FloatArray  # (3,) m/s^2; twist model: unused, zero
+
+
+@dataclass(frozen=True, slots=True)
+class Transition:
+    """One step of a motion model."""
+
+    nav: NavState
+    Phi: FloatArray  # (15, 15)
+    Q: FloatArray  # (15, 15)
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """A linear measurement of the navigation state's error: residual = H error + noise."""
+
+    H: FloatArray  # (k, 15)
+    residual: FloatArray  # (k,)
+    R: FloatArray  # (k, k)
+
+
+class ImuMotion:
+    """Gyro and accelerometer, gravity, two biases that walk."""
+
+    def __init__(self, settings: MsckfSettings) -> None:
+        self._settings = settings
+        self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
+        self._samples: list[ImuSample] = []
+
+    def take(self, sample: MotionSample) -> None:
+        """Keep a sample until the interval that needs it."""
+        assert isinstance(sample, ImuSample)
+        self._samples.append(sample)
+
+    @property
+    def ready(self) -> bool:
+        """Whether enough is known to start."""
+        return bool(self._samples)
+
+    def start(self, time_ns: int) -> tuple[NavState, FloatArray]:
+        """Return the state at the first frame and its covariance (15, 15): gravity from the accelerometer.
+
+        The samples before the frame are taken for a rest if they scatter little, which also gives the gyro bias;
+        else attitude and velocity start with honest doubt, and the images settle them.
+
+        Raises:
+            EstimationError: the accelerometer reads nothing.
+        """
+        s = self._settings
+        recent = [x for x in self._samples if x.time_ns >= self._samples[-1].time_ns - 500_000_000]
+        accel = np.mean([x.accel for x in recent], axis=0)
+        if np.linalg.norm(accel) < 1e-3:
+            raise EstimationError("the accelerometer reads zero; is it in m/s^2, with gravity in it?")
+        up = accel / np.linalg.norm(accel)
+        T = se3_from_parts(_rotation_to_up(up), np.zeros(3))
+        nav = NavState(T, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+        sigmas = np.concatenate(
+            [
+                np.zeros(3),
+                [np.radians(s.start_tilt_sigma_deg)] * 2,
+                [1e-6],
+                np.full(3, s.start_velocity_sigma_mps),
+                np.full(3, s.gyro_bias_sigma_radps),
+                np.full(3, s.accel_bias_sigma_mps2),
+            ]
+        )
+        return nav, np.diag(sigmas**2)
+
+    def advance(self, nav: NavState, start_ns: int, end_ns: int) -> Transition:
+        """Integrate from one time to another, equations (N1) to (N4).
+
+        Raises:
+            EstimationError: the IMU is silent for too long.
+        """
+        times, gyro, accel = self._interval(start_ns, end_ns)
+        dt = np.diff(times) * 1e-9
+        gyro, accel = gyro - nav.gyro_bias, accel - nav.accel_bias
+        steps = so3_exp(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None])
+        R = np.empty((len(times), 3, 3))
+        R[0] = nav.T_world_imu[:3, :3]
+        for k, step in enumerate(steps):
+            R[k + 1] = R[k] @ step
+        force = (R @ accel[..., None])[..., 0] + self._gravity
+        a = 0.5 * (force[:-1] + force[1:])
+        v = nav.velocity + np.concatenate([np.zeros((1, 3)), np.cumsum(a * dt[:, None], axis=0)])
+        moves = v[:-1] * dt[:, None] + 0.5 * a * (dt**2)[:, None]
+        p = nav.T_world_imu[:3, 3] + np.concatenate([np.zeros((1, 3)), np.cumsum(moves, axis=0)])
+        Phi, Q = self._linearise(times, dt, R, v, p)
+        return Transition(replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1]), Phi, Q)
+
+    def measurement(self, nav: NavState) -> Measurement | None:
+        """The IMU drives the state and measures nothing."""
+        return None
+
+    def velocity_world(self, nav: NavState) -> FloatArray:
+        """Velocity (3,) in the world frame."""
+        return nav.velocity
+
+    def corrected(self, nav: NavState, error: FloatArray) -> NavState:
+        """Return the state moved by an error (15,)."""
+        phi = error[3:6]
+        return NavState(
+            se3_exp(error[:6]) @ nav.T_world_imu,
+            so3_exp(phi) @ nav.velocity + so3_left_jacobian(phi) @ error[6:9],
+            nav.rate,
+            nav.gyro_bias + error[9:12],
+            nav.accel_bias + error[12:15],
+        )
+
+    def _interval(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Times relative to the start (K,) in ns, gyro (K, 3), accel (K, 3), interpolated at both ends."""
+        samples = self._samples
+        all_times = np.array([x.time_ns for x in samples], dtype=np.int64)
+        if not len(samples) or all_times[0] > start_ns + _MAX_GAP_S * 1e9 or all_times[-1] < end_ns - _MAX_GAP_S * 1e9:
+            raise EstimationError(
+                f"the IMU is silent between {start_ns} and {end_ns} ns; check that IMU and camera share a clock"
+            )
+        t = (all_times - start_ns).astype(np.float64)
+        end = float(end_ns - start_ns)
+        inside = t[(t > 0) & (t < end)]
+        cuts = np.concatenate([[0.0], inside, [end]])
+        if np.diff(cuts).max() > _MAX_GAP_S * 1e9:
+            raise EstimationError(f"the IMU is silent for {np.diff(cuts).max() * 1e-9:.2f} s before {end_ns} ns")
+        values = np.array([np.concatenate([x.gyro, x.accel]) for x in samples])
+        at = np.stack([np.interp(cuts, t, column) for column in values.T], axis=1)
+        keep = int(np.searchsorted(all_times, end_ns, side="right")) - 1
+        self._samples = samples[max(keep, 0) :]
+        return cuts, at[:, :3], at[:, 3:]
+
+    def _linearise(
+        self, times: FloatArray, dt: FloatArray, R: FloatArray, v: FloatArray, p: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Transition (15, 15) and noise (15, 15) over the interval; the navigation part depends on gravity alone."""
+        s = self._settings
+        total = float(times[-1]) * 1e-9
+        left = (times[-1] - 0.5 * (times[:-1] + times[1:])) * 1e-9  # from the middle of each step to the end
+        Rm = R[:-1]
+        vm, pm = 0.5 * (v[:-1] + v[1:]), 0.5 * (p[:-1] + p[1:])
+        B = np.zeros((len(dt), 9, 6))  # how bias errors and noise of gyro and accelerometer enter [rho phi xi_v]
+        B[:, 0:3, 0:3] = -so3_hat(pm) @ Rm
+        B[:, 3:6, 0:3] = -Rm
+        B[:, 6:9, 0:3] = -so3_hat(vm) @ Rm
+        B[:, 6:9, 3:6] = -Rm
+        moved = _free_flow(left, self._gravity) @ B
+        Phi = np.eye(DIM)
+        Phi[:9, :9] = _free_flow(np.array([total]), self._gravity)[0]
+        Phi[:9, 9:] = np.einsum("kij,k->ij", moved, dt)
+        densities = np.repeat([s.gyro_noise_density, s.accel_noise_density], 3) ** 2
+        Q = np.zeros((DIM, DIM))
+        Q[:9, :9] = np.einsum("kij,j,klj,k->il", moved, densities, moved, dt)
+        walks = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * total
+        Q[9:, 9:] = np.diag(walks)
+        return Phi, Q
+
+
+class TwistMotion:
+    """The body twist is a state that drifts with white acceleration; velocity samples, if any, measure it.
+
+    This is `vio.filters.motion.DriftingTwist` with the error on the world side and a bias of the angular rate.
+    """
+
+    def __init__(self, settings: MsckfSettings) -> None:
+        s = self._settings = settings
+        self._density = np.repeat([s.acceleration_density, s.angular_acceleration_density], 3) ** 2
+        self._pending: VelocitySample | None = None
+
+    @property
+    def ready(self) -> bool:
+        """Whether enough is known to start: always."""
+        return True
+
+    def take(self, sample: MotionSample) -> None:
+        """Keep a sample for the measurement that follows."""
+        assert isinstance(sample, VelocitySample)
+        self._pending = sample
+
+    def start(self, time_ns: int) -> tuple[NavState, FloatArray]:
+        """Return the state at the first frame and its covariance (15, 15): the world is where the body is."""
+        s = self._settings
+        zero = np.zeros(3)
+        sigmas = np.concatenate(
+            [
+                np.zeros(6),
+                np.full(3, s.start_velocity_sigma_mps),
+                np.full(3, s.start_rate_sigma_radps),
+                np.full(3, s.rate_bias_sigma_radps),
+            ]
+        )
+        return NavState(np.eye(4), zero, zero, zero, zero), np.diag(sigmas**2)
+
+    def advance(self, nav: NavState, start_ns: int, end_ns: int) -> Transition:
+        """Carry pose and twist over a time, equations (N5) and (N6)."""
+        tau = (end_ns - start_ns) * 1e-9
+        u = np.concatenate([nav.velocity, nav.rate])
+        T = nav.T_world_imu
+        moved = T @ se3_exp(tau * u)
+        # T exp(tau (u + du)) = exp(tau Ad(T) J_l(tau u) du) T exp(tau u)
+        lever = tau * se3_adjoint(T) @ se3_left_jacobian(tau * u)
+        Phi = np.eye(DIM)
+        Phi[:6, 6:12] = lever
+        Q = np.zeros((DIM, DIM))
+        D = np.diag(self._density)
+        Q[:6, :6] = lever @ D @ lever.T * (tau / 3)
+        Q[:6, 6:12] = lever @ D * (tau / 2)
+        Q[6:12, :6] = Q[:6, 6:12].T
+        Q[6:12, 6:12] = D * tau
+        Q[12:, 12:] = np.eye(3) * (self._settings.rate_bias_walk**2 * tau)
+        return Transition(replace(nav, T_world_imu=moved), Phi, Q)
+
+    def measurement(self, nav: NavState) -> Measurement | None:
+        """The velocity sample that has just been taken, if any."""
+        sample, self._pending = self._pending, None
+        if sample is None:
+            return None
+        s = self._settings
+        H = np.zeros((6, DIM))
+        H[:, 6:12] = np.eye(6)
+        H[3:, 12:15] = np.eye(3)
+        residual = np.concatenate([sample.linear - nav.velocity, sample.angular - nav.rate - nav.gyro_bias])
+        sigmas = np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3)
+        return Measurement(H, residual, np.diag(sigmas**2))
+
+    def velocity_world(self, nav: NavState) -> FloatArray:
+        """Velocity (3,) in the world frame."""
+        out: FloatArray = nav.T_world_imu[:3, :3] @ nav.velocity
+        return out
+
+    def corrected(self, nav: NavState, error: FloatArray) -> NavState:
+        """Return the state moved by an error (15,)."""
+        return NavState(
+            se3_exp(error[:6]) @ nav.T_world_imu,
+            nav.velocity + error[6:9],
+            nav.rate + error[9:12],
+            nav.gyro_bias + error[12:15],
+            nav.accel_bias,
+        )
+
+
+def _free_flow(s: FloatArray, gravity: FloatArray) -> FloatArray:
+    """Transition (K, 9, 9) of [rho phi xi_v] over times (K,): the same for every state, which is the filter's point."""
+    out = np.zeros((len(s), 9, 9))
+    out[:] = np.eye(9)
+    G = so3_hat(gravity)
+    out[:, 0:3, 6:9] = s[:, None, None] * np.eye(3)
+    out[:, 0:3, 3:6] = (0.5 * s**2)[:, None, None] * G
+    out[:, 6:9, 3:6] = s[:, None, None] * G
+    return out
+
+
+def _rotation_to_up(up_imu: FloatArray) -> FloatArray:
+    """A rotation R_world_imu (3, 3) that takes a direction of the IMU to the world's z axis, by the shortest turn."""
+    axis = np.cross(up_imu, [0.0, 0.0, 1.0])
+    s, c = float(np.linalg.norm(axis)), float(up_imu[2])
+    if s < 1e-9:
+        return np.eye(3) if c > 0 else so3_exp([np.pi, 0.0, 0.0])
+    return so3_exp(axis / s * np.arctan2(s, c))

@@ -1,0 +1,97 @@
+"""The pixels of all living tracks over the window, in arrays: rows are tracks, columns are clones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.filters.multiview import Views
+from vio.geometry.lie import FloatArray
+from vio.records import BoolArray, IntArray, Observations
+
+
+class TrackTable:
+    """Grows by doubling; a track keeps its row until it is removed."""
+
+    def __init__(self, columns: int) -> None:
+        self._columns = columns
+        self._row_of: dict[int, int] = {}
+        self._free: list[int] = []
+        self._ids = np.zeros(0, dtype=np.int64)
+        self._z = np.zeros((0, columns, 4))
+        self._weight = np.zeros((0, columns, 4))
+        self._grow(256)
+
+    def add_frame(self, column: int, seen: Observations) -> None:
+        """Write the observations of one frame into a column; unknown ids become new tracks."""
+        rows = np.array([self._row(i) for i in seen.ids.tolist()], dtype=np.int64)
+        if len(rows):
+            self._z[rows, column] = seen.z
+            self._weight[rows, column, :2] = 1.0
+            self._weight[rows, column, 2:] = seen.has_right[:, None]
+
+    def rows(self) -> IntArray:
+        """Rows (F,) of all tracks, in order of their ids, so that no result depends on the table's history."""
+        ids = np.array(sorted(self._row_of), dtype=np.int64)
+        return np.array([self._row_of[i] for i in ids.tolist()], dtype=np.int64)
+
+    def ids(self, rows: IntArray) -> IntArray:
+        """Ids (F,) of rows."""
+        return self._ids[rows]
+
+    def views(self, rows: IntArray, columns: int) -> Views:
+        """What rows showed in the first `columns` clones."""
+        return Views(self._z[rows, :columns], self._weight[rows, :columns])
+
+    def seen(self, rows: IntArray) -> BoolArray:
+        """Which columns (F, N) rows were seen in."""
+        return self._weight[rows, :, 0] > 0
+
+    def shift(self) -> None:
+        """Forget the oldest column; tracks that were seen there alone are removed."""
+        self._z[:, :-1], self._weight[:, :-1] = self._z[:, 1:].copy(), self._weight[:, 1:].copy()
+        self._weight[:, -1] = 0.0
+        rows = self.rows()
+        self.remove(rows[~self.seen(rows).any(axis=1)])
+
+    def forget_views(self, rows: IntArray) -> None:
+        """Forget all views of rows but keep the tracks; their pixels have been used."""
+        self._weight[rows] = 0.0
+
+    def remove(self, rows: IntArray) -> None:
+        """Remove tracks."""
+        for row in rows.tolist():
+            del self._row_of[int(self._ids[row])]
+            self._free.append(row)
+        self._weight[rows] = 0.0
+
+    def _row(self, track: int) -> int:
+        row = self._row_of.get(track)
+        if row is None:
+            if not self._free:
+                self._grow(2 * len(self._ids))
+            row = self._free.pop()
+            self._row_of[track] = row
+            self._ids[row] = track
+        return row
+
+    def _grow(self, size: int) -> None:
+        old = len(self._ids)
+        extra = size - old
+        self._ids = np.concatenate([self._ids, np.zeros(extra, dtype=np.int64)])
+        self._z = np.concatenate([self._z, np.zeros((extra, self._columns, 4))])
+        self._weight = np.concatenate([self._weight, np.zeros((extra, self._columns, 4))])
+        self._free += range(size - 1, old - 1, -1)
+
+
+def latest_pixels(seen: Observations, ids: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Pixels (K, 4), weights (K, 4) and a mask (K,) of given ids in one frame; the mask tells which are there."""
+    order = np.argsort(seen.ids)
+    at = np.searchsorted(seen.ids[order], ids)
+    at = np.minimum(at, max(len(order) - 1, 0))
+    if len(order) == 0:
+        return np.zeros((len(ids), 4)), np.zeros((len(ids), 4)), np.zeros(len(ids), dtype=np.bool_)
+    rows = order[at]
+    found = seen.ids[rows] == ids
+    weight = np.ones((len(ids), 4))
+    weight[:, 2:] = seen.has_right[rows][:, None]
+    return seen.z[rows], weight * found[:, None], found

@@ -1,0 +1,175 @@
+"""The window: navigation state, clones and landmarks, and the one covariance over all their errors.
+
+Layout of an error vector of length D: navigation state (15), clones (6 each, oldest first), landmarks (3 each). Only
+this module knows it. The means are the newest estimates, at which everything is linearised; `P` and `offset` describe
+the prior: what has been committed says that the true error of the means has mean `-offset` and covariance `P`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
+from vio.records import BoolArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Clone:
+    """The body at the time of a frame."""
+
+    frame_index: int
+    time_ns: int
+    T_world_imu: FloatArray  # (4, 4)
+
+
+class Window:
+    """State and covariance of the sliding-window filter; every change of the covariance happens here."""
+
+    def __init__(self, motion: ImuMotion | TwistMotion, nav: NavState, P: FloatArray) -> None:
+        self.motion = motion
+        self.nav = nav
+        self.clones: list[Clone] = []
+        self.landmark_ids: IntArray = np.zeros(0, dtype=np.int64)
+        self.landmarks: FloatArray = np.zeros((0, 3))
+        self.P = P
+        self.offset: FloatArray = np.zeros(len(P))
+
+    @property
+    def first_landmark(self) -> int:
+        """Row of the first landmark."""
+        return DIM + 6 * len(self.clones)
+
+    def clone_rows(self, index: int) -> slice:
+        """Rows of a clone."""
+        start = DIM + 6 * index
+        return slice(start, start + 6)
+
+    def T_cam0_world(self, T_cam0_imu: FloatArray) -> FloatArray:
+        """Camera poses (N, 4, 4) of all clones."""
+        out: FloatArray = T_cam0_imu @ se3_inverse(np.array([c.T_world_imu for c in self.clones]))
+        return out
+
+    def propagate(self, step: Transition) -> None:
+        """Move the navigation state by one step of its motion model."""
+        self.nav = step.nav
+        P, Phi = self.P, step.Phi
+        P[:DIM] = Phi @ P[:DIM]
+        P[:, :DIM] = P[:, :DIM] @ Phi.T
+        P[:DIM, :DIM] += step.Q
+        self.offset[:DIM] = Phi @ self.offset[:DIM]
+
+    def add_clone(self, frame_index: int, time_ns: int) -> None:
+        """Copy the pose as the newest clone; landmarks are anchored to its rotation from now on."""
+        at = self.first_landmark
+        rows = np.concatenate([np.arange(at), np.arange(6), np.arange(at, len(self.P))])
+        self.P = self.P[np.ix_(rows, rows)]
+        self.offset = self.offset[rows]
+        previous = len(self.clones) - 1
+        self.clones.append(Clone(frame_index, time_ns, self.nav.T_world_imu))
+        if len(self.landmarks):
+            self._anchor_to_newest(self.clone_rows(previous).start + 3)
+
+    def _anchor_to_newest(self, previous_rotation: int) -> None:
+        """Measure the landmarks' errors from the newest clone's rotation: xi_f += p^ (phi_new - phi_old)."""
+        first, newest = self.first_landmark, self.clone_rows(len(self.clones) - 1).start + 3
+        A = np.eye(len(self.P))
+        lever = so3_hat(self.landmarks)
+        for k in range(len(self.landmarks)):
+            rows = slice(first + 3 * k, first + 3 * k + 3)
+            A[rows, newest : newest + 3] += lever[k]
+            A[rows, previous_rotation : previous_rotation + 3] -= lever[k]
+        changed = A[first:]
+        moved = changed @ self.P
+        self.P[first:] = moved
+        self.P[:, first:] = np.concatenate([moved.T[:first], moved @ changed.T])
+        self.offset[first:] = changed @ self.offset
+
+    def drop_oldest_clone(self) -> None:
+        """Forget the oldest clone."""
+        self._keep_rows(np.delete(np.arange(len(self.P)), self.clone_rows(0)))
+        self.clones = self.clones[1:]
+
+    def keep_landmarks(self, chosen: BoolArray) -> None:
+        """Forget the landmarks outside a mask (M,)."""
+        if chosen.all():
+            return
+        rows = np.concatenate([np.ones(self.first_landmark, dtype=np.bool_), np.repeat(chosen, 3)])
+        self._keep_rows(np.flatnonzero(rows))
+        self.landmark_ids, self.landmarks = self.landmark_ids[chosen], self.landmarks[chosen]
+
+    def _keep_rows(self, rows: IntArray) -> None:
+        self.P = self.P[np.ix_(rows, rows)]
+        self.offset = self.offset[rows]
+
+    def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
+        """Add landmarks (K, 3) whose errors are `A xi + noise`, with A (3K, D) and noise covariance (K, 3, 3)."""
+        D, n = len(self.P), len(A)
+        P = np.zeros((D + n, D + n))
+        AP = A @ self.P
+        P[:D, :D], P[D:, :D], P[:D, D:] = self.P, AP, AP.T
+        P[D:, D:] = AP @ A.T
+        for k, block in enumerate(covariance):
+            P[D + 3 * k : D + 3 * k + 3, D + 3 * k : D + 3 * k + 3] += block
+        self.offset = np.concatenate([self.offset, A @ self.offset])
+        self.P = 0.5 * (P + P.T)
+        self.landmark_ids = np.concatenate([self.landmark_ids, ids])
+        self.landmarks = np.concatenate([self.landmarks, p_world])
+
+    def commit(self, information: FloatArray, vector: FloatArray) -> None:
+        """Take measurements into the prior for good.
+
+        Args:
+            information: `H' R^-1 H` (D, D) of the residuals at the present means.
+            vector: `H' R^-1 r` (D,).
+        """
+        self.P, shift = posterior(self.P, information, vector + information @ self.offset)
+        self.offset = self.offset - shift
+
+    def measure(self, measurement: Measurement) -> None:
+        """Commit a measurement of the navigation state and move the means by it."""
+        RiH = np.linalg.solve(measurement.R, measurement.H)
+        information = np.zeros_like(self.P)
+        information[:DIM, :DIM] = measurement.H.T @ RiH
+        vector = np.zeros(len(self.P))
+        vector[:DIM] = RiH.T @ measurement.residual
+        self.commit(information, vector)
+        self.relinearise(-self.offset)
+
+    def relinearise(self, error: FloatArray) -> None:
+        """Move the means by an error vector (D,); the prior stays where it is."""
+        self.nav = self.motion.corrected(self.nav, error[:DIM])
+        moves = se3_exp(error[DIM : self.first_landmark].reshape(-1, 6))
+        if len(self.landmarks):
+            phi = error[self.clone_rows(len(self.clones) - 1)][3:]
+            own = error[self.first_landmark :].reshape(-1, 3)
+            self.landmarks = self.landmarks @ so3_exp(phi).T + own @ so3_left_jacobian(phi).T
+        self.clones = [
+            Clone(c.frame_index, c.time_ns, move @ c.T_world_imu) for c, move in zip(self.clones, moves, strict=True)
+        ]
+        self.offset = self.offset + error
+
+
+def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance (D, D) and the shift of the mean (D,) after a measurement in information form.
+
+    `(P^-1 + A)^-1` without an inverse of P, which is singular where states are copies or known: with `P = L L'`, it is
+    `L (I + L' A L)^-1 L'`, symmetric and positive by construction.
+    """
+    L = _square_root(P)
+    inner = np.eye(len(P)) + L.T @ information @ L
+    K = np.linalg.cholesky(0.5 * (inner + inner.T))
+    W = np.linalg.solve(K, L.T)
+    P_new = W.T @ W
+    return P_new, P_new @ vector
+
+
+def _square_root(P: FloatArray) -> FloatArray:
+    """Some L (D, D) with L L' = P, also for singular P."""
+    try:
+        return np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24))
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(P)
+        return vectors * np.sqrt(np.maximum(values, 0.0))
