@@ -22,9 +22,11 @@ from vio.filters.multiview import (
     Residuals,
     TrackInformation,
     eliminate_points,
+    first_points,
+    refine_points,
     residuals,
     track_information,
-    triangulate_tracks,
+    within,
 )
 from vio.filters.navigation import DIM, ImuMotion, TwistMotion
 from vio.filters.settings import MsckfSettings
@@ -51,6 +53,8 @@ _CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
 _MIN_TRACKS_FOR_NOISE = 15
 _MAX_WAIT_FRAMES = 20
+_FIRST_STEPS, _LATER_STEPS = 3, 1  # Gauss-Newton steps on each point, before and after the poses moved
+_FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 
 
 class _Tracks:
@@ -172,7 +176,7 @@ class Msckf:
         self._waited += 1
         if self._waited > _MAX_WAIT_FRAMES:
             raise EstimationError(
-                f"{self._waited} frames without an IMU sample; check that IMU and camera share a clock, or use --motion none"
+                f"{self._waited} frames without an IMU sample; check the clocks, or use --motion none"
             )
         self._time_ns = observations.time_ns
         return UpdateReport(0, 0, 0, 0, None, None)
@@ -204,17 +208,19 @@ class Msckf:
         z, weight = z[found], weight[found]
         self._tracks.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
 
-        innovation = None
-        for step in range(self._settings.iterations):
-            tracks = self._linearise(window)
-            if step == 0:
-                innovation = _newest_innovation(tracks.at)
+        tracks = self._linearise(window, self._choose(window), _FIRST_STEPS)
+        innovation = _newest_innovation(tracks.at)
+        for _ in range(self._settings.iterations):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, z, weight)
             _, shift = posterior(window.P, A, b + A @ window.offset)
             window.relinearise(shift - window.offset)
+            tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
+            residual = _newest_innovation(tracks.at)
+            # Another step pays only where this one had far to go.
+            if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
+                break
 
-        tracks = self._linearise(window)
         good, nis = self._gate(tracks.at)
         self._follow_noise(tracks.at, nis)
         report = self._commit(window, tracks, good, z, weight)
@@ -227,32 +233,42 @@ class Msckf:
             nis_per_dof=float(np.median(nis)) if len(nis) else None,
         )
 
-    def _linearise(self, window: Window) -> _Tracks:
-        """Triangulate the tracks that say something of the poses, and linearise them at the present estimate."""
-        s, camera = self._settings, self._camera
+    def _choose(self, window: Window) -> IntArray:
+        """Rows of the tracks that say something of the poses: two views or more, the most telling first if too many."""
         rows = self._tracks.rows()
         seen = self._tracks.seen(rows)
         length = seen.sum(axis=1)
-        newest = len(window.clones) - 1
         rows, seen, length = rows[length >= 2], seen[length >= 2], length[length >= 2]
-        if len(rows) > s.max_features:
+        if len(rows) > self._settings.max_features:
             # What ends now has its last chance; then the longest.
-            ends = ~seen[:, newest] | seen[:, 0]
-            best = np.lexsort((self._tracks.ids(rows), -length, ~ends))[: s.max_features]
+            ends = ~seen[:, len(window.clones) - 1] | seen[:, 0]
+            best = np.lexsort((self._tracks.ids(rows), -length, ~ends))[: self._settings.max_features]
             rows = rows[np.sort(best)]
-        views = self._tracks.views(rows, newest + 1)
+        return rows
+
+    def _linearise(self, window: Window, rows: IntArray, steps: int) -> _Tracks:
+        """Triangulate tracks, from where their points were last, and linearise them at the present estimate."""
+        camera, table = self._camera, self._tracks
+        views = table.views(rows, len(window.clones))
         T = window.T_cam0_world(self._T_cam0_imu)
-        p, valid = triangulate_tracks(camera, T, views, s.max_distance * camera.baseline_m)
+        fresh = ~table.has_point[rows]
+        if fresh.any():
+            start, known = first_points(camera, T, views.take(fresh))
+            table.points[rows[fresh]], table.has_point[rows[fresh]] = start, known
+            rows = rows[table.has_point[rows]]
+            views = table.views(rows, len(window.clones))
+        p = refine_points(camera, T, table.points[rows], views, steps)
         at = residuals(camera, T, p, views)
-        keep = valid & at.ahead
+        keep = at.ahead & within(camera, T, p, self._settings.max_distance * camera.baseline_m)
+        table.points[rows], table.has_point[rows] = p, keep
+        rows, p = rows[keep], p[keep]
         at = Residuals(at.r[keep], at.z_D_p[keep], at.ahead[keep])
-        information = track_information(at, p[keep], self._robust_weights(at))
-        return _Tracks(rows[keep], p[keep], at, information)
+        return _Tracks(rows, p, at, track_information(at, p, self._robust_weights(at)))
 
     def _robust_weights(self, at: Residuals) -> FloatArray:
         """Cauchy weights (F, N) of all views; the scale is each clone's own, as a predicted pose is off as a whole."""
         squares = np.sum(at.r**2, axis=2)
-        used = np.any(at.z_D_p != 0, axis=(2, 3))
+        used: BoolArray = np.any(at.z_D_p[:, :, 1, :], axis=2)  # the row of vl is measured in every view
         weights = np.zeros(squares.shape)
         for n in range(squares.shape[1]):
             of_clone = squares[used[:, n], n]
@@ -308,13 +324,12 @@ class Msckf:
 
     def _gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
         """Which tracks (F,) pass the chi-square gate, and their squared residual over its degrees of freedom (F,)."""
-        dof = 2 * np.any(at.z_D_p[..., :2, :] != 0, axis=(2, 3)).sum(1) + 2 * np.any(
-            at.z_D_p[..., 2:, :] != 0, axis=(2, 3)
-        ).sum(1)
-        dof = np.maximum(dof - 3, 1)
+        pairs: BoolArray = np.any(at.z_D_p[:, :, 1::2, :], axis=3)  # (F, N, 2): seen left, seen right
+        dof = np.maximum(2 * pairs.sum(axis=(1, 2)) - 3, 1)
         squares = np.sum(at.r**2, axis=(1, 2)) / self._sigma2
         limit = _chi2_table(self._settings.gate_probability)[np.minimum(dof, 199)]
-        return squares <= limit, squares / dof
+        passed: BoolArray = squares <= limit
+        return passed, squares / dof
 
     def _follow_noise(self, at: Residuals, nis: FloatArray) -> None:
         """Let the pixel noise follow the median of the squared residuals, robustly and slowly."""
@@ -376,7 +391,8 @@ class Msckf:
         rotation = window.clone_rows(len(window.clones) - 1).start + 3
         A[:, :, rotation : rotation + 3] += so3_hat(p)
         ids = self._tracks.ids(tracks.rows[chosen])
-        window.add_landmarks(ids, p, A.reshape(-1, len(window.P)), self._sigma2 * C_inverse)
+        covariance: FloatArray = self._sigma2 * C_inverse
+        window.add_landmarks(ids, p, A.reshape(-1, len(window.P)), covariance)
         return chosen
 
 

@@ -16,8 +16,6 @@ from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
 from vio.records import BoolArray
 
 _MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
-_TRIANGULATION_STEPS = 4
-_FARTHEST = 1e6  # baselines; keeps numbers finite
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,51 +49,56 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
         views: what was seen.
     """
     R, t = T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]
-    p_cam = np.einsum("nij,fj->fni", R, p_world) + t
-    seen = views.weight.any(axis=2)
+    F, N = len(p_world), len(T_cam0_world)
+    p_cam = (p_world @ R.reshape(-1, 3).T).reshape(F, N, 3) + t
+    seen = views.weight[..., 0] > 0
     ok = p_cam[..., 2] > _MIN_DEPTH * camera.baseline_m
     safe = np.where((ok & seen)[..., None], p_cam, [0.0, 0.0, 1.0])
-    r = np.where(views.weight > 0, views.z - project(camera, safe), 0.0)
-    J = (z_D_p_cam(camera, safe) @ R) * views.weight[..., None]
-    usable = seen & ok
-    r = np.where(usable[..., None], r, 0.0)
-    J = np.where(usable[..., None, None], J, 0.0)
-    return Residuals(r, J, (ok | ~seen).all(axis=1))
+    usable = views.weight * ok[..., None]
+    r = (np.where(usable > 0, views.z, 0.0) - project(camera, safe)) * usable
+    J = (z_D_p_cam(camera, safe) * usable[..., None]) @ R
+    ahead: BoolArray = np.all(ok | ~seen, axis=1)
+    return Residuals(r, J, ahead)
 
 
-def triangulate_tracks(
-    camera: StereoCamera, T_cam0_world: FloatArray, views: Views, max_distance_m: float
-) -> tuple[FloatArray, BoolArray]:
-    """Points (F, 3) in the world from all views, and a mask (F,) of those that are determined.
-
-    The start is the stereo view with the largest disparity; a few damped Gauss-Newton steps on all pixels follow. A
-    track without any stereo view, or whose point lies behind a camera or too far, is not determined.
-
-    Args:
-        camera: rectified pair.
-        T_cam0_world: (N, 4, 4).
-        views: what was seen.
-        max_distance_m: farther points give False.
-    """
-    stereo = views.weight[..., 2] > 0
-    disparity = np.where(stereo, views.z[..., 0] - views.z[..., 2], -np.inf)
+def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -> tuple[FloatArray, BoolArray]:
+    """Points (F, 3) in the world from each track's stereo view of largest disparity; False (F,) where there is none."""
+    disparity = np.where(views.weight[..., 2] > 0, views.z[..., 0] - views.z[..., 2], -np.inf)
     best = np.argmax(disparity, axis=1)
     rows = np.arange(len(best))
-    start, valid = triangulate(camera, np.where(stereo[rows, best][:, None], views.z[rows, best], 0.0))
+    usable = disparity[rows, best] > 0
+    p_cam, valid = triangulate(camera, np.where(usable[:, None], views.z[rows, best], 0.0))
     T = T_cam0_world[best]
-    p = np.einsum("fji,fj->fi", T[:, :3, :3], start - T[:, :3, 3])
-    damping = 1e-9
-    for _ in range(_TRIANGULATION_STEPS):
+    p = ((p_cam - T[:, :3, 3])[:, None, :] @ T[:, :3, :3])[:, 0]
+    return p, usable & valid
+
+
+def refine_points(
+    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, steps: int
+) -> FloatArray:
+    """Move points (F, 3) by damped Gauss-Newton steps on all their pixels.
+
+    A step is cut to half the distance from the nearest camera that saw the point, so that a bad start cannot throw it
+    behind the cameras.
+    """
+    p = p_world
+    centre = -np.einsum("nji,nj->ni", T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]).mean(axis=0)
+    for _ in range(steps):
         at = residuals(camera, T_cam0_world, p, views)
-        C = np.einsum("fnki,fnkj->fij", at.z_D_p, at.z_D_p)
-        g = np.einsum("fnki,fnk->fi", at.z_D_p, at.r)
-        C += (damping + 1e-6 * np.trace(C, axis1=1, axis2=2))[:, None, None] * np.eye(3)
-        step = np.linalg.solve(C, g[..., None])[..., 0]
-        reach = np.linalg.norm(step, axis=1) / (0.5 * np.maximum(np.linalg.norm(start, axis=1), 1e-6))
+        J = at.z_D_p.reshape(len(p), 4 * len(T_cam0_world), 3)
+        Jt = np.swapaxes(J, 1, 2)
+        C = Jt @ J
+        C += (1e-9 + 1e-6 * np.trace(C, axis1=1, axis2=2))[:, None, None] * np.eye(3)
+        step = np.linalg.solve(C, Jt @ at.r.reshape(len(p), 4 * len(T_cam0_world), 1))[..., 0]
+        reach = np.linalg.norm(step, axis=1) / (0.5 * np.maximum(np.linalg.norm(p - centre, axis=1), 1e-6))
         p = p + step / np.maximum(reach, 1.0)[:, None]
-        p = np.clip(p, -_FARTHEST * camera.baseline_m, _FARTHEST * camera.baseline_m)
-    depth = np.einsum("fj,fj->f", T[:, 2, :3], p) + T[:, 2, 3]
-    return p, valid & (depth > _MIN_DEPTH * camera.baseline_m) & (depth < max_distance_m)
+    return p
+
+
+def within(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, max_distance_m: float) -> BoolArray:
+    """Which points (F,) lie ahead of the newest clone's camera plane by no more than a distance, and are finite."""
+    depth = p_world @ T_cam0_world[-1, 2, :3] + T_cam0_world[-1, 2, 3]
+    return np.isfinite(p_world).all(axis=1) & (np.abs(depth) < max_distance_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,14 +125,16 @@ def track_information(at: Residuals, p_world: FloatArray, weight: FloatArray) ->
         weight: (F, N) robust weight of each view.
     """
     J = at.z_D_p
-    C_i = np.einsum("fn,fnki,fnkj->fnij", weight, J, J)
-    g_i = np.einsum("fn,fnki,fnk->fni", weight, J, at.r)
-    B = point_lever(p_world)
     F, N = J.shape[:2]
-    G = np.einsum("fai,fnab->fnib", B, C_i).reshape(F, 6 * N, 3)
-    diagonal = np.einsum("fai,fnab,fbj->fnij", B, C_i, B)
-    gradient = np.einsum("fai,fna->fni", B, g_i).reshape(F, 6 * N)
-    return TrackInformation(G, C_i.sum(axis=1), diagonal, gradient, g_i.sum(axis=1))
+    Jt = np.swapaxes(J * weight[..., None, None], 2, 3)
+    C_i = Jt @ J
+    g_i = (Jt @ at.r[..., None])[..., 0]
+    B = point_lever(p_world)
+    Bt = np.swapaxes(B, 1, 2)
+    G_i = Bt[:, None] @ C_i
+    diagonal = G_i @ B[:, None]
+    gradient = (Bt[:, None] @ g_i[..., None]).reshape(F, 6 * N)
+    return TrackInformation(G_i.reshape(F, 6 * N, 3), C_i.sum(axis=1), diagonal, gradient, g_i.sum(axis=1))
 
 
 def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -147,7 +152,7 @@ def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatAr
     for i in range(N):
         A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += blocks[i]
     b = info.gradient[chosen].sum(axis=0)
-    b -= np.einsum("fik,fk->i", V, np.einsum("fik,fi->fk", L, info.point_gradient[chosen]))
+    b -= flat.T @ (np.swapaxes(L, 1, 2) @ info.point_gradient[chosen][..., None]).reshape(-1)
     return A, b
 
 

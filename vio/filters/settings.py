@@ -66,7 +66,7 @@ class MsckfSettings:
     clones: int = setting(11, "poses kept in the window")
     max_landmarks: int = setting(30, "long-lived landmarks kept in the state")
     max_features: int = setting(150, "tracks without a landmark of their own that enter one update")
-    iterations: int = setting(2, "Gauss-Newton steps over the window a frame")
+    iterations: int = setting(4, "most Gauss-Newton steps over the window in a frame; one is the rule")
     pixel_sigma_px: float = setting(0.5, "noise of one pixel coordinate at the start; then estimated", unit="px")
     pixel_sigma_min_px: float = setting(0.1, "the estimated noise stays above this", unit="px")
     pixel_sigma_max_px: float = setting(2.0, "the estimated noise stays below this", unit="px")

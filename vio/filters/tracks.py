@@ -19,6 +19,8 @@ class TrackTable:
         self._ids = np.zeros(0, dtype=np.int64)
         self._z = np.zeros((0, columns, 4))
         self._weight = np.zeros((0, columns, 4))
+        self.points = np.zeros((0, 3))  # world; the last triangulation of each row, a start for the next
+        self.has_point: BoolArray = np.zeros(0, dtype=np.bool_)
         self._grow(256)
 
     def add_frame(self, column: int, seen: Observations) -> None:
@@ -56,6 +58,7 @@ class TrackTable:
     def forget_views(self, rows: IntArray) -> None:
         """Forget all views of rows but keep the tracks; their pixels have been used."""
         self._weight[rows] = 0.0
+        self.has_point[rows] = False
 
     def remove(self, rows: IntArray) -> None:
         """Remove tracks."""
@@ -63,6 +66,7 @@ class TrackTable:
             del self._row_of[int(self._ids[row])]
             self._free.append(row)
         self._weight[rows] = 0.0
+        self.has_point[rows] = False
 
     def _row(self, track: int) -> int:
         row = self._row_of.get(track)
@@ -80,6 +84,8 @@ class TrackTable:
         self._ids = np.concatenate([self._ids, np.zeros(extra, dtype=np.int64)])
         self._z = np.concatenate([self._z, np.zeros((extra, self._columns, 4))])
         self._weight = np.concatenate([self._weight, np.zeros((extra, self._columns, 4))])
+        self.points = np.concatenate([self.points, np.zeros((extra, 3))])
+        self.has_point = np.concatenate([self.has_point, np.zeros(extra, dtype=np.bool_)])
         self._free += range(size - 1, old - 1, -1)
 
 

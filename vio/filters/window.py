@@ -172,4 +172,5 @@ def _square_root(P: FloatArray) -> FloatArray:
         return np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24))
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(P)
-        return vectors * np.sqrt(np.maximum(values, 0.0))
+        root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))
+        return root
