@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import multiprocessing
 import os
 from collections.abc import Callable, Sequence
@@ -213,11 +214,12 @@ def _ready(scenario: Scenario) -> tuple[MotionSpline, IntArray, None]:
     if isinstance(scenario.imu, Path):
         raise SimulationError("a recorded IMU goes with its own recorded trajectory; simulate one instead")
     duration_s = 30.0 if scenario.duration_s is None else scenario.duration_s
-    motion = _motion(scenario, duration_s + 2 * _MARGIN_S)
+    # A whole number of frame times, so that sensors that start with the motion at that rate meet the frames.
+    before = math.ceil(_MARGIN_S * scenario.rate_hz)
+    motion = _motion(scenario, duration_s + before / scenario.rate_hz + _MARGIN_S)
     if scenario.rig in _EUROC_AXES:
         motion = turned(motion, R_FLU_EUROC_IMU)
-    times = _regular(motion.start_ns + round(_MARGIN_S * _NS), duration_s, scenario.rate_hz)
-    return motion, times, None
+    return motion, _regular(motion.start_ns, duration_s, scenario.rate_hz, first=before), None
 
 
 def _motion(scenario: Scenario, duration_s: float) -> MotionSpline:
@@ -225,7 +227,7 @@ def _motion(scenario: Scenario, duration_s: float) -> MotionSpline:
         return car_loop(duration_s=duration_s, seed=scenario.seed)
     if scenario.scene == "corridor":
         return _walk(duration_s, scenario.seed)
-    centre = (0.0, -35.0, 1.5) if scenario.scene == "street" else (0.0, 0.0, 1.4)
+    centre = (0.0, -37.8, 1.5) if scenario.scene == "street" else (0.0, 0.0, 1.4)
     return hand_held(centre=centre, duration_s=duration_s, seed=scenario.seed)
 
 
@@ -243,9 +245,9 @@ def _walk(duration_s: float, seed: int) -> MotionSpline:
     return spline_from_waypoints(T @ se3_exp(shake), interval_s)
 
 
-def _regular(start_ns: int, duration_s: float, rate_hz: float) -> IntArray:
+def _regular(start_ns: int, duration_s: float, rate_hz: float, *, first: int = 0) -> IntArray:
     count = max(1, int(duration_s * rate_hz + 1e-6))
-    times: IntArray = start_ns + np.round(np.arange(count) * (_NS / rate_hz)).astype(np.int64)
+    times: IntArray = start_ns + np.round(np.arange(first, first + count) * (_NS / rate_hz)).astype(np.int64)
     return times
 
 

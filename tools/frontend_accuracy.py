@@ -1,0 +1,369 @@
+"""Hold a front end against rendered images whose every pixel is known; print a table, or JSON.
+
+    python tools/frontend_accuracy.py [--frontend klt] [--set frontend.klt.window_px=21] [--json FILE]
+
+Renders the room as seen along a hand-held flight by a rectified 752x480 rig like EuRoC's: 300 frames, then 100 under
+each effect. Errors are distances to the exact map: from where a feature was in the frame before (`step`), from where it
+began (`since birth`), and from its left pixel to the right image (`disparity`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from frontend import build_frontend
+from vio.config import Config, load_config
+from vio.errors import VioError
+from vio.geometry.distortion import rectified_camera, unproject_pixel
+from vio.geometry.lie import FloatArray
+from vio.protocols import Frontend
+from vio.records import BoolArray, FrontendOutput, Image, IntArray, Observations, StereoFrame
+from vio.sim.render import View, cast, correspondence, inside_image, observe, surface_points
+from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, plan, usual_workers
+from vio.sim.sequence import SimulatedRecording, Simulation, views
+from vio.sim.world import surfaces_at
+from vio.threads import one_blas_thread
+
+SHOWN_EFFECTS = (
+    "exposure",
+    "gain",
+    "gain-high",
+    "blur",
+    "noise",
+    "dark",
+    "bare-wall",
+    "moving",
+    "dropped",
+    "duplicated",
+)
+
+_OUTLIER_PX = 1.0
+_CROSSED_PX = 1.5  # a track this far off, at another depth than its point, has changed surface
+_CROSSED_DEPTH = 0.02  # relative
+_CROSSED_FRAMES = 3  # for longer, a track on the wrong side of an edge counts as kept
+_MARGIN_PX = 12.0  # a point nearer to the image's border may be given up
+_CORNERS = 150  # strongest corners of an image, for the recall of repeatable ones
+_CORNER_GAP_PX = 24.0
+_AGAIN_PX = 1.5  # a corner found this near to its true place is the same
+_HELD_PX = 3.0  # a track this near to a corner holds it
+
+
+@dataclass
+class Tally:
+    """Everything counted while a front end works; arrays of one entry per observation, gathered frame by frame."""
+
+    step: list[FloatArray] = field(default_factory=list)  # (N, 2) px, found minus true
+    since_birth: list[FloatArray] = field(default_factory=list)  # (N, 2) px
+    age: list[IntArray] = field(default_factory=list)  # (N,) frames since birth, beside `since_birth`
+    disparity: list[FloatArray] = field(default_factory=list)  # (N,) px
+    row: list[FloatArray] = field(default_factory=list)  # (N,) px, right row minus true
+    order: list[FloatArray] = field(default_factory=list)  # (N,) ul - ur
+    held: list[int] = field(default_factory=list)  # features in each frame
+    matched: list[int] = field(default_factory=list)  # features with a right pixel in each frame
+    lived: dict[int, int] = field(default_factory=dict)  # frames that each feature was seen in
+    crossed: dict[int, int] = field(default_factory=dict)  # longest time that each feature spent beyond an edge
+    could_go_on: int = 0  # features whose point is still visible in the next frame
+    went_on: int = 0  # of these, found there within _OUTLIER_PX
+    kept: int = 0  # of these, found there at all
+    corners: int = 0  # repeatable corners
+    corners_held: int = 0  # of these, held by one track in both images
+    reused: int = 0  # ids that came back after they had gone
+    ms: list[float] = field(default_factory=list)
+
+
+@dataclass
+class _Birth:
+    """Where on the scene the features of one frame began."""
+
+    surface: dict[int, int] = field(default_factory=dict)
+    place: dict[int, FloatArray] = field(default_factory=dict)
+    frame: dict[int, int] = field(default_factory=dict)
+
+
+def judge(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Frontend) -> Tally:
+    """Run a front end over rendered frames and compare everything it says with the truth."""
+    tally, birth, beyond = Tally(), _Birth(), dict[int, int]()
+    before: Observations | None = None
+    image_before: Image | None = None
+    for frame in frames:
+        start = time.perf_counter()
+        output = frontend.process(frame)
+        tally.ms.append(1e3 * (time.perf_counter() - start))
+        now = output.observations
+        now = now.take(~now.stale)
+        _count(tally, output, now, before)
+        left, right = views(simulation, int(simulation.taken_ns[frame.index]))
+        _judge_stereo(tally, simulation, now, left, right)
+        _judge_life(tally, birth, beyond, simulation, now, left, frame.index)
+        if before is not None and image_before is not None and frame.left is not None:
+            last = views(simulation, int(simulation.taken_ns[before.frame_index]))[0]
+            _judge_step(tally, simulation, before, now, last, left)
+            if frame.index % 5 == 0:
+                _judge_corners(tally, simulation, (before, image_before, last), (now, frame.left, left))
+        before, image_before = now, frame.left
+    return tally
+
+
+def _count(tally: Tally, output: FrontendOutput, now: Observations, before: Observations | None) -> None:
+    tally.held.append(len(now))
+    tally.matched.append(int(now.has_right.sum()))
+    alive = set() if before is None else set(before.ids.tolist())
+    for name in now.ids.tolist():
+        tally.reused += name in tally.lived and name not in alive
+        tally.lived[name] = tally.lived.get(name, 0) + 1
+
+
+def _judge_stereo(tally: Tally, simulation: Simulation, now: Observations, left: View, right: View) -> None:
+    seen = now.take(now.has_right)
+    true, visible = correspondence(simulation.world, left, right, seen.z[:, :2])
+    error = seen.z[:, 2:] - true
+    tally.disparity.append(-error[visible, 0])
+    tally.row.append(error[visible, 1])
+    tally.order.append(seen.z[:, 0] - seen.z[:, 2])
+
+
+def _judge_step(
+    tally: Tally, simulation: Simulation, before: Observations, now: Observations, last: View, left: View
+) -> None:
+    true, visible = correspondence(simulation.world, last, left, before.z[:, :2])
+    _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    error = now.z[j, :2] - true[i]
+    tally.step.append(error[visible[i]])
+    open_to = visible & inside_image(left.camera, true, margin_px=_MARGIN_PX)
+    tally.could_go_on += int(open_to.sum())
+    tally.kept += int(open_to[i].sum())
+    tally.went_on += int((open_to[i] & (np.linalg.norm(error, axis=1) <= _OUTLIER_PX)).sum())
+
+
+def _judge_life(
+    tally: Tally,
+    birth: _Birth,
+    beyond: dict[int, int],
+    simulation: Simulation,
+    now: Observations,
+    left: View,
+    frame_index: int,
+) -> None:
+    """Compare each feature with the point of the scene that it began on."""
+    surfaces = surfaces_at(simulation.world, left.time_ns)
+    rays, _ = unproject_pixel(left.camera, now.z[:, :2])
+    hits = cast(surfaces, left.T_world_cam, rays)
+    names = now.ids.tolist()
+    for k, name in enumerate(names):
+        if name not in birth.surface:
+            birth.surface[name], birth.place[name] = int(hits.surface[k]), hits.place[k]
+            birth.frame[name] = frame_index
+    if not names:
+        return
+    began = np.array([birth.surface[name] for name in names])
+    p_world = surface_points(surfaces, began, np.array([birth.place[name] for name in names]))
+    true, visible = observe(surfaces, left, p_world)
+    error = now.z[:, :2] - true
+    age = frame_index - np.array([birth.frame[name] for name in names])
+    old = visible & (age > 0)
+    tally.since_birth.append(error[old])
+    tally.age.append(age[old])
+    away = _beyond_edge(left, p_world, hits.distance, error, visible)
+    for name, crossed in zip(names, away.tolist(), strict=True):
+        beyond[name] = beyond.get(name, 0) + 1 if crossed else 0
+        if crossed:
+            tally.crossed[name] = max(tally.crossed.get(name, 0), beyond[name])
+
+
+def _beyond_edge(
+    left: View, p_world: FloatArray, distance: FloatArray, error: FloatArray, visible: BoolArray
+) -> BoolArray:
+    """Mask (N,) of features that stand on another surface than their point: it is hidden, or they slid off it."""
+    own = np.linalg.norm(p_world - left.T_world_cam[:3, 3], axis=1)
+    other_depth = np.abs(distance - own) > _CROSSED_DEPTH * own
+    far = np.linalg.norm(error, axis=1) > _CROSSED_PX
+    # Just behind an outline a point is hidden although its feature is hardly off: that is no crossing yet.
+    return np.asarray(other_depth & (far | ~visible), dtype=np.bool_)
+
+
+def _judge_corners(
+    tally: Tally,
+    simulation: Simulation,
+    before: tuple[Observations, Image, View],
+    now: tuple[Observations, Image, View],
+) -> None:
+    """Count strong corners that both images show at the same point, and those that one track holds in both."""
+    corners, again = _corners(before[1]), _corners(now[1])
+    if len(corners) == 0 or len(again) == 0:
+        return
+    true, visible = correspondence(simulation.world, before[2], now[2], corners)
+    repeatable = visible & (_distances(true, again).min(axis=1) <= _AGAIN_PX)
+    tally.corners += int(repeatable.sum())
+    _, i, j = np.intersect1d(before[0].ids, now[0].ids, assume_unique=True, return_indices=True)
+    if len(i) == 0:
+        return
+    here = _distances(corners, before[0].z[i, :2]) <= _HELD_PX
+    there = _distances(true, now[0].z[j, :2]) <= _HELD_PX
+    tally.corners_held += int((repeatable & (here & there).any(axis=1)).sum())
+
+
+def _corners(image: Image) -> FloatArray:
+    found = cv2.goodFeaturesToTrack(image, _CORNERS, 0.02, _CORNER_GAP_PX, blockSize=5)
+    return np.zeros((0, 2)) if found is None else np.asarray(found, dtype=np.float64).reshape(-1, 2)
+
+
+def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
+    out: FloatArray = np.linalg.norm(a[:, None] - b[None], axis=2)
+    return out
+
+
+# --- figures --------------------------------------------------------------------------------------------------------
+
+
+def figures(tally: Tally) -> dict[str, Any]:
+    """Reduce a tally to plain numbers; errors in pixels, shares from 0 to 1, None where nothing was seen."""
+    lives = np.array(list(tally.lived.values()) or [0])
+    tracked = int((lives > 1).sum())
+    crossed = np.array(list(tally.crossed.values()), dtype=int)
+    order = _joined(tally.order, 1)
+    return {
+        "frames": len(tally.held),
+        "features_median": float(np.median(tally.held)),
+        "features_least": int(min(tally.held)),
+        "stereo_median": float(np.median(tally.matched)),
+        "stereo_least": int(min(tally.matched)),
+        "step": _errors(_joined(tally.step, 2)),
+        "since_birth": _errors(_joined(tally.since_birth, 2)),
+        "disparity": _errors(_joined(tally.disparity, 1)),
+        "row": _errors(_joined(tally.row, 1)),
+        "least_disparity_px": float(order.min()) if len(order) else None,
+        "tracks": len(tally.lived),
+        "life_mean": float(lives.mean()),
+        "life_median": float(np.median(lives)),
+        "life_95": float(np.percentile(lives, 95)),
+        "life_of_an_observation": float((lives**2).sum() / max(lives.sum(), 1)),
+        "survival": tally.kept / tally.could_go_on if tally.could_go_on else None,
+        "recall": tally.went_on / tally.could_go_on if tally.could_go_on else None,
+        "corner_recall": tally.corners_held / tally.corners if tally.corners else None,
+        "crossed": len(crossed) / tracked if tracked else None,
+        "crossed_and_kept": int((crossed > _CROSSED_FRAMES).sum()) / tracked if tracked else None,
+        "ids_reused": tally.reused,
+        "ms_median": float(np.median(tally.ms)),
+    }
+
+
+def _joined(parts: Sequence[FloatArray], columns: int) -> FloatArray:
+    if columns == 1:
+        return np.concatenate([np.zeros(0), *parts])
+    return np.concatenate([np.zeros((0, columns)), *parts])
+
+
+def _errors(error: FloatArray) -> dict[str, Any] | None:
+    """Median, 95 % and outlier share of the size of signed errors (N,) or (N, 2), and their signed median."""
+    if len(error) == 0:
+        return None
+    size = np.abs(error) if error.ndim == 1 else np.linalg.norm(error, axis=1)
+    bias = np.median(error, axis=0)
+    return {
+        "count": len(size),
+        "median_px": float(np.median(size)),
+        "p95_px": float(np.percentile(size, 95)),
+        "outliers": float(np.mean(size > _OUTLIER_PX)),
+        "bias_px": float(bias) if error.ndim == 1 else [float(x) for x in bias],
+    }
+
+
+def accuracy_scenario(effect: str | None, *, frames: int, width: int | None = None, seed: int = 1) -> Scenario:
+    """The room along a hand-held flight at 20 Hz; `effect` is a name of `vio.sim.scenarios.EFFECTS`."""
+    conditions = conditions_of([] if effect is None else [effect])
+    return Scenario(width=width, duration_s=frames / 20.0, conditions=conditions, imu="none", seed=seed)
+
+
+def measure(scenario: Scenario, config: Config, *, workers: int) -> dict[str, Any]:
+    """Render a scenario, run the configured front end over it, and return the figures."""
+    simulation = plan(scenario)
+    with ParallelRecording(scenario, workers=workers, simulation=simulation) as parallel, one_blas_thread():
+        recording: SimulatedRecording = parallel if workers > 1 else SimulatedRecording(simulation)
+        frontend = build_frontend(config.frontend.name, rectified_camera(simulation.rig), config.frontend, recording)
+        return figures(judge(simulation, (recording.frame(k) for k in range(len(recording))), frontend))
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """Lay the figures out as markdown."""
+    head = (
+        "| conditions | frames | features, stereo | step: median, 95 %, > 1 px | bias u, v "
+        "| since birth: median, 95 %, > 1 px | disparity: median, 95 %, > 1 px, bias "
+        "| life | recall | corners | crossed, kept |"
+    )
+    lines = [head, "|" + "---|" * head.count(" |")]
+    for name, f in results.items():
+        step, row = f["step"], f["disparity"]
+        bias = "-" if step is None else f"{step['bias_px'][0]:.3f}, {step['bias_px'][1]:.3f}"
+        cells = [
+            name,
+            f"{f['frames']}",
+            f"{f['features_median']:.0f}, {f['stereo_median']:.0f}",
+            _three(step),
+            bias,
+            _three(f["since_birth"]),
+            _three(row) + ("" if row is None else f", {row['bias_px']:.3f}"),
+            f"{f['life_mean']:.1f}",
+            _percent(f["recall"]),
+            _percent(f["corner_recall"]),
+            f"{_percent(f['crossed'])}, {_percent(f['crossed_and_kept'])}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _three(errors: dict[str, Any] | None) -> str:
+    if errors is None:
+        return "-"
+    return f"{errors['median_px']:.3f}, {errors['p95_px']:.3f}, {_percent(errors['outliers'])}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100 * share:.2f} %"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frontend", default="klt", metavar="NAME", help="front end (default klt)")
+    parser.add_argument("--set", action="append", default=[], metavar="a.b=c", help="change a setting of it")
+    parser.add_argument("--effects", default=",".join(SHOWN_EFFECTS), metavar="NAME,…", help="'' for none")
+    parser.add_argument("--frames", type=int, default=300, help="without effects (default 300)")
+    parser.add_argument("--effect-frames", type=int, default=100, help="under each effect (default 100)")
+    parser.add_argument("--width", type=int, metavar="PX", help="image width (default 752)")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--workers", type=int, default=usual_workers(300), help="rendering processes")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write all figures")
+    args = parser.parse_args(argv)
+    effects = [name for name in args.effects.split(",") if name]
+    try:
+        unknown = [name for name in effects if name not in EFFECTS]
+        if unknown:
+            parser.error(f"no effect is called {unknown[0]}; choose from {', '.join(EFFECTS)}")
+        config = load_config(None, [*args.set, f'frontend.name="{args.frontend}"'])
+        results = {}
+        for effect in [None, *effects]:
+            frames = args.frames if effect is None else args.effect_frames
+            scenario = accuracy_scenario(effect, frames=frames, width=args.width, seed=args.seed)
+            results[effect or "none"] = measure(scenario, config, workers=args.workers)
+            print(f"{effect or 'no effect'} done", file=sys.stderr)
+    except VioError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(table(results))
+    if args.json is not None:
+        args.json.write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
