@@ -1,106 +1,198 @@
-"""Sub-pixel alignment of many small templates at once, by Gauss-Newton over warp, gain and offset.
+"""Sub-pixel alignment of many small templates at once, by Gauss-Newton over an affine warp, gain and offset.
 
-The gradients of the template serve in every iteration (inverse-compositional form), so one iteration costs one
-interpolation of the image under each template. The warp maps template offsets `[x, y, 1]` to image pixels `[u, v, 1]`.
+The gradients of the template serve in every iteration (inverse-compositional form), so that one iteration costs one
+interpolation of the image under each template, and a template is prepared once for as long as it lives. A warp (2, 3)
+maps template offsets `[x, y, 1]` to image pixels `[u, v]`.
 Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from frontend.patches import Patches, bilinear_patches, inside, warped_patches
+from frontend.patches import FloatImage, Patches, inside
 from vio.geometry.lie import FloatArray
-from vio.records import Image
+from vio.records import IntArray
 
-# "shift": translation. "row": also shear and stretch along the row, as the two views of a slanted surface in a
-# rectified pair differ. "affine": any linear map of the patch, as between two times.
-Warp: TypeAlias = Literal["shift", "row", "affine"]
-_PARAMETERS: dict[Warp, int] = {"shift": 4, "row": 6, "affine": 8}
-
+_PARAMETERS = 8  # shift u, v; gain; offset; linear part by rows
+_ROW_PARAMETERS = 6  # the same without the second row of the linear part
+_ROW_SIGMA_PX = 0.3  # how far from its row a feature may lie in the other image of a rectified pair
+_GRAY_SIGMA = 4.0  # difference of the two cameras' views of one patch, after gain and offset
+_ROW_WEIGHT = (_GRAY_SIGMA / _ROW_SIGMA_PX) ** 2
 _DONE_PX = 0.03  # the last step is taken; what then remains is a small fraction of it
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: weakly textured directions move slowly instead of wildly
+_SUBPIXELS = 32  # cv2.remap rounds coordinates to this fraction of a pixel, so shifts are rounded before it does
+_REMAP_ROWS = 30_000  # cv2.remap takes fewer than 32768 rows
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
 
 @dataclass(frozen=True, slots=True)
 class Templates:
-    """Patches with their gradients, ready to be found again."""
+    """Patches ready to be found again."""
 
-    patch: Patches  # (N, 2r+1, 2r+1)
-    basis: npt.NDArray[np.float32]  # (N, 8, (2r+1)^2) derivatives by du, dv, gain, offset, and the linear part by rows
+    patch: npt.NDArray[np.float32]  # (N, S) gray levels minus their mean, S = (2r + 1)^2
+    energy: npt.NDArray[np.float32]  # (N,) sum of squares of the patch
+    solver: npt.NDArray[np.float32]  # (N, 8, S) maps the pixels under the warp to its parameters
+    row_solver: npt.NDArray[np.float32]  # (N, 6, S) the same, when the row is expected to stay
+    row_pull: npt.NDArray[np.float32]  # (N, 6) change of these parameters by a pixel between expected and found row
+
+    def __len__(self) -> int:
+        return len(self.patch)
 
 
-def cut_patches(image: Image, centres: FloatArray, radius: int) -> Patches:
+def empty_templates(count: int, radius: int) -> Templates:
+    """Room for `count` templates of a radius."""
+    size = (2 * radius + 1) ** 2
+    shapes = ((size,), (), (_PARAMETERS, size), (_ROW_PARAMETERS, size), (_ROW_PARAMETERS,))
+    return Templates(*(np.zeros((count, *shape), np.float32) for shape in shapes))
+
+
+def offsets(radius: int) -> npt.NDArray[np.float32]:
+    """Offsets (3, S) `[x, y, 1]` of the pixels of a patch from its centre, row by row."""
+    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(np.float32).reshape(2, -1)
+    return np.stack([x, y, np.ones_like(x)])
+
+
+def warped_patches(image: FloatImage, warp: FloatArray, radius: int) -> npt.NDArray[np.float32]:
+    """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated.
+
+    Coordinates are rounded to 1/32 pixel.
+    """
+    if len(warp) == 0:
+        return np.zeros((0, (2 * radius + 1) ** 2), dtype=np.float32)
+    place = (warp.reshape(-1, 3).astype(np.float32) @ offsets(radius)).reshape(len(warp), 2, -1)
+    u, v = np.ascontiguousarray(place[:, 0]), np.ascontiguousarray(place[:, 1])
+    parts = [
+        cv2.remap(
+            image, u[k : k + _REMAP_ROWS], v[k : k + _REMAP_ROWS], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        for k in range(0, len(warp), _REMAP_ROWS)
+    ]
+    return np.asarray(parts[0] if len(parts) == 1 else np.concatenate(parts), dtype=np.float32)
+
+
+def cut_patches(image: FloatImage, centres: FloatArray, radius: int) -> Patches:
     """Patches (N, 2r+3, 2r+3) around sub-pixel points (N, 2), one pixel wider than the template made of them."""
-    return bilinear_patches(image, centres, radius + 1)
+    side = 2 * radius + 3
+    return warped_patches(image, shift_warps(centres), radius + 1).reshape(-1, side, side)
+
+
+def rounded(centres: FloatArray) -> FloatArray:
+    """Points rounded to the fraction of a pixel at which `cut_patches` cuts exactly."""
+    return np.rint(centres * _SUBPIXELS) / _SUBPIXELS
 
 
 def templates(wide: Patches) -> Templates:
     """Prepare templates from patches (N, 2r+3, 2r+3) cut by `cut_patches`."""
-    patch = np.ascontiguousarray(wide[:, 1:-1, 1:-1])
-    gu = (wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2
-    gv = (wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2
-    radius = patch.shape[1] // 2
-    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(np.float32)
-    basis = np.stack([gu, gv, patch, np.ones_like(patch), gu * x, gu * y, gv * x, gv * y], axis=1)
-    return Templates(patch, basis.reshape(len(patch), 8, patch.shape[1] ** 2))
+    n, radius = len(wide), wide.shape[1] // 2 - 1
+    flat = (n, (2 * radius + 1) ** 2)
+    patch = wide[:, 1:-1, 1:-1].reshape(flat)
+    gu = ((wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2).reshape(flat)
+    gv = ((wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2).reshape(flat)
+    x, y, one = offsets(radius)
+    basis = np.stack([gu, gv, patch, np.broadcast_to(one, patch.shape), gu * x, gu * y, gv * x, gv * y], axis=1)
+    normal = (basis @ basis.transpose(0, 2, 1)).astype(np.float64)
+    normal += (_DAMPING * np.einsum("nii->ni", normal) + 1e-6)[:, :, None] * np.eye(_PARAMETERS)
+    on_row = normal[:, :_ROW_PARAMETERS, :_ROW_PARAMETERS].copy()
+    on_row[:, 1, 1] += _ROW_WEIGHT
+    inverse, inverse_on_row = np.linalg.inv(normal).astype(np.float32), np.linalg.inv(on_row).astype(np.float32)
+    centred = patch - patch.mean(axis=1, keepdims=True)
+    return Templates(
+        patch=centred,
+        energy=np.einsum("ns,ns->n", centred, centred),
+        solver=inverse @ basis,
+        row_solver=inverse_on_row @ basis[:, :_ROW_PARAMETERS],
+        row_pull=inverse_on_row[:, :, 1] * np.float32(_ROW_WEIGHT),
+    )
 
 
 def align(
-    template: Templates, image: Image, warp: FloatArray, kind: Warp, iterations: int
+    store: Templates,
+    slots: IntArray,
+    image: FloatImage,
+    warp: FloatArray,
+    iterations: int,
+    rows: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Refine warps (N, 3, 3) from templates to the image, freeing what `kind` names.
+    """Refine warps (N, 2, 3) from templates to the image.
+
+    Args:
+        store: templates (M,).
+        slots: which of them (N,) to find.
+        image: where.
+        warp: where to start.
+        iterations: largest number of steps.
+        rows: expected image rows (N,) of the centres, as in the other image of a rectified pair: the centre is drawn to
+            its row as strongly as the patch leaves it undetermined, and the warp shears and stretches along rows only.
 
     Returns:
-        The refined warps (N, 3, 3), and the normalised correlation (N,) under them, -1 where the template's centre
-        comes too close to the image border for the patch to fit.
+        The refined warps (N, 2, 3), and the normalised correlation (N,) just before the last step; -1 where the
+        template's centre comes too close to the image border for the patch to fit.
     """
-    n, radius, size = len(warp), template.patch.shape[1] // 2, _PARAMETERS[kind]
-    warp = warp.copy()
-    if n == 0:
-        return warp, np.zeros(0)
-    used = template.basis[:, :size]
-    normal = (used @ used.transpose(0, 2, 1)).astype(np.float64)
-    diagonal = np.einsum("nii->ni", normal)
-    solver = np.linalg.inv(normal + (_DAMPING * diagonal + 1e-6)[:, :, None] * np.eye(size)).astype(np.float32) @ used
+    n, radius = len(warp), int(store.patch.shape[1] ** 0.5) // 2
+    warp, score = warp.copy(), np.full(n, -1.0)
     active = np.arange(n)
     for _ in range(iterations):
-        view = warped_patches(image, warp[active], radius).reshape(len(active), -1, 1)
-        fit = (solver[active] @ view)[:, :, 0].astype(np.float64)
-        # The image under the current warp is gain * template(step(x)) + offset, so the step is undone.
-        fit /= np.maximum(fit[:, 2:3], 0.1)
-        step = np.tile(np.eye(3), (len(active), 1, 1))
-        step[:, :2, 2] = np.clip(fit[:, :2], -_MAX_STEP_PX, _MAX_STEP_PX)
-        linear = np.zeros((len(active), 4))
-        linear[:, : size - 4] = np.clip(fit[:, 4:], -_MAX_LINEAR_STEP, _MAX_LINEAR_STEP)
-        step[:, :2, :2] += linear.reshape(-1, 2, 2)
-        warp[active] = warp[active] @ np.linalg.inv(step)
-        active = active[np.abs(fit[:, :2]).max(axis=1) > _DONE_PX]
         if len(active) == 0:
             break
-    score = correlation(template.patch, warped_patches(image, warp, radius))
-    return warp, np.where(inside(image, warp[:, :2, 2], radius + 1), score, -1.0)
+        chosen = slots[active]
+        here = warp[active]
+        here[:, :, 2] = rounded(here[:, :, 2])
+        view = warped_patches(image, here, radius)
+        score[active] = _correlation(store.patch[chosen], store.energy[chosen], view)
+        solver = store.solver if rows is None else store.row_solver
+        fit = np.matmul(solver[chosen], view[:, :, None])[:, :, 0].astype(np.float64)
+        # The image under the current warp is gain * template(step(x)) + offset, so the step is undone.
+        gain = np.maximum(fit[:, 2:3], 0.1)
+        fit /= gain
+        if rows is not None:
+            fit += store.row_pull[chosen] * (here[:, 1, 2] - rows[active])[:, None]
+        shift = np.clip(fit[:, :2], -_MAX_STEP_PX, _MAX_STEP_PX)
+        linear = np.zeros((len(active), 4))
+        linear[:, : fit.shape[1] - 4] = np.clip(fit[:, 4:], -_MAX_LINEAR_STEP, _MAX_LINEAR_STEP)
+        warp[active] = _undo(here, shift, linear)
+        active = active[np.abs(fit[:, :2]).max(axis=1) > _DONE_PX]
+    return warp, np.where(inside(image, warp[:, :, 2], radius + 1), score, -1.0)
+
+
+def _undo(warp: FloatArray, shift: FloatArray, linear: FloatArray) -> FloatArray:
+    """`warp` (N, 2, 3) after the inverse of the step `x -> (I + linear) x + shift`, given as (N, 2) and (N, 4)."""
+    a, b, c, d = 1.0 + linear[:, 0], linear[:, 1], linear[:, 2], 1.0 + linear[:, 3]
+    inverse = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
+    out = np.empty_like(warp)
+    out[:, :, :2] = warp[:, :, :2] @ inverse
+    out[:, :, 2] = warp[:, :, 2] - (out[:, :, :2] @ shift[:, :, None])[:, :, 0]
+    return out
+
+
+def _correlation(
+    patch: npt.NDArray[np.float32], energy: npt.NDArray[np.float32], view: npt.NDArray[np.float32]
+) -> FloatArray:
+    """Normalised correlation (N,) of mean-free patches (N, S) with pixels (N, S); -1 without contrast."""
+    size = view.shape[1]
+    product = np.einsum("ns,ns->n", patch, view)  # the patch has no mean, so the view's drops out
+    other = np.maximum(np.einsum("ns,ns->n", view, view) - view.sum(axis=1) ** 2 / size, 0.0)
+    flat = FLAT_RMS**2 * size
+    good = (other > flat) & (energy > flat)
+    norm = np.sqrt(np.where(good, other.astype(np.float64) * energy, 1.0))
+    return np.where(good, product / norm, -1.0)
 
 
 def shift_warps(centres: FloatArray) -> FloatArray:
-    """Warps (N, 3, 3) that put the template's centre at image points (N, 2), unturned and unscaled."""
-    warp = np.tile(np.eye(3), (len(centres), 1, 1))
-    warp[:, :2, 2] = centres
+    """Warps (N, 2, 3) that put the template's centre at image points (N, 2), unturned and unscaled."""
+    warp = np.zeros((len(centres), 2, 3))
+    warp[:, 0, 0] = warp[:, 1, 1] = 1.0
+    warp[:, :, 2] = centres
     return warp
 
 
-def correlation(a: Patches, b: Patches) -> FloatArray:
-    """Normalised correlation (N,) of patches (N, h, w); -1 where one has no contrast."""
-    a = a - a.mean(axis=(1, 2), keepdims=True)
-    b = b - b.mean(axis=(1, 2), keepdims=True)
-    aa, bb = np.einsum("nhw,nhw->n", a, a), np.einsum("nhw,nhw->n", b, b)
-    flat = FLAT_RMS**2 * a.shape[1] * a.shape[2]
-    good = (aa > flat) & (bb > flat)
-    return np.where(good, np.einsum("nhw,nhw->n", a, b) / np.sqrt(np.where(good, aa * bb, 1.0)), -1.0)
+def scale_change(warp: FloatArray) -> FloatArray:
+    """Scale (N,) of warps (N, 2, 3): the square root of the change of area; tiny where the warp is mirrored."""
+    A = warp[:, :, :2]
+    return np.sqrt(np.maximum(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0], 1e-6))

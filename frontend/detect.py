@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from frontend.settings import KltSettings
 from vio.geometry.lie import FloatArray
-from vio.records import Image, IntArray
+from vio.records import BoolArray, Image, IntArray
 
 Response = npt.NDArray[np.float32]
 
-_BLOCK_PX = 5
+_BLOCK_PX = 3
 _GRADIENT_PX = 3
 # cornerMinEigenVal takes gray levels as fractions of 255 and makes the Sobel derivative twice the gradient.
 _EIGENVALUE_OF_UNIT_GRADIENT = (2.0 / 255.0) ** 2
@@ -72,30 +72,52 @@ def local_maxima(response: Response, occupied: FloatArray, distance: int, border
     return np.stack([u, v], axis=1)
 
 
-def detect_corners(image: Image, occupied: FloatArray, wanted: int, settings: KltSettings) -> FloatArray:
+def detect_corners(
+    half: Image, occupied: FloatArray, wanted: int, settings: KltSettings, allowed: BoolArray | None = None
+) -> FloatArray:
     """Find up to `wanted` new corners (K, 2), sub-pixel, where the grid has few tracked points `occupied` (N, 2).
 
-    The emptiest cells are filled first, each by its strongest corners, up to twice a cell's even share.
+    Corners are looked for at half resolution: what is a corner there lasts longer, and costs a quarter. The emptiest
+    cells are filled first, each by its strongest corners, up to twice a cell's even share; a corner much weaker than
+    the best of its cell is none.
+
+    Args:
+        half: image (H/2, W/2) at half resolution.
+        occupied: tracked points in pixels of the full image.
+        wanted: largest number of corners.
+        settings: sizes and thresholds.
+        allowed: mask (H/2, W/2) of pixels that may hold corners; None: all.
+
+    Returns:
+        Corners in pixels of the full image, in the order in which they should be taken.
     """
-    height, width = image.shape
-    border = settings.stereo_radius_px + 3
+    height, width = half.shape
+    border = settings.anchor_radius_px // 2 + 2
     if wanted <= 0 or min(height, width) <= 4 * border:
         return np.zeros((0, 2))
-    response = corner_response(image)
-    distance = min_distance_px(width, height, settings)
-    candidates = local_maxima(response, occupied, distance, border, settings.min_gradient**2)
-    shape = grid_shape(width, height, settings)
-    cell = cell_index(candidates.astype(np.float64), width, height, shape)
-    held = np.bincount(cell_index(occupied, width, height, shape), minlength=shape[0] * shape[1])
+    # A gradient per pixel of the full image is half of one per pixel of the half image.
+    response = corner_response(half) / np.float32(4.0)
+    if allowed is not None:
+        response = np.where(allowed, response, np.float32(0.0))
+    distance = max(1, min_distance_px(2 * width, 2 * height, settings) // 2)
+    candidates = local_maxima(response, occupied / 2, distance, border, settings.min_gradient**2)
+    shape = grid_shape(2 * width, 2 * height, settings)
+    cells = shape[0] * shape[1]
+    cell = cell_index(2 * candidates.astype(np.float64), 2 * width, 2 * height, shape)
     strength = response[candidates[:, 1], candidates[:, 0]]
+    strongest = np.zeros(cells, dtype=np.float32)
+    np.maximum.at(strongest, cell, strength)
+    kept = strength >= settings.min_relative_gradient**2 * strongest[cell]
+    candidates, cell, strength = candidates[kept], cell[kept], strength[kept]
+    held = np.bincount(cell_index(occupied, 2 * width, 2 * height, shape), minlength=cells)
     order = np.lexsort((candidates[:, 0], candidates[:, 1], -strength, cell))
-    first = np.searchsorted(cell[order], np.arange(shape[0] * shape[1]))
+    first = np.searchsorted(cell[order], np.arange(cells))
     level = np.arange(len(order)) - first[cell[order]] + held[cell[order]]  # features that the cell then holds already
     # Cells are filled evenly, emptiest first; among equals the strongest corner wins.
     queue = np.lexsort((-strength[order], level))
     queue = queue[level[queue] < 2 * settings.cell_features][:wanted]
     chosen = candidates[order[queue]]
-    return chosen + _peak_offset(response, chosen)
+    return 2.0 * (chosen + _peak_offset(response, chosen))
 
 
 def _peak_offset(response: Response, pixels: IntArray) -> FloatArray:

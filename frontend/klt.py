@@ -3,34 +3,48 @@
 from __future__ import annotations
 
 import logging
-import time
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 
-from frontend.align import align, cut_patches, shift_warps, templates
+from frontend.align import (
+    Templates,
+    align,
+    cut_patches,
+    empty_templates,
+    rounded,
+    scale_change,
+    shift_warps,
+    templates,
+)
 from frontend.detect import detect_corners, min_distance_px
+from frontend.frames import FrameGate, Stopwatch, SwapAlarm, half_mask, load_mask
 from frontend.outliers import Consensus, epipolar_distance, fit_motion, pixel_errors, rigid_consensus
-from frontend.patches import Patches, inside
+from frontend.patches import FloatImage, inside
 from frontend.settings import KltSettings
-from frontend.stereo_match import RowPyramid, match_rows, mirrored, row_pyramid
-from vio.errors import DataError
+from frontend.stereo_match import RowField, half_image, match_rows
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior, observations
 
 logger = logging.getLogger(__name__)
 
-_SWAP_FRAMES = 3  # frames without matches before the mirrored search is believed
-_SWAP_FEW = 0.3  # share of matches below which a frame is suspicious
-_SWAP_MANY = 0.4  # share of matches in the mirrored images that proves the swap
-_SWAP_MIN_POINTS = 20
-_LK_EPSILON_PX = 0.01
-_ALIGN_ITERATIONS = 4
-_ALIGN_MAX_PX = 2.5
-_ANCHOR_LOST = 0.5  # correlation with its anchor below which a feature is taken for another
+_LK_EPSILON_PX = 0.02
 _LK_MIN_EIGENVALUE = 1e-4
+_TIME_ITERATIONS = 4
+_STEREO_ITERATIONS = 5
+_ALIGN_MAX_PX = 2.5  # a fit that moves further than this has left its peak
+_ANCHOR_LOST = 0.5  # correlation with its anchor below which a feature is taken for another
+_MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
+_COARSE_SLACK = 0.2  # by how much the coarse stereo search may correlate worse than the fine fit
+_SWAP_FEW = 0.3  # share of matches below which a frame is suspicious
+_SWAP_MIN_POINTS = 20
+_NEIGHBOURS = 3  # matched features whose depths stand in for an unknown one
+_FEW = 0.5  # share of the least number of features below which corners without depth are taken
+_VERY_FEW = 0.25  # share below which new features are shown at once
+_RETRY_SHARE = 0.25  # share of failures at which tracking is tried again with all pyramid levels
+_BANK_SPARE = 3  # templates in memory, over the number of features
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +56,13 @@ class _Tracks:
     right: FloatArray  # (N, 2) pixels, arbitrary where has_right is False
     has_right: BoolArray  # (N,)
     blind: IntArray  # (N,) frames in a row without a right match
-    velocity: FloatArray  # (N, 2) pixels moved since the frame before; zero for new features
-    anchor: Patches  # (N, 2r+3, 2r+3) what the feature looked like when its anchor was cut
-    warp: FloatArray  # (N, 3, 3) from offsets in the anchor to pixels of the current left image
+    age: IntArray  # (N,) frames since birth
+    shown: BoolArray  # (N,) handed out as observations
+    point: FloatArray  # (N, 3) cam0 frame, metres; arbitrary where placed is False
+    placed: BoolArray  # (N,)
+    slot: IntArray  # (N,) row of the anchor in the bank
+    warp: FloatArray  # (N, 2, 3) from offsets in the anchor to pixels of the left image
+    skew: FloatArray  # (N, 2, 2) what is added to the warp's linear part for the right image
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -54,7 +72,7 @@ class _Tracks:
         return _Tracks(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
 
 
-def _new_tracks(image: Image, ids: IntArray, left: FloatArray, radius: int) -> _Tracks:
+def _newborn(ids: IntArray, left: FloatArray, slot: IntArray) -> _Tracks:
     n = len(ids)
     return _Tracks(
         ids,
@@ -62,34 +80,64 @@ def _new_tracks(image: Image, ids: IntArray, left: FloatArray, radius: int) -> _
         right=np.zeros((n, 2)),
         has_right=np.zeros(n, dtype=np.bool_),
         blind=np.zeros(n, dtype=np.int64),
-        velocity=np.zeros((n, 2)),
-        anchor=cut_patches(image, left, radius),
+        age=np.zeros(n, dtype=np.int64),
+        shown=np.zeros(n, dtype=np.bool_),
+        point=np.zeros((n, 3)),
+        placed=np.zeros(n, dtype=np.bool_),
+        slot=slot,
         warp=shift_warps(left),
+        skew=np.zeros((n, 2, 2)),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _View:
+    """One image in the forms that the stages need."""
+
+    full: FloatImage  # (H, W) gray levels
+    half: Image  # (H/2, W/2)
 
 
 @dataclass(frozen=True, slots=True)
 class _Memory:
     """What the front end keeps of the frame before."""
 
-    index: int
     time_ns: int
-    image: Image  # left
+    left: _View
     tracks: _Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` of the last consensus, over its time
+    trusted: bool  # the last motion was one that most features followed
 
 
-@dataclass(slots=True)
-class _Stopwatch:
-    """Wall time per stage in milliseconds."""
+class _AnchorBank:
+    """Templates of the living features, in slots that are used again: anchors stay where they are while tracks move."""
 
-    stages_ms: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=time.perf_counter)
+    def __init__(self, count: int, radius: int) -> None:
+        self.store = empty_templates(count, radius)
+        self._taken = np.zeros(count, dtype=np.bool_)
 
-    def lap(self, stage: str) -> None:
-        now = time.perf_counter()
-        self.stages_ms[stage] = self.stages_ms.get(stage, 0.0) + 1e3 * (now - self._last)
-        self._last = now
+    def put(self, new: Templates) -> IntArray:
+        """Store templates; return their slots (N,)."""
+        free = np.flatnonzero(~self._taken)[: len(new)]
+        if len(free) < len(new):
+            more = empty_templates(len(self._taken) + len(new), round(len(self.store.patch[0]) ** 0.5) // 2)
+            parts = (np.concatenate([getattr(self.store, f.name), getattr(more, f.name)]) for f in fields(Templates))
+            self.store = Templates(*parts)
+            self._taken = np.concatenate([self._taken, np.zeros(len(more), dtype=np.bool_)])
+            free = np.flatnonzero(~self._taken)[: len(new)]
+        self._taken[free] = True
+        self.renew(free, new)
+        return free
+
+    def renew(self, slots: IntArray, new: Templates) -> None:
+        """Replace the templates of slots (N,)."""
+        for column in fields(Templates):
+            getattr(self.store, column.name)[slots] = getattr(new, column.name)
+
+    def keep_only(self, slots: IntArray) -> None:
+        """Free all slots but these."""
+        self._taken[:] = False
+        self._taken[slots] = True
 
 
 class KltFrontend:
@@ -103,9 +151,14 @@ class KltFrontend:
         self._camera = camera
         self._settings = KltSettings() if settings is None else settings
         self._clahe = cv2.createCLAHE(2.0, (8, 8)) if self._settings.equalise == "clahe" else None
+        self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
+        self._allowed: BoolArray | None = None
+        self._gate = FrameGate(camera, "klt")
+        self._swap = SwapAlarm()
+        self._bank = _AnchorBank(_BANK_SPARE * self._settings.target_features, self._settings.anchor_radius_px)
         self._memory: _Memory | None = None
+        self._rows: RowField | None = None
         self._next_id = 0
-        self._suspicious = 0  # frames in a row that look swapped
 
     @property
     def settings(self) -> KltSettings:
@@ -122,171 +175,77 @@ class KltFrontend:
         Raises:
             DataError: the frame has no images, images of a wrong size or type, or a time not after the last one's; or
                 left and right look swapped.
+            ConfigError: the mask is not of the images' size.
         """
-        watch = _Stopwatch()
-        left_image, right_image = self._images(frame)
-        left, right = row_pyramid(left_image), row_pyramid(right_image)
+        watch = Stopwatch()
+        left, right = (self._view(image) for image in self._gate.admit(frame))
+        if self._rows is None:
+            self._rows = RowField(left.full.shape[1], left.full.shape[0])
+        if self._mask is not None and self._allowed is None:
+            self._allowed = half_mask(self._mask, left.full.shape, left.half.shape)
         watch.lap("prepare")
-        memory = self._memory
-        tracks = self._fresh(left_image, np.zeros((0, 2)))
-        twist = np.zeros(6)
-        disparity = np.zeros(0)
-        motion: Consensus | None = None
-        if memory is not None and len(memory.tracks):
-            seconds = (frame.time_ns - memory.time_ns) * 1e-9
-            found, seen = self._flow_all(memory, left_image, prior, seconds)
-            watch.lap("track")
-            seen, motion = self._consensus(memory, found, seen, prior, seconds, frame.index)
-            watch.lap("reject")
-            before, tracks = self._aligned(memory.tracks, left_image, found, seen, motion)
-            twist = memory.twist_per_s if motion is None else se3_log(motion.T_curr_prev) / seconds
-            disparity = self._expected_disparity(before, motion)
-            watch.lap("align")
-        carried = len(tracks)
-        missing = self._settings.target_features - carried
-        tried = round(missing * (1.0 + self._settings.spare_corners))
-        corners = detect_corners(left_image, tracks.left, tried, self._settings)
+        tracks, motion = self._tracked(frame, left, right, prior, watch)
+        missing = self._settings.target_features - len(tracks)
+        corners = detect_corners(
+            left.half,
+            tracks.left,
+            round(missing * (1.0 + self._settings.spare_corners)),
+            self._settings,
+            self._allowed,
+        )
         watch.lap("detect")
-        expected = np.concatenate([disparity, np.full(len(corners), np.nan)])
-        match = match_rows(left, right, np.concatenate([tracks.left, corners]), expected, self._settings)
-        # Of the new corners, those with a right match come first, the best of them as the detector ranked them.
-        chosen = np.argsort(~match.valid[carried:], kind="stable")[: max(0, missing)]
-        rows = np.concatenate([np.arange(carried), carried + chosen])
-        tracks = _joined(tracks, self._fresh(left_image, corners[chosen]))
-        tracks = self._with_right(tracks, match.right[rows], match.valid[rows], expected[rows], motion is not None)
+        tracks = self._completed(left, right, tracks, corners, motion)
+        self._rows.learn(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
         watch.lap("stereo")
         self._check_swap(frame, left, right, tracks)
-        tracks = tracks.take(tracks.blind <= self._settings.max_left_only_frames)
+        tracks = self._with_shown(tracks)
+        self._bank.keep_only(tracks.slot)
+        before = self._memory
+        seconds = 0.0 if before is None else (frame.time_ns - before.time_ns) * 1e-9
+        twist = np.zeros(6) if before is None else before.twist_per_s
+        if motion is not None:
+            twist = se3_log(motion.T_curr_prev) / seconds
+        self._memory = _Memory(frame.time_ns, left, tracks, twist, motion is not None)
+        old_ids = np.zeros(0, dtype=np.int64) if before is None else before.tracks.ids[before.tracks.shown]
+        seen = tracks.take(tracks.shown)
+        carried = int(np.isin(seen.ids, old_ids, assume_unique=True).sum())
+        z = np.concatenate([seen.left, seen.right], axis=1)
         watch.lap("check")
-        self._memory = _Memory(frame.index, frame.time_ns, left_image, tracks, twist)
-        z = np.concatenate([tracks.left, tracks.right], axis=1)
         return FrontendOutput(
-            observations(frame.index, frame.time_ns, tracks.ids, z, tracks.has_right),
+            observations(frame.index, frame.time_ns, seen.ids, z, seen.has_right),
             tracked=carried,
-            matched=int(tracks.has_right.sum()),
-            detected=len(chosen),
+            matched=int(seen.has_right.sum()),
+            detected=len(seen) - carried,
             stages_ms=watch.stages_ms,
         )
 
-    def _images(self, frame: StereoFrame) -> tuple[Image, Image]:
-        """Check and equalise the images of a frame."""
-        if frame.left is None or frame.right is None:
-            raise DataError(
-                f"frame {frame.index} has no images, but the klt front end needs them; "
-                "use the precomputed front end, or a recording with images"
-            )
-        camera, memory = self._camera, self._memory
-        if memory is not None and frame.time_ns <= memory.time_ns:
-            raise DataError(
-                f"frame {frame.index} is not later than frame {memory.index} ({frame.time_ns} ns after "
-                f"{memory.time_ns} ns); sort the frames by time"
-            )
-        known = (camera.height, camera.width)
-        for name, image in (("left", frame.left), ("right", frame.right)):
-            if image.ndim != 2 or image.dtype != np.uint8:
-                raise DataError(
-                    f"frame {frame.index}: the {name} image has shape {image.shape} and type {image.dtype}; "
-                    "the klt front end needs 8-bit gray images"
-                )
-            size = image.shape
-            if None not in known and size != known:
-                raise DataError(
-                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, but the calibration is for "
-                    f"{camera.width}x{camera.height}; check that calibration and images belong together"
-                )
-            if size != frame.left.shape or (memory is not None and size != memory.image.shape):
-                raise DataError(
-                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, unlike the images before; "
-                    "all images of a recording must have one size"
-                )
-        if self._clahe is None:
-            # The next frame is tracked from this one, so the pixels must not change under us.
-            return frame.left.copy(), np.ascontiguousarray(frame.right)
-        left, right = self._clahe.apply(frame.left), self._clahe.apply(frame.right)
-        return np.asarray(left, dtype=np.uint8), np.asarray(right, dtype=np.uint8)
+    def _view(self, image: Image) -> _View:
+        """Equalise an image and convert it; nothing of the result shares memory with it."""
+        if self._clahe is not None:
+            image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
+        return _View(image.astype(np.float32), half_image(image))
 
-    def _fresh(self, image: Image, points: FloatArray) -> _Tracks:
-        """Give new points (N, 2) of the left image their ids and anchors."""
-        ids = np.arange(self._next_id, self._next_id + len(points), dtype=np.int64)
-        self._next_id += len(points)
-        return _new_tracks(image, ids, points, self._settings.anchor_radius_px)
+    # --- features of the frame before -------------------------------------------------------------------------------
 
-    def _flow_all(
-        self, memory: _Memory, image: Image, prior: TrackPrior | None, seconds: float
-    ) -> tuple[FloatArray, BoolArray]:
-        """Follow the features of the frame before; return pixels (N, 2) and the mask (N,) of those found."""
-        old = memory.tracks
-        guess, informed = self._predict(memory, prior, seconds)
-        found, good = self._flow_both_ways(memory.image, image, old.left, guess)
-        retry = np.flatnonzero(~good & informed)
-        if 2 * len(retry) > len(old):  # the prediction as a whole was wrong: start from where the features were
-            found[retry], good[retry] = self._flow_both_ways(memory.image, image, old.left[retry], old.left[retry])
-        return found, good
-
-    def _aligned(
-        self, old: _Tracks, image: Image, found: FloatArray, seen: BoolArray, motion: Consensus | None
-    ) -> tuple[_Tracks, _Tracks]:
-        """Align the features with their anchors; return the survivors, as they were and as they are.
-
-        Lucas-Kanade steps add up to a drift; the anchor does not drift. Features that Lucas-Kanade lost are looked
-        for where the consensus motion puts them. Features that were found, but look somewhat different from their
-        anchor, stay where they were found and get a new one; those that look altogether different are dropped.
-        """
-        settings = self._settings
-        start, tried, scale = found.copy(), seen.copy(), np.ones(len(old))
-        if motion is not None:
-            p, valid = self._points(old)
-            predicted = self._moved(old, motion.T_curr_prev)
-            tried |= valid & inside(image, predicted, settings.anchor_radius_px + 2.0)
-            start[~seen] = predicted[~seen]
-            depth = transform_points(motion.T_curr_prev, p)[:, 2]
-            scale = np.where(valid & (depth > 0.1), p[:, 2] / np.maximum(depth, 0.1), 1.0)
-        rows = np.flatnonzero(tried)
-        warp = old.warp[rows]
-        warp[:, :2, :2] *= scale[rows, None, None]
-        warp[:, :2, 2] = start[rows]
-        warp, score = align(templates(old.anchor[rows]), image, warp, "affine", _ALIGN_ITERATIONS)
-        place = warp[:, :2, 2].copy()
-        size = np.sqrt(np.abs(np.linalg.det(warp)))
-        good = (
-            (score >= settings.min_anchor_correlation)
-            & (np.abs(place - start[rows]).max(axis=1) <= _ALIGN_MAX_PX)
-            & (np.abs(np.log(np.maximum(size, 1e-3))) <= np.log(2 * settings.max_anchor_scale))
-        )
-        if motion is not None:
-            error = pixel_errors(self._camera, motion.T_curr_prev, p[rows], place)
-            good &= ~valid[rows] | (error <= settings.consensus_px)
-        kept = good | (seen[rows] & (score >= _ANCHOR_LOST))
-        rows, warp, place, size, good = rows[kept], warp[kept], place[kept], size[kept], good[kept]
-        place[~good] = found[rows[~good]]
-        renew = np.flatnonzero(~good | (np.abs(np.log(np.maximum(size, 1e-3))) > np.log(settings.max_anchor_scale)))
-        anchor = old.anchor[rows]
-        anchor[renew] = cut_patches(image, place[renew], settings.anchor_radius_px)
-        warp[renew] = shift_warps(place[renew])
-        before = old.take(rows)
-        now = replace(before, left=place, velocity=place - before.left, anchor=anchor, warp=warp)
-        alone = _apart(place, 0.5 * min_distance_px(image.shape[1], image.shape[0], settings))
-        return before.take(alone), now.take(alone)
-
-    def _predict(self, memory: _Memory, prior: TrackPrior | None, seconds: float) -> tuple[FloatArray, BoolArray]:
-        """Guess the left pixels (N, 2) in the coming frame, and tell which differ from the old ones."""
-        old, settings = memory.tracks, self._settings
-        guess = old.left.copy()
-        T = self._expected_motion(memory, prior, seconds)
-        if settings.guess == "velocity" and prior is None:
-            guess += old.velocity
-        elif settings.guess == "motion" or prior is not None:
-            guess = self._moved(old, T)
-        if prior is not None and len(prior.ids):
-            row = np.searchsorted(old.ids, prior.ids)
-            row = np.minimum(row, len(old) - 1)
-            known = (old.ids[row] == prior.ids) & np.isfinite(prior.z[:, :2]).all(axis=1)
-            guess[row[known]] = prior.z[known, :2]
-        # A guess outside the image cannot be tracked; the old pixel may still be found inside.
-        outside = ~inside(memory.image, guess, 0.0)
-        guess[outside] = old.left[outside]
-        informed = np.linalg.norm(guess - old.left, axis=1) > 0.5
-        return guess, informed
+    def _tracked(
+        self, frame: StereoFrame, left: _View, right: _View, prior: TrackPrior | None, watch: Stopwatch
+    ) -> tuple[_Tracks, Consensus | None]:
+        """Follow the features of the frame before into both images; return the survivors and the voted motion."""
+        memory = self._memory
+        nothing = np.zeros(0, dtype=np.int64)
+        if memory is None or len(memory.tracks) == 0:
+            return _newborn(nothing, np.zeros((0, 2)), nothing), None
+        seconds = (frame.time_ns - memory.time_ns) * 1e-9
+        expected = self._expected_motion(memory, prior, seconds)
+        found, seen = self._flow_all(memory, left, prior, expected)
+        watch.lap("track")
+        seen, motion = self._consensus(memory.tracks, found, seen, prior, expected, frame.index)
+        watch.lap("reject")
+        tracks = self._aligned(memory, left, found, seen, motion)
+        watch.lap("align")
+        tracks = self._with_right(tracks, right, motion is not None)
+        watch.lap("stereo")
+        return tracks, motion
 
     def _expected_motion(self, memory: _Memory, prior: TrackPrior | None, seconds: float) -> FloatArray:
         """Motion (4, 4) `T_curr_prev` expected from the last one, its rotation replaced by a predicted one."""
@@ -295,121 +254,340 @@ class KltFrontend:
             return se3_from_parts(prior.R_cam_prev, T[:3, 3])
         return T
 
-    def _moved(self, old: _Tracks, T_curr_prev: FloatArray) -> FloatArray:
-        """Pixels (N, 2) of the old features after a camera motion; those of unknown depth count as infinitely far."""
-        camera = self._camera
-        p, valid = self._points(old)
-        rays = np.stack(
-            [(old.left[:, 0] - camera.cu) / camera.fu, (old.left[:, 1] - camera.cv) / camera.fv, np.ones(len(old))],
-            axis=1,
+    def _flow_all(
+        self, memory: _Memory, left: _View, prior: TrackPrior | None, expected: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Follow the features of the frame before; return pixels (N, 2) and the mask (N,) of those found.
+
+        Where the pixels are predicted, few pyramid levels are searched; should many fail, all levels; should most fail
+        even so, the prediction as a whole was wrong, and the search starts from where the features were.
+        """
+        old, settings = memory.tracks, self._settings
+        guess = self._predict(old, prior, expected, left.full)
+        trusted = prior is not None or (memory.trusted and settings.guess == "motion")
+        few = min(settings.trusted_levels, settings.pyramid_levels)
+        found, good = self._flow_both_ways(
+            memory.left.half, left, old.left, guess, few if trusted else settings.pyramid_levels
         )
-        moved = np.where(valid[:, None], transform_points(T_curr_prev, p), rays @ T_curr_prev[:3, :3].T)
+        attempts = [old.left] if not trusted else [guess, old.left]
+        for k, start in enumerate(attempts):
+            retry = np.flatnonzero(~good)
+            limit = 0.5 if k == len(attempts) - 1 else _RETRY_SHARE
+            if len(retry) <= limit * len(old):
+                break
+            found[retry], good[retry] = self._flow_both_ways(
+                memory.left.half, left, old.left[retry], start[retry], settings.pyramid_levels
+            )
+        return found, good
+
+    def _predict(self, old: _Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage) -> FloatArray:
+        """Guess the left pixels (N, 2) in the coming frame."""
+        guess = old.left.copy()
+        if self._settings.guess == "motion" or prior is not None:
+            guess = self._moved(old, self._with_neighbours(old), expected)
+        if prior is not None and len(prior.ids):
+            row = np.minimum(np.searchsorted(old.ids, prior.ids), len(old) - 1)
+            known = (old.ids[row] == prior.ids) & np.isfinite(prior.z[:, :2]).all(axis=1)
+            guess[row[known]] = prior.z[known, :2]
+        # A guess outside the image cannot be tracked; the old pixel may still be found inside.
+        outside = ~inside(image, guess, 0.0)
+        guess[outside] = old.left[outside]
+        return guess
+
+    def _with_neighbours(self, old: _Tracks) -> FloatArray:
+        """Points (N, 3) of the features, those of unknown depth as deep as their nearest neighbours in the image."""
+        known, unknown = np.flatnonzero(old.placed), np.flatnonzero(~old.placed)
+        if len(unknown) == 0 or len(known) < _NEIGHBOURS:
+            return np.where(old.placed[:, None], old.point, self._rays(old.left) * 1e6)
+        gap = np.abs(old.left[unknown, None] - old.left[known]).sum(axis=2)
+        nearest = known[np.argpartition(gap, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]]
+        point = old.point.copy()
+        point[unknown] = self._rays(old.left[unknown]) * np.median(old.point[nearest, 2], axis=1)[:, None]
+        return point
+
+    def _rays(self, pixels: FloatArray) -> FloatArray:
+        """Rays (N, 3) of unit depth through left pixels (N, 2)."""
+        camera = self._camera
+        x, y = (pixels[:, 0] - camera.cu) / camera.fu, (pixels[:, 1] - camera.cv) / camera.fv
+        return np.stack([x, y, np.ones(len(pixels))], axis=1)
+
+    def _moved(self, old: _Tracks, point: FloatArray, T_curr_prev: FloatArray) -> FloatArray:
+        """Pixels (N, 2) of old points (N, 3) after a camera motion; those that end up behind stay where they were."""
+        moved = transform_points(T_curr_prev, point)
         ahead = moved[:, 2] > 0.1
-        pixels = project(camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
+        pixels = project(self._camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
         return np.where(ahead[:, None], pixels, old.left)
 
-    def _points(self, tracks: _Tracks) -> tuple[FloatArray, BoolArray]:
-        """Points (N, 3) in cam0 of features with a right match, and the mask (N,) of those."""
-        z = np.concatenate([tracks.left, tracks.right], axis=1)
-        p, valid = triangulate(self._camera, z)
-        return p, valid & tracks.has_right
-
     def _flow_both_ways(
-        self, previous: Image, current: Image, points: FloatArray, guess: FloatArray
+        self, previous_half: Image, left: _View, points: FloatArray, guess: FloatArray, levels: int
     ) -> tuple[FloatArray, BoolArray]:
         """Track points (N, 2) forth and back; return the new pixels and the mask of those that came back."""
-        forth, seen = self._flow(previous, current, points, guess)
-        back, seen_back = self._flow(current, previous, forth, points)
+        forth, seen = self._flow(previous_half, left.half, points, guess, levels)
+        back, seen_back = self._flow(left.half, previous_half, forth, points, levels)
         error = np.linalg.norm(back - points, axis=1)
-        margin = self._settings.stereo_radius_px + 2
-        good = seen & seen_back & (error <= self._settings.max_forward_backward_px) & inside(current, forth, margin)
+        margin = self._settings.anchor_radius_px + 2
+        good = seen & seen_back & (error <= self._settings.max_forward_backward_px) & inside(left.full, forth, margin)
         return forth, good
 
     def _flow(
-        self, source: Image, target: Image, points: FloatArray, guess: FloatArray
+        self, source: Image, target: Image, points: FloatArray, guess: FloatArray, levels: int
     ) -> tuple[FloatArray, BoolArray]:
+        """Track points (N, 2) between half-resolution images, all in pixels of the full image."""
         settings = self._settings
-        start = guess.astype(np.float32).reshape(-1, 1, 2)
         found, status, _ = cv2.calcOpticalFlowPyrLK(
             source,
             target,
-            points.astype(np.float32).reshape(-1, 1, 2),
-            start,
+            (points / 2).astype(np.float32).reshape(-1, 1, 2),
+            (guess / 2).astype(np.float32).reshape(-1, 1, 2),
             winSize=(settings.window_px, settings.window_px),
-            maxLevel=settings.pyramid_levels,
+            maxLevel=levels,
             criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, settings.iterations, _LK_EPSILON_PX),
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
             minEigThreshold=_LK_MIN_EIGENVALUE,
         )
-        pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+        pixels = 2 * np.asarray(found, dtype=np.float64).reshape(-1, 2)
         seen = (np.asarray(status).reshape(-1) == 1) & np.isfinite(pixels).all(axis=1)
         return np.where(seen[:, None], pixels, points), seen
 
     def _consensus(
         self,
-        memory: _Memory,
+        old: _Tracks,
         found: FloatArray,
         seen: BoolArray,
         prior: TrackPrior | None,
-        seconds: float,
+        expected: FloatArray,
         frame_index: int,
     ) -> tuple[BoolArray, Consensus | None]:
         """Mask (N,) of the found features that move as the static world does, and that motion where there is one."""
-        camera, settings, old = self._camera, self._settings, memory.tracks
-        p, valid = self._points(old)
-        known = np.flatnonzero(valid & seen)
-        expected = self._expected_motion(memory, prior, seconds)
+        camera, settings = self._camera, self._settings
+        known = np.flatnonzero(old.has_right & old.placed & seen)
         R_prior = None if prior is None else prior.R_cam_prev
         T_prior = None
         if prior is not None:
             _, a, b = np.intersect1d(old.ids[known], prior.ids, assume_unique=True, return_indices=True)
-            T_prior = fit_motion(camera, p[known[a]], prior.z[b, :2], expected, settings)
+            T_prior = fit_motion(camera, old.point[known[a]], prior.z[b, :2], expected, settings)
         rng = np.random.default_rng((settings.seed, frame_index))
-        motion = rigid_consensus(camera, p[known], found[known], expected, R_prior, T_prior, rng, settings)
+        motion = rigid_consensus(camera, old.point[known], found[known], expected, R_prior, T_prior, rng, settings)
         if motion is None:
             return seen, None
         keep = seen.copy()
         keep[known] = motion.inliers
-        flat = np.flatnonzero(seen & ~valid)
-        near_m = camera.fu * camera.baseline_m / (settings.max_disparity * memory.image.shape[1])
-        distance = epipolar_distance(camera, motion.T_curr_prev, old.left[flat], found[flat], near_m)
-        keep[flat] = distance <= settings.consensus_px
+        flat = np.flatnonzero(seen & ~(old.has_right & old.placed))
+        if len(flat):
+            near_m = camera.fu * camera.baseline_m / self._max_disparity(self._width())
+            distance = epipolar_distance(camera, motion.T_curr_prev, old.left[flat], found[flat], near_m)
+            keep[flat] = distance <= settings.consensus_px
         return keep, motion
 
-    def _expected_disparity(self, before: _Tracks, motion: Consensus | None) -> FloatArray:
-        """Disparity (N,) in the current frame: the old point moved, or the old disparity; NaN where unknown."""
-        p, valid = self._points(before)
-        disparity = before.left[:, 0] - before.right[:, 0]
-        if motion is not None:
-            depth = transform_points(motion.T_curr_prev, p)[:, 2]
-            disparity = self._camera.fu * self._camera.baseline_m / np.maximum(depth, 0.05)
-        return np.where(valid, disparity, np.nan)
+    def _width(self) -> int:
+        assert self._memory is not None
+        return int(self._memory.left.full.shape[1])
 
-    def _with_right(
-        self, tracks: _Tracks, right: FloatArray, valid: BoolArray, expected: FloatArray, moved: bool
+    def _max_disparity(self, width: int) -> float:
+        return self._settings.max_disparity * width
+
+    def _aligned(
+        self, memory: _Memory, left: _View, found: FloatArray, seen: BoolArray, motion: Consensus | None
     ) -> _Tracks:
-        """Take in the right pixels; with a known motion, a disparity must agree with the one expected from it."""
-        if moved:
-            change = np.abs(tracks.left[:, 0] - right[:, 0] - expected)
-            valid = valid & ~(change > self._settings.consensus_px)  # NaN, nothing expected, passes
-        return replace(tracks, right=right, has_right=valid, blind=np.where(valid, 0, tracks.blind + 1))
+        """Align the features with their anchors; return the survivors as they are now.
 
-    def _check_swap(self, frame: StereoFrame, left: RowPyramid, right: RowPyramid, tracks: _Tracks) -> None:
+        Lucas-Kanade steps add up to a drift; the anchor does not drift. Features that Lucas-Kanade lost are looked
+        for where the consensus motion puts them. Features that were found, but look unlike their anchor, are aligned
+        with their looks in the frame before, which become their new anchor.
+        """
+        settings, old = self._settings, memory.tracks
+        start, tried, scale, placed = found.copy(), seen.copy(), np.ones(len(old)), old.placed.copy()
+        point = old.point
+        if motion is not None:
+            point = transform_points(motion.T_curr_prev, old.point)
+            predicted = self._moved(old, old.point, motion.T_curr_prev)
+            tried |= old.placed & inside(left.full, predicted, settings.anchor_radius_px + 2.0)
+            start[~seen] = predicted[~seen]
+            ahead = old.placed & (point[:, 2] > 0.1)
+            scale = np.where(ahead, old.point[:, 2] / np.where(ahead, point[:, 2], 1.0), 1.0)
+        rows = np.flatnonzero(tried)
+        warp = old.warp[rows]
+        warp[:, :, :2] *= scale[rows, None, None]
+        warp[:, :, 2] = start[rows]
+        warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _TIME_ITERATIONS)
+        moved_px = np.abs(warp[:, :, 2] - start[rows]).max(axis=1)
+        change = np.abs(np.log(scale_change(warp)))
+        good = (score >= settings.min_anchor_correlation) & (moved_px <= _ALIGN_MAX_PX)
+        good &= change <= np.log(2 * settings.max_anchor_scale)
+        kept = good.copy()
+        again = np.flatnonzero(~good & seen[rows] & (score >= _ANCHOR_LOST))
+        if len(again):
+            warp[again], kept[again] = self._realigned(memory, left, rows[again], start[rows[again]], scale)
+        if motion is not None:
+            error = pixel_errors(self._camera, motion.T_curr_prev, old.point[rows], warp[:, :, 2])
+            astray = error > settings.consensus_px
+            kept &= ~(astray & old.placed[rows] & old.has_right[rows])
+            placed[rows[astray]] = False  # its depth was carried along without being measured, and was wrong
+        rows, warp, change = rows[kept], warp[kept], change[kept]
+        place = warp[:, :, 2].copy()
+        far = np.flatnonzero(good[kept] & (change > np.log(settings.max_anchor_scale)))
+        if len(far):
+            place[far] = rounded(place[far])
+            self._bank.renew(old.slot[rows[far]], self._cut(left, place[far]))
+            warp[far] = shift_warps(place[far])
+        now = replace(
+            old.take(rows),
+            left=place,
+            warp=warp,
+            point=point[rows],
+            placed=placed[rows],
+            age=old.age[rows] + 1,
+            has_right=np.zeros(len(rows), dtype=np.bool_),
+        )
+        return now.take(_apart(place, 0.5 * min_distance_px(left.full.shape[1], left.full.shape[0], settings)))
+
+    def _cut(self, left: _View, centres: FloatArray) -> Templates:
+        return templates(cut_patches(left.full, centres, self._settings.anchor_radius_px))
+
+    def _realigned(
+        self, memory: _Memory, left: _View, rows: IntArray, start: FloatArray, scale: FloatArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Align features with a new anchor cut from the frame before; return warps (N, 2, 3) and a mask (N,)."""
+        old, settings = memory.tracks, self._settings
+        centres = rounded(old.left[rows])
+        self._bank.renew(old.slot[rows], self._cut(memory.left, centres))
+        warp = shift_warps(start + centres - old.left[rows])
+        warp[:, :, :2] *= scale[rows, None, None]
+        warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _TIME_ITERATIONS)
+        # The anchor was cut beside the feature by the rounding; give the feature its own place back.
+        beside = (old.left[rows] - centres)[:, :, None]
+        warp[:, :, 2] += (warp[:, :, :2] @ beside)[:, :, 0]
+        moved_px = np.abs(warp[:, :, 2] - start).max(axis=1)
+        return warp, (score >= settings.min_anchor_correlation) & (moved_px <= _ALIGN_MAX_PX)
+
+    # --- the right image --------------------------------------------------------------------------------------------
+
+    def _with_right(self, tracks: _Tracks, right: _View, moved: bool) -> _Tracks:
+        """Align features of known depth with the right image; with a known motion, the disparity must agree with it."""
+        rows = np.flatnonzero(tracks.placed & (tracks.point[:, 2] > 0.05))
+        expected = self._camera.fu * self._camera.baseline_m / tracks.point[rows, 2]
+        place, skew, valid = self._right_of(tracks.take(rows), right, expected)
+        if moved:
+            valid &= np.abs(tracks.left[rows, 0] - place[:, 0] - expected) <= self._settings.consensus_px
+        return self._taken_in(tracks, rows[valid], place[valid], skew[valid])
+
+    def _right_of(
+        self, tracks: _Tracks, right: _View, disparity: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Align features with the right image near expected disparities (N,).
+
+        Returns:
+            Right pixels (N, 2), the change of the warp's linear part (N, 2, 2), and a mask (N,) of the good ones.
+        """
+        settings = self._settings
+        assert self._rows is not None
+        rows = self._rows.rows(tracks.left)
+        warp = tracks.warp.copy()
+        warp[:, :, :2] += tracks.skew
+        warp[:, 0, 2] -= disparity
+        warp[:, 1, 2] = rows
+        start = warp[:, :, 2].copy()
+        warp, score = align(self._bank.store, tracks.slot, right.full, warp, _STEREO_ITERATIONS, rows)
+        place, skew = warp[:, :, 2], warp[:, :, :2] - tracks.warp[:, :, :2]
+        found = tracks.left[:, 0] - place[:, 0]
+        valid = (
+            (score >= settings.min_correlation)
+            & (np.abs(place - start).max(axis=1) <= _ALIGN_MAX_PX)
+            & (np.abs(skew).max(axis=(1, 2)) <= _MAX_STRETCH)
+            & (np.abs(rows - place[:, 1]) <= settings.max_epipolar_px)
+            & (found >= settings.min_disparity_px)
+            & (found <= self._max_disparity(right.full.shape[1]))
+        )
+        return place, skew, valid
+
+    def _taken_in(self, tracks: _Tracks, rows: IntArray, place: FloatArray, skew: FloatArray) -> _Tracks:
+        """Give the named rows their right pixels (K, 2), and the depth that follows."""
+        right, has_right, skews = tracks.right.copy(), tracks.has_right.copy(), tracks.skew.copy()
+        right[rows], has_right[rows], skews[rows] = place, True, skew
+        p, valid = triangulate(self._camera, np.concatenate([tracks.left[rows], place], axis=1))
+        point, placed = tracks.point.copy(), tracks.placed.copy()
+        point[rows[valid]], placed[rows[valid]] = p[valid], True
+        return replace(tracks, right=right, has_right=has_right, skew=skews, point=point, placed=placed)
+
+    def _completed(
+        self, left: _View, right: _View, tracks: _Tracks, corners: FloatArray, motion: Consensus | None
+    ) -> _Tracks:
+        """Search right matches for features that lack one and for new corners; keep the best new ones."""
+        settings = self._settings
+        corners = rounded(corners)
+        slots = self._bank.put(self._cut(left, corners))
+        ids = np.arange(len(corners), dtype=np.int64) + self._next_id
+        carried = len(tracks)
+        tracks = _joined(tracks, _newborn(ids, corners, slots))
+        rows = np.flatnonzero(~tracks.has_right)
+        disparity, unique = match_rows(
+            left.half,
+            right.half,
+            tracks.left[rows],
+            self._max_disparity(left.full.shape[1]),
+            settings.min_correlation - _COARSE_SLACK,
+            settings.min_peak_margin,
+        )
+        rows, disparity = rows[unique], disparity[unique]
+        place, skew, valid = self._right_of(tracks.take(rows), right, disparity)
+        if motion is not None:
+            # What was placed before, but was not found again near its place, must not turn up elsewhere.
+            valid &= ~tracks.placed[rows]
+        tracks = self._taken_in(tracks, rows[valid], place[valid], skew[valid])
+        tracks = replace(tracks, blind=np.where(tracks.has_right, 0, tracks.blind + 1))
+        old = np.flatnonzero((tracks.blind <= settings.max_left_only_frames)[:carried])
+        new = carried + self._worthwhile(
+            tracks.take(np.arange(carried, len(tracks))), motion, left.full, int(tracks.has_right[old].sum())
+        )
+        tracks = tracks.take(np.concatenate([old, np.sort(new[: max(0, settings.target_features - carried)])]))
+        # Ids of corners that were not kept are free again: nobody has seen them.
+        fresh = tracks.age == 0
+        tracks.ids[fresh] = np.arange(int(fresh.sum())) + self._next_id
+        self._next_id += int(fresh.sum())
+        return tracks
+
+    def _worthwhile(self, new: _Tracks, motion: Consensus | None, image: FloatImage, carried: int) -> IntArray:
+        """Rows of the new features that should be taken, best first: those with depth that will stay in the image.
+
+        Those that will soon leave are taken only while less than the least number of features is carried over; those
+        without depth only while few are.
+        """
+        settings = self._settings
+        stays = np.ones(len(new), dtype=np.bool_)
+        if motion is not None and settings.wanted_life_frames > 0:
+            T = np.linalg.matrix_power(motion.T_curr_prev, settings.wanted_life_frames)
+            ahead = transform_points(T, new.point)[:, 2] > 0.5
+            stays = ~new.placed | (ahead & inside(image, self._moved(new, new.point, T), 0.0))
+        least = settings.least_features * settings.target_features
+        lasting, leaving = np.flatnonzero(new.has_right & stays), np.flatnonzero(new.has_right & ~stays)
+        flat = np.flatnonzero(~new.has_right)
+        leaving = leaving[: max(0, round(least) - carried - len(lasting))]
+        return np.concatenate([lasting, leaving, flat if carried < _FEW * least else flat[:0]])
+
+    def _with_shown(self, tracks: _Tracks) -> _Tracks:
+        """Show features that outlived their probation; all of them where few would be left."""
+        proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & tracks.has_right)
+        if proven.sum() < _VERY_FEW * self._settings.target_features:
+            proven[:] = True
+        return replace(tracks, shown=proven)
+
+    def _check_swap(self, frame: StereoFrame, left: _View, right: _View, tracks: _Tracks) -> None:
         """Raise when several frames in a row match only with negative disparities."""
         n, matched = len(tracks), int(tracks.has_right.sum())
         if n < _SWAP_MIN_POINTS or matched >= _SWAP_FEW * n:
-            self._suspicious = 0
+            self._swap.clear()
             return
-        flipped = tracks.left * [-1.0, 1.0] + [left.full.shape[1] - 1.0, 0.0]
-        nothing = np.full(n, np.nan)
-        negative = int(match_rows(mirrored(left), mirrored(right), flipped, nothing, self._settings).valid.sum())
-        self._suspicious = self._suspicious + 1 if negative >= max(_SWAP_MANY * n, 2 * matched) else 0
-        if self._suspicious >= _SWAP_FRAMES:
-            raise DataError(
-                f"frame {frame.index}: left and right images look swapped ({negative} of {n} features match with a "
-                f"negative disparity, {matched} with a positive one, in {_SWAP_FRAMES} frames); exchange the image "
-                "folders or the cameras' calibration"
-            )
+        settings = self._settings
+        flipped = tracks.left * [-1.0, 1.0] + [2.0 * (left.half.shape[1] - 1), 0.0]
+        disparity, unique = match_rows(
+            np.ascontiguousarray(left.half[:, ::-1]),
+            np.ascontiguousarray(right.half[:, ::-1]),
+            flipped,
+            self._max_disparity(left.full.shape[1]),
+            settings.min_correlation,
+            settings.min_peak_margin,
+        )
+        self._swap.check(frame, n, matched, int((unique & (disparity >= 1.0)).sum()))
 
 
 def _apart(points: FloatArray, distance: float) -> BoolArray:

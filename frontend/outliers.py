@@ -101,13 +101,17 @@ def _search(
 ) -> tuple[FloatArray, BoolArray]:
     """Best motion (4, 4) over minimal sets and over the starts (S, 4, 4) themselves, with its inliers (N,)."""
     limit = settings.consensus_px
-    sets = rng.integers(0, len(p_prev), size=(settings.consensus_samples, 3))
     begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
+    sure = _refine(camera, begin, p_prev, pixels, limit / 2, free)
+    inliers = pixel_errors(camera, sure, p_prev, pixels) <= limit
+    if inliers.mean() >= settings.sure_share:
+        return sure, inliers
+    sets = rng.integers(0, len(p_prev), size=(settings.consensus_samples, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
     T = _gauss_newton(
         camera, T, p_prev[sets], pixels[sets], np.ones(sets.shape), iterations=_SAMPLE_ITERATIONS, free=free
     )
-    T = np.concatenate([starts, T])
+    T = np.concatenate([starts, sure[None], T])
     cost = np.minimum(pixel_errors(camera, T, p_prev, pixels), limit) ** 2
     best = _refine(camera, T[int(np.argmin(cost.sum(axis=1)))], p_prev, pixels, limit / 2, free)
     return best, pixel_errors(camera, best, p_prev, pixels) <= limit

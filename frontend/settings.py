@@ -13,26 +13,31 @@ from vio.setting import setting
 class KltSettings:
     """Corners tracked by pyramidal Lucas-Kanade; one set of defaults serves 640x360 to 1242x375."""
 
-    target_features: int = setting(350, "features to keep alive; new corners are added below this number")
+    target_features: int = setting(400, "features to keep alive; new corners are added below this number")
     cell_features: int = setting(4, "features wanted in one grid cell; the cell size follows from it")
-    min_distance: float = setting(0.3, "least distance between features, over the spacing of a uniform grid of them")
+    min_distance: float = setting(0.15, "least distance between features, over the spacing of a uniform grid of them")
     min_gradient: float = setting(
-        1.8, "least gradient of a corner in its weakest direction, root mean square over 5x5 pixels", unit="gray/px"
+        1.0, "least gradient of a corner in its weakest direction, root mean square over 6x6 pixels", unit="gray/px"
     )
+    min_relative_gradient: float = setting(0.15, "the same, over that of the strongest corner of its grid cell")
     spare_corners: float = setting(
-        1.0, "corners tried beyond the missing ones, over their number; those with a right match are kept first"
+        2.5, "corners tried beyond the missing ones, over their number; the best in stereo are kept"
     )
+    mask: Path | None = setting(None, "image of the recording's size; where it is black no corner is taken")
     equalise: Literal["none", "clahe"] = setting("none", "local contrast equalisation before everything else")
-    window_px: int = setting(15, "side of the tracking window", unit="px")
-    pyramid_levels: int = setting(3, "coarser image levels above the full one when tracking in time")
-    iterations: int = setting(30, "largest number of Lucas-Kanade iterations a level")
-    guess: Literal["previous", "velocity", "motion"] = setting(
-        "motion",
-        "start of the search where the filter predicts nothing: old pixel, pixel velocity, or last camera motion",
+    window_px: int = setting(11, "side of the tracking window, in pixels of the half-resolution image", unit="px")
+    pyramid_levels: int = setting(2, "image levels coarser than half resolution when tracking in time")
+    trusted_levels: int = setting(1, "the same where the last motion or the filter predicts the pixels")
+    iterations: int = setting(20, "largest number of Lucas-Kanade iterations a level")
+    guess: Literal["previous", "motion"] = setting(
+        "motion", "start of the search where the filter predicts nothing: the old pixel, or the last camera motion"
     )
-    max_forward_backward_px: float = setting(0.5, "largest error after tracking there and back", unit="px")
+    max_forward_backward_px: float = setting(1.5, "largest error after tracking there and back", unit="px")
     consensus_px: float = setting(1.0, "largest distance from where the consensus motion puts a feature", unit="px")
     consensus_samples: int = setting(96, "random minimal sets tried for the consensus motion")
+    sure_share: float = setting(
+        0.7, "share of features that must follow the expected motion, refined, for no samples to be tried"
+    )
     prior_max_deviation_deg: float = setting(
         1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"
     )
@@ -47,9 +52,15 @@ class KltSettings:
     max_disparity: float = setting(0.16, "largest disparity, over the image width")
     min_disparity_px: float = setting(0.3, "smallest disparity of a stereo match", unit="px")
     max_epipolar_px: float = setting(1.0, "largest difference of the rows of a stereo match", unit="px")
-    stereo_radius_px: int = setting(6, "half side of the patch matched between left and right", unit="px")
     min_correlation: float = setting(0.8, "smallest normalised correlation of a stereo match")
     min_peak_margin: float = setting(0.03, "least lead in correlation over the second-best place in the row")
+    probation_frames: int = setting(
+        1, "frames for which a new corner must hold, in time and stereo, before it is shown"
+    )
+    wanted_life_frames: int = setting(8, "frames for which a new corner should stay in the image")
+    least_features: float = setting(
+        0.7, "share of the features to keep alive, below which corners that leave sooner are taken too"
+    )
     max_left_only_frames: int = setting(10, "frames that a feature may go on without a right match")
     seed: int = setting(0, "seed of the consensus sampling; equal seeds give equal bits")
 

@@ -1,53 +1,68 @@
-"""Left-right matching on a rectified pair: a normalised search along the row, then sub-pixel alignment.
+"""Left-right matching on a rectified pair: a normalised search along the row over all disparities.
 
-The search compares zero-mean, unit-norm patches, so that exposure and gain may differ between the cameras. New points
-are searched over the whole disparity range at half resolution; points with a predicted disparity only near it. In the
-alignment a patch may shift, shear and stretch along the row, because the disparity of a slanted surface (the road,
-above all) changes across it.
+The search compares zero-mean, unit-norm patches, so that exposure and gain may differ between the cameras. It runs at
+half resolution, both ways; the sub-pixel place in the full image is found afterwards by alignment (`frontend.align`).
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from frontend.align import FLAT_RMS, align, cut_patches, shift_warps, templates
-from frontend.patches import inside, integer_patches
-from frontend.settings import KltSettings
+from frontend.align import FLAT_RMS
+from frontend.patches import integer_patches
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
-_COARSE_RADIUS = 4  # pixels of the half-resolution image
-_NEAR_PX = 3  # half width of the search around a predicted or coarse disparity
-_BACK_PX = 6  # half width of the search back in the left image
+_RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
-_ALIGN_ITERATIONS = 6
-_MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
-_ALIGN_MAX_PX = 2.0  # a fit that moves further than this has left its peak
 
 
-@dataclass(frozen=True, slots=True)
-class RowPyramid:
-    """One image at full and at half resolution; a point (u, v) lies at (u/2, v/2) in the half image."""
-
-    full: Image
-    half: Image
+_FIELD_MEMORY = 0.95  # weight of what was learned before, per frame
+_FIELD_PRIOR = 4.0  # matches that it takes to believe in a row difference
+_FIELD_SIGMA_PX = 0.5
+_FIELD_ITERATIONS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class StereoMatch:
-    """Right pixels of N left points."""
+class RowField:
+    """How far matched rows differ over the image, learned from the matches: what the rectification left over.
 
-    right: FloatArray  # (N, 2) [ur vr], arbitrary where not valid
-    valid: BoolArray  # (N,)
+    A small error of the relative rotation or principal point moves rows by a low polynomial in the pixel. On KITTI it
+    reaches 0.9 px in the corners, and a feature on a slanted edge turns it into an error of its disparity.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        self._centre = np.array([width / 2, height / 2])
+        self._scale = width / 2
+        self._normal = _FIELD_PRIOR * np.eye(5)
+        self._moment = np.zeros(5)
+        self._field: FloatArray = np.zeros(5)
+
+    def _terms(self, pixels: FloatArray) -> FloatArray:
+        x, y = ((pixels - self._centre) / self._scale).T
+        return np.stack([np.ones_like(x), x, y, x * y, y * y], axis=1)
+
+    def rows(self, left: FloatArray) -> FloatArray:
+        """Expected rows (N,) in the right image of left pixels (N, 2)."""
+        return left[:, 1] + self._terms(left) @ self._field
+
+    def learn(self, left: FloatArray, right: FloatArray) -> None:
+        """Take in the matches (N, 2) and (N, 2) of one frame; those far from what is known count little."""
+        terms = self._terms(left)
+        off = right[:, 1] - left[:, 1]
+        prior = (1 - _FIELD_MEMORY) * _FIELD_PRIOR * np.eye(5)
+        kept, moment = _FIELD_MEMORY * self._normal + prior, _FIELD_MEMORY * self._moment
+        for _ in range(_FIELD_ITERATIONS):
+            weight = 1.0 / (1.0 + ((off - terms @ self._field) / _FIELD_SIGMA_PX) ** 2)
+            self._normal = kept + (terms * weight[:, None]).T @ terms
+            self._moment = moment + terms.T @ (weight * off)
+            self._field = np.asarray(np.linalg.solve(self._normal, self._moment), dtype=np.float64)
 
 
-def row_pyramid(image: Image) -> RowPyramid:
-    """Build the two levels that `match_rows` needs."""
-    return RowPyramid(image, np.asarray(cv2.pyrDown(image), dtype=np.uint8))
+def half_image(image: Image) -> Image:
+    """The image at half resolution; what lies at (u, v) in the full image lies at (u/2, v/2) there."""
+    return np.asarray(cv2.pyrDown(image), dtype=np.uint8)
 
 
 def row_correlation(
@@ -89,105 +104,56 @@ def _window_sums(values: npt.NDArray[np.float32], side: int) -> FloatArray:
     return sums
 
 
-def _best(score: npt.NDArray[np.float32]) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Return the best candidate (N,), its score (N,), and the best score away from its peak (N,)."""
-    rows = np.arange(len(score))
-    best = np.argmax(score, axis=1)
-    near = np.abs(np.arange(score.shape[1]) - best[:, None]) <= _PEAK_HALF_WIDTH
-    second = np.where(near, -1.0, score).max(axis=1)
-    return best, score[rows, best].astype(np.float64), second.astype(np.float64)
-
-
 def _search(
-    source: Image, target: Image, points: FloatArray, low: FloatArray, high: FloatArray, radius: int
+    source: Image, target: Image, points: FloatArray, low: int, high: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Search shifts `low..high` (N,) along the row; return the best shift (N,), its score and the runner-up's."""
+    """Search shifts `low..high` along the row for points (N, 2).
+
+    Returns:
+        The best shift (N,), sub-pixel; its score (N,), -1 too close to the border; the best score off its peak.
+    """
+    rows = np.arange(len(points))
     centres = np.rint(points).astype(np.int64)
-    start = np.floor(low).astype(np.int64)
-    count = int(np.max(np.ceil(high) - start, initial=0)) + 1
-    safe = np.clip(centres, radius, np.array([source.shape[1], source.shape[0]]) - radius - 1)
-    score = row_correlation(source, target, safe, safe[:, 0] + start, count, radius)
-    shifts = start[:, None] + np.arange(count)
-    score = np.where(shifts <= np.ceil(high)[:, None], score, np.float32(-1.0))
-    best, top, second = _best(score)
+    safe = np.clip(centres, _RADIUS, np.array([source.shape[1], source.shape[0]]) - _RADIUS - 1)
+    score = row_correlation(source, target, safe, safe[:, 0] + low, high - low + 1, _RADIUS)
+    best = np.argmax(score, axis=1)
+    top = score[rows, best].astype(np.float64)
+    near = np.abs(np.arange(score.shape[1]) - best[:, None]) <= _PEAK_HALF_WIDTH
+    second = np.where(near, np.float32(-1.0), score).max(axis=1, initial=-1.0).astype(np.float64)
+    before = score[rows, np.maximum(best - 1, 0)].astype(np.float64)
+    after = score[rows, np.minimum(best + 1, score.shape[1] - 1)].astype(np.float64)
+    bend = before - 2 * top + after
+    peaked = (best > 0) & (best < score.shape[1] - 1) & (bend < 0)
+    offset = np.where(peaked, (before - after) / (2 * np.where(peaked, bend, -1.0)), 0.0)
     # The patches were cut at whole pixels; the shift carries over to the sub-pixel point.
-    return (start + best).astype(np.float64), np.where((safe == centres).all(axis=1), top, -1.0), second
+    return low + best + np.clip(offset, -0.5, 0.5), np.where((safe == centres).all(axis=1), top, -1.0), second
 
 
 def match_rows(
-    left: RowPyramid, right: RowPyramid, points: FloatArray, disparity_guess: FloatArray, settings: KltSettings
-) -> StereoMatch:
-    """Match left points (N, 2) into the right image of a rectified pair.
+    left_half: Image, right_half: Image, points: FloatArray, max_disparity: float, min_correlation: float, margin: float
+) -> tuple[FloatArray, BoolArray]:
+    """Match points of the left image into the right one, to about half a pixel.
 
     Args:
-        left: the image of the points.
-        right: the image to search.
-        points: left pixels (N, 2).
-        disparity_guess: expected `ul - ur` (N,); NaN where nothing is known, which costs a search of the whole range.
-        settings: gates and patch size.
-    """
-    n = len(points)
-    radius = settings.stereo_radius_px
-    max_disparity = settings.max_disparity * left.full.shape[1]
-    guess = np.clip(disparity_guess, 0.0, max_disparity)
-    shift, score = np.zeros(n), np.full(n, -1.0)
-    known = np.flatnonzero(np.isfinite(guess))
-    if len(known):
-        shift[known], score[known] = _near(left.full, right.full, points[known], -guess[known], _NEAR_PX, radius)
-    lost = np.flatnonzero(score < settings.min_correlation)
-    if len(lost):
-        coarse, unique = _whole_row(left.half, right.half, points[lost], max_disparity, settings.min_peak_margin)
-        shift[lost], score[lost] = _near(left.full, right.full, points[lost], coarse, _NEAR_PX, radius)
-        score[lost[~unique]] = -1.0
-    found = np.flatnonzero((score > settings.min_correlation - 0.2) & inside(left.full, points, radius + 2))
-    place, valid = np.zeros((n, 2)), np.zeros(n, dtype=np.bool_)
-    if len(found) == 0:
-        return StereoMatch(place, valid)
-    start = points[found] + np.stack([shift[found], np.zeros(len(found))], axis=1)
-    template = templates(cut_patches(left.full, points[found], radius))
-    warp, score[found] = align(template, right.full, shift_warps(start), "row", _ALIGN_ITERATIONS)
-    place[found] = warp[:, :2, 2]
-    on_peak = (np.abs(place[found] - start).max(axis=1) <= _ALIGN_MAX_PX) & (
-        np.abs(warp[:, 0, :2] - [1.0, 0.0]).max(axis=1) <= _MAX_STRETCH
-    )
-    back, _ = _near(right.full, left.full, place[found], points[found, 0] - place[found, 0], _BACK_PX, radius)
-    returns = np.abs(place[found, 0] + back - points[found, 0]) <= 1.5  # whole-pixel search: one pixel plus rounding
-    disparity = points[found, 0] - place[found, 0]
-    valid[found] = (
-        returns
-        & on_peak
-        & (score[found] >= settings.min_correlation)
-        & (np.abs(points[found, 1] - place[found, 1]) <= settings.max_epipolar_px)
-        & (disparity >= settings.min_disparity_px)
-        & (disparity <= max_disparity)
-    )
-    return StereoMatch(place, valid)
-
-
-def _near(
-    source: Image, target: Image, points: FloatArray, shift: FloatArray, half_width: int, radius: int
-) -> tuple[FloatArray, FloatArray]:
-    """Search within `half_width` pixels of a predicted shift (N,); return the best shift and its score."""
-    best, score, _ = _search(source, target, points, shift - half_width, shift + half_width, radius)
-    return best, score
-
-
-def _whole_row(
-    left: Image, right: Image, points: FloatArray, max_disparity: float, margin: float
-) -> tuple[FloatArray, BoolArray]:
-    """Search the whole disparity range at half resolution, both ways.
+        left_half: left image at half resolution.
+        right_half: right image at half resolution.
+        points: left pixels (N, 2) of the full image.
+        max_disparity: largest disparity, pixels of the full image.
+        min_correlation: smallest normalised correlation.
+        margin: least lead over the second-best place in the row.
 
     Returns:
-        Shifts (N,) in full-resolution pixels, and a mask (N,) of those that are unique and found again backwards.
+        Disparities (N,) in pixels of the full image, and a mask (N,) of those that are good enough, unique, and found
+        again when searching back.
     """
-    n = len(points)
-    reach = np.full(n, max_disparity / 2)
-    shift, score, second = _search(left, right, points / 2, -reach, np.zeros(n), _COARSE_RADIUS)
-    there = points / 2 + np.stack([shift, np.zeros(n)], axis=1)
-    back, _, _ = _search(right, left, there, np.zeros(n), reach, _COARSE_RADIUS)
-    return 2 * shift, (np.abs(shift + back) <= 1.0) & (score - second >= margin)
-
-
-def mirrored(pyramid: RowPyramid) -> RowPyramid:
-    """Return the pyramid of the image flipped left to right; negative disparities become positive in it."""
-    return row_pyramid(np.ascontiguousarray(pyramid.full[:, ::-1]))
+    if len(points) == 0:
+        return np.zeros(0), np.zeros(0, dtype=np.bool_)
+    reach = int(np.ceil(max_disparity / 2))
+    shift, score, second = _search(left_half, right_half, points / 2, -reach, 1)
+    valid = (score >= min_correlation) & (score - second >= margin)
+    rows = np.flatnonzero(valid)
+    if len(rows):
+        there = points[rows] / 2 + np.stack([shift[rows], np.zeros(len(rows))], axis=1)
+        back, _, _ = _search(right_half, left_half, there, -1, reach)
+        valid[rows] = np.abs(shift[rows] + back) <= 1.0
+    return -2 * shift, valid

@@ -1,0 +1,468 @@
+"""Error, track length and time per stage of every front end, on rendered and on real images.
+
+    python tools/bench_frontend.py [--names klt orb sift] [--clips room street kitti_0039] [--repeat 3] [--json FILE]
+
+Rendered clips and TartanAir have a truth for every pixel. On KITTI the features of one frame are triangulated, moved
+by one rigid motion fitted to the pair, and compared with the pixels tracked there; and, apart, by the true motion.
+Real clips are read from the folder named by VIO_DATA. One thread; times are medians with quartiles over all frames but
+the first of all repetitions. On a shared machine compare figures of one call only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from frontend import build_frontend
+from frontend.outliers import fit_motion, pixel_errors
+from frontend.settings import KltSettings
+from vio.config import load_config
+from vio.datasets import open_dataset
+from vio.datasets.images import load_gray
+from vio.errors import VioError
+from vio.geometry.distortion import StereoRig, rectified_camera
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.stereo import StereoCamera, triangulate
+from vio.records import BoolArray, FrontendOutput, Observations, Recording, StereoFrame
+from vio.sim.effects import SensorEffects, develop
+from vio.sim.motion import MotionSpline, car_loop, hand_held
+from vio.sim.oracle import OracleFrontend, OracleSettings
+from vio.sim.render import correspondence
+from vio.sim.rigs import kitti_like_rig, small_rig
+from vio.sim.sequence import SimulatedRecording, simulate, views
+from vio.sim.world import World, room, street
+from vio.threads import one_blas_thread
+
+Truth = Callable[[int, FloatArray], tuple[FloatArray, BoolArray]]  # frame, left pixels (N, 2): true pixels, seen there
+
+
+@dataclass(frozen=True)
+class Clip:
+    """Frames with what is known about them."""
+
+    name: str
+    camera: StereoCamera
+    frames: list[StereoFrame]
+    in_next: Truth | None  # where the left image of the next frame shows the same point
+    in_right: Truth | None  # where the right image shows it
+    poses: FloatArray | None = None  # (F, 4, 4) T_world_cam0, ground truth
+    judged: tuple[int, ...] | None = None  # transitions k -> k + 1 that count for temporal figures; None: all
+    simulation: SimulatedRecording | None = None
+
+
+# --- rendered clips -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Scene:
+    world: World
+    rig: StereoRig
+    motion: MotionSpline
+    rate_hz: float
+    first_s: float
+
+
+def _room_scene() -> _Scene:
+    return _Scene(room(seed=1), small_rig(752, 480), hand_held(duration_s=8.0), 20.0, 3.0)
+
+
+def _street_scene() -> _Scene:
+    return _Scene(street(seed=4), kitti_like_rig(), car_loop(duration_s=8.0, start_m=12.0, seed=4), 10.0, 0.5)
+
+
+def _rendered(scene: _Scene, count: int, *, exposure_ms: float = 0.0, exact_blur: bool = False) -> SimulatedRecording:
+    step_ns = round(1e9 / scene.rate_hz)
+    times = scene.motion.start_ns + round(scene.first_s * 1e9) + step_ns * np.arange(count)
+    effects = SensorEffects(blur_exposure_ms=exposure_ms, blur_exact=exact_blur)
+    return SimulatedRecording(simulate(scene.world, scene.rig, scene.motion, frame_times_ns=times, effects=effects))
+
+
+def _truths(recording: SimulatedRecording) -> tuple[Truth, Truth]:
+    simulation = recording.simulation
+
+    def in_next(k: int, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
+        now, later = (views(simulation, int(simulation.taken_ns[i]))[0] for i in (k, k + 1))
+        return correspondence(simulation.world, now, later, uv)
+
+    def in_right(k: int, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
+        return correspondence(simulation.world, *views(simulation, int(simulation.taken_ns[k])), uv)
+
+    return in_next, in_right
+
+
+def _developed(
+    name: str,
+    recording: SimulatedRecording,
+    radiance: list[tuple[Any, Any]],
+    effects_of: Callable[[int], SensorEffects],
+    judged: tuple[int, ...] | None = None,
+) -> Clip:
+    frames = []
+    for k, pair in enumerate(radiance):
+        time_ns = int(recording.simulation.taken_ns[k])
+        left, right = (
+            develop(image, effects_of(k), time_ns=time_ns, frame_index=k, camera=i, seed=5)
+            for i, image in enumerate(pair)
+        )
+        frames.append(StereoFrame(k, time_ns, left, right))
+    camera = rectified_camera(recording.simulation.rig)
+    return Clip(name, camera, frames, *_truths(recording), judged=judged, simulation=recording)
+
+
+def rendered_clips(wanted: set[str], count: int) -> Iterator[Clip]:
+    """Render the clips whose names are wanted; those of one scene share their perfect images."""
+    plain = SensorEffects(read_noise=1.5)
+    period = 5  # frames between steps of the exposure
+    steps = tuple(range(period - 1, count - 1, period))
+    room_effects: dict[str, tuple[Callable[[int], SensorEffects], tuple[int, ...] | None]] = {
+        "room": (lambda k: plain, None),
+        "room_exposure_step": (lambda k: replace(plain, exposure=1.3 if (k // period) % 2 else 1.0), steps),
+        "room_gain_0.6": (lambda k: replace(plain, right_gain=0.6), None),
+        "room_gain_1.6": (lambda k: replace(plain, right_gain=1.6), None),
+        "room_noise_5": (lambda k: replace(plain, read_noise=5.0), None),
+        "room_dark": (lambda k: replace(plain, exposure=0.25), None),
+    }
+    if wanted & (room_effects.keys() | {"room_blur_5px"}):
+        scene = _room_scene()
+        recording = _rendered(scene, count)
+        times = recording.simulation.taken_ns
+        if wanted & room_effects.keys():
+            radiance = [recording.radiance(int(t)) for t in times]
+            for name, (effects_of, judged) in room_effects.items():
+                if name in wanted:
+                    yield _developed(name, recording, radiance, effects_of, judged)
+        if "room_blur_5px" in wanted:
+            speed = [
+                np.median(np.linalg.norm(recording.flow(0, int(a), int(b)), axis=2))
+                for a, b in zip(times[:-1:4], times[1::4], strict=False)
+            ]
+            shutter_ms = 5.0 / float(np.mean(speed)) * 1e3 / scene.rate_hz
+            blurred = _rendered(scene, count, exposure_ms=shutter_ms)
+            radiance = [blurred.radiance(int(t)) for t in times]
+            yield _developed("room_blur_5px", blurred, radiance, lambda k: plain)
+    if "street" in wanted:
+        recording = _rendered(_street_scene(), count)
+        radiance = [recording.radiance(int(t)) for t in recording.simulation.taken_ns]
+        yield _developed("street", recording, radiance, lambda k: plain)
+
+
+# --- real clips -----------------------------------------------------------------------------------------------------
+
+
+def kitti_clip(folder: Path, name: str, count: int | None) -> Clip:
+    """Read a folder in KITTI odometry layout with its poses."""
+    dataset = open_dataset(str(folder))
+    frames = [event for event in dataset.events(0, count) if isinstance(event, StereoFrame)]
+    reference = dataset.recording.reference
+    poses = None
+    if reference is not None:
+        T_cam0_imu = dataset.recording.T_cam0_imu
+        poses = (reference if T_cam0_imu is None else reference.in_cam0(T_cam0_imu)).T_world_body[: len(frames)]
+    return Clip(name, dataset.recording.camera, frames, None, None, poses)
+
+
+def tartanair_clip(folder: Path) -> Clip:
+    """Read the TartanAir v2 clip with its dense flow and depth. Reference: Wang et al., TartanAir (IROS 2020)."""
+    lefts = sorted((folder / "image_lcam_front").glob("*.png"))
+    rights = sorted((folder / "image_rcam_front").glob("*.png"))
+    frames = [
+        StereoFrame(k, k * 100_000_000, load_gray(left)[0], load_gray(right)[0])
+        for k, (left, right) in enumerate(zip(lefts, rights, strict=True))
+    ]
+    depth = [
+        np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED)).view("<f4")[..., 0]
+        for path in sorted((folder / "depth_lcam_front").glob("*.png"))
+    ]
+    flow = [
+        (np.asarray(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))[..., :2].astype(np.float32) - 32768) / 64
+        for path in sorted((folder / "flow_lcam_front").glob("*.png"))
+    ]
+    camera = StereoCamera(320.0, 320.0, 320.0, 320.0, 0.25, 640, 640)
+
+    def sampled(dense: Any, uv: FloatArray) -> Any:
+        at = uv.astype(np.float32)
+        return cv2.remap(np.ascontiguousarray(dense), at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)[0]
+
+    def smooth(k: int, uv: FloatArray) -> BoolArray:
+        """Mask (N,) of pixels whose 7x7 surroundings differ by less than 5 % in depth: elsewhere truth is luck."""
+        nearest, farthest = (f(depth[k], np.ones((7, 7), np.uint8)) for f in (cv2.erode, cv2.dilate))
+        row, column = (np.clip(np.rint(uv[:, i]).astype(int), 0, 639) for i in (1, 0))
+        return np.asarray(farthest[row, column] < 1.05 * nearest[row, column])
+
+    def in_next(k: int, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
+        there = uv + sampled(flow[k], uv)
+        return there, smooth(k, uv) & (there > 8).all(axis=1) & (there < 631).all(axis=1)
+
+    def in_right(k: int, uv: FloatArray) -> tuple[FloatArray, BoolArray]:
+        disparity = camera.fu * camera.baseline_m / sampled(depth[k], uv)
+        there = uv - np.stack([disparity, np.zeros(len(uv))], axis=1)
+        return there, smooth(k, uv) & (there[:, 0] > 0)
+
+    return Clip("tartanair2_clip", camera, frames, in_next, in_right)
+
+
+RENDERED = (
+    "room",
+    "street",
+    "room_exposure_step",
+    "room_gain_0.6",
+    "room_gain_1.6",
+    "room_blur_5px",
+    "room_noise_5",
+    "room_dark",
+)
+REAL = ("kitti_0039", "kitti_06_head", "tartanair2_clip")
+
+
+def clips(wanted: set[str], count: int) -> Iterator[Clip]:
+    """Make the clips by name; real ones whose folder is absent are left out with a warning."""
+    yield from rendered_clips(wanted, count)
+    data = Path(os.environ.get("VIO_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    for name in REAL:
+        if name in wanted:
+            if not (data / name).is_dir():
+                logging.getLogger(__name__).warning("no %s in %s (VIO_DATA): left out", name, data)
+                continue
+            yield tartanair_clip(data / name) if name == "tartanair2_clip" else kitti_clip(data / name, name, None)
+
+
+# --- measuring ------------------------------------------------------------------------------------------------------
+
+Builder = Callable[[Clip], Any]  # a fresh front end for a clip
+
+
+def run(clip: Clip, build: Builder) -> list[tuple[FrontendOutput, float]]:
+    """Outputs of a fresh front end with the milliseconds that each frame took."""
+    frontend = build(clip)
+    results = []
+    for frame in clip.frames:
+        start = time.perf_counter()
+        output = frontend.process(frame)
+        results.append((output, 1e3 * (time.perf_counter() - start)))
+    return results
+
+
+def accuracy(clip: Clip, outputs: list[FrontendOutput]) -> dict[str, Any]:
+    """Errors against the truth, stereo counts and track lengths."""
+    seen = [output.observations for output in outputs]
+    ids = np.concatenate([o.ids for o in seen])
+    lengths = np.unique(ids, return_counts=True)[1]
+    stereo = np.array([int(o.has_right.sum()) for o in seen])
+    figures: dict[str, Any] = {
+        "stereo_observations": {"least": int(stereo.min()), "median": float(np.median(stereo))},
+        "track_length": {
+            "median": float(np.median(lengths)) if len(lengths) else 0.0,
+            "mean": float(lengths.mean()) if len(lengths) else 0.0,
+            "tracks": len(lengths),
+        },
+    }
+    if clip.in_next is not None and clip.in_right is not None:
+        temporal, shown, kept = [], 0, 0
+        for k in range(len(seen) - 1) if clip.judged is None else clip.judged:
+            there, visible = clip.in_next(k, seen[k].z[:, :2])
+            visible &= _within(clip, there)
+            found, row = _rows(seen[k].ids, seen[k + 1].ids)
+            temporal.append(np.linalg.norm(seen[k + 1].z[row, :2] - there, axis=1)[found & visible])
+            shown, kept = shown + int(visible.sum()), kept + int((found & visible).sum())
+        figures["temporal_px"] = _summary(np.concatenate(temporal))
+        figures["survived"] = kept / max(shown, 1)
+        disparity = []
+        for k, o in enumerate(seen):
+            there, visible = clip.in_right(k, o.z[:, :2])
+            disparity.append((there[:, 0] - o.z[:, 2])[visible & o.has_right])
+        figures["disparity_px"] = _summary(np.concatenate(disparity))
+    elif clip.poses is not None:
+        figures |= _rigid_figures(clip, seen)
+    return figures
+
+
+def _within(clip: Clip, uv: FloatArray) -> BoolArray:
+    assert clip.camera.width is not None
+    assert clip.camera.height is not None
+    margin = 10.0
+    return (
+        (uv >= margin).all(axis=1) & (uv[:, 0] < clip.camera.width - margin) & (uv[:, 1] < clip.camera.height - margin)
+    )
+
+
+def _rows(ids: Any, later: Any) -> tuple[BoolArray, Any]:
+    """Whether each id is among the later ones, and its row there (arbitrary where not)."""
+    order = np.argsort(later)
+    if len(later) == 0:
+        return np.zeros(len(ids), dtype=np.bool_), np.zeros(len(ids), dtype=np.int64)
+    row = order[np.minimum(np.searchsorted(later[order], ids), len(later) - 1)]
+    return later[row] == ids, row
+
+
+def _rigid_figures(clip: Clip, seen: list[Observations]) -> dict[str, Any]:
+    """Reprojection of stereo points into the next frame, under a motion fitted to each pair and under the truth."""
+    assert clip.poses is not None
+    settings, fitted, raw = KltSettings(), [], []
+    for k in range(len(seen) - 1):
+        stereo = seen[k].take(seen[k].has_right)
+        found, row = _rows(stereo.ids, seen[k + 1].ids)
+        p, valid = triangulate(clip.camera, stereo.z)
+        used = found & valid
+        pixels = seen[k + 1].z[row[used], :2]
+        T_true = se3_inverse(clip.poses[k + 1]) @ clip.poses[k]
+        T = fit_motion(clip.camera, p[used], pixels, T_true, settings)
+        raw.append(pixel_errors(clip.camera, T_true, p[used], pixels))
+        if T is not None:
+            fitted.append(pixel_errors(clip.camera, T, p[used], pixels))
+    return {
+        "reprojection_fitted_px": _summary(np.concatenate(fitted)),
+        "reprojection_truth_px": _summary(np.concatenate(raw)),
+        "fitted_pairs": len(fitted),
+        "pairs": len(seen) - 1,
+    }
+
+
+def _summary(error: FloatArray) -> dict[str, float]:
+    """Median and 95 % of the size of errors (N,), the median error with its sign, and the share beyond 1 px."""
+    if len(error) == 0:
+        return {"count": 0}
+    size = np.abs(error)
+    return {
+        "median": float(np.median(size)),
+        "p95": float(np.percentile(size, 95)),
+        "bias": float(np.median(error)),
+        "beyond_1px": float(np.mean(size > 1)),
+        "count": len(error),
+    }
+
+
+def timing(runs: list[list[tuple[FrontendOutput, float]]]) -> dict[str, list[float]]:
+    """Quartiles [25, 50, 75 %] in milliseconds of every stage and of the whole frame, first frames left out."""
+    frames = [frame for results in runs for frame in results[1:]]
+    stages = dict.fromkeys(stage for output, _ in frames for stage in output.stages_ms)
+    columns = {stage: [output.stages_ms.get(stage, 0.0) for output, _ in frames] for stage in stages}
+    columns["frame"] = [ms for _, ms in frames]
+    return {stage: [float(q) for q in np.percentile(values, [25, 50, 75])] for stage, values in columns.items()}
+
+
+def builders(names: list[str], overrides: list[str]) -> dict[str, Builder]:
+    """How to build each front end for a clip, with settings overridden by `key=value` below `frontend.`."""
+    settings = load_config(None, [f"frontend.{override}" for override in overrides]).frontend
+
+    def builder(name: str) -> Builder:
+        if name == "oracle":
+
+            def build(clip: Clip) -> Any:
+                if clip.simulation is None:
+                    return None
+                return OracleFrontend(clip.simulation.simulation, OracleSettings(max_features=350, sigma_px=0.0))
+
+            return build
+        return lambda clip: build_frontend(name, clip.camera, settings, _ClipDataset(clip))
+
+    return {name: builder(name) for name in names}
+
+
+class _ClipDataset:
+    """A clip as the dataset that builders ask for."""
+
+    def __init__(self, clip: Clip) -> None:
+        times = np.array([frame.time_ns for frame in clip.frames])
+        self.recording = Recording("clip", Path(clip.name), clip.camera, None, times, True, frozenset(), None)
+        self._frames = clip.frames
+
+    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[StereoFrame]:
+        yield from self._frames[start:stop]
+
+    def observations(self, index: int) -> Observations | None:
+        return None
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """The results as one Markdown table a clip."""
+    lines = []
+    for clip_name, by_name in results.items():
+        real = any("reprojection_fitted_px" in figures for figures in by_name.values())
+        first = "fitted reprojection px: median, 95 %" if real else "temporal px: median, 95 %, > 1 px; survived"
+        second = "under the true poses" if real else "disparity px: median, 95 %, bias, > 1 px"
+        lines += [
+            f"\n{clip_name}",
+            f"| | {first} | {second} | stereo rows: least, median | track length: median, mean | ms |",
+            "|---|---|---|---|---|---|",
+        ]
+        for name, f in by_name.items():
+            if real:
+                fit, raw = f["reprojection_fitted_px"], f["reprojection_truth_px"]
+                cells = [f"{fit['median']:.3f}, {fit['p95']:.3f}", f"{raw['median']:.2f}, {raw['p95']:.2f}"]
+            else:
+                t, d = f["temporal_px"], f["disparity_px"]
+                cells = [
+                    _cell(t, "median", "p95", "beyond_1px") + f"; {100 * f['survived']:.0f} %",
+                    _cell(d, "median", "p95", "bias", "beyond_1px"),
+                ]
+            rows, length, ms = f["stereo_observations"], f["track_length"], f["ms"]["frame"]
+            cells += [
+                f"{rows['least']}, {rows['median']:.0f}",
+                f"{length['median']:.0f}, {length['mean']:.1f}",
+                f"{ms[1]:.1f} ({ms[0]:.1f}, {ms[2]:.1f})",
+            ]
+            lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _cell(summary: dict[str, float], *keys: str) -> str:
+    if summary["count"] == 0:
+        return "none"
+    return ", ".join(f"{100 * summary[k]:.1f} %" if k == "beyond_1px" else f"{summary[k]:.3f}" for k in keys)
+
+
+def main() -> int:
+    """Run the benchmark; print tables, and write JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--names", nargs="+", default=["klt", "orb", "sift", "oracle"])
+    parser.add_argument("--clips", nargs="+", default=[*RENDERED, *REAL], choices=[*RENDERED, *REAL])
+    parser.add_argument("--frames", type=int, default=40, help="frames of each rendered clip")
+    parser.add_argument("--repeat", type=int, default=1, help="repetitions, for the times")
+    parser.add_argument(
+        "--set", action="append", default=[], help="setting below `frontend.`, such as klt.window_px=21"
+    )
+    parser.add_argument("--json", type=Path)
+    args = parser.parse_args()
+    cv2.setNumThreads(1)
+    results: dict[str, dict[str, Any]] = {}
+    try:
+        with one_blas_thread():
+            for clip in clips(set(args.clips), args.frames):
+                results[clip.name] = measure(clip, builders(args.names, args.set), args.repeat)
+    except VioError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(table(results))
+    if args.json is not None:
+        args.json.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    return 0
+
+
+def measure(clip: Clip, build: dict[str, Builder], repeat: int) -> dict[str, Any]:
+    """Figures of each front end on one clip; repetitions take turns, so that a busy machine hits all alike."""
+    runs: dict[str, list[list[tuple[FrontendOutput, float]]]] = {name: [] for name in build}
+    for _ in range(repeat):
+        for name in build:
+            if name == "oracle" and clip.simulation is None:
+                continue
+            runs[name].append(run(clip, build[name]))
+    return {
+        name: accuracy(clip, [output for output, _ in results[0]]) | {"ms": timing(results)}
+        for name, results in runs.items()
+        if results
+    }
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
