@@ -51,7 +51,7 @@ _BANK_SPARE = 3  # templates in memory, over the number of features
 class _Tracks:
     """The features alive after a frame; older features come first."""
 
-    ids: IntArray  # (N,) increasing
+    ids: IntArray  # (N,) given when a feature is first shown; arbitrary before
     left: FloatArray  # (N, 2) pixels
     right: FloatArray  # (N, 2) pixels, arbitrary where has_right is False
     has_right: BoolArray  # (N,)
@@ -72,10 +72,10 @@ class _Tracks:
         return _Tracks(**{column.name: getattr(self, column.name)[index] for column in fields(self)})
 
 
-def _newborn(ids: IntArray, left: FloatArray, slot: IntArray) -> _Tracks:
-    n = len(ids)
+def _newborn(left: FloatArray, slot: IntArray) -> _Tracks:
+    n = len(left)
     return _Tracks(
-        ids,
+        np.zeros(n, dtype=np.int64),
         left,
         right=np.zeros((n, 2)),
         has_right=np.zeros(n, dtype=np.bool_),
@@ -234,7 +234,7 @@ class KltFrontend:
         memory = self._memory
         nothing = np.zeros(0, dtype=np.int64)
         if memory is None or len(memory.tracks) == 0:
-            return _newborn(nothing, np.zeros((0, 2)), nothing), None
+            return _newborn(np.zeros((0, 2)), nothing), None
         seconds = (frame.time_ns - memory.time_ns) * 1e-9
         expected = self._expected_motion(memory, prior, seconds)
         found, seen = self._flow_all(memory, left, prior, expected)
@@ -286,9 +286,9 @@ class KltFrontend:
         if self._settings.guess == "motion" or prior is not None:
             guess = self._moved(old, self._with_neighbours(old), expected)
         if prior is not None and len(prior.ids):
-            row = np.minimum(np.searchsorted(old.ids, prior.ids), len(old) - 1)
-            known = (old.ids[row] == prior.ids) & np.isfinite(prior.z[:, :2]).all(axis=1)
-            guess[row[known]] = prior.z[known, :2]
+            row, given = _common(old, np.arange(len(old)), prior.ids)
+            finite = np.isfinite(prior.z[given, :2]).all(axis=1)
+            guess[row[finite]] = prior.z[given[finite], :2]
         # A guess outside the image cannot be tracked; the old pixel may still be found inside.
         outside = ~inside(image, guess, 0.0)
         guess[outside] = old.left[outside]
@@ -364,8 +364,8 @@ class KltFrontend:
         R_prior = None if prior is None else prior.R_cam_prev
         T_prior = None
         if prior is not None:
-            _, a, b = np.intersect1d(old.ids[known], prior.ids, assume_unique=True, return_indices=True)
-            T_prior = fit_motion(camera, old.point[known[a]], prior.z[b, :2], expected, settings)
+            row, given = _common(old, known, prior.ids)
+            T_prior = fit_motion(camera, old.point[row], prior.z[given, :2], expected, settings)
         rng = np.random.default_rng((settings.seed, frame_index))
         motion = rigid_consensus(camera, old.point[known], found[known], expected, R_prior, T_prior, rng, settings)
         if motion is None:
@@ -516,9 +516,8 @@ class KltFrontend:
         settings = self._settings
         corners = rounded(corners)
         slots = self._bank.put(self._cut(left, corners))
-        ids = np.arange(len(corners), dtype=np.int64) + self._next_id
         carried = len(tracks)
-        tracks = _joined(tracks, _newborn(ids, corners, slots))
+        tracks = _joined(tracks, _newborn(corners, slots))
         rows = np.flatnonzero(~tracks.has_right)
         disparity, unique = match_rows(
             left.half,
@@ -539,12 +538,7 @@ class KltFrontend:
         new = carried + self._worthwhile(
             tracks.take(np.arange(carried, len(tracks))), motion, left.full, int(tracks.has_right[old].sum())
         )
-        tracks = tracks.take(np.concatenate([old, np.sort(new[: max(0, settings.target_features - carried)])]))
-        # Ids of corners that were not kept are free again: nobody has seen them.
-        fresh = tracks.age == 0
-        tracks.ids[fresh] = np.arange(int(fresh.sum())) + self._next_id
-        self._next_id += int(fresh.sum())
-        return tracks
+        return tracks.take(np.concatenate([old, np.sort(new[: max(0, settings.target_features - carried)])]))
 
     def _worthwhile(self, new: _Tracks, motion: Consensus | None, image: FloatImage, carried: int) -> IntArray:
         """Rows of the new features that should be taken, best first: those with depth that will stay in the image.
@@ -565,11 +559,14 @@ class KltFrontend:
         return np.concatenate([lasting, leaving, flat if carried < _FEW * least else flat[:0]])
 
     def _with_shown(self, tracks: _Tracks) -> _Tracks:
-        """Show features that outlived their probation; all of them where few would be left."""
+        """Show features that outlived their probation, under new ids; all of them where few would be left."""
         proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & tracks.has_right)
         if proven.sum() < _VERY_FEW * self._settings.target_features:
             proven[:] = True
-        return replace(tracks, shown=proven)
+        ids, first = tracks.ids.copy(), proven & ~tracks.shown
+        ids[first] = np.arange(int(first.sum())) + self._next_id
+        self._next_id += int(first.sum())
+        return replace(tracks, ids=ids, shown=proven)
 
     def _check_swap(self, frame: StereoFrame, left: _View, right: _View, tracks: _Tracks) -> None:
         """Raise when several frames in a row match only with negative disparities."""
@@ -588,6 +585,13 @@ class KltFrontend:
             settings.min_peak_margin,
         )
         self._swap.check(frame, n, matched, int((unique & (disparity >= 1.0)).sum()))
+
+
+def _common(tracks: _Tracks, rows: IntArray, ids: IntArray) -> tuple[IntArray, IntArray]:
+    """Those of the rows whose feature is among the ids, and where among the ids it is."""
+    shown = rows[tracks.shown[rows]]
+    _, a, b = np.intersect1d(tracks.ids[shown], ids, assume_unique=True, return_indices=True)
+    return shown[a], b
 
 
 def _apart(points: FloatArray, distance: float) -> BoolArray:
