@@ -53,7 +53,7 @@ _CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
 _MIN_TRACKS_FOR_NOISE = 15
 _MAX_WAIT_FRAMES = 20
-_FIRST_STEPS, _LATER_STEPS = 3, 1  # Gauss-Newton steps on each point, before and after the poses moved
+_FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 
 
@@ -214,7 +214,9 @@ class Msckf:
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, z, weight)
             _, shift = posterior(window.P, A, b + A @ window.offset)
-            window.relinearise(shift - window.offset)
+            error = shift - window.offset
+            self._move_points(tracks, error[DIM : window.first_landmark])
+            window.relinearise(error)
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = _newest_innovation(tracks.at)
             # Another step pays only where this one had far to go.
@@ -264,6 +266,13 @@ class Msckf:
         rows, p = rows[keep], p[keep]
         at = Residuals(at.r[keep], at.z_D_p[keep], at.ahead[keep])
         return _Tracks(rows, p, at, track_information(at, p, self._robust_weights(at)))
+
+    def _move_points(self, tracks: _Tracks, clones_error: FloatArray) -> None:
+        """Move each point as its own normal equations say once the clones have moved (6N,): back-substitution."""
+        info = tracks.information
+        right = info.point_gradient - np.einsum("fik,i->fk", info.G, clones_error)
+        step = np.linalg.solve(info.C, right[..., None])[..., 0]
+        self._tracks.points[tracks.rows] = tracks.p_world + step
 
     def _robust_weights(self, at: Residuals) -> FloatArray:
         """Cauchy weights (F, N) of all views; the scale is each clone's own, as a predicted pose is off as a whole."""

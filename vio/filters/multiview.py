@@ -62,8 +62,12 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
 
 
 def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -> tuple[FloatArray, BoolArray]:
-    """Points (F, 3) in the world from each track's stereo view of largest disparity; False (F,) where there is none."""
+    """Points (F, 3) in the world from each track's stereo view of largest disparity; False (F,) where there is none.
+
+    The newest clone's view counts only where it is the only one, as its pose has yet to be corrected.
+    """
     disparity = np.where(views.weight[..., 2] > 0, views.z[..., 0] - views.z[..., 2], -np.inf)
+    disparity[:, -1] = np.where(np.isfinite(disparity[:, :-1]).any(axis=1), -np.inf, disparity[:, -1])
     best = np.argmax(disparity, axis=1)
     rows = np.arange(len(best))
     usable = disparity[rows, best] > 0
