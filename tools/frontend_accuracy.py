@@ -27,11 +27,11 @@ from vio.errors import VioError
 from vio.geometry.distortion import rectified_camera, unproject_pixel
 from vio.geometry.lie import FloatArray
 from vio.protocols import Frontend
-from vio.records import BoolArray, FrontendOutput, Image, IntArray, Observations, StereoFrame
+from vio.records import FrontendOutput, Image, IntArray, Observations, StereoFrame
 from vio.sim.render import View, cast, correspondence, inside_image, observe, surface_points
 from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, plan, usual_workers
 from vio.sim.sequence import SimulatedRecording, Simulation, views
-from vio.sim.world import surfaces_at
+from vio.sim.world import Surfaces, surfaces_at
 from vio.threads import one_blas_thread
 
 SHOWN_EFFECTS = (
@@ -49,7 +49,8 @@ SHOWN_EFFECTS = (
 
 _OUTLIER_PX = 1.0
 _CROSSED_PX = 1.5  # a track this far off, at another depth than its point, has changed surface
-_CROSSED_DEPTH = 0.02  # relative
+_OTHER_DEPTH = 0.02  # relative
+_RIM_PX = 3.0  # a feature this near to a nearer surface may be a point of that one's outline
 _CROSSED_FRAMES = 3  # for longer, a track on the wrong side of an edge counts as kept
 _MARGIN_PX = 12.0  # a point nearer to the image's border may be given up
 _CORNERS = 150  # strongest corners of an image, for the recall of repeatable ones
@@ -83,11 +84,12 @@ class Tally:
 
 @dataclass
 class _Birth:
-    """Where on the scene the features of one frame began."""
+    """Where on the scene each feature began, and which nearer surface its pixel's surroundings belong to."""
 
-    surface: dict[int, int] = field(default_factory=dict)
-    place: dict[int, FloatArray] = field(default_factory=dict)
     frame: dict[int, int] = field(default_factory=dict)
+    surface: dict[int, tuple[int, int]] = field(default_factory=dict)  # own, rim
+    place: dict[int, FloatArray] = field(default_factory=dict)  # (2, 2) m on own, on rim
+    offset: dict[int, FloatArray] = field(default_factory=dict)  # (2,) px from the rim's point to the feature
 
 
 def judge(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Frontend) -> Tally:
@@ -154,41 +156,61 @@ def _judge_life(
     left: View,
     frame_index: int,
 ) -> None:
-    """Compare each feature with the point of the scene that it began on."""
+    """Compare each feature with the point of the scene that it began on.
+
+    A corner on an outline may belong to the surface behind by a fraction of a pixel and yet be a point of the outline:
+    features that began within a few pixels of a nearer surface may follow either.
+    """
+    names = now.ids.tolist()
+    if not names:
+        return
     surfaces = surfaces_at(simulation.world, left.time_ns)
     rays, _ = unproject_pixel(left.camera, now.z[:, :2])
     hits = cast(surfaces, left.T_world_cam, rays)
-    names = now.ids.tolist()
-    for k, name in enumerate(names):
-        if name not in birth.surface:
-            birth.surface[name], birth.place[name] = int(hits.surface[k]), hits.place[k]
-            birth.frame[name] = frame_index
-    if not names:
-        return
-    began = np.array([birth.surface[name] for name in names])
-    p_world = surface_points(surfaces, began, np.array([birth.place[name] for name in names]))
+    fresh = [k for k, name in enumerate(names) if name not in birth.frame]
+    _begin(birth, [names[k] for k in fresh], surfaces, left, now.z[fresh, :2], frame_index)
+    own, rim = np.array([birth.surface[name] for name in names]).T
+    place = np.array([birth.place[name] for name in names])
+    p_world = surface_points(surfaces, own, place[:, 0])
     true, visible = observe(surfaces, left, p_world)
     error = now.z[:, :2] - true
+    on_rim, _ = observe(surfaces, left, surface_points(surfaces, rim, place[:, 1]))
+    rim_error = now.z[:, :2] - on_rim - np.array([birth.offset[name] for name in names])
+    follows_rim = np.linalg.norm(rim_error, axis=1) < np.linalg.norm(error, axis=1)
     age = frame_index - np.array([birth.frame[name] for name in names])
     old = visible & (age > 0)
-    tally.since_birth.append(error[old])
+    tally.since_birth.append(np.where(follows_rim[:, None], rim_error, error)[old])
     tally.age.append(age[old])
-    away = _beyond_edge(left, p_world, hits.distance, error, visible)
+    distance = np.linalg.norm(p_world - left.T_world_cam[:3, 3], axis=1)
+    elsewhere = np.abs(hits.distance - distance) > _OTHER_DEPTH * distance
+    # Just behind an outline a point is hidden although its feature is hardly off: that is no crossing yet.
+    away = elsewhere & ((np.linalg.norm(error, axis=1) > _CROSSED_PX) | ~visible)
+    away &= np.linalg.norm(rim_error, axis=1) > _CROSSED_PX
     for name, crossed in zip(names, away.tolist(), strict=True):
         beyond[name] = beyond.get(name, 0) + 1 if crossed else 0
         if crossed:
             tally.crossed[name] = max(tally.crossed.get(name, 0), beyond[name])
 
 
-def _beyond_edge(
-    left: View, p_world: FloatArray, distance: FloatArray, error: FloatArray, visible: BoolArray
-) -> BoolArray:
-    """Mask (N,) of features that stand on another surface than their point: it is hidden, or they slid off it."""
-    own = np.linalg.norm(p_world - left.T_world_cam[:3, 3], axis=1)
-    other_depth = np.abs(distance - own) > _CROSSED_DEPTH * own
-    far = np.linalg.norm(error, axis=1) > _CROSSED_PX
-    # Just behind an outline a point is hidden although its feature is hardly off: that is no crossing yet.
-    return np.asarray(other_depth & (far | ~visible), dtype=np.bool_)
+def _begin(birth: _Birth, names: list[int], surfaces: Surfaces, left: View, uv: FloatArray, frame_index: int) -> None:
+    """Remember what features (N,) at pixels (N, 2) stand on, and the nearest surface around each."""
+    if not names:
+        return
+    ring = np.concatenate(
+        [[[0.0, 0.0]], _RIM_PX * np.array([[x, y] for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y])]
+    )
+    around = uv[:, None] + ring
+    rays, _ = unproject_pixel(left.camera, around.reshape(-1, 2))
+    hits = cast(surfaces, left.T_world_cam, rays)
+    distance = np.where(hits.found, hits.distance, np.inf).reshape(len(uv), -1)
+    surface, place = hits.surface.reshape(len(uv), -1), hits.place.reshape(len(uv), -1, 2)
+    nearest = np.where(distance.min(axis=1) < (1 - _OTHER_DEPTH) * distance[:, 0], distance.argmin(axis=1), 0)
+    for k, name in enumerate(names):
+        rim = int(nearest[k])
+        birth.frame[name] = frame_index
+        birth.surface[name] = int(surface[k, 0]), int(surface[k, rim])
+        birth.place[name] = place[k, [0, rim]]
+        birth.offset[name] = -ring[rim]
 
 
 def _judge_corners(
