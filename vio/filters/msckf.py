@@ -54,6 +54,7 @@ _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
 _MIN_TRACKS_FOR_NOISE = 15
 _MAX_WAIT_FRAMES = 20
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
+_VIEW_LIMIT = 23.5  # chi-square with 4 degrees of freedom, probability 0.9999
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 
 
@@ -223,6 +224,7 @@ class Msckf:
             if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
                 break
 
+        tracks = self._without_wrong_views(tracks)
         good, nis = self._gate(tracks.at)
         self._follow_noise(tracks.at, nis)
         report = self._commit(window, tracks, good, z, weight)
@@ -259,7 +261,7 @@ class Msckf:
             table.points[rows[fresh]], table.has_point[rows[fresh]] = start, known
             rows = rows[table.has_point[rows]]
             views = table.views(rows, len(window.clones))
-        p = refine_points(camera, T, table.points[rows], views, steps)
+        p = refine_points(camera, T, table.points[rows], views, steps, _CAUCHY * self.pixel_sigma_px)
         at = residuals(camera, T, p, views)
         keep = at.ahead & within(camera, T, p, self._settings.max_distance * camera.baseline_m)
         table.points[rows], table.has_point[rows] = p, keep
@@ -330,6 +332,22 @@ class Msckf:
         usable = weight * ahead[:, None]
         r = np.where(usable > 0, z - project(self._camera, p_cam), 0.0)
         return (z_D_p_cam(self._camera, p_cam) @ T[:3, :3]) * usable[..., None], r, ahead
+
+    def _without_wrong_views(self, tracks: _Tracks) -> _Tracks:
+        """Drop single views that contradict the rest of their track, for good, and linearise what is left."""
+        squares = np.sum(tracks.at.r**2, axis=2) / self._sigma2
+        wrong: BoolArray = squares > _VIEW_LIMIT
+        if not wrong.any():
+            return tracks
+        self._tracks.drop_views(tracks.rows, wrong)
+        kept = ~wrong
+        at = Residuals(
+            tracks.at.r * kept[..., None], tracks.at.z_D_p * kept[..., None, None], np.ones(len(wrong), dtype=np.bool_)
+        )
+        enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
+        at = Residuals(at.r[enough], at.z_D_p[enough], at.ahead[enough])
+        p = tracks.p_world[enough]
+        return _Tracks(tracks.rows[enough], p, at, track_information(at, p, self._robust_weights(at)))
 
     def _gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
         """Which tracks (F,) pass the chi-square gate, and their squared residual over its degrees of freedom (F,)."""

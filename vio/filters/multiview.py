@@ -78,9 +78,9 @@ def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -
 
 
 def refine_points(
-    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, steps: int
+    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, steps: int, scale_px: float
 ) -> FloatArray:
-    """Move points (F, 3) by damped Gauss-Newton steps on all their pixels.
+    """Move points (F, 3) by damped Gauss-Newton steps on all their pixels, with Cauchy weights of a scale in pixels.
 
     A step is cut to half the distance from the nearest camera that saw the point, so that a bad start cannot throw it
     behind the cameras.
@@ -89,8 +89,9 @@ def refine_points(
     centre = -np.einsum("nji,nj->ni", T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]).mean(axis=0)
     for _ in range(steps):
         at = residuals(camera, T_cam0_world, p, views)
+        weight = 1 / (1 + np.sum(at.r**2, axis=2) / (4 * scale_px**2))
         J = at.z_D_p.reshape(len(p), 4 * len(T_cam0_world), 3)
-        Jt = np.swapaxes(J, 1, 2)
+        Jt = np.swapaxes((at.z_D_p * weight[..., None, None]).reshape(J.shape), 1, 2)
         C = Jt @ J
         C += (1e-9 + 1e-6 * np.trace(C, axis1=1, axis2=2))[:, None, None] * np.eye(3)
         step = np.linalg.solve(C, Jt @ at.r.reshape(len(p), 4 * len(T_cam0_world), 1))[..., 0]

@@ -60,6 +60,10 @@ class TrackTable:
         self._weight[rows] = 0.0
         self.has_point[rows] = False
 
+    def drop_views(self, rows: IntArray, views: BoolArray) -> None:
+        """Forget single views (F, N) of rows for good."""
+        self._weight[rows, : views.shape[1]] *= ~views[..., None]
+
     def remove(self, rows: IntArray) -> None:
         """Remove tracks."""
         for row in rows.tolist():

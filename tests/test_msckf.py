@@ -1,0 +1,597 @@
+"""The sliding-window filter: its Jacobians, the algebra it rests on, consistency, and behaviour under trouble."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.numerics import numeric_jacobian
+from vio.errors import ConfigError, EstimationError
+from vio.filters.msckf import Msckf
+from vio.filters.multiview import (
+    Residuals,
+    Views,
+    eliminate_points,
+    first_points,
+    point_lever,
+    refine_points,
+    residuals,
+    track_information,
+)
+from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
+from vio.filters.settings import MsckfSettings
+from vio.filters.tracks import TrackTable, latest_pixels
+from vio.filters.window import Window, posterior
+from vio.geometry.lie import (
+    FloatArray,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    so3_exp,
+    so3_left_jacobian_inverse,
+    so3_log,
+    transform_points,
+)
+from vio.geometry.stereo import StereoCamera, project
+from vio.records import ImuSample, Observations, VelocitySample, observations
+
+CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
+T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
+STEP_NS = 50_000_000
+
+
+def _poses(n: int, seed: int = 0) -> FloatArray:
+    """Camera poses T_cam0_world (n, 4, 4) a few centimetres and degrees apart."""
+    rng = np.random.default_rng(seed)
+    steps = se3_exp(np.cumsum(rng.normal(0, [0.08, 0.05, 0.05, 0.02, 0.02, 0.02], (n, 6)), axis=0))
+    return np.array([T_CAM0_IMU @ T for T in steps])
+
+
+def _world_points(T_cam0_world: FloatArray, n: int, seed: int = 1) -> FloatArray:
+    rng = np.random.default_rng(seed)
+    p_cam = np.column_stack([rng.uniform(-1.2, 1.2, n), rng.uniform(-0.8, 0.8, n), rng.uniform(2, 6, n)])
+    return transform_points(se3_inverse(T_cam0_world[0]), p_cam)
+
+
+def _views(T: FloatArray, p: FloatArray, noise: float = 0.0, seed: int = 2) -> Views:
+    rng = np.random.default_rng(seed)
+    z = np.array([[project(CAMERA, transform_points(T_i, p_f)) for T_i in T] for p_f in p])
+    weight = np.ones_like(z)
+    weight[0, 1] = 0.0  # unseen
+    weight[1, 2, 2:] = 0.0  # seen left only
+    return Views(z + rng.normal(0, noise, z.shape), weight)
+
+
+# Algebra of many views
+
+
+def test_residual_jacobians_equal_central_differences() -> None:
+    T, views = _poses(4), None
+    p = _world_points(T, 3)
+    views = _views(T, p, noise=1.0)
+    at = residuals(CAMERA, T, p, views)
+    for f in range(3):
+
+        def predicted(q: FloatArray, f: int = f) -> FloatArray:
+            moved = p.copy()
+            moved[f] = q
+            return -residuals(CAMERA, T, moved, views).r[f].reshape(-1)
+
+        numeric = numeric_jacobian(predicted, p[f]).reshape(4, 4, 3)
+        np.testing.assert_allclose(at.z_D_p[f], numeric, rtol=1e-5, atol=1e-4)
+
+
+def test_clone_jacobian_is_that_of_the_right_invariant_error() -> None:
+    """dz = J B xi for T_world_imu <- exp(xi) T_world_imu, against central differences."""
+    T = _poses(1)
+    T_world_imu = se3_inverse(se3_inverse(T_CAM0_IMU) @ T[0])
+    p = _world_points(T, 1)
+    views = Views(np.zeros((1, 1, 4)), np.ones((1, 1, 4)))
+    at = residuals(CAMERA, T, p, views)
+
+    def pixels(xi: FloatArray) -> FloatArray:
+        moved = T_CAM0_IMU @ se3_inverse(se3_exp(xi) @ T_world_imu)
+        return project(CAMERA, transform_points(moved, p[0]))
+
+    analytic = at.z_D_p[0, 0] @ point_lever(p)[0]
+    np.testing.assert_allclose(analytic, numeric_jacobian(pixels, np.zeros(6)), rtol=1e-5, atol=1e-4)
+
+
+def test_points_are_found_from_noisy_views() -> None:
+    T = _poses(6)
+    p = _world_points(T, 30)
+    views = _views(T, p, noise=0.3)
+    start, known = first_points(CAMERA, T, views)
+    assert known.all()
+    refined = refine_points(CAMERA, T, start, views, 6, 1e3)
+    at = residuals(CAMERA, T, refined, views)
+    gradient = np.einsum("fnki,fnk->fi", at.z_D_p, at.r)
+    assert np.abs(gradient).max() < 1e-2  # a minimum
+    assert np.median(np.linalg.norm(refined - p, axis=1)) < np.median(np.linalg.norm(start - p, axis=1))
+
+
+def _stacked(at: Residuals, p: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Per track: H_clones (4N, 6N), H_point (4N, 3), r (4N,)."""
+    N = at.r.shape[1]
+    B = point_lever(p)
+    out = []
+    for f in range(len(p)):
+        H = np.zeros((4 * N, 6 * N))
+        for n in range(N):
+            H[4 * n : 4 * n + 4, 6 * n : 6 * n + 6] = at.z_D_p[f, n] @ B[f]
+        out.append((H, at.z_D_p[f].reshape(-1, 3), at.r[f].reshape(-1)))
+    return out
+
+
+def test_elimination_equals_the_left_null_space() -> None:
+    """The MSCKF's projection onto the left null space of H_point, done by QR, gives the same information."""
+    T = _poses(5)
+    p = _world_points(T, 8)
+    at = residuals(CAMERA, T, p, _views(T, p, noise=0.5))
+    A, b = eliminate_points(track_information(at, p, np.ones((8, 5))), np.ones(8, dtype=np.bool_))
+    A_null, b_null = np.zeros_like(A), np.zeros_like(b)
+    for H, H_point, r in _stacked(at, p):
+        Q, _ = np.linalg.qr(H_point, mode="complete")
+        null = Q[:, 3:].T
+        A_null += (null @ H).T @ (null @ H)
+        b_null += (null @ H).T @ (null @ r)
+    np.testing.assert_allclose(A, A_null, rtol=1e-7, atol=1e-6 * np.abs(A).max())
+    np.testing.assert_allclose(b, b_null, rtol=1e-6, atol=1e-6 * np.abs(b).max())
+
+
+def test_elimination_equals_a_marginalised_landmark() -> None:
+    """Put the point into the state with a flat prior, update, and look at the clones alone."""
+    T = _poses(4)
+    p = _world_points(T, 1)
+    views = Views(_views(T, np.repeat(p, 2, axis=0), noise=0.4).z[:1], np.ones((1, 4, 4)))
+    at = residuals(CAMERA, T, p, views)
+    H, H_point, r = _stacked(at, p)[0]
+    root = np.random.default_rng(4).normal(size=(24, 24)) * 0.02
+    P = root @ root.T
+    A, b = eliminate_points(track_information(at, p, np.ones((1, 4))), np.ones(1, dtype=np.bool_))
+    P_new, shift = posterior(P, A, b)
+    J = np.concatenate([H, H_point], axis=1)
+    flat = np.linalg.inv(P)
+    joint = np.zeros((27, 27))
+    joint[:24, :24] = flat
+    joint += J.T @ J
+    covariance = np.linalg.inv(joint)
+    np.testing.assert_allclose(P_new, covariance[:24, :24], rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(shift, (covariance @ J.T @ r)[:24], rtol=1e-5, atol=1e-7)
+
+
+def test_batch_equals_sequential() -> None:
+    T = _poses(4)
+    p = _world_points(T, 6)
+    at = residuals(CAMERA, T, p, _views(T, p, noise=0.5))
+    info = track_information(at, p, np.ones((6, 4)))
+    root = np.random.default_rng(5).normal(size=(24, 24)) * 0.02
+    P = root @ root.T
+    batch = posterior(P, *eliminate_points(info, np.ones(6, dtype=np.bool_)))
+    first = np.array([True, True, False, False, True, False])
+    A1, b1 = eliminate_points(info, first)
+    P1, shift1 = posterior(P, A1, b1)
+    A2, b2 = eliminate_points(info, ~first)
+    P2, shift2 = posterior(P1, A2, b2 - A2 @ shift1)
+    np.testing.assert_allclose(P2, batch[0], rtol=1e-8, atol=1e-12)
+    np.testing.assert_allclose(shift1 + shift2, batch[1], rtol=1e-7, atol=1e-12)
+
+
+def test_posterior_is_the_kalman_update_also_for_a_singular_prior() -> None:
+    rng = np.random.default_rng(6)
+    root = rng.normal(size=(8, 5))
+    P = root @ root.T  # rank 5
+    H, r = rng.normal(size=(12, 8)), rng.normal(size=12)
+    P_new, shift = posterior(P, H.T @ H, H.T @ r)
+    K = P @ H.T @ np.linalg.inv(H @ P @ H.T + np.eye(12))
+    np.testing.assert_allclose(P_new, (np.eye(8) - K @ H) @ P, atol=1e-7)
+    np.testing.assert_allclose(shift, K @ r, atol=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_unobservable_directions_gain_nothing_whatever_the_estimate(seed: int) -> None:
+    """Moving and yawing the whole world leaves all pixels alone: with right-invariant errors exactly, everywhere."""
+    T = _poses(5, seed) @ se3_exp(np.random.default_rng(seed).normal(0, 3, 6))
+    p = _world_points(T, 20, seed)
+    estimate = p + np.random.default_rng(seed + 50).normal(0, 0.3, p.shape)
+    at = residuals(CAMERA, T, estimate, _views(T, p, noise=2.0))
+    A, _ = eliminate_points(track_information(at, estimate, np.ones((20, 5))), np.ones(20, dtype=np.bool_))
+    for direction in np.eye(6):
+        world_moves = np.tile(direction, 5)
+        assert abs(world_moves @ A @ world_moves) < 1e-6 * np.abs(A).max()
+        assert np.abs(A @ world_moves).max() < 1e-6 * np.abs(A).max()
+
+
+# Motion models
+
+
+def _imu_settings() -> MsckfSettings:
+    return MsckfSettings()
+
+
+def _spin(n: int = 11, seed: int = 3) -> list[ImuSample]:
+    rng = np.random.default_rng(seed)
+    w, a = rng.normal(0, 0.6, (n, 3)), rng.normal([0, 0, 9.8], 1.0, (n, 3))
+    return [ImuSample(k * 5_000_000, w[k], a[k]) for k in range(n)]
+
+
+def _imu_nav() -> NavState:
+    T = se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1])
+    return NavState(
+        T, np.array([1.0, -0.5, 0.3]), np.zeros(3), np.array([0.01, -0.02, 0.03]), np.array([0.1, 0.05, -0.1])
+    )
+
+
+def _difference(motion: ImuMotion | TwistMotion, a: NavState, b: NavState) -> FloatArray:
+    """The error that takes b to a: the inverse of `corrected`."""
+    xi = se3_log(a.T_world_imu @ se3_inverse(b.T_world_imu))
+    if isinstance(motion, TwistMotion):
+        return np.concatenate([xi, a.velocity - b.velocity, a.rate - b.rate, a.gyro_bias - b.gyro_bias])
+    phi = xi[3:]
+    v = so3_left_jacobian_inverse(phi) @ (a.velocity - so3_exp(phi) @ b.velocity)
+    return np.concatenate([xi, v, a.gyro_bias - b.gyro_bias, a.accel_bias - b.accel_bias])
+
+
+def test_imu_transition_equals_central_differences() -> None:
+    def advanced(nav: NavState) -> NavState:
+        motion = ImuMotion(_imu_settings())
+        for sample in _spin():
+            motion.take(sample)
+        return motion.advance(nav, 0, 50_000_000).nav
+
+    motion = ImuMotion(_imu_settings())
+    for sample in _spin():
+        motion.take(sample)
+    nav = _imu_nav()
+    step = motion.advance(nav, 0, 50_000_000)
+
+    def flow(error: FloatArray) -> FloatArray:
+        return _difference(motion, advanced(motion.corrected(nav, error)), step.nav)
+
+    numeric = numeric_jacobian(flow, np.zeros(DIM), eps=1e-5)
+    np.testing.assert_allclose(step.Phi[:, :9], numeric[:, :9], atol=2e-6)
+    # The bias columns are summed by the midpoint rule over 5 ms steps.
+    np.testing.assert_allclose(step.Phi[:, 9:], numeric[:, 9:], atol=5e-4)
+
+
+def test_navigation_part_of_the_imu_transition_does_not_depend_on_the_state() -> None:
+    """The point of the invariant error: (position, attitude, velocity) flow the same from every state."""
+    Phis = []
+    for nav in (_imu_nav(), NavState(np.eye(4), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))):
+        motion = ImuMotion(_imu_settings())
+        for sample in _spin():
+            motion.take(sample)
+        Phis.append(motion.advance(nav, 0, 50_000_000).Phi[:9, :9])
+    np.testing.assert_array_equal(Phis[0], Phis[1])
+
+
+def test_imu_at_rest_stays_at_rest() -> None:
+    motion = ImuMotion(_imu_settings())
+    up = np.array([0.3, -0.2, 0.9])
+    for k in range(-20, 201):
+        motion.take(ImuSample(k * 5_000_000, np.zeros(3), 9.81 * up / np.linalg.norm(up)))
+        if k == 0:
+            nav, _ = motion.start(0)
+    moved = motion.advance(nav, 0, 1_000_000_000).nav
+    np.testing.assert_allclose(moved.T_world_imu, nav.T_world_imu, atol=1e-9)
+    np.testing.assert_allclose(moved.velocity, 0, atol=1e-9)
+
+
+def test_twist_transition_equals_central_differences() -> None:
+    motion = TwistMotion(MsckfSettings())
+    nav = NavState(
+        se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1]),
+        np.array([8.0, 0.2, -0.1]),
+        np.array([0.1, -0.2, 0.4]),
+        np.zeros(3),
+        np.zeros(3),
+    )
+    step = motion.advance(nav, 0, 100_000_000)
+
+    def flow(error: FloatArray) -> FloatArray:
+        return _difference(motion, motion.advance(motion.corrected(nav, error), 0, 100_000_000).nav, step.nav)
+
+    np.testing.assert_allclose(step.Phi, numeric_jacobian(flow, np.zeros(DIM)), atol=1e-6)
+
+
+def test_velocity_measurement_moves_the_twist_and_its_bias() -> None:
+    motion = TwistMotion(MsckfSettings())
+    nav, _ = motion.start(0)
+    motion.take(VelocitySample(0, np.array([5.0, 0, 0]), np.array([0, 0, 0.3])))
+    measurement = motion.measurement(nav)
+    assert measurement is not None
+    np.testing.assert_allclose(measurement.residual, [5, 0, 0, 0, 0, 0.3])
+    assert motion.measurement(nav) is None  # a sample measures once
+
+
+# The window
+
+
+def _window(seed: int = 0) -> Window:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(DIM, DIM)) * 0.05
+    window = Window(TwistMotion(MsckfSettings()), NavState(np.eye(4), *np.zeros((4, 3))), root @ root.T)
+    for k in range(4):
+        window.add_clone(k, k * STEP_NS)
+        window.propagate(window.motion.advance(window.nav, k * STEP_NS, (k + 1) * STEP_NS))
+    return window
+
+
+def test_clone_is_a_copy_with_all_its_correlations() -> None:
+    window = _window()
+    window.add_clone(9, 9)
+    rows = window.clone_rows(4)
+    np.testing.assert_array_equal(window.P[rows], window.P[:6])
+    np.testing.assert_allclose(window.P, window.P.T, atol=1e-15)
+
+
+def test_new_anchor_of_the_landmarks_changes_no_prediction() -> None:
+    """Errors of a landmark in the newest clone's camera: the same distribution before and after the anchor moves."""
+    window = _window()
+    p = np.array([[4.0, 1.0, 0.5], [6.0, -2.0, 1.0]])
+    A = np.random.default_rng(1).normal(size=(6, len(window.P))) * 0.3
+    window.add_landmarks(np.array([3, 8]), p, A, np.array([np.eye(3) * 1e-3] * 2))
+    first, newest = window.first_landmark, window.clone_rows(3)
+    # Position of landmark minus position of the clone, as the anchor clone sees it: xi_f - xi_rho.
+    J = np.zeros((3, len(window.P)))
+    J[:, first : first + 3], J[:, newest.start : newest.start + 3] = np.eye(3), -np.eye(3)
+    before = J @ window.P @ J.T
+    window.add_clone(9, 9)
+    first = window.first_landmark
+    J = np.zeros((3, len(window.P)))
+    lever = point_lever(p)[0][:, 3:]
+    new = window.clone_rows(4)
+    J[:, first : first + 3], J[:, newest.start : newest.start + 3] = np.eye(3), -np.eye(3)
+    J[:, newest.start + 3 : newest.stop] += lever
+    J[:, new.start + 3 : new.stop] -= lever
+    np.testing.assert_allclose(J @ window.P @ J.T, before, atol=1e-12)
+
+
+def test_relinearising_moves_the_means_and_not_the_prior() -> None:
+    window = _window()
+    P = window.P.copy()
+    error = np.random.default_rng(2).normal(size=len(P)) * 0.01
+    window.relinearise(error)
+    np.testing.assert_array_equal(window.P, P)
+    np.testing.assert_allclose(window.offset, error)
+    window.relinearise(-window.offset)
+    np.testing.assert_allclose(window.offset, 0, atol=1e-15)
+    np.testing.assert_allclose(window.clones[2].T_world_imu, _window().clones[2].T_world_imu, atol=1e-4)
+
+
+def test_commit_in_two_parts_equals_commit_at_once() -> None:
+    rng = np.random.default_rng(7)
+    H, r = rng.normal(size=(40, DIM + 24)), rng.normal(size=40)
+    once, twice = _window(), _window()
+    once.commit(H.T @ H, H.T @ r)
+    once.relinearise(-once.offset)
+    for part in (slice(0, 15), slice(15, 40)):
+        twice.commit(H[part].T @ H[part], H[part].T @ r[part])
+    twice.relinearise(-twice.offset)
+    np.testing.assert_allclose(twice.P, once.P, atol=1e-12)
+    np.testing.assert_allclose(twice.nav.T_world_imu, once.nav.T_world_imu, atol=1e-10)
+
+
+def test_track_table_keeps_rows_apart_and_grows() -> None:
+    table = TrackTable(4)
+    z = np.arange(4 * 600, dtype=np.float64).reshape(600, 4)
+    table.add_frame(0, observations(0, 0, np.arange(600), z))
+    table.add_frame(1, observations(1, 1, np.arange(300, 600), z[300:] + 1, has_right=np.arange(300) % 2 == 0))
+    rows = table.rows()
+    np.testing.assert_array_equal(table.ids(rows), np.arange(600))
+    views = table.views(rows, 2)
+    np.testing.assert_array_equal(views.z[450, 1], z[450] + 1)
+    assert views.weight[301, 1].tolist() == [1, 1, 0, 0]
+    table.remove(rows[:300])
+    table.shift()
+    rows = table.rows()
+    np.testing.assert_array_equal(table.ids(rows), np.arange(300, 600))
+    np.testing.assert_array_equal(table.views(rows, 1).z[150, 0], z[450] + 1)
+    table.shift()
+    assert len(table.rows()) == 0
+
+
+def test_latest_pixels_finds_ids_in_any_order() -> None:
+    seen = observations(0, 0, [9, 2, 5], np.arange(12.0).reshape(3, 4), has_right=[True, False, True])
+    z, weight, found = latest_pixels(seen, np.array([5, 7, 2]))
+    assert found.tolist() == [True, False, True]
+    np.testing.assert_array_equal(z[0], [8, 9, 10, 11])
+    assert weight[2].tolist() == [1, 1, 0, 0]
+    assert latest_pixels(seen.take(np.zeros(3, dtype=np.bool_)), np.array([5]))[2].tolist() == [False]
+
+
+# The whole filter on an exact world
+
+
+class Flight:
+    """A smooth flight among points, with exact states, an IMU that follows from them, and pixels with noise."""
+
+    def __init__(self, frames: int = 60, *, still: bool = False) -> None:
+        self.frames, self.still = frames, still
+        self.points = np.random.default_rng(0).uniform([-6, -6, -1], [12, 6, 4], (1500, 3))
+
+    def state(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """R, p, v, a, omega (body) at a time, from analytic curves."""
+        if self.still:
+            return np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+        w = np.array([0.9, 0.7, 1.3])
+        scale = np.array([1.5, 1.0, 0.3])
+        p, v, a = scale * np.sin(w * t), scale * w * np.cos(w * t), -scale * w**2 * np.sin(w * t)
+
+        def attitude(s: float) -> FloatArray:
+            return so3_exp([0, 0, 0.5 * np.sin(0.8 * s)]) @ so3_exp([0.1 * np.sin(1.1 * s), 0.12 * np.sin(0.9 * s), 0])
+
+        h = 1e-5
+        omega = so3_log(attitude(t - h).T @ attitude(t + h)) / (2 * h)
+        return attitude(t), p, v, a, omega
+
+    def imu(self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray) -> list[ImuSample]:
+        """Samples at 200 Hz with white noise and constant biases (6,)."""
+        rate = 200.0
+        out = []
+        for k in range(int(self.frames * 10) + 1):
+            R, _, _, a, omega = self.state(k / rate)
+            gyro = omega + bias[:3] + noise.normal(0, settings.gyro_noise_density * np.sqrt(rate), 3)
+            accel = (
+                R.T @ (a + np.array([0, 0, 9.81]))
+                + bias[3:]
+                + noise.normal(0, settings.accel_noise_density * np.sqrt(rate), 3)
+            )
+            out.append(ImuSample(int(k * 5_000_000), gyro, accel))
+        return out
+
+    def T_world_imu(self, k: int) -> FloatArray:
+        R, p, *_ = self.state(k * 0.05)
+        return se3_from_parts(R, p)
+
+    def observe(self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60) -> Observations:
+        p = transform_points(T_CAM0_IMU @ se3_inverse(self.T_world_imu(k)), self.points)
+        near = (p[:, 2] > 1.0) & (p[:, 2] < 12)
+        z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
+        ok = near & (z[:, 2] > 5) & (z[:, 0] < 747) & (z[:, 1] > 5) & (z[:, 1] < 475)
+        ids = np.flatnonzero(ok)[:limit]
+        return observations(k, k * STEP_NS, ids, z[ids] + noise.normal(0, sigma, (len(ids), 4)))
+
+    def run(
+        self,
+        settings: MsckfSettings,
+        motion: str | None,
+        seed: int = 0,
+        *,
+        sigma: float = 0.5,
+        bias: FloatArray | None = None,
+        spoil: object = None,
+        limit: int = 60,
+    ) -> tuple[FloatArray, FloatArray, Msckf]:
+        """Return pose errors xi (frames, 6) and covariances (frames, 6, 6), as `Estimate` defines them, and the filter.
+
+        The estimate's world is moved onto the truth by the first pose, which the filter takes as known.
+        """
+        noise = np.random.default_rng(seed)
+        filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion=motion)  # type: ignore[arg-type]
+        samples = self.imu(noise, settings, np.zeros(6) if bias is None else bias) if motion == "imu" else []
+        errors, covariances = [], []
+        fed = 0
+        T_shift = np.eye(4)
+        for k in range(self.frames):
+            while fed < len(samples) and samples[fed].time_ns <= k * STEP_NS:
+                filt.propagate(samples[fed])
+                fed += 1
+            if motion == "velocity":
+                R, _, v, _, omega = self.state(k * 0.05)
+                u = noise.normal(0, np.repeat([0.5, 0.05], 3))
+                filt.propagate(VelocitySample(k * STEP_NS, R.T @ v + u[:3], omega + u[3:]))
+            seen = self.observe(k, sigma, noise, limit)
+            filt.update(seen if spoil is None else spoil(k, seen, noise))  # type: ignore[operator]
+            estimate = filt.estimate()
+            if k == 0:
+                T_shift = self.T_world_imu(0) @ se3_inverse(estimate.T_world_imu)
+            error = se3_log(se3_inverse(self.T_world_imu(k)) @ T_shift @ estimate.T_world_imu)
+            errors.append(error)
+            covariances.append(estimate.covariance)
+        return np.array(errors), np.array(covariances), filt
+
+
+@pytest.mark.parametrize("motion", [None, "velocity", "imu"])
+def test_flight_that_starts_in_motion_is_followed(motion: str | None) -> None:
+    errors, _, _ = Flight().run(MsckfSettings(), motion)
+    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.05
+    assert np.linalg.norm(errors[5:, 3:], axis=1).max() < 0.03
+
+
+def test_biases_are_found() -> None:
+    bias = np.array([0.02, -0.05, 0.08, 0.1, -0.05, 0.08])
+    errors, _, filt = Flight(frames=160).run(MsckfSettings(), "imu", bias=bias)
+    np.testing.assert_allclose(filt.estimate().gyro_bias, bias[:3], atol=3e-3)
+    np.testing.assert_allclose(filt.estimate().accel_bias, bias[3:], atol=0.06)
+    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.08
+
+
+def test_wrong_matches_do_not_capture_it() -> None:
+    """Three rows in ten jump by tens of pixels at random, in every frame."""
+
+    def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
+        wrong = noise.random(len(seen)) < 0.3
+        z = seen.z + np.where(wrong[:, None], noise.uniform(-40, 40, (len(seen), 1)) * [1, 0.3, 1, 0.3], 0)
+        return replace(seen, z=z)
+
+    errors, _, _ = Flight().run(MsckfSettings(), "imu", spoil=spoil, limit=120)
+    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.2
+
+
+def test_blackout_grows_the_covariance_and_is_survived() -> None:
+    def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
+        return seen.take(np.zeros(len(seen), dtype=np.bool_)) if 30 <= k < 50 else seen
+
+    errors, covariances, _ = Flight(frames=80).run(MsckfSettings(), "imu", spoil=spoil)
+    trace = np.trace(covariances[:, :3, :3], axis1=1, axis2=2)
+    assert trace[49] > 3 * trace[29]
+    assert np.all(np.diff(trace[31:50]) > 0)
+    assert np.linalg.norm(errors[79, :3]) < 0.15
+
+
+def test_standing_still_does_not_drift() -> None:
+    errors, _, _ = Flight(frames=200, still=True).run(MsckfSettings(), "imu", sigma=0.2)
+    assert np.linalg.norm(errors[100:, :3], axis=1).max() < 0.004
+
+
+def test_two_runs_give_the_same_bits() -> None:
+    a, b = (Flight(frames=25).run(MsckfSettings(), "imu")[0] for _ in range(2))
+    np.testing.assert_array_equal(a, b)
+
+
+def test_window_and_map_stay_bounded() -> None:
+    settings = MsckfSettings(clones=6, max_landmarks=8)
+    _, _, filt = Flight(frames=60).run(settings, "imu")
+    window = filt._window
+    assert window is not None
+    assert len(window.clones) <= 6
+    assert len(filt.landmarks().ids) <= 8
+    assert window.P.shape[0] <= DIM + 36 + 24
+
+
+def test_left_only_views_count() -> None:
+    """Half of the rows have no right match; they still pull the pose."""
+
+    def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
+        has_right = seen.ids % 2 == 0 if k else np.ones(len(seen), dtype=np.bool_)
+        return replace(seen, has_right=has_right, z=np.where(has_right[:, None], seen.z, [1, 1, 0, 0] * seen.z))
+
+    with_left, _, _ = Flight(frames=40).run(MsckfSettings(), None, spoil=spoil)
+    assert np.linalg.norm(with_left[:, :3], axis=1).max() < 0.05
+
+
+@pytest.mark.parametrize("change", [{"clones": 2}, {"iterations": 0}, {"max_features": 0}, {"max_landmarks": -1}])
+def test_settings_out_of_range(change: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match="msckf"):
+        Msckf(CAMERA, T_CAM0_IMU, replace(MsckfSettings(), **change), motion=None)
+
+
+def test_samples_of_another_kind_are_refused() -> None:
+    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion="imu")
+    with pytest.raises(ConfigError, match="VelocitySample"):
+        filt.propagate(VelocitySample(0, np.zeros(3), np.zeros(3)))
+
+
+def test_frames_before_the_first_imu_sample_wait_but_not_for_ever() -> None:
+    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion="imu")
+    flight = Flight()
+    rng = np.random.default_rng(0)
+    assert filt.update(flight.observe(0, 0.5, rng)).used == 0
+    np.testing.assert_array_equal(filt.estimate().T_world_imu, np.eye(4))
+    for k in range(1, 20):
+        filt.update(flight.observe(k, 0.5, rng))
+    with pytest.raises(EstimationError, match="without an IMU sample"):
+        filt.update(flight.observe(20, 0.5, rng))
+
+
+def test_a_silent_imu_is_named() -> None:
+    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion="imu")
+    flight, rng = Flight(), np.random.default_rng(0)
+    filt.propagate(ImuSample(0, np.zeros(3), np.array([0, 0, 9.81])))
+    filt.update(flight.observe(0, 0.5, rng))
+    with pytest.raises(EstimationError, match="silent"):
+        filt.update(flight.observe(20, 0.5, rng))
