@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vio.cli.run import lengths
+
+if TYPE_CHECKING:
+    from vio.geometry.lie import FloatArray
+    from vio.records import Trajectory
 
 
 def add_parser(commands: Any) -> None:
@@ -15,10 +19,13 @@ def add_parser(commands: Any) -> None:
         "eval",
         help="compare a trajectory with a reference",
         description="Compare a trajectory, or a run's folder, with a reference: ATE, RPE and KITTI drift. Files in "
-        "TUM, KITTI or EuRoC form; a reference in KITTI form is associated by frame number, others by time.",
+        "TUM, KITTI or EuRoC form, or a COLMAP model; a reference in KITTI form, or a model whose images are "
+        "numbered, is associated by frame number, others by time.",
     )
     parser.add_argument("estimate", type=Path, metavar="EST", help="a trajectory file or a run's folder")
-    parser.add_argument("reference", type=Path, metavar="REF", help="a trajectory file or a run's folder")
+    parser.add_argument(
+        "reference", type=Path, metavar="REF", help="a trajectory file, a run's folder or a COLMAP model"
+    )
     parser.add_argument("--align", choices=("se3", "sim3", "none"), default="se3", help="alignment (default se3)")
     parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
     parser.add_argument(
@@ -38,10 +45,9 @@ def execute(args: argparse.Namespace) -> int:
     import json
 
     from vio.evaluation import KITTI_LENGTHS_M, evaluate
-    from vio.run_folder import read_run
 
-    estimate, T_cam0_imu = read_run(args.estimate)
-    reference, other = read_run(args.reference)
+    estimate, T_cam0_imu = _read(args.estimate)
+    reference, other = _read(args.reference)
     if args.extrinsics is not None:
         from vio.datasets.kitti import read_extrinsics
         from vio.errors import DataError
@@ -65,3 +71,16 @@ def execute(args: argparse.Namespace) -> int:
             if not isinstance(value, (list, dict)):
                 print(f"{key:<22} {'–' if value is None else value if isinstance(value, str) else f'{value:.6g}'}")
     return 0
+
+
+def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
+    """Read a trajectory file, a run's folder or a COLMAP model, with the extrinsics where it has them."""
+    from vio.run_folder import MARKER, read_run
+
+    if path.is_dir() and not (path / MARKER).is_file():
+        from vio import colmap
+
+        colmap.quiet()
+        if colmap.model_folder(path) is not None:
+            return colmap.read_colmap_trajectory(path), None
+    return read_run(path)
