@@ -9,6 +9,7 @@ Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -34,13 +35,13 @@ FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
 @dataclass(frozen=True, slots=True)
 class Templates:
-    """Patches ready to be found again."""
+    """Patches ready to be found again; S = (2r + 1)^2 pixels each."""
 
-    patch: npt.NDArray[np.float32]  # (N, S) gray levels minus their mean, S = (2r + 1)^2
+    patch: npt.NDArray[np.float32]  # (N, S) gray levels minus their mean
+    gradient: npt.NDArray[np.float32]  # (N, 2, S) along u and v
     energy: npt.NDArray[np.float32]  # (N,) sum of squares of the patch
-    solver: npt.NDArray[np.float32]  # (N, 8, S) maps the pixels under the warp to its parameters
-    row_solver: npt.NDArray[np.float32]  # (N, 6, S) the same, when the row is expected to stay
-    row_pull: npt.NDArray[np.float32]  # (N, 6) change of these parameters by a pixel between expected and found row
+    inverse: npt.NDArray[np.float32]  # (N, 8, 8) of the normal matrix
+    row_inverse: npt.NDArray[np.float32]  # (N, 6, 6) the same, when the row is expected to stay
 
     def __len__(self) -> int:
         return len(self.patch)
@@ -49,14 +50,17 @@ class Templates:
 def empty_templates(count: int, radius: int) -> Templates:
     """Room for `count` templates of a radius."""
     size = (2 * radius + 1) ** 2
-    shapes = ((size,), (), (_PARAMETERS, size), (_ROW_PARAMETERS, size), (_ROW_PARAMETERS,))
+    shapes = ((size,), (2, size), (), (_PARAMETERS, _PARAMETERS), (_ROW_PARAMETERS, _ROW_PARAMETERS))
     return Templates(*(np.zeros((count, *shape), np.float32) for shape in shapes))
 
 
+@lru_cache(maxsize=8)
 def offsets(radius: int) -> npt.NDArray[np.float32]:
-    """Offsets (3, S) `[x, y, 1]` of the pixels of a patch from its centre, row by row."""
+    """Offsets (3, S) `[x, y, 1]` of the pixels of a patch from its centre, row by row; not to be written to."""
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(np.float32).reshape(2, -1)
-    return np.stack([x, y, np.ones_like(x)])
+    out = np.stack([x, y, np.ones_like(x)])
+    out.flags.writeable = False
+    return out
 
 
 def warped_patches(image: FloatImage, warp: FloatArray, radius: int) -> npt.NDArray[np.float32]:
@@ -96,19 +100,18 @@ def templates(wide: Patches) -> Templates:
     gu = ((wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2).reshape(flat)
     gv = ((wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2).reshape(flat)
     x, y, one = offsets(radius)
-    basis = np.stack([gu, gv, patch, np.broadcast_to(one, patch.shape), gu * x, gu * y, gv * x, gv * y], axis=1)
+    centred = patch - patch.mean(axis=1, keepdims=True)
+    basis = np.stack([gu, gv, centred, np.broadcast_to(one, patch.shape), gu * x, gu * y, gv * x, gv * y], axis=1)
     normal = (basis @ basis.transpose(0, 2, 1)).astype(np.float64)
     normal += (_DAMPING * np.einsum("nii->ni", normal) + 1e-6)[:, :, None] * np.eye(_PARAMETERS)
     on_row = normal[:, :_ROW_PARAMETERS, :_ROW_PARAMETERS].copy()
     on_row[:, 1, 1] += _ROW_WEIGHT
-    inverse, inverse_on_row = np.linalg.inv(normal).astype(np.float32), np.linalg.inv(on_row).astype(np.float32)
-    centred = patch - patch.mean(axis=1, keepdims=True)
     return Templates(
         patch=centred,
+        gradient=np.stack([gu, gv], axis=1),
         energy=np.einsum("ns,ns->n", centred, centred),
-        solver=inverse @ basis,
-        row_solver=inverse_on_row @ basis[:, :_ROW_PARAMETERS],
-        row_pull=inverse_on_row[:, :, 1] * np.float32(_ROW_WEIGHT),
+        inverse=np.linalg.inv(normal).astype(np.float32),
+        row_inverse=np.linalg.inv(on_row).astype(np.float32),
     )
 
 
@@ -138,27 +141,40 @@ def align(
     n, radius = len(warp), int(store.patch.shape[1] ** 0.5) // 2
     warp, score = warp.copy(), np.full(n, -1.0)
     active = np.arange(n)
+    inverse = store.inverse if rows is None else store.row_inverse
     for _ in range(iterations):
         if len(active) == 0:
             break
-        chosen = slots[active]
-        here = warp[active]
+        chosen, here = slots[active], warp[active]
         here[:, :, 2] = rounded(here[:, :, 2])
         view = warped_patches(image, here, radius)
-        score[active] = _correlation(store.patch[chosen], store.energy[chosen], view)
-        solver = store.solver if rows is None else store.row_solver
-        fit = np.matmul(solver[chosen], view[:, :, None])[:, :, 0].astype(np.float64)
-        # The image under the current warp is gain * template(step(x)) + offset, so the step is undone.
-        gain = np.maximum(fit[:, 2:3], 0.1)
-        fit /= gain
+        moments = _moments(store, chosen, view, radius)
+        score[active] = _correlation(store.energy[chosen], moments, view)
         if rows is not None:
-            fit += store.row_pull[chosen] * (here[:, 1, 2] - rows[active])[:, None]
+            gain = np.maximum(moments[:, 2] / np.maximum(store.energy[chosen], 1.0), 0.1)
+            moments[:, 1] += np.float32(_ROW_WEIGHT) * gain * (here[:, 1, 2] - rows[active]).astype(np.float32)
+        size = inverse.shape[1]
+        fit = (inverse[chosen] @ moments[:, :size, None])[:, :, 0].astype(np.float64)
+        # The image under the current warp is gain * template(step(x)) + offset, so the step is undone.
+        fit /= np.maximum(fit[:, 2:3], 0.1)
         shift = np.clip(fit[:, :2], -_MAX_STEP_PX, _MAX_STEP_PX)
         linear = np.zeros((len(active), 4))
-        linear[:, : fit.shape[1] - 4] = np.clip(fit[:, 4:], -_MAX_LINEAR_STEP, _MAX_LINEAR_STEP)
+        linear[:, : size - 4] = np.clip(fit[:, 4:], -_MAX_LINEAR_STEP, _MAX_LINEAR_STEP)
         warp[active] = _undo(here, shift, linear)
         active = active[np.abs(fit[:, :2]).max(axis=1) > _DONE_PX]
     return warp, np.where(inside(image, warp[:, :, 2], radius + 1), score, -1.0)
+
+
+def _moments(store: Templates, chosen: IntArray, view: npt.NDArray[np.float32], radius: int) -> npt.NDArray[np.float32]:
+    """Products (N, 8) of pixels (N, S) with the derivatives by the parameters; the linear part by rows comes last."""
+    size = view.shape[1]
+    by_gradient = ((store.gradient[chosen] * view[:, None]).reshape(-1, size) @ offsets(radius).T).reshape(-1, 2, 3)
+    out = np.empty((len(view), _PARAMETERS), dtype=np.float32)
+    out[:, :2] = by_gradient[:, :, 2]
+    out[:, 2] = np.einsum("ns,ns->n", store.patch[chosen], view)
+    out[:, 3] = view.sum(axis=1)
+    out[:, 4:] = by_gradient[:, :, :2].reshape(-1, 4)
+    return out
 
 
 def _undo(warp: FloatArray, shift: FloatArray, linear: FloatArray) -> FloatArray:
@@ -172,16 +188,15 @@ def _undo(warp: FloatArray, shift: FloatArray, linear: FloatArray) -> FloatArray
 
 
 def _correlation(
-    patch: npt.NDArray[np.float32], energy: npt.NDArray[np.float32], view: npt.NDArray[np.float32]
+    energy: npt.NDArray[np.float32], moments: npt.NDArray[np.float32], view: npt.NDArray[np.float32]
 ) -> FloatArray:
-    """Normalised correlation (N,) of mean-free patches (N, S) with pixels (N, S); -1 without contrast."""
+    """Normalised correlation (N,) of patches of known energy with pixels (N, S); -1 where one has no contrast."""
     size = view.shape[1]
-    product = np.einsum("ns,ns->n", patch, view)  # the patch has no mean, so the view's drops out
-    other = np.maximum(np.einsum("ns,ns->n", view, view) - view.sum(axis=1) ** 2 / size, 0.0)
+    other = np.maximum(np.einsum("ns,ns->n", view, view) - moments[:, 3] ** 2 / size, 0.0)
     flat = FLAT_RMS**2 * size
     good = (other > flat) & (energy > flat)
     norm = np.sqrt(np.where(good, other.astype(np.float64) * energy, 1.0))
-    return np.where(good, product / norm, -1.0)
+    return np.where(good, moments[:, 2] / norm, -1.0)
 
 
 def shift_warps(centres: FloatArray) -> FloatArray:

@@ -32,8 +32,8 @@ logger = logging.getLogger(__name__)
 
 _LK_EPSILON_PX = 0.02
 _LK_MIN_EIGENVALUE = 1e-4
-_TIME_ITERATIONS = 4
-_STEREO_ITERATIONS = 5
+_TIME_ITERATIONS = 6
+_STEREO_ITERATIONS = 6
 _ALIGN_MAX_PX = 2.5  # a fit that moves further than this has left its peak
 _ANCHOR_LOST = 0.5  # correlation with its anchor below which a feature is taken for another
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
@@ -42,6 +42,7 @@ _SWAP_FEW = 0.3  # share of matches below which a frame is suspicious
 _SWAP_MIN_POINTS = 20
 _NEIGHBOURS = 3  # matched features whose depths stand in for an unknown one
 _FEW = 0.5  # share of the least number of features below which corners without depth are taken
+_TRIED = 1.5  # corners aligned for each one that is missing
 _VERY_FEW = 0.25  # share below which new features are shown at once
 _RETRY_SHARE = 0.25  # share of failures at which tracking is tried again with all pyramid levels
 _BANK_SPARE = 3  # templates in memory, over the number of features
@@ -512,51 +513,79 @@ class KltFrontend:
     def _completed(
         self, left: _View, right: _View, tracks: _Tracks, corners: FloatArray, motion: Consensus | None
     ) -> _Tracks:
-        """Search right matches for features that lack one and for new corners; keep the best new ones."""
+        """Search right matches for features that lack one and for new corners; add the best new ones."""
         settings = self._settings
-        corners = rounded(corners)
-        slots = self._bank.put(self._cut(left, corners))
-        carried = len(tracks)
-        tracks = _joined(tracks, _newborn(corners, slots))
-        rows = np.flatnonzero(~tracks.has_right)
+        lacking = ~tracks.has_right
+        if motion is not None:
+            # What was placed before, but was not found again near its place, must not turn up elsewhere.
+            lacking &= ~tracks.placed
+        rows = np.flatnonzero(lacking)
         disparity, unique = match_rows(
             left.half,
             right.half,
-            tracks.left[rows],
+            np.concatenate([tracks.left[rows], corners]),
             self._max_disparity(left.full.shape[1]),
             settings.min_correlation - _COARSE_SLACK,
             settings.min_peak_margin,
         )
-        rows, disparity = rows[unique], disparity[unique]
-        place, skew, valid = self._right_of(tracks.take(rows), right, disparity)
-        if motion is not None:
-            # What was placed before, but was not found again near its place, must not turn up elsewhere.
-            valid &= ~tracks.placed[rows]
-        tracks = self._taken_in(tracks, rows[valid], place[valid], skew[valid])
+        again, fresh = np.split(disparity, [len(rows)])
+        known, unique = np.split(unique, [len(rows)])
+        tracks = self._matched(tracks, right, rows[known], again[known])
         tracks = replace(tracks, blind=np.where(tracks.has_right, 0, tracks.blind + 1))
-        old = np.flatnonzero((tracks.blind <= settings.max_left_only_frames)[:carried])
-        new = carried + self._worthwhile(
-            tracks.take(np.arange(carried, len(tracks))), motion, left.full, int(tracks.has_right[old].sum())
-        )
-        return tracks.take(np.concatenate([old, np.sort(new[: max(0, settings.target_features - carried)])]))
+        tracks = tracks.take(tracks.blind <= settings.max_left_only_frames)
+        return _joined(tracks, self._born(left, right, tracks, corners, fresh, unique, motion))
 
-    def _worthwhile(self, new: _Tracks, motion: Consensus | None, image: FloatImage, carried: int) -> IntArray:
-        """Rows of the new features that should be taken, best first: those with depth that will stay in the image.
+    def _matched(self, tracks: _Tracks, right: _View, rows: IntArray, disparity: FloatArray) -> _Tracks:
+        """Give the named rows right pixels near their disparities (K,), where they are found."""
+        place, skew, valid = self._right_of(tracks.take(rows), right, disparity)
+        return self._taken_in(tracks, rows[valid], place[valid], skew[valid])
 
-        Those that will soon leave are taken only while less than the least number of features is carried over; those
-        without depth only while few are.
+    def _born(
+        self,
+        left: _View,
+        right: _View,
+        tracks: _Tracks,
+        corners: FloatArray,
+        disparity: FloatArray,
+        unique: BoolArray,
+        motion: Consensus | None,
+    ) -> _Tracks:
+        """New features from corners (K, 2), the best first, with coarse disparities (K,) where they are unique (K,).
+
+        Wanted are those with depth that will stay in the image. Those that will soon leave are taken only while less
+        than the least number of features is there; those without depth only while few are.
         """
         settings = self._settings
-        stays = np.ones(len(new), dtype=np.bool_)
-        if motion is not None and settings.wanted_life_frames > 0:
-            T = np.linalg.matrix_power(motion.T_curr_prev, settings.wanted_life_frames)
-            ahead = transform_points(T, new.point)[:, 2] > 0.5
-            stays = ~new.placed | (ahead & inside(image, self._moved(new, new.point, T), 0.0))
-        least = settings.least_features * settings.target_features
-        lasting, leaving = np.flatnonzero(new.has_right & stays), np.flatnonzero(new.has_right & ~stays)
-        flat = np.flatnonzero(~new.has_right)
-        leaving = leaving[: max(0, round(least) - carried - len(lasting))]
-        return np.concatenate([lasting, leaving, flat if carried < _FEW * least else flat[:0]])
+        room = max(0, settings.target_features - len(tracks))
+        least = settings.least_features * settings.target_features - int(tracks.has_right.sum())
+        stays = self._stays(corners, disparity, motion, left.full)
+        tried = round(_TRIED * room)
+        lasting, leaving = np.flatnonzero(unique & stays)[:tried], np.flatnonzero(unique & ~stays)[:tried]
+        leaving = leaving[: max(0, round(_TRIED * (least - len(lasting) / _TRIED)))]
+        flat = np.flatnonzero(~unique)[:room]
+        if int(tracks.has_right.sum()) > _FEW * settings.least_features * settings.target_features:
+            flat = flat[:0]
+        chosen = np.concatenate([lasting, leaving, flat])
+        centres = rounded(corners[chosen])
+        born = _newborn(centres, self._bank.put(self._cut(left, centres)))
+        deep = np.arange(len(lasting) + len(leaving))
+        born = self._matched(born, right, deep, disparity[chosen[deep]])
+        born = replace(born, blind=np.where(born.has_right, 0, 1))
+        good = np.flatnonzero(born.has_right | (len(flat) > 0))
+        return born.take(good[np.argsort(~born.has_right[good], kind="stable")][:room])
+
+    def _stays(
+        self, corners: FloatArray, disparity: FloatArray, motion: Consensus | None, image: FloatImage
+    ) -> BoolArray:
+        """Mask (K,) of corners that remain in view for a while if the camera goes on as it does."""
+        if motion is None or self._settings.wanted_life_frames == 0:
+            return np.ones(len(corners), dtype=np.bool_)
+        T = np.linalg.matrix_power(motion.T_curr_prev, self._settings.wanted_life_frames)
+        depth = self._camera.fu * self._camera.baseline_m / np.maximum(disparity, 0.1)
+        moved = transform_points(T, self._rays(corners) * depth[:, None])
+        ahead = moved[:, 2] > 0.5
+        pixels = project(self._camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
+        return np.asarray(ahead & inside(image, pixels, 0.0))
 
     def _with_shown(self, tracks: _Tracks) -> _Tracks:
         """Show features that outlived their probation, under new ids; all of them where few would be left."""

@@ -44,11 +44,11 @@ class KltSettings:
     prior_min_support: float = setting(
         0.4, "share of the consensus' inliers that the predicted motion needs to replace it"
     )
-    anchor_radius_px: int = setting(6, "half side of the patch that a feature is aligned with for life", unit="px")
+    anchor_radius_px: int = setting(7, "half side of the patch that a feature is aligned with for life", unit="px")
     min_anchor_correlation: float = setting(
         0.8, "smallest normalised correlation with that patch; below, it is renewed"
     )
-    max_anchor_scale: float = setting(1.8, "change of scale at which that patch is renewed")
+    max_anchor_scale: float = setting(1.25, "change of scale at which that patch is renewed")
     max_disparity: float = setting(0.16, "largest disparity, over the image width")
     min_disparity_px: float = setting(0.3, "smallest disparity of a stereo match", unit="px")
     max_epipolar_px: float = setting(1.0, "largest difference of the rows of a stereo match", unit="px")

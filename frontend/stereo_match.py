@@ -9,6 +9,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import numpy.typing as npt
+from numpy.lib.stride_tricks import sliding_window_view
 
 from frontend.align import FLAT_RMS
 from frontend.patches import integer_patches
@@ -87,21 +88,17 @@ def row_correlation(
     product = np.zeros((len(centres), count), dtype=np.float32)
     for column in range(side):
         product += np.einsum("nhk,nh->nk", strip[:, :, column : column + count], template[:, :, column])
-    total = _window_sums(strip.sum(axis=1), side)
-    square = _window_sums(np.einsum("nhk,nhk->nk", strip, strip), side)
-    target_norm = np.sqrt(np.maximum(square - total * total / side**2, 0.0))
+    target_norm = sliding_window_view(_window_norms(padded, side), count, axis=1)[centres[:, 1], corner[:, 0] + radius]
     flat = FLAT_RMS * side
     good = (norm[:, None] > flat) & (target_norm > flat) & (columns >= radius) & (columns < width - radius)
-    score = np.where(good, product / np.where(good, norm[:, None] * target_norm, 1.0), -1.0)
-    return score.astype(np.float32)
+    return np.where(good, product / np.where(good, norm[:, None] * target_norm, 1.0), -1.0).astype(np.float32)
 
 
-def _window_sums(values: npt.NDArray[np.float32], side: int) -> FloatArray:
-    """Sums (N, K - side + 1) of `side` neighbouring values (N, K); exact for whole numbers."""
-    running = np.cumsum(values, axis=1, dtype=np.float64)
-    sums = running[:, side - 1 :].copy()
-    sums[:, 1:] -= running[:, :-side]
-    return sums
+def _window_norms(image: Image, side: int) -> npt.NDArray[np.float32]:
+    """Norm (H, W) of the window around each pixel after its mean is taken away."""
+    total = cv2.boxFilter(image, cv2.CV_32F, (side, side), normalize=False)
+    square = cv2.sqrBoxFilter(image, cv2.CV_32F, (side, side), normalize=False)
+    return np.asarray(np.sqrt(np.maximum(square - total * total / side**2, 0.0)), dtype=np.float32)
 
 
 def _search(
