@@ -9,6 +9,7 @@ import pytest
 
 from tests.numerics import numeric_jacobian
 from vio.errors import ConfigError, EstimationError
+from vio.evaluation import nees, nees_bounds
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import (
     Residuals,
@@ -468,7 +469,8 @@ class Flight:
     ) -> tuple[FloatArray, FloatArray, Msckf]:
         """Return pose errors xi (frames, 6) and covariances (frames, 6, 6), as `Estimate` defines them, and the filter.
 
-        The estimate's world is moved onto the truth by the first pose, which the filter takes as known.
+        The estimate's world is moved onto the truth by the first pose, which the filter takes as known; with an IMU by
+        its position and yaw alone, as the world is then upright and the first tilt is an estimate like any other.
         """
         noise = np.random.default_rng(seed)
         filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion=motion)  # type: ignore[arg-type]
@@ -489,6 +491,10 @@ class Flight:
             estimate = filt.estimate()
             if k == 0:
                 T_shift = self.T_world_imu(0) @ se3_inverse(estimate.T_world_imu)
+                if motion == "imu":
+                    R = T_shift[:3, :3]
+                    yaw = np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
+                    T_shift = se3_from_parts(so3_exp([0, 0, yaw]), self.T_world_imu(0)[:3, 3])
             error = se3_log(se3_inverse(self.T_world_imu(k)) @ T_shift @ estimate.T_world_imu)
             errors.append(error)
             covariances.append(estimate.covariance)
@@ -500,6 +506,26 @@ def test_flight_that_starts_in_motion_is_followed(motion: str | None) -> None:
     errors, _, _ = Flight().run(MsckfSettings(), motion)
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.05
     assert np.linalg.norm(errors[5:, 3:], axis=1).max() < 0.03
+
+
+@pytest.mark.parametrize("motion", [None, "velocity", "imu"])
+def test_covariance_can_be_believed(motion: str | None) -> None:
+    """NEES of the pose over 20 seeded runs: inside its 95 % band in at least 90 % of the steps.
+
+    The first tilt is doubted by one degree only: with more, yaw about the true and about the estimated vertical
+    differ to second order, and the comparison would measure that instead.
+    """
+    runs, frames = 20, 20
+    settings = MsckfSettings(start_tilt_sigma_deg=1.0)
+    values = []
+    for seed in range(runs):
+        bias = np.random.default_rng(1000 + seed).normal(0, [0.02] * 3 + [0.05] * 3)
+        errors, covariances, _ = Flight(frames).run(settings, motion, seed, bias=bias, limit=30)
+        values.append(nees(errors[1:], covariances[1:]))
+    mean = np.mean(values, axis=0)
+    low, high = nees_bounds(6, runs)
+    assert np.mean(mean < high) >= 0.9, f"overconfident: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    assert mean.mean() > 0.6 * low, f"far too cautious: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
 
 
 def test_biases_are_found() -> None:
@@ -519,7 +545,9 @@ def test_wrong_matches_do_not_capture_it() -> None:
         return replace(seen, z=z)
 
     errors, _, _ = Flight().run(MsckfSettings(), "imu", spoil=spoil, limit=120)
-    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.2
+    distances = np.linalg.norm(errors[:, :3], axis=1)
+    assert np.median(distances) < 0.1
+    assert distances.max() < 0.4  # without the rejection of views: 5.2
 
 
 def test_blackout_grows_the_covariance_and_is_survived() -> None:
@@ -546,10 +574,11 @@ def test_two_runs_give_the_same_bits() -> None:
 def test_window_and_map_stay_bounded() -> None:
     settings = MsckfSettings(clones=6, max_landmarks=8)
     _, _, filt = Flight(frames=60).run(settings, "imu")
+    assert len(filt.landmarks().ids) > 100  # the map that is told remembers every track
     window = filt._window
     assert window is not None
     assert len(window.clones) <= 6
-    assert len(filt.landmarks().ids) <= 8
+    assert len(window.landmark_ids) <= 8
     assert window.P.shape[0] <= DIM + 36 + 24
 
 

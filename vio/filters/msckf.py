@@ -98,6 +98,7 @@ class Msckf:
         self._waited = 0
         self._sigma2 = settings.pixel_sigma_px**2
         self._output: FloatArray = np.zeros((DIM, DIM))
+        self._map: list[Landmarks] = []
 
     def propagate(self, sample: MotionSample) -> None:
         """Take a motion sample.
@@ -156,12 +157,30 @@ class Msckf:
         )
 
     def landmarks(self) -> Landmarks:
-        """Return the long-lived landmarks in the state."""
+        """Return the points of all tracks that have been used, with their covariance given the poses.
+
+        A point that came back under its id appears once, as it was seen last.
+        """
         window = self._started()
         first, n = window.first_landmark, len(window.landmarks)
         blocks = [window.P[first + 3 * k : first + 3 * k + 3, first + 3 * k : first + 3 * k + 3] for k in range(n)]
-        covariance = np.array(blocks) if n else np.zeros((0, 3, 3))
-        return Landmarks(window.landmark_ids.copy(), window.landmarks.copy(), covariance)
+        parts = [*self._map, Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))]
+        ids = np.concatenate([part.ids for part in parts])[::-1]
+        points = np.concatenate([part.p_world for part in parts])[::-1]
+        covariances = np.concatenate([part.covariance for part in parts])[::-1]
+        kept, last = np.unique(ids, return_index=True)
+        return Landmarks(kept, points[last], covariances[last])
+
+    def _remember_landmarks(self, window: Window, chosen: BoolArray) -> None:
+        first = window.first_landmark
+        rows = [slice(first + 3 * k, first + 3 * k + 3) for k in np.flatnonzero(chosen).tolist()]
+        blocks = np.array([window.P[r, r] for r in rows]).reshape(-1, 3, 3)
+        self._remember(window.landmark_ids[chosen], window.landmarks[chosen], blocks)
+
+    def _remember(self, ids: IntArray, p_world: FloatArray, covariance: FloatArray) -> None:
+        """Add points to the map that is only told, never used."""
+        if len(ids):
+            self._map.append(Landmarks(ids, p_world, covariance))
 
     @property
     def pixel_sigma_px(self) -> float:
@@ -205,6 +224,7 @@ class Msckf:
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Everything that a frame's observations do."""
         z, weight, found = latest_pixels(seen, window.landmark_ids)
+        self._remember_landmarks(window, ~found)
         window.keep_landmarks(found)
         z, weight = z[found], weight[found]
         self._tracks.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
@@ -379,6 +399,10 @@ class Msckf:
         A, b = self._information(window, tracks, ending & good, z, weight)
         window.commit(A, b)
 
+        done = ending & good
+        told = np.asarray(self._sigma2 * np.linalg.inv(tracks.information.C[done]), dtype=np.float64)
+        self._remember(self._tracks.ids(tracks.rows[done]), tracks.p_world[done], told)
+
         going_on = good & ~ending
         A_on = np.zeros_like(A)
         clones = slice(DIM, window.first_landmark)
@@ -418,7 +442,7 @@ class Msckf:
         rotation = window.clone_rows(len(window.clones) - 1).start + 3
         A[:, :, rotation : rotation + 3] += so3_hat(p)
         ids = self._tracks.ids(tracks.rows[chosen])
-        covariance: FloatArray = self._sigma2 * C_inverse
+        covariance = np.asarray(self._sigma2 * C_inverse, dtype=np.float64)
         window.add_landmarks(ids, p, A.reshape(-1, len(window.P)), covariance)
         return chosen
 

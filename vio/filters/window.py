@@ -161,8 +161,8 @@ def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tup
     L = _square_root(P)
     inner = np.eye(len(P)) + L.T @ information @ L
     K = np.linalg.cholesky(0.5 * (inner + inner.T))
-    W = np.linalg.solve(K, L.T)
-    P_new = W.T @ W
+    W: FloatArray = np.linalg.solve(K, L.T)
+    P_new: FloatArray = W.T @ W
     return P_new, P_new @ vector
 
 
@@ -172,5 +172,4 @@ def _square_root(P: FloatArray) -> FloatArray:
         return np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24))
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(P)
-        root: FloatArray = vectors * np.sqrt(np.maximum(values, 0.0))
-        return root
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
