@@ -180,7 +180,8 @@ def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
     ("overrides", "velocity", "message"),
     [
         (["motion=velocity"], False, "the recording holds no motion sensor"),
-        (["motion=imu"], True, "no model for --motion imu"),
+        (["motion=imu"], True, "the recording holds velocity"),
+        (["motion=imu", "backend=vislam"], True, "no model for --motion imu"),
     ],
 )
 def test_motion_that_cannot_be_had_is_an_error(overrides: list[str], velocity: bool, message: str) -> None:

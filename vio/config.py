@@ -39,7 +39,9 @@ class Config:
         "what carries the pose between frames: imu, velocity, none (images alone), or auto: the best that the "
         "recording holds and the back end takes",
     )
-    backend: BackendName = setting("vislam", "the estimator")
+    backend: BackendName = setting(
+        "msckf", "the estimator: msckf, the sliding-window filter, or vislam, the paper's filter"
+    )
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
     frontend: FrontendSettings = field(default_factory=FrontendSettings)
     selector: SelectorSettings = field(default_factory=SelectorSettings)

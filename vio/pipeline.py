@@ -154,10 +154,12 @@ def run(
             marks = [clock, time.perf_counter()]
             output = frontend.process(event)
             marks.append(time.perf_counter())
-            stereo = output.observations.take(output.observations.has_right)
-            selection = selector.select(stereo)
+            seen = output.observations
+            if config.backend == "vislam":  # the paper's filter knows stereo observations only
+                seen = seen.take(seen.has_right)
+            selection = selector.select(seen)
             marks.append(time.perf_counter())
-            report = backend.update(stereo.take(selection.chosen))
+            report = backend.update(seen.take(selection.chosen))
             estimate = backend.estimate()
             marks.append(time.perf_counter())
 
@@ -199,7 +201,11 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     if config.motion == "none":
         return None
     if config.motion == "auto":
-        return next((source for source in taken if source in recording.motion), None)
+        found = next((source for source in taken if source in recording.motion), None)
+        if found is None and recording.motion:
+            held = ", ".join(sorted(recording.motion))
+            log.warning("%s: backend %s has no model for its %s; images alone", recording.path, config.backend, held)
+        return found
     if config.motion not in taken:
         raise ConfigError(
             f"backend {config.backend} has no model for --motion {config.motion}; it takes {', '.join(taken)} or none"

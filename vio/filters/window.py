@@ -169,7 +169,7 @@ def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tup
 def _square_root(P: FloatArray) -> FloatArray:
     """Some L (D, D) with L L' = P, also for singular P."""
     try:
-        return np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24))
+        return np.asarray(np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24)), dtype=np.float64)
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(P)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
