@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,17 +21,33 @@ _GRADIENT_PX = 3
 _EIGENVALUE_OF_UNIT_GRADIENT = (2.0 / 255.0) ** 2
 
 
-def feature_spacing(width: int, height: int, settings: KltSettings) -> float:
+class GridSettings(Protocol):
+    """The settings that say how densely and evenly features should lie."""
+
+    @property
+    def target_features(self) -> int:
+        """Features to keep alive."""
+
+    @property
+    def cell_features(self) -> int:
+        """Features wanted in one grid cell."""
+
+    @property
+    def min_distance(self) -> float:
+        """Least distance between features, over the spacing of a uniform grid of them."""
+
+
+def feature_spacing(width: int, height: int, settings: GridSettings) -> float:
     """Spacing in pixels of `target_features` points spread evenly over the image."""
     return math.sqrt(width * height / settings.target_features)
 
 
-def min_distance_px(width: int, height: int, settings: KltSettings) -> int:
+def min_distance_px(width: int, height: int, settings: GridSettings) -> int:
     """Least distance in pixels between features in an image of this size."""
     return max(2, round(settings.min_distance * feature_spacing(width, height, settings)))
 
 
-def grid_shape(width: int, height: int, settings: KltSettings) -> tuple[int, int]:
+def grid_shape(width: int, height: int, settings: GridSettings) -> tuple[int, int]:
     """Rows and columns of the balancing grid: nearly square cells that hold `cell_features` features each."""
     cell = feature_spacing(width, height, settings) * math.sqrt(settings.cell_features)
     return max(1, round(height / cell)), max(1, round(width / cell))
@@ -118,6 +135,34 @@ def detect_corners(
     queue = queue[level[queue] < 2 * settings.cell_features][:wanted]
     chosen = candidates[order[queue]]
     return 2.0 * (chosen + _peak_offset(response, chosen))
+
+
+def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int], settings: GridSettings) -> IntArray:
+    """Rows of points (N, 2), strongest first, that fill the grid evenly beside `occupied` (M, 2).
+
+    At most what `target_features` leaves room for; none closer than the least distance to another or to an occupied
+    one; the emptiest cells are filled first. `size` is the image's width and height.
+    """
+    width, height = size
+    wanted = settings.target_features - len(occupied)
+    if wanted <= 0 or len(points) == 0:
+        return np.zeros(0, dtype=np.int64)
+    distance = min_distance_px(width, height, settings)
+    together = np.concatenate([occupied, points])
+    near = np.abs(points[:, :1] - together[:, 0]) < distance
+    near &= np.abs(points[:, 1:] - together[:, 1]) < distance
+    # A point counts as too close to stronger ones only, itself and weaker ones excepted.
+    near[:, len(occupied) :] &= np.tril(np.ones((len(points), len(points)), dtype=np.bool_), -1)
+    candidates = np.flatnonzero(~near.any(axis=1))
+    shape = grid_shape(width, height, settings)
+    cells = shape[0] * shape[1]
+    cell = cell_index(points[candidates], width, height, shape)
+    held = np.bincount(cell_index(occupied, width, height, shape), minlength=cells)
+    order = np.argsort(cell, kind="stable")
+    first = np.searchsorted(cell[order], np.arange(cells))
+    level = np.empty(len(candidates), dtype=np.int64)
+    level[order] = np.arange(len(order)) - first[cell[order]] + held[cell[order]]
+    return candidates[np.argsort(level, kind="stable")[:wanted]]
 
 
 def _peak_offset(response: Response, pixels: IntArray) -> FloatArray:

@@ -9,10 +9,10 @@ truncated cost; Geiger et al., StereoScan, IV (2011), for Gauss-Newton on minima
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
-from frontend.settings import KltSettings
 from vio.geometry.lie import FloatArray, circledot, se3_exp, se3_from_parts, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.records import BoolArray
@@ -23,6 +23,31 @@ _MIN_SHARE = 0.2  # a consensus of fewer points says nothing
 _SAMPLE_ITERATIONS = 5
 _REFINE_ITERATIONS = 6
 _DAMPING = 1e-4
+_SETTLED = 3e-6  # change of a motion, in radians and metres, below which it is not refined further
+
+
+class ConsensusSettings(Protocol):
+    """The settings that every front end with a vote on the motion has."""
+
+    @property
+    def consensus_px(self) -> float:
+        """Largest distance from where the consensus motion puts a feature."""
+
+    @property
+    def consensus_samples(self) -> int:
+        """Random minimal sets tried."""
+
+    @property
+    def sure_share(self) -> float:
+        """Share of features that must follow the refined expected motion for no samples to be tried."""
+
+    @property
+    def prior_max_deviation_deg(self) -> float:
+        """Turn away from the predicted rotation beyond which a consensus is distrusted."""
+
+    @property
+    def prior_min_support(self) -> float:
+        """Share of the consensus' inliers that the predicted motion needs to replace it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +111,10 @@ def _refine(
     for _ in range(_REFINE_ITERATIONS):
         error = pixel_errors(camera, T, p_prev, pixels)
         weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
+        before = T
         T = _gauss_newton(camera, T[None], p_prev[None], pixels[None], weight[None], iterations=1, free=free)[0]
+        if np.abs(T - before).max() < _SETTLED:
+            break
     return T
 
 
@@ -96,7 +124,7 @@ def _search(
     pixels: FloatArray,
     starts: FloatArray,
     rng: np.random.Generator,
-    settings: KltSettings,
+    settings: ConsensusSettings,
     free: slice,
 ) -> tuple[FloatArray, BoolArray]:
     """Best motion (4, 4) over minimal sets and over the starts (S, 4, 4) themselves, with its inliers (N,)."""
@@ -131,7 +159,7 @@ def rigid_consensus(
     R_prior: FloatArray | None,
     T_prior: FloatArray | None,
     rng: np.random.Generator,
-    settings: KltSettings,
+    settings: ConsensusSettings,
 ) -> Consensus | None:
     """Find the motion that most static points follow.
 
@@ -205,7 +233,7 @@ def epipolar_distance(
 
 
 def fit_motion(
-    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, start: FloatArray, settings: KltSettings
+    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, start: FloatArray, settings: ConsensusSettings
 ) -> FloatArray | None:
     """Motion (4, 4) `T_curr_prev` that predicted pixels (N, 2) of points (N, 3) stand for; None with too few points."""
     finite = np.isfinite(pixels).all(axis=1)

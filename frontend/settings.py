@@ -66,13 +66,67 @@ class KltSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class MatchSettings:
+    """Key points matched by descriptor; for the front ends orb, sift and kornia."""
+
+    max_keypoints: int = setting(1200, "key points extracted from each image")
+    target_features: int = setting(400, "features to keep alive; new key points are added below this number")
+    cell_features: int = setting(4, "features wanted in one grid cell; the cell size follows from it")
+    min_distance: float = setting(0.15, "least distance between features, over the spacing of a uniform grid of them")
+    ratio: float = setting(0.8, "largest distance of descriptors, over that of the second-nearest")
+    search_radius: float = setting(0.06, "half side of the search about the predicted pixel, over the image width")
+    epipolar_band_px: float = setting(1.5, "largest difference of the rows of a stereo match", unit="px")
+    min_disparity_px: float = setting(0.3, "smallest disparity of a stereo match", unit="px")
+    max_disparity: float = setting(0.16, "largest disparity, over the image width")
+    refine: Literal["none", "align"] = setting(
+        "align", "align the patches of matched key points to a fraction of a pixel"
+    )
+    consensus_px: float = setting(1.5, "largest distance from where the consensus motion puts a feature", unit="px")
+    consensus_samples: int = setting(96, "random minimal sets tried for the consensus motion")
+    sure_share: float = setting(
+        0.7, "share of features that must follow the expected motion, refined, for no samples to be tried"
+    )
+    prior_max_deviation_deg: float = setting(
+        1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"
+    )
+    prior_min_support: float = setting(
+        0.4, "share of the consensus' inliers that the predicted motion needs to replace it"
+    )
+    seed: int = setting(0, "seed of the consensus sampling; equal seeds give equal bits")
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedSettings:
+    """The front end `kornia`: detector and descriptor run by torch."""
+
+    detector: Literal["gftt", "harris", "keynet", "aliked", "disk", "xfeat"] = setting(
+        "gftt", "what finds and, for aliked, disk and xfeat, also describes; gftt and harris need no weights"
+    )
+    descriptor: Literal["sift", "mkd", "hardnet", "hynet", "sosnet"] = setting(
+        "sift", "what describes the patches of gftt, harris and keynet; sift needs no weights"
+    )
+    detector_weights: Path | None = setting(None, "weights of keynet, aliked, disk or xfeat")
+    descriptor_weights: Path | None = setting(None, "weights of mkd, hardnet, hynet or sosnet")
+    affine_weights: Path | None = setting(None, "weights of AffNet, for affine patches; None: upright square patches")
+    orientation_weights: Path | None = setting(None, "weights of OriNet, for turned patches; None: upright")
+    matcher: Literal["nearest", "lightglue"] = setting("nearest", "mutual nearest with ratio, or LightGlue")
+    matcher_weights: Path | None = setting(None, "weights of LightGlue for the descriptor in use")
+    aliked_model: Literal["aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32"] = setting(
+        "aliked-t16", "the size of ALIKED that the weights are of"
+    )
+    device: Literal["cpu", "cuda"] = setting("cpu", "where torch computes; half precision on cuda")
+
+
+@dataclass(frozen=True, slots=True)
 class FrontendSettings:
     """Which front end runs, and its settings."""
 
-    name: Literal["auto", "klt", "precomputed"] = setting(
+    name: Literal["auto", "klt", "orb", "sift", "kornia", "precomputed"] = setting(
         "auto", "auto: klt where the recording has images, precomputed where it has features only"
     )
     features: Path | None = setting(
         None, "observation log or feature file to take in place of the recording's own, for the precomputed front end"
     )
     klt: KltSettings = field(default_factory=KltSettings, metadata={"doc": "corner tracking", "unit": ""})
+    match: MatchSettings = field(default_factory=MatchSettings, metadata={"doc": "descriptor matching", "unit": ""})
+    learned: LearnedSettings = field(default_factory=LearnedSettings, metadata={"doc": "kornia and torch", "unit": ""})
