@@ -13,15 +13,17 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from vio.calibration import RayMatches
 from vio.errors import DataError, EstimationError, MissingDependencyError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.mapping import PointTracks, keep_rows, reprojection
-from vio.records import Trajectory
+from vio.records import BoolArray, Image, IntArray, Trajectory
 
 try:
     import pycolmap
@@ -349,13 +351,8 @@ def _solve(
 ) -> tuple[FloatArray, FloatArray]:
     """Poses (K, 4, 4) and points (M, 3) of one bundle adjustment."""
     count = len(T_world_cam0)
-    blank = tuple(f"{k}" for k in range(count))
-    model = build_model(camera, T_world_cam0, tracks, ModelImages(blank, tuple(f"{k}r" for k in range(count))))
-    config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.images:
-        config.add_image(image_id)
-    for camera_id in (_LEFT, _RIGHT):
-        config.set_constant_cam_intrinsics(camera_id)
+    model = build_model(camera, T_world_cam0, tracks, _numbered(count))
+    config = _whole(model)
     config.set_constant_sensor_from_rig_pose(model.camera(_RIGHT).sensor_id)
     config.set_constant_rig_from_world_pose(_frame_id(0))
     options = _solver_options(loss_px, threads)
@@ -365,12 +362,67 @@ def _solve(
         adjuster = pycolmap.create_pose_prior_bundle_adjuster(
             options, pycolmap.PosePriorBundleAdjustmentOptions(), config, _pose_priors(model, priors, sigma_px), model
         )
-    summary = adjuster.solve()
-    if not summary.is_solution_usable():
-        raise EstimationError(f"the bundle adjustment failed ({summary.brief_report()}); check the run's poses")
+    _solved(adjuster)
     T_cam0_world = np.array([_matrix(model.frame(_frame_id(k)).rig_from_world) for k in range(count)])
     points = np.array([model.point3D(m + 1).xyz for m in range(len(tracks.ids))])
     return se3_inverse(T_cam0_world), points
+
+
+def _solved(adjuster: pycolmap.BundleAdjuster) -> None:
+    summary = adjuster.solve()
+    if not summary.is_solution_usable():
+        raise EstimationError(f"the bundle adjustment failed ({summary.brief_report()}); check poses and calibration")
+
+
+def adjust_rig_in_motion(
+    camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks, *, gate_sigma: float = 5.0
+) -> tuple[FloatArray, FloatArray]:
+    """Bundle-adjust the pose of cam1 in cam0 together with keyframes and points, over tracks in time.
+
+    Motion shows what a single pair leaves to the lens model: a turn of one camera about the vertical shifts all
+    disparities, which the way between two frames contradicts.
+
+    Returns `R_cam1_cam0` (3, 3) and the unit direction (3,) from cam0 to cam1 in cam0, of the rectified pair.
+
+    Raises:
+        EstimationError: the solver failed, or no track is consistent.
+    """
+    good = np.ones(len(tracks.point), dtype=np.bool_)
+    R, direction = np.eye(3), np.array([1.0, 0.0, 0.0])
+    for loss_px in (1.0, 0.5):
+        kept = keep_rows(tracks, good)
+        if not len(kept.ids):
+            raise EstimationError("not observable because no track is consistent over the keyframes")
+        count = len(T_world_cam0)
+        model = build_model(camera, T_world_cam0, kept, _numbered(count))
+        config = _whole(model)
+        config.set_constant_rig_from_world_pose(_frame_id(0))
+        options = _solver_options(loss_px, 1)
+        options.refine_sensor_from_rig = True
+        _solved(pycolmap.create_default_bundle_adjuster(options, config, model))
+        T_cam1_cam0 = _matrix(model.rig(_RIG).sensor_from_rig(model.camera(_RIGHT).sensor_id))
+        R = T_cam1_cam0[:3, :3]
+        direction = -R.T @ T_cam1_cam0[:3, 3]
+        direction /= np.linalg.norm(direction)
+        model.update_point_3d_errors()
+        errors = np.array([model.point3D(m + 1).error for m in range(len(kept.ids))])
+        limit = gate_sigma * float(np.median(errors))
+        good = np.isin(tracks.ids[tracks.point], kept.ids[errors < limit])
+    return R, direction
+
+
+def _numbered(count: int) -> ModelImages:
+    return ModelImages(tuple(f"{k}" for k in range(count)), tuple(f"{k}r" for k in range(count)))
+
+
+def _whole(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
+    """All images of a model, intrinsics held fixed."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in model.images:
+        config.add_image(image_id)
+    for camera_id in (_LEFT, _RIGHT):
+        config.set_constant_cam_intrinsics(camera_id)
+    return config
 
 
 def _solver_options(loss_px: float, threads: int) -> pycolmap.BundleAdjustmentOptions:
@@ -400,3 +452,263 @@ def _pose_priors(model: pycolmap.Reconstruction, priors: PositionPriors, sigma_p
             )
         )
     return out
+
+
+# --- reconstruction -------------------------------------------------------------------------------------------------
+
+Mapper: TypeAlias = Literal["incremental", "global"]
+_FEATURES = 1500  # per image
+_NEXT = (1, 2, 3, 5, 8, 16)  # keyframes ahead that the left camera is matched with
+_CROSS_NEXT = (1,)  # keyframes ahead of the left camera that the right one is matched with
+_LEAST_REGISTERED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Reconstructed:
+    """What COLMAP made of images alone."""
+
+    mapper: Mapper
+    T_world_cam0: FloatArray  # (R, 4, 4) of the registered keyframes, in COLMAP's own world, metric by the rig
+    keyframes: IntArray  # (R,) their indices, increasing
+    points: int
+    mean_reprojection_error_px: float
+
+
+def match_images(database: Path, images: Path, names: ModelImages, camera: StereoCamera, *, threads: int = 1) -> None:
+    """Find SIFT features in image files and match them within and between keyframes, into a new COLMAP database.
+
+    Args:
+        database: the file to make.
+        images: folder that the names are relative to; left images must lie in one folder, right ones in another.
+        names: the keyframes' images.
+        camera: the rectified pair, intrinsics and baseline of the rig.
+        threads: for all steps; one makes the result repeatable.
+    """
+    pycolmap.set_random_seed(SEED)
+    reader = pycolmap.ImageReaderOptions(
+        camera_model="PINHOLE",
+        camera_params=f"{camera.fu!r},{camera.fv!r},{camera.cu + HALF_PX!r},{camera.cv + HALF_PX!r}",
+    )
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
+    extraction.sift.max_num_features = _FEATURES
+    pycolmap.extract_features(
+        database,
+        images,
+        image_names=[*names.left, *names.right],
+        camera_mode=pycolmap.CameraMode.PER_FOLDER,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+    right_from_rig = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-camera.baseline_m, 0.0, 0.0]))
+    left, right = (f"{Path(side[0]).parent.as_posix()}/" for side in (names.left, names.right))
+    rig = pycolmap.RigConfig(
+        cameras=[
+            pycolmap.RigConfigCamera(ref_sensor=True, image_prefix=left),
+            pycolmap.RigConfigCamera(image_prefix=right, cam_from_rig=right_from_rig),
+        ]
+    )
+    with pycolmap.Database.open(database) as opened:
+        pycolmap.apply_rig_config([rig], opened)
+    pairs = database.with_name("pairs.txt")
+    pairs.write_text("".join(f"{a} {b}\n" for a, b in _pairs(names)), encoding="utf-8")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    verification.ransac.max_error = 2.0
+    pycolmap.match_image_pairs(
+        database,
+        matching_options=pycolmap.FeatureMatchingOptions(num_threads=threads),
+        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=pairs),
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+
+
+def _pairs(names: ModelImages) -> list[tuple[str, str]]:
+    count = len(names.left)
+    out = list(zip(names.left, names.right, strict=True))
+    out += [(names.left[k], names.left[k + step]) for step in _NEXT for k in range(count - step)]
+    out += [(names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)]
+    return out
+
+
+def reconstruct(
+    database: Path, images: Path, names: ModelImages, mapper: Mapper, out: Path, *, threads: int = 1
+) -> Reconstructed | None:
+    """Reconstruct keyframes from a database of matches, rig and intrinsics held fixed; None: nothing came of it.
+
+    Args:
+        database: made by `match_images`; left as it is.
+        images: folder that the names are relative to.
+        names: the keyframes' images.
+        mapper: COLMAP's incremental mapper, or its global one.
+        out: folder for the model, made if missing.
+        threads: for all steps.
+    """
+    pycolmap.set_random_seed(SEED)
+    out.mkdir(parents=True, exist_ok=True)
+    if mapper == "incremental":
+        models = pycolmap.incremental_mapping(database, images, out, options=_incremental_options(threads))
+    else:
+        models = pycolmap.global_mapping(database, images, out, options=_global_options(threads))
+    if not models:
+        return None
+    model = max(models.values(), key=lambda m: int(m.num_reg_images()))
+    place = {name: k for k, name in enumerate(names.left)}
+    found = sorted(
+        (place[image.name], _matrix(image.cam_from_world()))
+        for image in model.images.values()
+        if image.has_pose and image.name in place
+    )
+    if len(found) < _LEAST_REGISTERED:
+        return None
+    return Reconstructed(
+        mapper,
+        se3_inverse(np.array([T for _, T in found])),
+        np.array([k for k, _ in found], dtype=np.int64),
+        int(model.num_points3D()),
+        mean_reprojection_error_px(model),
+    )
+
+
+def _incremental_options(threads: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=SEED)
+    options.multiple_models = options.extract_colors = False
+    options.min_model_size = _LEAST_REGISTERED
+    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    options.ba_refine_sensor_from_rig = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.init_min_tri_angle = 4.0  # keyframes of one drive see the scene from nearly one direction
+    options.mapper.init_min_num_inliers = 50
+    options.mapper.filter_max_reproj_error = 2.0
+    options.mapper.filter_min_tri_angle = 0.5
+    options.triangulation.min_angle = 0.5
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
+    return options
+
+
+def _global_options(threads: int) -> pycolmap.GlobalPipelineOptions:
+    options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=SEED)
+    mapper = options.mapper
+    mapper.num_threads, mapper.random_seed = threads, SEED
+    mapper.refine_sensor_from_rig = False
+    mapper.min_tri_angle_deg = 0.5
+    mapper.global_positioning.use_gpu = False
+    adjustment = mapper.bundle_adjustment
+    adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
+    adjustment.refine_sensor_from_rig = False
+    adjustment.ceres.use_gpu = False
+    mapper.retriangulation.min_angle = 0.5
+    return options
+
+
+# --- stereo pairs ---------------------------------------------------------------------------------------------------
+
+_RATIO = 0.8  # of the distances to the best and the second best descriptor
+_VIRTUAL_PX = 500.0  # focal length of the camera that rays are turned into pixels with
+_ESSENTIAL_PX = 1.0
+
+
+def sift_matches(left: Image, right: Image, *, threads: int = 1) -> tuple[FloatArray, FloatArray]:
+    """Pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), outliers among them."""
+    options = pycolmap.FeatureExtractionOptions(num_threads=threads)
+    options.sift.max_num_features = _FEATURES
+    sift = pycolmap.Sift(options, device=pycolmap.Device.cpu)
+    (keys0, features0), (keys1, features1) = (sift.extract(np.ascontiguousarray(image)) for image in (left, right))
+    if len(keys0) < 2 or len(keys1) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    likeness = features0 @ features1.T
+    norm0, norm1 = np.sum(features0**2, axis=1), np.sum(features1**2, axis=1)
+    distance = norm0[:, None] + norm1[None, :] - 2 * likeness
+    best1, best0 = np.argmin(distance, axis=1), np.argmin(distance, axis=0)
+    two = np.partition(distance, 1, axis=1)[:, :2]
+    good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _RATIO**2 * two[:, 1])
+    uv0, uv1 = (np.asarray(keys[:, :2], dtype=np.float64) - HALF_PX for keys in (keys0, keys1))
+    return uv0[good], uv1[best1[good]]
+
+
+def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:
+    """Rotation `R_cam1_cam0` (3, 3) and unit direction (3,) of cam1 in cam0, by RANSAC over the matches of all pairs.
+
+    None: no consensus.
+    """
+    pixels = [_VIRTUAL_PX * ray[:, :2] / ray[:, 2:] for ray in (matches.ray0, matches.ray1)]
+    camera = pycolmap.Camera(
+        camera_id=1, model="PINHOLE", width=1000, height=1000, params=[_VIRTUAL_PX, _VIRTUAL_PX, 0.0, 0.0]
+    )
+    options = pycolmap.RANSACOptions(
+        max_error=_ESSENTIAL_PX, random_seed=SEED, min_num_trials=200, max_num_trials=2000, num_threads=1
+    )
+    found = pycolmap.estimate_essential_matrix(pixels[0], pixels[1], camera, camera, options)
+    if found is None:
+        return None
+    T_cam1_cam0 = _matrix(found["cam2_from_cam1"])
+    # COLMAP gives the length one; the position of cam1 in cam0 is -R^T t.
+    direction = -T_cam1_cam0[:3, :3].T @ T_cam1_cam0[:3, 3]
+    return T_cam1_cam0[:3, :3], direction / np.linalg.norm(direction)
+
+
+def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Bundle-adjust the pose of cam1 in a rig over the matches (inliers) of all pairs; same form as the input.
+
+    Each pair is a frame of one rig with its own points; only the rig's inner transform and the points move, and the
+    scale, which two cameras leave open, is taken out again.
+
+    Raises:
+        EstimationError: the solver failed.
+    """
+    model = pycolmap.Reconstruction()
+    for camera_id in (_LEFT, _RIGHT):
+        model.add_camera(
+            pycolmap.Camera(
+                camera_id=camera_id,
+                model="PINHOLE",
+                width=1000,
+                height=1000,
+                params=[_VIRTUAL_PX, _VIRTUAL_PX, 0.0, 0.0],
+            )
+        )
+    rig = pycolmap.Rig(rig_id=_RIG)
+    rig.add_ref_sensor(model.camera(_LEFT).sensor_id)
+    right = model.camera(_RIGHT).sensor_id
+    rig.add_sensor(right, pycolmap.Rigid3d(pycolmap.Rotation3d(R_cam1_cam0), -R_cam1_cam0 @ direction))
+    model.add_rig(rig)
+    points, valid = _two_view_points(matches, R_cam1_cam0, direction)
+    matches, points = matches.take(valid), points[valid]
+    names, pair = np.unique(matches.pair, return_inverse=True)
+    order = np.argsort(pair, kind="stable")
+    for k in range(len(names)):
+        rows = order[pair[order] == k]
+        left, other = (_VIRTUAL_PX * ray[rows, :2] / ray[rows, 2:] - HALF_PX for ray in (matches.ray0, matches.ray1))
+        _add_frame(model, k, np.eye(4), _numbered(len(names)), left, other)
+        for at, row in enumerate(rows.tolist()):
+            track = pycolmap.Track(
+                [pycolmap.TrackElement(_image_id(k, _LEFT), at), pycolmap.TrackElement(_image_id(k, _RIGHT), at)]
+            )
+            model.add_point3D(points[row], track, np.zeros(3, dtype=np.uint8))
+    config = _whole(model)
+    for k in range(len(names)):
+        config.set_constant_rig_from_world_pose(_frame_id(k))
+    options = _solver_options(0.5, 1)
+    options.refine_sensor_from_rig = True
+    options.refine_rig_from_world = False
+    _solved(pycolmap.create_default_bundle_adjuster(options, config, model))
+    T_cam1_cam0 = _matrix(model.rig(_RIG).sensor_from_rig(right))
+    moved = -T_cam1_cam0[:3, :3].T @ T_cam1_cam0[:3, 3]
+    return T_cam1_cam0[:3, :3], moved / np.linalg.norm(moved)
+
+
+def _two_view_points(
+    matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Points (N, 3) in cam0 in units of the baseline, nearest to both rays, and a mask of those ahead of both."""
+    a, b = matches.ray0, matches.ray1 @ R_cam1_cam0
+    cosine = np.sum(a * b, axis=1)
+    along_a, along_b = a @ direction, b @ direction
+    sine2 = 1 - cosine**2
+    valid = sine2 > 1e-6
+    safe = np.where(valid, sine2, 1.0)
+    s, t = (along_a - cosine * along_b) / safe, (cosine * along_a - along_b) / safe
+    valid &= (s > 0.5) & (t > 0.5)
+    points = (s[:, None] * a + direction + t[:, None] * b) / 2
+    return points, valid

@@ -7,7 +7,7 @@ adjuster or an exporter needs from a run's folder is prepared here, with numpy a
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,22 @@ from vio.datasets import open_dataset
 from vio.datasets.common import read_npz
 from vio.datasets.features import FeatureDataset
 from vio.datasets.observation_log import read_observation_log
-from vio.errors import DataError, EstimationError
-from vio.evaluation import align_poses, apply_alignment, rotation_angle_deg
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_hat, transform_points
+from vio.datasets.tracks import FeatureTracks
+from vio.errors import DataError, EstimationError, EvaluationError
+from vio.evaluation import align_poses, apply_alignment, evaluate, rotation_angle_deg
+from vio.geometry.lie import FloatArray, nearest_rotation, se3_exp, se3_inverse, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
-from vio.records import BoolArray, Estimate, Image, IntArray, Landmarks, StereoFrame, Trajectory
+from vio.records import (
+    BoolArray,
+    Estimate,
+    Image,
+    IntArray,
+    Landmarks,
+    Observations,
+    Recording,
+    StereoFrame,
+    Trajectory,
+)
 from vio.run_folder import MARKER
 from vio.trajectory_io import read_trajectory
 
@@ -34,6 +45,10 @@ _POSE_STEPS = 12
 _LEAST_POSE_ROWS = 6
 _SCENE_SHARE = 0.08  # of the median depth: a new keyframe is due after moving so far …
 _TURN_DEG = 6.0  # … or turning so far
+_LEAST_STRETCH = 20  # frames
+_SCALE_SIGMA = 0.02  # a scale less certain than this is not stated
+_LEAST_MOTIONS = 8  # keyframes needed to say which motions stand out
+_OUTLYING = 6.0  # robust standard deviations
 _LEAST_SIGMA_M = 1e-4  # of a prior: the first pose of a filter is certain by definition
 
 
@@ -430,3 +445,178 @@ def write_png(path: Path, image: Image) -> None:
 
     _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     path.write_bytes(data.tobytes())
+
+
+# --- comparison -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A stretch between keyframes over which two trajectories move differently."""
+
+    first_frame: int
+    last_frame: int
+    difference_m: float  # largest difference of the motions between neighbouring keyframes
+    difference_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A second opinion on a run's keyframes."""
+
+    total: int  # keyframes compared
+    frames: IntArray  # (R,) frame numbers
+    aligned: FloatArray  # (R, 4, 4) the other poses in the run's world, after SE(3) alignment
+    difference_m: FloatArray  # (R,)
+    difference_deg: FloatArray  # (R,)
+    ate_m: float  # after SE(3) alignment
+    ate_deg: float
+    scale: float | None  # length of the other trajectory over the run's; None: see why_no_scale
+    scale_sigma: float | None  # standard error
+    why_no_scale: str | None
+    segments: tuple[Segment, ...]
+    reference_ate_m: float | None  # of the other poses, against ground truth
+    reference_scale: float | None  # length of the other trajectory over that of ground truth
+    run_reference_ate_m: float | None  # of the run at the same keyframes
+
+
+def compare_keyframes(run: SavedRun, rows: IntArray, T_other_cam0: FloatArray) -> Comparison:
+    """Compare poses (R, 4, 4) of the left camera from elsewhere with those of the run at rows (R,) of its trajectory.
+
+    Reference: Umeyama (1991) for the alignment, as in `vio.evaluation`.
+    """
+    own = run.trajectory.T_world_body[rows]
+    aligned = apply_alignment(align_poses(T_other_cam0, own, "se3"), T_other_cam0)
+    difference_m = np.linalg.norm(aligned[:, :3, 3] - own[:, :3, 3], axis=1)
+    # Rotations are compared apart: a straight path leaves the roll of an alignment by positions open.
+    turn = nearest_rotation(np.einsum("nij,nkj->ik", own[:, :3, :3], T_other_cam0[:, :3, :3]))
+    difference_deg = rotation_angle_deg(np.swapaxes(own[:, :3, :3], 1, 2) @ turn @ T_other_cam0[:, :3, :3])
+    scale, sigma, why = _scale_ratio(T_other_cam0, own, float(np.sqrt(np.mean(difference_m**2))))
+    against = _against_reference(run, rows, T_other_cam0)
+    return Comparison(
+        total=len(rows),
+        frames=run.frames[rows],
+        aligned=aligned,
+        difference_m=difference_m,
+        difference_deg=difference_deg,
+        ate_m=float(np.sqrt(np.mean(difference_m**2))),
+        ate_deg=float(np.sqrt(np.mean(difference_deg**2))),
+        scale=scale,
+        scale_sigma=sigma,
+        why_no_scale=why,
+        segments=_disagreements(run.frames[rows], own, T_other_cam0),
+        reference_ate_m=against[0],
+        reference_scale=against[1],
+        run_reference_ate_m=against[2],
+    )
+
+
+def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[float | None, float | None, str | None]:
+    """Length of the other trajectory over one's own with its standard error, or why there is none."""
+    p = T_own[:, :3, 3]
+    extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
+    if len(p) < 3:
+        return None, None, f"only {len(p)} keyframes are connected"
+    try:
+        alignment = align_poses(T_other, T_own, "sim3")
+    except EvaluationError:
+        return None, None, "the camera does not move (pure rotation or standstill)"
+    rest = apply_alignment(alignment, T_other)[:, :3, 3] - p
+    sigma = float(np.sqrt(np.mean(np.sum(rest**2, axis=1)))) / (extent * np.sqrt(len(p)))
+    if sigma > _SCALE_SIGMA:
+        return None, None, f"the camera moves over {extent:.3g} m only, against differences of {ate_m:.2g} m"
+    return 1 / alignment.scale, sigma, None
+
+
+def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray) -> tuple[Segment, ...]:
+    """Stretches where motions between neighbouring keyframes differ far more than they usually do."""
+    if len(frames) < _LEAST_MOTIONS:
+        return ()
+    motion_own = se3_inverse(T_own[:-1]) @ T_own[1:]
+    motion_other = se3_inverse(T_other[:-1]) @ T_other[1:]
+    off_m = np.linalg.norm(motion_own[:, :3, 3] - motion_other[:, :3, 3], axis=1)
+    off_deg = rotation_angle_deg(np.swapaxes(motion_own[:, :3, :3], 1, 2) @ motion_other[:, :3, :3])
+    bad = _stands_out(off_m) | _stands_out(off_deg)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8)))
+    return tuple(
+        Segment(int(frames[a]), int(frames[b]), float(off_m[a:b].max()), float(off_deg[a:b].max()))
+        for a, b in edges.reshape(-1, 2).tolist()
+    )
+
+
+def _stands_out(values: FloatArray) -> BoolArray:
+    middle = float(np.median(values))
+    return values > middle + _OUTLYING * max(1.4826 * float(np.median(np.abs(values - middle))), 0.1 * middle, 1e-9)
+
+
+def _against_reference(
+    run: SavedRun, rows: IntArray, T_other_cam0: FloatArray
+) -> tuple[float | None, float | None, float | None]:
+    """ATE of the other poses, their scale, and ATE of the run's, against the recording's ground truth."""
+    reference = run.dataset.recording.reference
+    if reference is None:
+        return None, None, None
+    own = replace(
+        run.trajectory,
+        T_world_body=run.trajectory.T_world_body[rows],
+        times_ns=None if run.trajectory.times_ns is None else run.trajectory.times_ns[rows],
+        frame_indices=run.frames[rows],
+    )
+    other = replace(own, T_world_body=T_other_cam0)
+    try:
+        ate, of_run = (
+            float(evaluate(t, reference, T_cam0_imu=run.T_cam0_imu).as_dict()["ate_m"]) for t in (other, own)
+        )
+        scale = float(evaluate(other, reference, align="sim3", T_cam0_imu=run.T_cam0_imu).as_dict()["scale"])
+    except EvaluationError:
+        return None, None, None
+    return ate, 1 / scale, of_run
+
+
+def joined_tracks(seen: Mapping[int, Observations], frames: int) -> FeatureTracks:
+    """The observations of some of `frames` frames, by frame number, as one table."""
+    counts = np.zeros(frames + 1, dtype=np.int64)
+    for k, o in seen.items():
+        counts[k + 1] = len(o)
+    parts = [seen[k] for k in sorted(seen)]
+    return FeatureTracks(
+        np.cumsum(counts),
+        np.concatenate([np.zeros(0, dtype=np.int64), *(o.ids for o in parts)]),
+        np.concatenate([np.zeros((0, 4)), *(o.z for o in parts)]),
+        np.concatenate([np.zeros(0, dtype=np.bool_), *(o.has_right for o in parts)]),
+        np.concatenate([np.zeros(0, dtype=np.bool_), *(o.stale for o in parts)]),
+    )
+
+
+def tracked_stretches(
+    recording: Recording, tracks: FeatureTracks, frames: IntArray, twists: FloatArray, *, longest: int, most: int
+) -> list[SavedRun]:
+    """Pieces of a recording, with poses chained from frame to frame, as if each were a run of its own.
+
+    Args:
+        recording: whose features they are.
+        tracks: stereo features.
+        frames: (K,) earlier frame of each interval with a known motion, increasing.
+        twists: (K, 6) of cam0 over it, [v; omega].
+        longest: frames of a piece.
+        most: pieces, spread over the recording.
+    """
+    breaks = np.flatnonzero(np.diff(frames) != 1) + 1
+    parts = [
+        part[k : k + longest] for part in np.split(np.arange(len(frames)), breaks) for k in range(0, len(part), longest)
+    ]
+    parts = [part for part in parts if len(part) >= min(longest, _LEAST_STRETCH)]
+    out: list[SavedRun] = []
+    if not parts:
+        return out
+    for part in (parts[k] for k in np.unique(np.linspace(0, len(parts) - 1, most).astype(int))):
+        indices = np.arange(frames[part[0]], frames[part[-1]] + 2)
+        times_ns = recording.frame_times_ns[indices]
+        poses = [np.eye(4)]
+        for step, dt_ns in zip(twists[part], np.diff(times_ns), strict=True):
+            poses.append(poses[-1] @ se3_exp(1e-9 * float(dt_ns) * step))
+        trajectory = Trajectory(np.array(poses), times_ns, "cam0", indices)
+        stale = np.zeros(len(recording.frame_times_ns), dtype=np.bool_)
+        dataset = FeatureDataset(recording, tracks, (), indices, stale)
+        out.append(SavedRun(recording.path, str(recording.path), dataset, trajectory, np.eye(4), {}))
+    return out

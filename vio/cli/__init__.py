@@ -12,10 +12,10 @@ import sys
 from collections.abc import Sequence
 
 from vio._version import __version__
-from vio.cli import config, demo, evaluate, export, rectify, refine, render, reproduce, run
+from vio.cli import calibrate, check, config, demo, evaluate, export, rectify, refine, render, reproduce, run
 from vio.errors import VioError
 
-_COMMANDS = (run, evaluate, refine, export, demo, render, rectify, reproduce, config)
+_COMMANDS = (run, evaluate, check, refine, export, calibrate, demo, render, rectify, reproduce, config)
 
 
 def build_parser() -> argparse.ArgumentParser:
