@@ -139,7 +139,7 @@ def _extractor(learned: LearnedSettings, match: MatchSettings, device: torch.dev
         return _Whole(_filled(kf.DISK(), learned.detector_weights, "detector_weights").to(device), name, count, device)
     if name == "xfeat":
         xfeat = kf.XFeat(top_k=count)
-        _filled(xfeat.net if hasattr(xfeat, "net") else xfeat.model, learned.detector_weights, "detector_weights")
+        _filled(xfeat.net, learned.detector_weights, "detector_weights")
         return _Whole(xfeat.eval().to(device), name, count, device)
     describe = _descriptor(learned).to(device)
     patch_px = _PATCH_PX.get(learned.descriptor, 32)
@@ -254,6 +254,8 @@ class _Whole:
             pixels = _as_tensor(image, self.device)
             if self.name == "disk":
                 found = self.network(pixels.repeat(1, 3, 1, 1), n=self.count, pad_if_not_divisible=True)[0]
+            elif self.name == "xfeat":
+                found = self.network.detectAndCompute(pixels.repeat(1, 3, 1, 1))[0]
             else:
                 found = self.network(pixels.repeat(1, 3, 1, 1))[0]
         if isinstance(found, dict):
@@ -382,6 +384,12 @@ def _lightglue(learned: LearnedSettings, camera: StereoCamera, device: torch.dev
             f"{learned.detector}; set matcher to nearest"
         )
     options = dict(kf.LightGlue.features[_LIGHTGLUE[learned.detector]])
+    if learned.detector == "aliked" and learned.aliked_model == "aliked-t16":
+        raise ConfigError(
+            f"{_SECTION}.matcher is lightglue, which takes ALIKED's descriptors of 128 numbers, but aliked-t16 gives "
+            "64; 
+            "set aliked_model to aliked-n16, with its weights"
+        )
     network = kf.LightGlue(features=cast(Any, None), **(options | {"weights": None}))
     state = load_weights(learned.matcher_weights, "matcher_weights")
     state = {key.removeprefix("matcher."): value for key, value in state.items()}

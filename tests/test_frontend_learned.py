@@ -1,0 +1,368 @@
+"""The parts that need torch: weights from files only, clear errors, and Lucas-Kanade with OpenCV's numbers."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from frontend import LearnedSettings, MatchSettings
+from frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
+from frontend.detect import detect_corners
+from frontend.settings import KltSettings
+from frontend.stereo_match import half_image
+from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
+from vio.datasets.images import load_gray
+from vio.errors import ConfigError, DataError, MissingDependencyError
+from vio.geometry.lie import FloatArray
+from vio.records import Image, StereoFrame
+
+REASON = "not installed: pip install 'stereo-vio[learned]'"
+MATCH = MatchSettings(max_keypoints=250, target_features=200)
+
+
+@pytest.fixture(scope="module")
+def torch() -> Any:
+    pytest.importorskip("kornia", reason=REASON)
+    return pytest.importorskip("torch", reason=REASON)
+
+
+SMALL = replace(CAMERA, width=240, height=160)
+
+
+def build(settings: LearnedSettings, match: MatchSettings = MATCH) -> DescriptorFrontend:
+    from frontend.learned import build_learned
+
+    return build_learned(SMALL, match, settings)
+
+
+def small_frame(index: int, pose: FloatArray) -> StereoFrame:
+    """The upper left part of the rendered pair, where pixels keep their numbers."""
+    frame = stereo_frame(index, pose)
+    assert frame.left is not None
+    assert frame.right is not None
+    left, right = (np.ascontiguousarray(image[:160, :240]) for image in (frame.left, frame.right))
+    return replace(frame, left=left, right=right)
+
+
+# --- without torch --------------------------------------------------------------------------------------------------
+
+
+def test_importing_the_packages_does_not_import_torch() -> None:
+    modules = "vio, frontend, frontend.klt, frontend.descriptors, frontend.learned, frontend.torch_klt"
+    code = f"import sys, {modules}; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from frontend.torch_klt import TorchFlow
+
+    for module in ("torch", "kornia", "kornia.feature"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingDependencyError, match=r"stereo-vio\[learned\]"):
+        build(LearnedSettings())
+    with pytest.raises(MissingDependencyError, match=r"stereo-vio\[learned\]"):
+        TorchFlow()
+
+
+# --- weights and devices --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        (LearnedSettings(detector="aliked"), "detector_weights"),
+        (LearnedSettings(detector="disk"), "detector_weights"),
+        (LearnedSettings(detector="xfeat"), "detector_weights"),
+        (LearnedSettings(detector="keynet"), "detector_weights"),
+        (LearnedSettings(descriptor="mkd"), "descriptor_weights"),
+        (LearnedSettings(descriptor="hardnet"), "descriptor_weights"),
+    ],
+)
+def test_weights_that_are_needed_must_be_named(torch: Any, settings: LearnedSettings, named: str) -> None:
+    with pytest.raises(ConfigError, match=f"frontend.learned.{named} is not set"):
+        build(settings)
+
+
+def test_files_that_are_no_weights_are_named(torch: Any, tmp_path: Path) -> None:
+    text, lists = tmp_path / "text.pth", tmp_path / "list.pth"
+    text.write_text("not weights")
+    torch.save([1, 2, 3], lists)
+    for path in (text, tmp_path / "missing.pth"):
+        with pytest.raises(DataError, match=f"{path.name} .*cannot be read as weights"):
+            build(LearnedSettings(detector="aliked", detector_weights=path))
+    with pytest.raises(DataError, match="holds no named weights"):
+        build(LearnedSettings(detector="aliked", detector_weights=lists))
+
+
+class _Evil:
+    def __reduce__(self) -> tuple[Any, tuple[str]]:
+        return exec, ("raise SystemExit('a file of weights ran code')",)
+
+
+def test_a_file_of_weights_cannot_run_code(torch: Any, tmp_path: Path) -> None:
+    path = tmp_path / "evil.pth"
+    torch.save({"state_dict": _Evil()}, path)
+    with pytest.raises(DataError, match="cannot be read as weights"):
+        build(LearnedSettings(detector="aliked", detector_weights=path))
+
+
+def test_weights_of_another_network_are_refused(torch: Any, tmp_path: Path) -> None:
+    import kornia.feature as kf
+
+    path = tmp_path / "hardnet.pth"
+    torch.save({"state_dict": kf.HardNet(pretrained=False).state_dict()}, path)
+    for settings in (
+        LearnedSettings(detector="aliked", detector_weights=path),
+        LearnedSettings(detector="disk", detector_weights=path),
+        LearnedSettings(affine_weights=path),
+        LearnedSettings(orientation_weights=path),
+    ):
+        with pytest.raises(DataError, match=r"hardnet.pth .* holds weights of another network"):
+            build(settings)
+    with pytest.raises(DataError, match="no whitening of MKD"):
+        build(LearnedSettings(descriptor="mkd", descriptor_weights=path))
+
+
+def test_cuda_that_is_absent_is_refused(torch: Any) -> None:
+    from frontend.torch_klt import TorchFlow
+
+    if torch.cuda.is_available():
+        pytest.skip("this machine has CUDA")
+    with pytest.raises(ConfigError, match="no CUDA device here; set it to cpu"):
+        build(LearnedSettings(device="cuda"))
+    with pytest.raises(ConfigError, match="no CUDA device"):
+        TorchFlow(device="cuda")
+
+
+def test_lightglue_needs_a_detector_that_it_was_trained_for(torch: Any) -> None:
+    with pytest.raises(ConfigError, match="goes with the detectors aliked, disk, xfeat"):
+        build(LearnedSettings(matcher="lightglue"))
+
+
+def test_weights_of_lightglue_for_other_descriptors_are_refused(torch: Any, tmp_path: Path) -> None:
+    files = networks(torch, tmp_path)
+    for name, weights in (("disk", "hardnet"), ("xfeat", "lightglue")):
+        settings = LearnedSettings(
+            detector=name,  # type: ignore[arg-type]
+            detector_weights=files[name],
+            matcher="lightglue",
+            matcher_weights=files[weights],
+        )
+        with pytest.raises(DataError, match="holds no weights of LightGlue"):
+            build(settings)
+    small = LearnedSettings(detector="aliked", detector_weights=files["aliked"], matcher="lightglue")
+    with pytest.raises(ConfigError, match="aliked-t16 gives 64"):
+        build(replace(small, matcher_weights=files["lightglue"]))
+
+
+# --- networks filled from files -------------------------------------------------------------------------------------
+
+
+def networks(torch: Any, folder: Path) -> dict[str, Path]:
+    """Files of random weights of every supported network; what they find is nonsense, but of the right form."""
+    import kornia.feature as kf
+
+    torch.manual_seed(1)
+    made = {
+        "aliked": kf.ALIKED("aliked-t16"),
+        "disk": kf.DISK(),
+        "xfeat": kf.XFeatModel(),
+        "hardnet": kf.HardNet(pretrained=False),
+        "hynet": kf.HyNet(pretrained=False),
+        "sosnet": kf.SOSNet(pretrained=False),
+        "lightglue": kf.LightGlue(features=None, weights=None, input_dim=128),  # type: ignore[arg-type]
+    }
+    paths = {}
+    for name, network in made.items():
+        paths[name] = folder / f"{name}.pth"
+        torch.save(network.state_dict(), paths[name])
+    return paths
+
+
+@pytest.mark.parametrize("name", ["aliked", "disk", "xfeat", "hardnet", "hynet", "sosnet", "lightglue"])
+def test_every_network_runs_with_weights_from_a_file(torch: Any, name: str, tmp_path: Path) -> None:
+    files = networks(torch, tmp_path)
+    settings = LearnedSettings(descriptor_weights=files.get(name))
+    if name == "lightglue":
+        settings = LearnedSettings(
+            detector="disk", detector_weights=files["disk"], matcher="lightglue", matcher_weights=files[name]
+        )
+    elif name in ("aliked", "disk", "xfeat"):
+        settings = LearnedSettings(detector=name, detector_weights=files[name])  # type: ignore[arg-type]
+    else:
+        settings = replace(settings, descriptor=name)  # type: ignore[arg-type]
+    frontend = build(settings, replace(MATCH, max_keypoints=40))
+    for k, pose in enumerate(flight(2)):
+        seen = frontend.process(small_frame(k, pose)).observations
+        assert np.isfinite(seen.z).all()
+        assert ((seen.z[:, :2] >= 0) & (seen.z[:, :2] <= [239, 159])).all()
+
+
+WEIGHTED = {
+    "aliked": {"detector": "aliked", "detector_weights": "aliked/aliked-t16.pth"},
+    "aliked-n16": {
+        "detector": "aliked",
+        "aliked_model": "aliked-n16",
+        "detector_weights": "aliked/aliked-n16.pth",
+    },
+    "keynet-mkd": {
+        "detector": "keynet",
+        "detector_weights": "keynet/keynet_pytorch.pth",
+        "descriptor": "mkd",
+        "descriptor_weights": "mkd/mkd-cart-64.pth",
+        "affine_weights": "affnet/AffNet.pth",
+        "orientation_weights": "affnet/OriNet.pth",
+    },
+}
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> None:
+    """On the rendered wall, whose truth is known."""
+    if not (data_dir / "weights").is_dir():
+        pytest.skip("no weights in VIO_DATA")
+    options = {
+        key: data_dir / "weights" / value if key.endswith("_weights") else value
+        for key, value in WEIGHTED[name].items()
+    }
+    frontend = build(LearnedSettings(**options), replace(MATCH, max_keypoints=120))  # type: ignore[arg-type]
+    poses = flight(2)
+    a, b = (frontend.process(small_frame(k, pose)).observations for k, pose in enumerate(poses))
+    _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
+    assert len(i) > 0.3 * len(a)
+    expected = truth(SLANTED, poses[0], a.z[i, :2], poses[1])[:, :2]
+    assert np.median(np.linalg.norm(b.z[j, :2] - expected, axis=1)) < 0.08
+    stereo = a.take(a.has_right)
+    assert len(stereo) > 25
+    assert np.median(np.abs(stereo.z[:, 2] - truth(SLANTED, poses[0], stereo.z[:, :2], poses[0])[:, 2])) < 0.05
+
+
+@pytest.mark.parametrize("detector", ["gftt", "harris"])
+def test_corners_lie_at_corners(torch: Any, detector: str) -> None:
+    """White squares: the four kinds of corner err inwards alike, so that a shift of half a pixel would show."""
+    from frontend.learned import _extractor, pick_device
+
+    image = np.full((192, 256), 40, dtype=np.uint8)
+    true = []
+    for v in range(20, 170, 40):
+        for u in range(20, 230, 40):
+            image[v : v + 17, u : u + 17] = 200
+            true += [(u + a, v + b) for a in (-0.5, 16.5) for b in (-0.5, 16.5)]
+    found = _extractor(LearnedSettings(detector=detector), MATCH, pick_device("cpu"))(image)  # type: ignore[arg-type]
+    gap = found.pixels[:, None] - np.array(true)
+    nearest = np.abs(gap).max(axis=2).argmin(axis=0)
+    offset = gap[nearest, np.arange(len(true))]
+    assert np.abs(offset).max() < 1.5
+    assert np.abs(offset.mean(axis=0)).max() < 0.01
+
+
+# --- matching -------------------------------------------------------------------------------------------------------
+
+
+def points_of(descriptors: FloatArray) -> Keypoints:
+    unit = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
+    n = len(unit)
+    return Keypoints(np.zeros((n, 2)), unit, np.zeros(n), np.zeros(n))
+
+
+def test_mutual_nearest_equals_a_loop() -> None:
+    rng = np.random.default_rng(3)
+    a, b = points_of(rng.normal(size=(40, 8))), points_of(rng.normal(size=(50, 8)))
+    allowed = rng.random((40, 50)) < 0.5
+    gap = np.linalg.norm(a.descriptors[:, None].astype(float) - b.descriptors[None].astype(float), axis=2)
+    gap[~allowed] = np.inf
+    expected = []
+    for i in range(40):
+        order = np.argsort(gap[i])
+        j = int(order[0])
+        if np.isfinite(gap[i, j]) and np.argmin(gap[:, j]) == i and gap[i, j] <= 0.9 * gap[i, order[1]]:
+            expected.append([i, j])
+    assert len(expected) > 5
+    np.testing.assert_array_equal(MutualNearest(0.9)(a, b, allowed), expected)
+
+
+def test_bits_are_compared_by_how_many_differ() -> None:
+    from frontend.descriptors import distances
+
+    rng = np.random.default_rng(4)
+    a, b = rng.integers(0, 256, (5, 32), dtype=np.uint8), rng.integers(0, 256, (7, 32), dtype=np.uint8)
+    expected = [[sum(bin(int(x) ^ int(y)).count("1") for x, y in zip(p, q, strict=True)) for q in b] for p in a]
+    np.testing.assert_array_equal(distances(a, b), expected)
+
+
+# --- Lucas-Kanade in torch ------------------------------------------------------------------------------------------
+
+
+def opencv_flow(source: Image, target: Image, points: FloatArray, guess: FloatArray) -> tuple[FloatArray, Any]:
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        source,
+        target,
+        points.astype(np.float32).reshape(-1, 1, 2),
+        guess.astype(np.float32).reshape(-1, 1, 2),
+        winSize=(15, 15),
+        maxLevel=3,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=1e-4,
+    )
+    return np.asarray(found, dtype=np.float64).reshape(-1, 2), np.asarray(status).reshape(-1) == 1
+
+
+def compare(images: list[Image]) -> None:
+    """Time, left to right and right to left in one call, against OpenCV call by call: [left, next left, right]."""
+    from frontend.torch_klt import TorchFlow
+
+    points = detect_corners(half_image(images[0]), np.zeros((0, 2)), 200, KltSettings())
+    legs = [(0, 1), (0, 2), (2, 0)]
+    engine = TorchFlow()
+    n = len(points)
+    source, target = (np.repeat([leg[i] for leg in legs], n) for i in (0, 1))
+    found, seen = engine.track(engine.pyramid(images), source, target, np.tile(points, (3, 1)), np.tile(points, (3, 1)))
+    for k, (a, b) in enumerate(legs):
+        expected, status = opencv_flow(images[a], images[b], points, points)
+        back, _ = opencv_flow(images[b], images[a], expected, points)
+        # Where OpenCV itself does not return, it found nothing that a number could agree with.
+        settled = status & (np.linalg.norm(back - points, axis=1) < 0.5)
+        rows = slice(k * n, (k + 1) * n)
+        assert settled.sum() > 0.3 * n
+        assert seen[rows][settled].mean() > 0.97
+        error = np.linalg.norm(found[rows] - expected, axis=1)[settled & seen[rows]]
+        assert np.median(error) < 0.005
+        assert np.percentile(error, 95) < 0.05
+
+
+def test_torch_flow_has_opencvs_numbers_on_rendered_images(torch: Any) -> None:
+    a, b = (stereo_frame(k, pose) for k, pose in enumerate(flight(2)))
+    assert a.left is not None
+    assert b.left is not None
+    assert a.right is not None
+    compare([a.left, b.left, a.right])
+
+
+def test_torch_flow_has_opencvs_numbers_on_a_real_drive(torch: Any, data_dir: Path) -> None:
+    folder = data_dir / "kitti_0039"
+    compare(
+        [load_gray(folder / path)[0] for path in ("image_0/000000.png", "image_0/000001.png", "image_1/000000.png")]
+    )
+
+
+def test_torch_flow_of_nothing_and_of_flat_images(torch: Any) -> None:
+    from frontend.torch_klt import TorchFlow
+
+    engine = TorchFlow(levels=1)
+    flat = np.full((60, 80), 90, dtype=np.uint8)
+    pyramid = engine.pyramid([flat, flat])
+    none = np.zeros(0, dtype=np.int64)
+    found, seen = engine.track(pyramid, none, none, np.zeros((0, 2)), np.zeros((0, 2)))
+    assert found.shape == (0, 2)
+    assert seen.shape == (0,)
+    point = np.array([[40.0, 30.0]])
+    _, seen = engine.track(pyramid, np.array([0]), np.array([1]), point, point)
+    assert not seen.any()
