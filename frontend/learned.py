@@ -386,9 +386,8 @@ def _lightglue(learned: LearnedSettings, camera: StereoCamera, device: torch.dev
     options = dict(kf.LightGlue.features[_LIGHTGLUE[learned.detector]])
     if learned.detector == "aliked" and learned.aliked_model == "aliked-t16":
         raise ConfigError(
-            f"{_SECTION}.matcher is lightglue, which takes ALIKED's descriptors of 128 numbers, but aliked-t16 gives "
-            "64; 
-            "set aliked_model to aliked-n16, with its weights"
+            f"{_SECTION}.matcher is lightglue, which takes ALIKED's descriptors of 128 numbers, but "
+            "aliked-t16 gives 64; set aliked_model to aliked-n16, with its weights"
         )
     network = kf.LightGlue(features=cast(Any, None), **(options | {"weights": None}))
     state = load_weights(learned.matcher_weights, "matcher_weights")
