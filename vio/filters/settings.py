@@ -73,8 +73,10 @@ class MsckfSettings:
     gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected")
     max_distance: float = setting(400.0, "tracks farther away than this many baselines are not used")
     gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2")
-    gyro_noise_density: float = setting(2.0e-4, "gyro white noise", unit="rad/s/sqrt(Hz)")
-    accel_noise_density: float = setting(2.5e-3, "accelerometer white noise", unit="m/s^2/sqrt(Hz)")
+    gyro_noise_density: float = setting(
+        1.0e-3, "gyro white noise, five times a data sheet's, for vibration", unit="rad/s/sqrt(Hz)"
+    )
+    accel_noise_density: float = setting(1.2e-2, "accelerometer white noise, likewise", unit="m/s^2/sqrt(Hz)")
     gyro_bias_walk: float = setting(2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)")
     accel_bias_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)")
     start_tilt_sigma_deg: float = setting(8.0, "doubt of the first roll and pitch", unit="deg")
