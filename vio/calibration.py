@@ -54,6 +54,16 @@ class RayMatches:
         return RayMatches(self.pair[rows], self.ray0[rows], self.ray1[rows])
 
 
+def join_matches(parts: Sequence[RayMatches]) -> RayMatches:
+    """All matches of several pairs as one table."""
+    none = np.zeros((0, 3))
+    return RayMatches(
+        np.concatenate([np.zeros(0, dtype=np.int64), *(m.pair for m in parts)]),
+        np.concatenate([none, *(m.ray0 for m in parts)]),
+        np.concatenate([none, *(m.ray1 for m in parts)]),
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class StereoEstimate:
     """Left-right extrinsics without scale."""
@@ -653,6 +663,13 @@ def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: Ray
         > _CLEARLY_WORSE * epipolar_spread(estimate.R_cam1_cam0, estimate.direction, inliers)
     )
     if swing_deg > 180 - max(swing_limit, 20.0):
+        if turn_deg > turn_limit and float(rotation_angle_deg(estimate.R_cam1_cam0 @ R_given)) < turn_limit:
+            return (
+                Finding(
+                    "cameras swapped",
+                    "the calibration is that of the two cameras exchanged, or the inverse transform: its inverse fits",
+                ),
+            )
         found.append(
             Finding(
                 "baseline translation inverted",
@@ -677,6 +694,31 @@ def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: Ray
             )
         )
     return tuple(found)
+
+
+def judge_exchange(matches: RayMatches, exchanged: RayMatches, T_cam0_cam1: FloatArray) -> tuple[Finding, ...]:
+    """Say whether the given calibration (4, 4) fits the images much better with the two cameras' images exchanged.
+
+    Args:
+        matches: rays by the cameras as the recording has them.
+        exchanged: the same matches, each image taken for the other camera's.
+        T_cam0_cam1: given pose of cam1 in cam0.
+    """
+    if too_few(matches) is not None or too_few(exchanged) is not None:
+        return ()
+    direction = T_cam0_cam1[:3, 3] / np.linalg.norm(T_cam0_cam1[:3, 3])
+    as_given, other_way = (
+        float(np.degrees(epipolar_spread(T_cam0_cam1[:3, :3].T, direction, m))) for m in (matches, exchanged)
+    )
+    if other_way * _CLEARLY_WORSE > as_given or other_way > _EXCHANGED_DEG:
+        return ()
+    return (
+        Finding(
+            "cameras swapped",
+            f"with the images of cam0 and cam1 exchanged the calibration fits them to {other_way:.3f} deg, as they are "
+            f"to {as_given:.3f} deg; exchange the two image folders",
+        ),
+    )
 
 
 def judge_imu(alignment: ImuAlignment, lever: LeverArm | NotObservable, T_cam0_imu: FloatArray) -> tuple[Finding, ...]:
@@ -737,6 +779,7 @@ def judge_imu(alignment: ImuAlignment, lever: LeverArm | NotObservable, T_cam0_i
 
 
 _CLEARLY_WORSE = 2.0  # spread of the given calibration's epipolar angles over that of the measured one
+_EXCHANGED_DEG = 0.2  # largest epipolar angle of a calibration that fits
 _NAMED_ROTATION_DEG = 0.3  # smaller differences are not called faults
 _NAMED_DIRECTION_DEG = 1.0
 _NAMED_IMU_ROTATION_DEG = 0.5

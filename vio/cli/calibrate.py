@@ -159,11 +159,12 @@ def _raw_euroc(path: Path, refused: str) -> _Source | None:
 
 
 def _measure(source: _Source, pairs: int, frames: int, show: Callable[[int, int], None]) -> _Report:
-    from vio.calibration import NotObservable, camera_motion, judge_stereo, row_residuals
+    from vio.calibration import NotObservable, camera_motion, judge_exchange, judge_stereo, row_residuals
 
     notes = () if source.refused is None else (f"the reader refuses this calibration: {source.refused}",)
     tracks, samples = _tracks(source, frames) if not source.raw_pairs else (None, ())
-    matches, z = _stereo_matches(source, tracks, pairs, show)
+    matches, z, exchanged = _stereo_matches(source, tracks, pairs, show)
+    swapped = () if exchanged is None else judge_exchange(matches, exchanged, _given_baseline(source))
     stereo, matches = _stereo_estimate(matches)
     rows: RowResiduals | NotObservable = NotObservable("row alignment", "the images cannot be rectified")
     imu: ImuAlignment | NotObservable
@@ -171,10 +172,10 @@ def _measure(source: _Source, pairs: int, frames: int, show: Callable[[int, int]
     if source.dataset is None:
         why = "the left-right calibration must be mended first: it decides where features are and how far away"
         imu, lever = NotObservable("IMU-camera rotation and time offset", why), NotObservable("lever arm", why)
-        return _Report(source, stereo, rows, imu, lever, _judged(source, stereo, matches), notes)
+        return _Report(source, stereo, rows, imu, lever, swapped or _judged(source, stereo, matches), notes)
     rows = row_residuals(z, *_size(source, z))
     recording = source.dataset.recording
-    findings = _judged(source, stereo, matches)
+    findings = swapped or _judged(source, stereo, matches)
     if any(f.fault in _HOPELESS for f in findings):
         why = f"{findings[0].fault}: mend that first"
         imu, lever = NotObservable("IMU-camera rotation and time offset", why), NotObservable("lever arm", why)
@@ -240,34 +241,33 @@ def _rectifying(source: _Source) -> tuple[FloatArray, FloatArray] | None:
 
 def _stereo_matches(
     source: _Source, tracks: FeatureTracks | None, pairs: int, show: Callable[[int, int], None]
-) -> tuple[RayMatches, FloatArray]:
-    """Matches of spread pairs as rays of the raw cameras, and as rectified pixels `[ul vl ur vr]` where possible."""
+) -> tuple[RayMatches, FloatArray, RayMatches | None]:
+    """Matches of spread pairs as rays of the raw cameras, and as rectified pixels `[ul vl ur vr]` where possible.
+
+    Third, where the cameras differ, the same matches with each image taken for the other camera's.
+    """
     import numpy as np
 
     from vio import colmap
-    from vio.calibration import RayMatches
+    from vio.calibration import join_matches
     from vio.datasets.images import load_gray
-    from vio.geometry.distortion import unproject_pixel
     from vio.geometry.rectify import rectify_pixels
 
     if tracks is not None:
-        return _track_matches(source, tracks, pairs)
+        return (*_track_matches(source, tracks, pairs), None)
     assert source.rig is not None
     rig, dataset = source.rig, source.dataset
     rotations = _rectifying(source)
-    label: list[FloatArray] = []
-    rays: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    parts: list[RayMatches] = []
+    exchanged: list[RayMatches] = []
     z: list[FloatArray] = []
     chosen = np.unique(np.linspace(0, len(source.raw_pairs) - 1, pairs).astype(int))
     for done, k in enumerate(chosen.tolist()):
         left, right = (load_gray(path)[0] for path in source.raw_pairs[k])
         uv0, uv1 = colmap.sift_matches(left, right)
-        ray0, valid0 = unproject_pixel(rig.cam0, uv0)
-        ray1, valid1 = unproject_pixel(rig.cam1, uv1)
-        valid = valid0 & valid1 & (ray0[:, 2] > 0.1) & (ray1[:, 2] > 0.1)
-        label.append(np.full(int(valid.sum()), k))
-        rays[0].append(ray0[valid])
-        rays[1].append(ray1[valid])
+        matches, valid = _rays(rig, uv0, uv1, k)
+        parts.append(matches)
+        exchanged.append(_rays(rig, uv1, uv0, k)[0])
         if dataset is not None:
             if rotations is not None:
                 camera = dataset.recording.camera
@@ -275,12 +275,22 @@ def _stereo_matches(
                 uv1, _ = rectify_pixels(rig.cam1, rotations[1], camera, uv1)
             z.append(np.concatenate([uv0, uv1], axis=1)[valid])
         show(done + 1, len(chosen))
-    matches = RayMatches(
-        np.concatenate([*label, np.zeros(0)]).astype(np.int64),
-        np.concatenate([*rays[0], np.zeros((0, 3))]),
-        np.concatenate([*rays[1], np.zeros((0, 3))]),
-    )
-    return matches, np.concatenate([*z, np.zeros((0, 4))])
+    differ = rig.cam0 != rig.cam1
+    joined = np.concatenate([*z, np.zeros((0, 4))])
+    return join_matches(parts), joined, join_matches(exchanged) if differ else None
+
+
+def _rays(rig: StereoRig, uv0: FloatArray, uv1: FloatArray, pair: int) -> tuple[RayMatches, Any]:
+    """Rays of matched pixels of both cameras, and which of the matches have them."""
+    import numpy as np
+
+    from vio.calibration import RayMatches
+    from vio.geometry.distortion import unproject_pixel
+
+    ray0, valid0 = unproject_pixel(rig.cam0, uv0)
+    ray1, valid1 = unproject_pixel(rig.cam1, uv1)
+    valid = valid0 & valid1 & (ray0[:, 2] > 0.1) & (ray1[:, 2] > 0.1)
+    return RayMatches(np.full(int(valid.sum()), pair), ray0[valid], ray1[valid]), valid
 
 
 def _track_matches(source: _Source, tracks: FeatureTracks, pairs: int) -> tuple[RayMatches, FloatArray]:
