@@ -32,8 +32,8 @@ logger = logging.getLogger(__name__)
 
 _LK_EPSILON_PX = 0.02
 _LK_MIN_EIGENVALUE = 1e-4
-_TIME_ITERATIONS = 6
-_STEREO_ITERATIONS = 6
+_TIME_ITERATIONS = 5
+_STEREO_ITERATIONS = 5
 _ALIGN_MAX_PX = 2.5  # a fit that moves further than this has left its peak
 _ANCHOR_LOST = 0.5  # correlation with its anchor below which a feature is taken for another
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4

@@ -21,7 +21,7 @@ class KltSettings:
     )
     min_relative_gradient: float = setting(0.15, "the same, over that of the strongest corner of its grid cell")
     spare_corners: float = setting(
-        2.5, "corners tried beyond the missing ones, over their number; the best in stereo are kept"
+        1.5, "corners tried beyond the missing ones, over their number; the best in stereo are kept"
     )
     mask: Path | None = setting(None, "image of the recording's size; where it is black no corner is taken")
     equalise: Literal["none", "clahe"] = setting("none", "local contrast equalisation before everything else")

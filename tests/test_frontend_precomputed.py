@@ -83,7 +83,7 @@ def test_auto_follows_what_the_recording_holds() -> None:
 
 def test_an_unknown_name_lists_the_known_ones() -> None:
     dataset = cast(Dataset, cast(Any, SimpleNamespace()))
-    with pytest.raises(ConfigError, match=r"'orbit'.*auto, klt, precomputed"):
+    with pytest.raises(ConfigError, match=r"'orbit'.*auto, klt, orb, sift, kornia, precomputed"):
         build_frontend("orbit", CAMERA, FrontendSettings(), dataset)
 
 

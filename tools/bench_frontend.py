@@ -225,16 +225,23 @@ RENDERED = (
 REAL = ("kitti_0039", "kitti_06_head", "tartanair2_clip")
 
 
-def clips(wanted: set[str], count: int) -> Iterator[Clip]:
+def data_folder() -> Path:
+    """The folder of real recordings."""
+    return Path(os.environ.get("VIO_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+
+
+def clips(wanted: set[str], count: int, real_count: int | None = None) -> Iterator[Clip]:
     """Make the clips by name; real ones whose folder is absent are left out with a warning."""
     yield from rendered_clips(wanted, count)
-    data = Path(os.environ.get("VIO_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    data = data_folder()
     for name in REAL:
         if name in wanted:
             if not (data / name).is_dir():
                 logging.getLogger(__name__).warning("no %s in %s (VIO_DATA): left out", name, data)
                 continue
-            yield tartanair_clip(data / name) if name == "tartanair2_clip" else kitti_clip(data / name, name, None)
+            yield (
+                tartanair_clip(data / name) if name == "tartanair2_clip" else kitti_clip(data / name, name, real_count)
+            )
 
 
 # --- measuring ------------------------------------------------------------------------------------------------------
@@ -351,22 +358,52 @@ def timing(runs: list[list[tuple[FrontendOutput, float]]]) -> dict[str, list[flo
     return {stage: [float(q) for q in np.percentile(values, [25, 50, 75])] for stage, values in columns.items()}
 
 
+KORNIA = {
+    "kornia-gftt-sift": {"detector": "gftt", "descriptor": "sift"},
+    "kornia-aliked-t16": {"detector": "aliked", "detector_weights": "aliked/aliked-t16.pth"},
+    "kornia-aliked-n16": {
+        "detector": "aliked",
+        "aliked_model": "aliked-n16",
+        "detector_weights": "aliked/aliked-n16.pth",
+    },
+    "kornia-keynet-mkd": {
+        "detector": "keynet",
+        "detector_weights": "keynet/keynet_pytorch.pth",
+        "descriptor": "mkd",
+        "descriptor_weights": "mkd/mkd-cart-64.pth",
+    },
+    "kornia-keynet-affnet-mkd": {
+        "detector": "keynet",
+        "detector_weights": "keynet/keynet_pytorch.pth",
+        "descriptor": "mkd",
+        "descriptor_weights": "mkd/mkd-cart-64.pth",
+        "affine_weights": "affnet/AffNet.pth",
+        "orientation_weights": "affnet/OriNet.pth",
+    },
+}  # variants of the front end `kornia`, with weights from the folder `weights` of VIO_DATA
+NAMES = ("klt", "orb", "sift", "oracle", *KORNIA)
+
+
 def builders(names: list[str], overrides: list[str]) -> dict[str, Builder]:
     """How to build each front end for a clip, with settings overridden by `key=value` below `frontend.`."""
-    settings = load_config(None, [f"frontend.{override}" for override in overrides]).frontend
 
     def builder(name: str) -> Builder:
         if name == "oracle":
-
-            def build(clip: Clip) -> Any:
-                if clip.simulation is None:
-                    return None
-                return OracleFrontend(clip.simulation.simulation, OracleSettings(max_features=350, sigma_px=0.0))
-
-            return build
-        return lambda clip: build_frontend(name, clip.camera, settings, _ClipDataset(clip))
+            return _oracle
+        learned = [
+            f"learned.{key}={data_folder() / 'weights' / value if key.endswith('_weights') else value}"
+            for key, value in KORNIA.get(name, {}).items()
+        ]
+        settings = load_config(None, [f"frontend.{override}" for override in [*learned, *overrides]]).frontend
+        kind = "kornia" if name in KORNIA else name
+        return lambda clip: build_frontend(kind, clip.camera, settings, _ClipDataset(clip))
 
     return {name: builder(name) for name in names}
+
+
+def _oracle(clip: Clip) -> Any:
+    assert clip.simulation is not None
+    return OracleFrontend(clip.simulation.simulation, OracleSettings(max_features=350, sigma_px=0.0))
 
 
 class _ClipDataset:
@@ -425,9 +462,10 @@ def _cell(summary: dict[str, float], *keys: str) -> str:
 def main() -> int:
     """Run the benchmark; print tables, and write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--names", nargs="+", default=["klt", "orb", "sift", "oracle"])
+    parser.add_argument("--names", nargs="+", default=["klt", "orb", "sift", "oracle"], choices=NAMES)
     parser.add_argument("--clips", nargs="+", default=[*RENDERED, *REAL], choices=[*RENDERED, *REAL])
     parser.add_argument("--frames", type=int, default=40, help="frames of each rendered clip")
+    parser.add_argument("--real-frames", type=int, help="frames of each KITTI clip (default: all)")
     parser.add_argument("--repeat", type=int, default=1, help="repetitions, for the times")
     parser.add_argument(
         "--set", action="append", default=[], help="setting below `frontend.`, such as klt.window_px=21"
@@ -438,7 +476,7 @@ def main() -> int:
     results: dict[str, dict[str, Any]] = {}
     try:
         with one_blas_thread():
-            for clip in clips(set(args.clips), args.frames):
+            for clip in clips(set(args.clips), args.frames, args.real_frames):
                 results[clip.name] = measure(clip, builders(args.names, args.set), args.repeat)
     except VioError as error:
         print(f"error: {error}", file=sys.stderr)
