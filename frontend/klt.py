@@ -45,6 +45,11 @@ _FEW = 0.5  # share of the least number of features below which corners without 
 _TRIED = 1.5  # corners aligned for each one that is missing
 _VERY_FEW = 0.25  # share below which new features are shown at once
 _RETRY_SHARE = 0.25  # share of failures at which tracking is tried again with all pyramid levels
+_SPARSE = 4  # every so many pixels of the half image tell its brightness
+_SPARSE_CONTRAST = 1.0  # gray levels; less is no contrast to compare
+_SAME_GAIN = 0.06  # change of contrast, and
+_SAME_LEVEL = 6.0  # of the mean gray level, that tracking bears
+_MAX_GAIN = 4.0
 _BANK_SPARE = 3  # templates in memory, over the number of features
 
 
@@ -264,12 +269,11 @@ class KltFrontend:
         even so, the prediction as a whole was wrong, and the search starts from where the features were.
         """
         old, settings = memory.tracks, self._settings
+        previous = _as_bright(memory.left.half, left.half)
         guess = self._predict(old, prior, expected, left.full)
         trusted = prior is not None or (memory.trusted and settings.guess == "motion")
         few = min(settings.trusted_levels, settings.pyramid_levels)
-        found, good = self._flow_both_ways(
-            memory.left.half, left, old.left, guess, few if trusted else settings.pyramid_levels
-        )
+        found, good = self._flow_both_ways(previous, left, old.left, guess, few if trusted else settings.pyramid_levels)
         attempts = [old.left] if not trusted else [guess, old.left]
         for k, start in enumerate(attempts):
             retry = np.flatnonzero(~good)
@@ -277,7 +281,7 @@ class KltFrontend:
             if len(retry) <= limit * len(old):
                 break
             found[retry], good[retry] = self._flow_both_ways(
-                memory.left.half, left, old.left[retry], start[retry], settings.pyramid_levels
+                previous, left, old.left[retry], start[retry], settings.pyramid_levels
             )
         return found, good
 
@@ -614,6 +618,17 @@ class KltFrontend:
             settings.min_peak_margin,
         )
         self._swap.check(frame, n, matched, int((unique & (disparity >= 1.0)).sum()))
+
+
+def _as_bright(image: Image, other: Image) -> Image:
+    """The image with the other's mean and contrast where they differ clearly: Lucas-Kanade compares gray levels."""
+    a, b = (part[::_SPARSE, ::_SPARSE].astype(np.float64) for part in (image, other))
+    gain = float(b.std() / max(a.std(), _SPARSE_CONTRAST))
+    if (abs(gain - 1) < _SAME_GAIN and abs(float(b.mean() - a.mean())) < _SAME_LEVEL) or gain <= 0:
+        return image
+    gain = min(max(gain, 1 / _MAX_GAIN), _MAX_GAIN)
+    levels = gain * (np.arange(256) - a.mean()) + b.mean()
+    return np.asarray(cv2.LUT(image, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8)
 
 
 def _common(tracks: _Tracks, rows: IntArray, ids: IntArray) -> tuple[IntArray, IntArray]:

@@ -14,7 +14,7 @@ from frontend.klt import KltFrontend
 from frontend.outliers import fit_motion
 from frontend.settings import KltSettings
 from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
-from vio.errors import DataError
+from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import FrontendOutput, StereoFrame, TrackPrior
@@ -273,6 +273,92 @@ def test_the_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutp
     frontend.process(StereoFrame(0, 0, left, right))
     left[:], right[:] = 0, 0
     np.testing.assert_array_equal(frontend.process(FRAMES[1]).observations.z, outputs[1].observations.z)
+
+
+def test_new_features_are_shown_after_their_probation(outputs: list[FrontendOutput]) -> None:
+    """Every id that appears after the first frame was found in an earlier frame: it was never new and fresh at once."""
+    held = run(FRAMES, replace(SETTINGS, target_features=300, probation_frames=1))
+    free = run(FRAMES, replace(SETTINGS, target_features=300, probation_frames=0))
+    late = [later.observations.ids[later.observations.ids > held[0].observations.ids.max()] for later in held[1:]]
+    assert sum(map(len, late)) > 0
+    assert held[1].detected <= free[1].detected + free[0].detected
+    once = [np.unique(np.concatenate([o.observations.ids for o in a]), return_counts=True)[1] for a in (held, free)]
+    # Of the features that can live for three frames or more, fewer are seen only once.
+    shares = [np.mean(counts == 1) for counts in once]
+    assert shares[0] <= shares[1]
+
+
+def test_rectification_that_is_off_is_learned_and_costs_no_disparity() -> None:
+    """The right camera is rolled by 0.15 degrees: rows differ by up to 0.6 px at the sides."""
+    roll = np.radians(0.15)
+    frames = []
+    for frame in FRAMES:
+        assert frame.right is not None
+        turn = np.array([[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0]])
+        centre = np.array([CAMERA.cu, CAMERA.cv])
+        turn[:, 2] = centre - turn[:, :2] @ centre
+        rolled = cv2.warpAffine(frame.right, turn, (480, 300), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        frames.append(replace(frame, right=np.asarray(rolled, dtype=np.uint8)))
+    for pose, output in list(zip(POSES, run(frames), strict=True))[2:]:
+        seen = output.observations.take(output.observations.has_right)
+        assert len(seen) > 0.7 * SETTINGS.target_features
+        expected = truth(SLANTED, pose, seen.z[:, :2], pose)[:, 2:]
+        turned = expected @ turn[:, :2].T + turn[:, 2]
+        assert np.median(np.abs(seen.z[:, 3] - turned[:, 1])) < 0.06
+        assert np.median(np.abs(seen.z[:, 2] - turned[:, 0])) < 0.05
+
+
+def test_a_step_of_exposure_keeps_the_tracks(outputs: list[FrontendOutput]) -> None:
+    brighter = []
+    for k, frame in enumerate(FRAMES[:4]):
+        assert frame.left is not None
+        assert frame.right is not None
+        gain = 1.0 if k % 2 == 0 else 0.7
+        pair = [np.rint(gain * image.astype(np.float64)).astype(np.uint8) for image in (frame.left, frame.right)]
+        brighter.append(replace(frame, left=pair[0], right=pair[1]))
+    stepped = run(brighter)
+    for k in range(3):
+        before, after = common(stepped[k], stepped[k + 1])
+        assert len(before) > 0.8 * len(stepped[k].observations)
+        error = np.linalg.norm(after[:, :2] - truth(SLANTED, POSES[k], before[:, :2], POSES[k + 1])[:, :2], axis=1)
+        assert np.median(error) < 0.06
+
+
+def test_the_mask_keeps_features_away(tmp_path: Path) -> None:
+    mask = np.full((300, 480), 255, dtype=np.uint8)
+    mask[150:] = 0
+    path = tmp_path / "mask.png"
+    cv2.imwrite(str(path), mask)
+    first = run(FRAMES[:1], replace(SETTINGS, mask=path))[0].observations
+    assert len(first) > 50
+    assert first.z[:, 1].max() < 151
+
+
+def test_a_wrong_mask_is_named(tmp_path: Path) -> None:
+    small = tmp_path / "small.png"
+    cv2.imwrite(str(small), np.zeros((20, 30), dtype=np.uint8))
+    with pytest.raises(ConfigError, match="mask is 30x20, but the images are 480x300"):
+        run(FRAMES[:1], replace(SETTINGS, mask=small))
+    with pytest.raises(ConfigError, match="cannot be read as an image"):
+        KltFrontend(CAMERA, replace(SETTINGS, mask=tmp_path / "none.png"))
+
+
+def test_a_wrong_prediction_is_given_up() -> None:
+    """The prior is off by 60 px everywhere; the search starts again from where the features were."""
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    seen = frontend.process(FRAMES[0]).observations
+    wrong = TrackPrior(seen.ids, seen.z + np.array([60.0, 25.0, 60.0, 25.0]))
+    assert frontend.process(FRAMES[1], wrong).tracked > 0.8 * len(seen)
+
+
+def test_a_prior_may_name_unknown_ids_and_hold_no_number() -> None:
+    plain, told = KltFrontend(CAMERA, SETTINGS), KltFrontend(CAMERA, SETTINGS)
+    seen = plain.process(FRAMES[0]).observations
+    told.process(FRAMES[0])
+    ids = np.concatenate([seen.ids[:5], np.array([10**6, 10**6 + 1])])
+    nothing = TrackPrior(ids, np.full((7, 4), np.nan))
+    a, b = plain.process(FRAMES[1]), told.process(FRAMES[1], nothing)
+    assert abs(a.tracked - b.tracked) <= 2
 
 
 def kitti(folder: Path, count: int) -> tuple[StereoCamera, list[StereoFrame], FloatArray]:
