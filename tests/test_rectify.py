@@ -96,8 +96,8 @@ def test_impossible_rigs_are_named() -> None:
     with pytest.raises(CalibrationError, match="baseline is zero"):
         rectify(replace(rig, T_imu_cam1=rig.T_imu_cam0))
     behind = rig.T_imu_cam0 @ se3_from_parts(so3_exp([0, np.pi, 0]), [0.1, 0, 0])
-    with pytest.raises(CalibrationError, match="opposite ways|turn the"):
+    with pytest.raises(CalibrationError, match=r"opposite ways|turn the"):
         rectify(replace(rig, T_imu_cam1=behind))
     aside = rig.T_imu_cam0 @ se3_exp([0.1, 0, 0, 0, 1.4, 0])
-    with pytest.raises(CalibrationError, match="share no field of view|turn the"):
+    with pytest.raises(CalibrationError, match=r"share no field of view|turn the"):
         rectify(replace(rig, T_imu_cam1=aside))

@@ -21,7 +21,7 @@ from typing import get_args
 import cv2
 import numpy as np
 
-from frontend.align import Warp, align, cut_patches, shift_warps, templates
+from frontend.align import align, cut_patches, shift_warps, templates
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rectified import Rectifier, make_rectifier
 from vio.datasets.settings import Interpolation
@@ -244,11 +244,12 @@ def _track(first: Image, second: Image, start: FloatArray, guess: FloatArray) ->
 
 
 def _align(
-    first: Image, second: Image, start: FloatArray, guess: FloatArray, warp: Warp
+    first: Image, second: Image, start: FloatArray, guess: FloatArray, *, same_row: bool
 ) -> tuple[FloatArray, BoolArray]:
     """The front end's own last step from where Lucas-Kanade ended: pixels (N, 2) and a mask of good fits."""
-    prepared = templates(cut_patches(first, start, _RADIUS))
-    warps, score = align(prepared, second, shift_warps(guess), warp, 12)
+    prepared = templates(cut_patches(first.astype(np.float32), start, _RADIUS))
+    rows = start[:, 1] if same_row else None
+    warps, score = align(prepared, np.arange(len(start)), second.astype(np.float32), shift_warps(guess), 12, rows)
     return warps[:, :2, 2], score > _CORRELATION
 
 
@@ -297,7 +298,7 @@ def tracking_errors(*, moments: int, noise: float = 1.5, seed: int = 3) -> list[
                     p, q = (_to_raw(scene, 0, start), _to_raw(scene, camera, guess)) if raw else (start, guess)
                     end, kept[name] = _track(*pair, p, q)
                     if tracker == _ALIGNED:
-                        end, fits = _align(*pair, p, end, "row" if stereo and not raw else "affine")
+                        end, fits = _align(*pair, p, end, same_row=stereo and not raw)
                         kept[name] = kept[name] & fits
                     ends[name] = _to_rectified(scene, camera, end) if raw else end
                 common = np.logical_and.reduce(list(kept.values()))

@@ -13,7 +13,7 @@ def add_parser(commands: Any) -> None:
         "run",
         help="process a recording",
         description="Process a recording and write a folder of results. The kind of SOURCE is seen from its content; "
-        "'kind:path' forces it (kitti, ece276a, utias, log).",
+        "'kind:path' forces it (kitti, kitti_raw, euroc, ece276a, utias, log).",
     )
     parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
     add_config_arguments(parser)
