@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from vio.threads import one_blas_thread
+
 ROOT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_blas_thread() -> Iterator[None]:
+    """As the command line does: on small matrices a second thread costs a hundred times what it brings."""
+    with one_blas_thread():
+        yield
 
 
 @pytest.fixture(scope="session")
