@@ -747,7 +747,11 @@ def judge_imu(alignment: ImuAlignment, lever: LeverArm | NotObservable, T_cam0_i
     if isinstance(lever, LeverArm):
         off_m = float(np.linalg.norm(lever.t_cam0_imu - t))
         limit_m = max(_NAMED_LEVER_M, 5 * float(np.linalg.norm(lever.sigma_m)))
-        others = {"its negative": -t, "the camera's position in the IMU frame": -R.T @ t}
+        others = {
+            "its negative": -t,
+            "as the camera's position in the IMU frame it": -R @ t,
+            "the inverse transform": -R.T @ t,
+        }
         nearest = min(others, key=lambda name: float(np.linalg.norm(lever.t_cam0_imu - others[name])))
         near_m = float(np.linalg.norm(lever.t_cam0_imu - others[nearest]))
         if off_m > limit_m and near_m < 0.5 * off_m:

@@ -49,6 +49,7 @@ _NS_PER_S = 1_000_000_000
 def quiet() -> None:
     """Keep COLMAP's own log to errors."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    pycolmap.logging.verbose_level = -1
 
 
 # --- models ---------------------------------------------------------------------------------------------------------
@@ -176,7 +177,7 @@ def _matrix(T: pycolmap.Rigid3d | None) -> FloatArray:
 
 
 def mean_reprojection_error_px(model: pycolmap.Reconstruction) -> float:
-    """Mean length of the residuals over all observations, as COLMAP computes it."""
+    """Mean over the points of the mean length of their residuals: COLMAP's own figure."""
     model.update_point_3d_errors()
     return float(model.compute_mean_reprojection_error())
 
@@ -227,7 +228,7 @@ def read_colmap_trajectory(folder: Path) -> Trajectory:
         raise DataError(f"{folder}: no COLMAP model (images.bin or images.txt, also looked for in sparse/0)")
     try:
         model = pycolmap.Reconstruction(place)
-    except (ValueError, RuntimeError, OSError) as error:
+    except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as error:
         raise DataError(f"{place}: pycolmap cannot read the model ({_one_line(error)}); export it again") from error
     images = [image for image in model.images.values() if image.has_pose and _is_reference(model, image)]
     if not images:
@@ -522,6 +523,7 @@ def match_images(database: Path, images: Path, names: ModelImages, camera: Stere
         verification_options=verification,
         device=pycolmap.Device.cpu,
     )
+    pairs.unlink()
 
 
 def _pairs(names: ModelImages) -> list[tuple[str, str]]:
@@ -613,8 +615,8 @@ def sift_matches(left: Image, right: Image, *, threads: int = 1) -> tuple[FloatA
     """Pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), outliers among them."""
     options = pycolmap.FeatureExtractionOptions(num_threads=threads)
     options.sift.max_num_features = _FEATURES
-    sift = pycolmap.Sift(options, device=pycolmap.Device.cpu)
-    (keys0, features0), (keys1, features1) = (sift.extract(np.ascontiguousarray(image)) for image in (left, right))
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    (keys0, features0), (keys1, features1) = (_features(extractor, image) for image in (left, right))
     if len(keys0) < 2 or len(keys1) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     likeness = features0 @ features1.T
@@ -623,8 +625,17 @@ def sift_matches(left: Image, right: Image, *, threads: int = 1) -> tuple[FloatA
     best1, best0 = np.argmin(distance, axis=1), np.argmin(distance, axis=0)
     two = np.partition(distance, 1, axis=1)[:, :2]
     good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _RATIO**2 * two[:, 1])
-    uv0, uv1 = (np.asarray(keys[:, :2], dtype=np.float64) - HALF_PX for keys in (keys0, keys1))
+    uv0, uv1 = (keys - HALF_PX for keys in (keys0, keys1))
     return uv0[good], uv1[best1[good]]
+
+
+def _features(extractor: pycolmap.FeatureExtractor, image: Image) -> tuple[FloatArray, npt.NDArray[np.float32]]:
+    """COLMAP's pixels (N, 2) of the features of an image, and their descriptors (N, 128)."""
+    keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(image))
+    if not len(keypoints):
+        return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
+    matrix = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float64)
+    return matrix[:, :2], np.asarray(descriptors.data, dtype=np.float32)
 
 
 def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:

@@ -43,6 +43,7 @@ _MIN_DEPTH_M = 0.05
 _POINT_STEPS = 8
 _POSE_STEPS = 12
 _LEAST_POSE_ROWS = 6
+_ALL_FRAMES = 300  # a shorter run is adjusted whole
 _SCENE_SHARE = 0.08  # of the median depth: a new keyframe is due after moving so far …
 _TURN_DEG = 6.0  # … or turning so far
 _LEAST_STRETCH = 20  # frames
@@ -128,6 +129,7 @@ def choose_keyframes(run: SavedRun, *, most: int | None = None) -> IntArray:
     """Rows (K,) of the trajectory that become keyframes: first and last, and whenever the view has changed enough.
 
     Enough is a share of the scene's median depth or a few degrees. Where that gives more than `most`, both limits grow.
+    Without `most`, a short run gives all of its frames.
 
     Raises:
         DataError: the run is shorter than two frames.
@@ -136,6 +138,8 @@ def choose_keyframes(run: SavedRun, *, most: int | None = None) -> IntArray:
     if len(T) < 2:
         raise DataError(f"{run.folder}: a run of {len(T)} frames has no two views; process more of the recording")
     step_m = _SCENE_SHARE * _median_depth_m(run)
+    if len(T) <= (_ALL_FRAMES if most is None else most):
+        return np.arange(len(T))
     factor = 1.0
     while True:
         chosen = [0]
@@ -412,7 +416,12 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
     Raises:
         DataError: the recording is gone, holds no images, has another camera, or a frame cannot be read.
     """
-    dataset = open_dataset(source or run.source)
+    try:
+        dataset = open_dataset(source or run.source)
+    except DataError as error:
+        raise DataError(
+            f"the images of {run.folder} are not to be had: {error}; name the recording with --source"
+        ) from error
     recording = dataset.recording
     if not recording.has_images:
         raise DataError(f"{source or run.source} holds no images; name the recording with --source or use --no-images")

@@ -30,6 +30,7 @@ MARKER = "calibration.json"
 _PAIRS = 30
 _FRAMES = 1200
 _STRETCH, _STRETCHES, _STRETCH_KEYFRAMES = 36, 6, 20  # frames, pieces, keyframes of each, for the rig in motion
+_CROOKED_PX = 2.0  # rows further apart than this are matched wrongly or not at all
 _HOPELESS = ("cameras swapped", "baseline translation inverted")  # features mean nothing then
 
 
@@ -159,14 +160,15 @@ def _raw_euroc(path: Path, refused: str) -> _Source | None:
 
 
 def _measure(source: _Source, pairs: int, frames: int, show: Callable[[int, int], None]) -> _Report:
-    from vio.calibration import NotObservable, camera_motion, judge_exchange, judge_stereo, row_residuals
+    from vio.calibration import NotObservable, RowResiduals, camera_motion, judge_exchange, judge_stereo, row_residuals
 
     notes = () if source.refused is None else (f"the reader refuses this calibration: {source.refused}",)
     tracks, samples = _tracks(source, frames) if not source.raw_pairs else (None, ())
     matches, z, exchanged = _stereo_matches(source, tracks, pairs, show)
     swapped = () if exchanged is None else judge_exchange(matches, exchanged, _given_baseline(source))
     stereo, matches = _stereo_estimate(matches)
-    rows: RowResiduals | NotObservable = NotObservable("row alignment", "the images cannot be rectified")
+    rows: RowResiduals | NotObservable
+    rows = NotObservable("row alignment", "the images cannot be rectified")
     imu: ImuAlignment | NotObservable
     lever: LeverArm | NotObservable
     if source.dataset is None:
@@ -176,8 +178,9 @@ def _measure(source: _Source, pairs: int, frames: int, show: Callable[[int, int]
     rows = row_residuals(z, *_size(source, z))
     recording = source.dataset.recording
     findings = swapped or _judged(source, stereo, matches)
-    if any(f.fault in _HOPELESS for f in findings):
-        why = f"{findings[0].fault}: mend that first"
+    crooked = isinstance(rows, RowResiduals) and abs(rows.median_px) + rows.spread_px > _CROOKED_PX
+    if crooked or any(f.fault in _HOPELESS for f in findings):
+        why = f"{findings[0].fault if findings else 'image rows do not match'}: mend that first, then measure again"
         imu, lever = NotObservable("IMU-camera rotation and time offset", why), NotObservable("lever arm", why)
         return _Report(source, stereo, rows, imu, lever, findings, notes)
     if tracks is None:

@@ -1,0 +1,444 @@
+"""Models as pycolmap reads them, refinement of simulated runs, and the commands that stand on both."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from tests.dataset_makers import make_kitti
+from vio import colmap
+from vio.cli import main
+from vio.config import Config
+from vio.datasets import open_dataset
+from vio.errors import DataError, EstimationError
+from vio.evaluation import rotation_angle_deg
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
+from vio.geometry.stereo import project
+from vio.mapping import (
+    Comparison,
+    SavedRun,
+    align_to_points,
+    build_tracks,
+    choose_keyframes,
+    compare_keyframes,
+    landmarks_of,
+    position_covariances,
+    read_saved_run,
+    reprojection,
+    triangulate_tracks,
+)
+from vio.pipeline import run as process
+from vio.records import Estimate
+from vio.run_folder import write_run_folder
+from vio.sim.effects import CLEAN
+from vio.sim.export import export_kitti
+from vio.sim.imu import ImuNoise
+from vio.sim.motion import hand_held
+from vio.sim.oracle import OracleFrontend, OracleSettings
+from vio.sim.rigs import small_rig
+from vio.sim.sequence import SimulatedRecording, Simulation, simulate
+from vio.sim.world import room
+
+SIGMA_PX = 0.3
+
+
+@pytest.fixture(scope="module")
+def simulation() -> Simulation:
+    motion = hand_held(duration_s=9.0, seed=2)
+    return simulate(room(1), small_rig(320, 200), motion, rate_hz=10.0, imu=ImuNoise(), effects=CLEAN, seed=1)
+
+
+def _make_run(simulation: Simulation, folder: Path, *, stop: int | None = None, lost_after: int | None = None) -> Path:
+    """A run's folder from exact geometry with noise, without rendering."""
+    settings = OracleSettings(max_features=120, sigma_px=SIGMA_PX, outlier_fraction=0.02, max_track_length=lost_after)
+    dataset = SimulatedRecording(simulation)
+    config = replace(Config(), backend="vislam", motion="none")
+    front = OracleFrontend(simulation, settings, seed=4)
+    result = process(dataset, config, frontend=front, stop=stop, keep_observations=True)
+    write_run_folder(folder, result, dataset.recording.reference, save_observations=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def whole_run(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _make_run(simulation, tmp_path_factory.mktemp("runs") / "whole")
+
+
+@pytest.fixture
+def folder(whole_run: Path, tmp_path: Path) -> Path:
+    out = tmp_path / "run"
+    shutil.copytree(whole_run, out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def saved(whole_run: Path) -> SavedRun:
+    return read_saved_run(whole_run)
+
+
+def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, object]:
+    assert main([*arguments, "--json"]) == 0
+    out: dict[str, object] = json.loads(capsys.readouterr().out)
+    return out
+
+
+def _error(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(list(arguments)) == 1
+    return capsys.readouterr().err
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+# --- keyframes, points, poses ---------------------------------------------------------------------------------------
+
+
+def test_keyframes_span_the_run_and_obey_their_limit(saved: SavedRun) -> None:
+    every = choose_keyframes(saved)
+    few = choose_keyframes(saved, most=8)
+    assert 2 < len(few) <= 8 < len(every)
+    for chosen in (every, few):
+        assert (chosen[0], chosen[-1]) == (0, len(saved.frames) - 1)
+        assert (np.diff(chosen) > 0).all()
+
+
+def test_points_of_exact_pixels_are_exact(saved: SavedRun) -> None:
+    keyframes = choose_keyframes(saved, most=8)
+    T = saved.trajectory.T_world_body[keyframes]
+    tracks = build_tracks(saved, keyframes, T)
+    T_cam0_world = se3_inverse(T)[tracks.keyframe]
+    p = np.einsum("nij,nj->ni", T_cam0_world[:, :3, :3], tracks.p_world[tracks.point]) + T_cam0_world[:, :3, 3]
+    exact = replace(tracks, z=project(saved.camera, p), p_world=tracks.p_world + 1.0)
+    again, valid = triangulate_tracks(saved.camera, T, exact)
+    assert valid.all()
+    np.testing.assert_allclose(again, tracks.p_world, atol=1e-6)
+    residual, ahead = reprojection(saved.camera, T, replace(exact, p_world=again))
+    assert ahead.all()
+    assert np.abs(residual).max() < 1e-5
+
+
+def test_a_pose_comes_back_from_points(saved: SavedRun) -> None:
+    rng = np.random.default_rng(0)
+    p_world = rng.uniform([-3, -2, 3], [3, 2, 9], (60, 3))
+    T_world_cam0 = se3_exp([0.2, -0.1, 0.3, 0.05, -0.1, 0.02])
+    z = project(saved.camera, transform_points(se3_inverse(T_world_cam0), p_world))
+    z[:9] += 40  # outliers
+    has_right = rng.random(60) < 0.8
+    start = T_world_cam0 @ se3_exp([0.05, 0.05, -0.05, 0.02, 0.01, -0.02])
+    found = align_to_points(saved.camera, start, p_world, z, has_right)
+    assert found is not None
+    np.testing.assert_allclose(found, T_world_cam0, atol=1e-4)
+    assert align_to_points(saved.camera, start, p_world[:4], z[:4], has_right[:4]) is None
+
+
+def test_covariances_of_positions_and_points_match_sampling(saved: SavedRun) -> None:
+    rng = np.random.default_rng(1)
+    T_cam0_imu = se3_exp([0.3, -0.2, 0.1, 0.4, 0.2, -0.3])
+    T_world_imu = se3_exp([1.0, 2.0, 3.0, 0.3, -0.4, 0.5])
+    A = rng.standard_normal((6, 6))
+    P = 1e-6 * (A @ A.T)
+    xi = rng.multivariate_normal(np.zeros(6), P, size=20000)
+    moved = se3_inverse(se3_exp(xi) @ se3_inverse(T_world_imu)) @ se3_inverse(T_cam0_imu)
+    cloud = np.cov(moved[:, :3, 3].T)
+    own = position_covariances([Estimate(0, T_world_imu, P)], T_cam0_imu)[0] - 1e-8 * np.eye(3)
+    np.testing.assert_allclose(own, cloud, atol=0.05 * np.abs(cloud).max())
+    keyframes = choose_keyframes(saved, most=6)
+    T = saved.trajectory.T_world_body[keyframes]
+    tracks = build_tracks(saved, keyframes, T)
+    covariance = landmarks_of(saved.camera, T, tracks, SIGMA_PX).covariance
+    assert (np.linalg.eigvalsh(covariance) > 0).all()
+
+
+# --- models ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_model_projects_as_our_camera_does_but_for_half_a_pixel(saved: SavedRun, tmp_path: Path) -> None:
+    keyframes = choose_keyframes(saved, most=8)
+    T = saved.trajectory.T_world_body[keyframes]
+    tracks = build_tracks(saved, keyframes, T)
+    names = colmap.ModelImages(
+        tuple(f"left/{k:06d}.png" for k in keyframes), tuple(f"right/{k:06d}.png" for k in keyframes)
+    )
+    colours = np.arange(3 * len(tracks.ids), dtype=np.int64).astype(np.uint8).reshape(-1, 3)
+    colmap.write_model(colmap.build_model(saved.camera, T, tracks, names, colours), tmp_path)
+    model = pycolmap.Reconstruction(tmp_path)
+    assert (model.num_cameras(), model.num_rigs(), model.num_frames()) == (2, 1, len(keyframes))
+    assert model.num_points3D() == len(tracks.ids)
+    b = saved.camera.baseline_m
+    offsets = {"left": np.zeros(3), "right": np.array([b, 0, 0])}
+    for image in model.images.values():
+        side, _, name = image.name.partition("/")
+        k = int(np.flatnonzero(keyframes == int(Path(name).stem))[0])
+        centre = transform_points(T[k], offsets[side])
+        np.testing.assert_allclose(image.projection_center(), centre, atol=1e-9)
+        rows = tracks.keyframe == k
+        rows &= tracks.has_right | (side == "left")
+        column = slice(0, 2) if side == "left" else slice(2, 4)
+        ours = project(saved.camera, transform_points(se3_inverse(T[k]), tracks.p_world[tracks.point[rows]]))
+        np.testing.assert_allclose([p.xy for p in image.points2D], tracks.z[rows][:, column] + 0.5)
+        for point, uv in zip(image.points2D, ours[:, column], strict=True):
+            p_world = model.point3D(point.point3D_id).xyz
+            seen = model.camera(image.camera_id).img_from_cam(image.cam_from_world() * p_world)
+            np.testing.assert_allclose(seen, uv + 0.5, atol=1e-9)
+    np.testing.assert_array_equal(model.point3D(5).color, colours[4])
+    residual, _ = reprojection(saved.camera, T, tracks)
+    left, right = np.linalg.norm(residual[:, :2], axis=1), np.linalg.norm(residual[:, 2:], axis=1)
+    total = np.bincount(tracks.point, left + right) / np.bincount(tracks.point, 1.0 + tracks.has_right)
+    assert colmap.mean_reprojection_error_px(model) == pytest.approx(total.mean(), rel=1e-9)
+
+
+@pytest.mark.parametrize("stamped", [False, True])
+def test_a_model_is_read_as_a_trajectory(saved: SavedRun, tmp_path: Path, stamped: bool) -> None:
+    keyframes = choose_keyframes(saved, most=6)
+    T = saved.trajectory.T_world_body[keyframes]
+    tracks = build_tracks(saved, keyframes, T)
+    numbers = 1403715273262142976 + 10**8 * keyframes if stamped else keyframes
+    names = colmap.ModelImages(tuple(f"cam0/{k}.png" for k in numbers), tuple(f"cam1/{k}.png" for k in numbers))
+    place = tmp_path / "sparse" / "0"
+    place.mkdir(parents=True)
+    colmap.write_model(colmap.build_model(saved.camera, T, tracks, names), place)
+    found = colmap.read_colmap_trajectory(tmp_path)
+    assert found.body == "cam0"
+    np.testing.assert_allclose(found.T_world_body, T, atol=1e-12)
+    assert (found.times_ns is not None) == stamped
+    assert ((found.times_ns if stamped else found.frame_indices) == numbers).all()
+    with pytest.raises(DataError, match="no COLMAP model"):
+        colmap.read_colmap_trajectory(place.parent.parent / "nothing")
+    (place / "points3D.bin").write_bytes(b"broken")
+    (place / "images.bin").write_bytes(b"broken")
+    with pytest.raises(DataError, match="cannot read the model"):
+        colmap.read_colmap_trajectory(tmp_path)
+
+
+# --- refinement -----------------------------------------------------------------------------------------------------
+
+
+def test_refine_lowers_the_error_and_leaves_the_run_as_it_was(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = _contents(folder)
+    first = _json(capsys, "refine", str(folder))
+    after = _contents(folder)
+    assert {name: data for name, data in after.items() if not name.startswith("refined")} == before
+    assert isinstance(first["ate_m"], float)
+    assert isinstance(first["ate_before_m"], float)
+    assert first["ate_m"] < 0.9 * first["ate_before_m"]
+    assert first["sigma_px"] == pytest.approx(SIGMA_PX, rel=0.2)
+    again = _json(capsys, "refine", str(folder))
+    assert again["ate_m"] == first["ate_m"], "one thread repeats to the bit"
+    assert _contents(folder)["refined/trajectory.tum"] == after["refined/trajectory.tum"]
+    scores = _json(capsys, "eval", str(folder / "refined"), str(folder))
+    assert 0 < float(str(scores["ate_m"])) < 2 * first["ate_before_m"]
+
+
+def test_priors_need_a_filter_that_repeats_itself(
+    folder: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    held = _json(capsys, "refine", str(folder), "--priors", "filter", "--keyframes", "12")
+    assert held["priors"] == "filter"
+    free = _json(capsys, "refine", str(folder), "--keyframes", "12")
+    assert float(str(held["moved_rms_m"])) < float(str(free["moved_rms_m"])), "priors hold on to the filter"
+    config = (folder / "config.yaml").read_text()
+    assert "pixel_sigma_px: 0.75" in config
+    (folder / "config.yaml").write_text(config.replace("pixel_sigma_px: 0.75", "pixel_sigma_px: 2.5"))
+    other = _json(capsys, "refine", str(folder), "--priors", "filter", "--keyframes", "12")
+    assert other["priors"] == "none"
+    assert "does not repeat" in caplog.text
+
+
+def test_an_interrupted_refinement_leaves_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = _contents(folder)
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vio.run_folder.landmarks_ply", interrupted)  # in the midst of writing
+    assert main(["refine", str(folder)]) == 130
+    capsys.readouterr()
+    assert _contents(folder) == before
+    assert sorted(p.name for p in folder.parent.iterdir()) == ["run"]
+
+
+def test_what_cannot_be_refined_is_said(
+    simulation: Simulation, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "no run folder" in _error(capsys, "refine", str(tmp_path))
+    short = _make_run(simulation, tmp_path / "short", stop=1)
+    assert "a run of 1 frames has no two views" in _error(capsys, "refine", str(short))
+    blink = _make_run(simulation, tmp_path / "blink", stop=20, lost_after=1)
+    message = _error(capsys, "refine", str(blink))
+    assert "not observable because no feature is seen consistently in 2 keyframes" in message
+    assert "do not overlap" in message
+    assert not (blink / "refined").exists()
+    (folder / "observations.npz").unlink()
+    assert "repeat its run with --save-observations" in _error(capsys, "refine", str(folder))
+
+
+# --- export ---------------------------------------------------------------------------------------------------------
+
+
+def test_export_without_images_is_a_reference_for_eval(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    facts = _json(capsys, "export", "colmap", str(folder), "--no-images")
+    assert float(str(facts["mean_reprojection_error_px"])) < 2 * SIGMA_PX
+    scores = _json(capsys, "eval", str(folder), str(folder / "colmap"))
+    assert scores["association"] == "frame"
+    assert float(str(scores["ate_m"])) < 1e-9
+    document = json.loads((folder / "colmap" / "transforms.json").read_text())
+    model = pycolmap.Reconstruction(folder / "colmap" / "sparse" / "0")
+    assert len(document["frames"]) == model.num_images()
+    for entry in document["frames"]:
+        image = model.find_image_with_name(entry["file_path"].removeprefix("images/"))
+        c2w = np.array(entry["transform_matrix"])
+        np.testing.assert_allclose(c2w[:3, 3], image.projection_center(), atol=1e-9)
+        np.testing.assert_allclose(-c2w[:3, 2], image.viewing_direction(), atol=1e-9)
+    camera = model.camera(1)
+    assert [document[k] for k in ("fl_x", "fl_y", "cx", "cy")] == pytest.approx(list(camera.params))
+    _json(capsys, "refine", str(folder))
+    refined = _json(capsys, "export", "colmap", str(folder), "--no-images", "--refined")
+    assert float(str(refined["mean_reprojection_error_px"])) < float(str(facts["mean_reprojection_error_px"]))
+
+
+def test_export_wants_images_and_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "name the recording with --source" in _error(capsys, "export", "colmap", str(folder))
+    assert not (folder / "colmap").exists()
+    assert "make it with `vio refine" in _error(capsys, "export", "colmap", str(folder), "--refined")
+
+
+# --- rendered images ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A KITTI folder of 14 rendered frames, and a run on it with exact tracks."""
+    place = tmp_path_factory.mktemp("rendered")
+    motion = hand_held(duration_s=5.0, seed=2)
+    plan = simulate(room(1, texel_m=0.006), small_rig(320, 200), motion, rate_hz=3.0, effects=CLEAN, seed=1)
+    export_kitti(SimulatedRecording(plan), place / "kitti")
+    dataset = open_dataset(place / "kitti")
+    front = OracleFrontend(plan, OracleSettings(max_features=80, sigma_px=0.1), seed=1)
+    config = replace(Config(), backend="vislam", motion="none")
+    result = process(dataset, config, frontend=front, keep_observations=True)
+    write_run_folder(place / "run", result, dataset.recording.reference, save_observations=True)
+    return place / "kitti", place / "run"
+
+
+def test_export_writes_images_and_colours(
+    rendered: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "model"
+    facts = _json(capsys, "export", "colmap", str(rendered[1]), "--out", str(out), "--keyframes", "6")
+    model = pycolmap.Reconstruction(out / "sparse" / "0")
+    assert facts["images"] == model.num_images()
+    assert all((out / "images" / image.name).is_file() for image in model.images.values())
+    gray = np.array([point.color for point in model.points3D.values()])
+    assert gray.std() > 10, "colours come from the images"
+    ours = {m: c.copy() for m, c in zip(model.points3D, gray, strict=True)}
+    for point in model.points3D.values():
+        point.color = np.zeros(3, dtype=np.uint8)
+    model.extract_colors_for_all_images(out / "images", num_threads=1)
+    theirs = np.array([point.color for point in model.points3D.values()], dtype=float)
+    mine = np.array([ours[m] for m in model.points3D], dtype=float)
+    assert np.corrcoef(mine[:, 0], theirs[:, 0])[0, 1] > 0.9, "COLMAP finds the same colours at the same places"
+
+
+def test_check_agrees_with_a_good_run_and_gives_the_scale(
+    rendered: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = _json(capsys, "check", str(rendered[1]), "--mapper", "incremental", "--keyframes", "9")
+    facts = report["mappers"]["incremental"]  # type: ignore[index]
+    assert facts["registered"] == report["keyframes"]
+    assert facts["ate_m"] < 0.02
+    assert facts["scale"] == pytest.approx(1.0, abs=0.02)
+    assert (rendered[1] / "check" / "check.png").stat().st_size > 10_000
+    assert sorted(p.name for p in (rendered[1] / "check").iterdir()) == ["check.json", "check.png", "incremental"]
+
+
+def test_images_without_texture_give_a_verdict_not_a_number(
+    rendered: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    blank = tmp_path / "blank"
+    shutil.copytree(rendered[0], blank)
+    for path in blank.glob("image_*/*.png"):
+        import cv2
+
+        cv2.imwrite(str(path), np.full((200, 320), 120, dtype=np.uint8))
+    report = _json(capsys, "check", str(rendered[1]), "--source", str(blank), "--keyframes", "5")
+    for facts in report["mappers"].values():  # type: ignore[attr-defined]
+        assert facts["verdict"].startswith("not observable because")
+        assert facts["registered"] == 0
+    facts = _json(capsys, "calibrate", str(blank), "--out", str(tmp_path / "cal"), "--pairs", "3", "--frames", "6")
+    assert "have no texture" in facts["stereo"]["verdict"]  # type: ignore[index]
+    assert facts["findings"] == []
+
+
+def test_calibrate_measures_rectified_images_and_finds_swapped_ones(
+    rendered: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "cal"
+    facts = _json(capsys, "calibrate", str(rendered[0]), "--out", str(out), "--pairs", "5", "--frames", "8")
+    assert facts["findings"] == []
+    R = np.array(facts["stereo"]["R_cam1_cam0"])  # type: ignore[index]
+    assert float(rotation_angle_deg(R)) < 0.3
+    assert (out / "camchain-imucam.yaml").is_file()
+    assert (out / "cam1" / "sensor.yaml").is_file()
+    swapped = tmp_path / "swapped"
+    shutil.copytree(rendered[0], swapped)
+    (swapped / "image_0").rename(swapped / "aside")
+    (swapped / "image_1").rename(swapped / "image_0")
+    (swapped / "aside").rename(swapped / "image_1")
+    facts = _json(capsys, "calibrate", str(swapped), "--out", str(out), "--pairs", "5", "--frames", "8")
+    assert [f["fault"] for f in facts["findings"]] == ["cameras swapped"]  # type: ignore[attr-defined]
+
+
+# --- comparison -----------------------------------------------------------------------------------------------------
+
+
+def test_a_comparison_finds_scale_and_the_place_of_a_jump(saved: SavedRun) -> None:
+    rows = choose_keyframes(saved, most=30)
+    rng = np.random.default_rng(2)
+    T = saved.trajectory.T_world_body[rows].copy()
+    T[:, :3, 3] += 1e-4 * rng.standard_normal((len(rows), 3))
+    T[:, :3, 3] *= 1.01
+    jump = len(rows) // 2
+    T[jump:, :3, 3] += [0.05, 0, 0]
+    found: Comparison = compare_keyframes(saved, rows, se3_exp([1, 2, 3, 0.1, 0.2, 0.3]) @ T)
+    assert found.scale == pytest.approx(1.01, abs=0.03)
+    assert len(found.segments) == 1
+    assert (found.segments[0].first_frame, found.segments[0].last_frame) == (
+        int(saved.frames[rows[jump - 1]]),
+        int(saved.frames[rows[jump]]),
+    )
+    assert found.segments[0].difference_m == pytest.approx(0.05, rel=0.2)
+
+
+def test_pure_rotation_has_no_scale(saved: SavedRun) -> None:
+    rows = np.arange(10)
+    still = np.repeat(np.eye(4)[None], len(saved.frames), axis=0)
+    still[:, :3, :3] = so3_exp(np.linspace(0, 1, len(saved.frames))[:, None] * [0.0, 1.0, 0.0])
+    turning = replace(saved, trajectory=replace(saved.trajectory, T_world_body=still))
+    noisy: FloatArray = still[rows].copy()
+    noisy[:, :3, 3] = 1e-3 * np.random.default_rng(0).standard_normal((10, 3))
+    found = compare_keyframes(turning, rows, noisy)
+    assert found.scale is None
+    assert found.why_no_scale is not None
+    assert "does not move" in found.why_no_scale
+
+
+def test_a_run_without_right_matches_says_why(saved: SavedRun) -> None:
+    tracks = replace(saved.dataset.tracks, has_right=np.zeros_like(saved.dataset.tracks.has_right))
+    blind = replace(saved, dataset=replace(saved.dataset, tracks=tracks))
+    with pytest.raises(EstimationError, match="not observable because no feature has a right match"):
+        choose_keyframes(blind)
+
+
+def test_a_kitti_folder_of_noise_is_not_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = make_kitti(tmp_path / "kitti")
+    facts = _json(capsys, "calibrate", str(source), "--out", str(tmp_path / "cal"), "--pairs", "3", "--frames", "4")
+    assert "not observable because" in facts["stereo"]["verdict"]  # type: ignore[index]
