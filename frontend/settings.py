@@ -57,7 +57,7 @@ class KltSettings:
     probation_frames: int = setting(
         1, "frames for which a new corner must hold, in time and stereo, before it is shown"
     )
-    wanted_life_frames: int = setting(8, "frames for which a new corner should stay in the image")
+    wanted_life_frames: int = setting(7, "frames for which a new corner should stay in the image")
     least_features: float = setting(
         0.7, "share of the features to keep alive, below which corners that leave sooner are taken too"
     )
