@@ -50,7 +50,7 @@ SIGMA_PX = 0.3
 
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
-    motion = hand_held(duration_s=9.0, seed=2)
+    motion = hand_held(duration_s=6.0, seed=2)
     return simulate(room(1), small_rig(320, 200), motion, rate_hz=10.0, imu=ImuNoise(), effects=CLEAN, seed=1)
 
 
