@@ -18,7 +18,7 @@ from vio.datasets import open_dataset
 from vio.errors import VioError
 from vio.evaluation import KITTI_LENGTHS_M
 from vio.pipeline import run
-from vio.records import Estimate, FrontendOutput, Recording, Trajectory, UpdateReport
+from vio.records import Estimate, FrontendOutput, UpdateReport
 from vio.run_folder import MARKER, write_run_folder
 from vio.threads import one_blas_thread
 from vio.trajectory_io import read_trajectory
@@ -84,7 +84,7 @@ def process(
     recording = dataset.recording
     for note in recording.notes:
         log.warning("%s", note)
-    truth = recording.reference if reference is None else read_reference(reference, recording)
+    truth = recording.reference if reference is None else read_trajectory(reference)
     folder = check_out(out) if out is not None else free_folder(recording.path)
     total = len(recording.frame_times_ns)
     frames = max(min(total, total if stop is None else stop) - start, 0)
@@ -94,11 +94,6 @@ def process(
     return write_run_folder(
         folder, result, truth, lengths_m=lengths_m or KITTI_LENGTHS_M, save_observations=save_observations
     )
-
-
-def read_reference(path: Path, recording: Recording) -> Trajectory:
-    """Read ground truth; what a file does not say of the frame it describes follows from its form."""
-    return read_trajectory(path)
 
 
 def check_out(folder: Path) -> Path:

@@ -6,19 +6,25 @@ decoded.
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import struct
 import zlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 
+from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
-from vio.records import Image
+from vio.records import Image, StereoFrame
+
+logger = logging.getLogger(__name__)
 
 SUFFIXES = (".png", ".jpg", ".jpeg")
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -151,3 +157,33 @@ def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) 
             yield result
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@dataclass(frozen=True, slots=True)
+class BadFrame:
+    """A frame with an unreadable image, and why."""
+
+    index: int
+    why: str
+
+
+def readable_frames(
+    load: Callable[[int], StereoFrame | BadFrame], chosen: Iterable[int], settings: DatasetSettings
+) -> Generator[StereoFrame]:
+    """Load frames ahead in a thread, leaving unreadable ones out with a warning up to the limit of the settings.
+
+    Raises:
+        DataError: too many frames are unreadable, or whatever `load` raises.
+    """
+    bad = 0
+    with contextlib.closing(prefetch(load, chosen, settings.prefetch_frames)) as loaded:
+        for frame in loaded:
+            if isinstance(frame, StereoFrame):
+                yield frame
+                continue
+            bad += 1
+            if bad > settings.max_bad_frames:
+                raise DataError(
+                    f"{frame.why} ({bad} unreadable frames, dataset.max_bad_frames allows {settings.max_bad_frames})"
+                )
+            logger.warning("frame %d is skipped: %s", frame.index, frame.why)

@@ -10,9 +10,7 @@ KITTI's poses and `T_cam0_imu.txt` describe camera 0. Where the colour pair is u
 
 from __future__ import annotations
 
-import contextlib
-import logging
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,10 +26,11 @@ from vio.datasets.common import (
     velocity_samples,
 )
 from vio.datasets.images import (
+    BadFrame,
     UnreadableImageError,
     load_gray,
     pair_images,
-    prefetch,
+    readable_frames,
     refuse_other_size,
 )
 from vio.datasets.settings import DatasetSettings
@@ -40,8 +39,6 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import Event, IntArray, Observations, Recording, StereoFrame, Trajectory, VelocitySample
 from vio.trajectory_io import read_trajectory
-
-logger = logging.getLogger(__name__)
 
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 _GRAY, _COLOUR = (0, 1), (2, 3)
@@ -54,14 +51,6 @@ class _Calibration:
     camera: StereoCamera  # without image size
     T_left_cam0: FloatArray  # (4, 4) from KITTI's camera 0 to the left camera used
     off_axis_m: float  # distance of the right camera from the left one's x axis
-
-
-@dataclass(frozen=True, slots=True)
-class _BadFrame:
-    """A frame with an unreadable image, and why."""
-
-    index: int
-    why: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +72,7 @@ class KittiDataset:
             DataError: the range holds no frame, images differ in size, or too many are unreadable.
         """
         chosen = frame_range(self.recording, start, stop)
-        frames = self._frames(chosen) if images else (self._frame(k) for k in chosen)
+        frames = readable_frames(self._load, chosen, self.settings) if images else (self._frame(k) for k in chosen)
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def observations(self, index: int) -> Observations | None:
@@ -93,23 +82,7 @@ class KittiDataset:
     def _frame(self, index: int) -> StereoFrame:
         return StereoFrame(index, int(self.recording.frame_times_ns[index]), None, None)
 
-    def _frames(self, chosen: range) -> Generator[StereoFrame]:
-        bad = 0
-        loaded = prefetch(self._load, chosen, self.settings.prefetch_frames)
-        with contextlib.closing(loaded):
-            for frame in loaded:
-                if isinstance(frame, StereoFrame):
-                    yield frame
-                    continue
-                bad += 1
-                if bad > self.settings.max_bad_frames:
-                    raise DataError(
-                        f"{frame.why} ({bad} unreadable frames, dataset.max_bad_frames allows "
-                        f"{self.settings.max_bad_frames})"
-                    )
-                logger.warning("frame %d is skipped: %s", frame.index, frame.why)
-
-    def _load(self, index: int) -> StereoFrame | _BadFrame:
+    def _load(self, index: int) -> StereoFrame | BadFrame:
         camera = self.recording.camera
         assert camera.width is not None
         assert camera.height is not None
@@ -117,7 +90,7 @@ class KittiDataset:
         try:
             left, right = load_gray(left_path)[0], load_gray(right_path)[0]
         except UnreadableImageError as error:
-            return _BadFrame(index, str(error))
+            return BadFrame(index, str(error))
         if left.shape != right.shape:
             refuse_other_size(right, right_path, left.shape[1], left.shape[0], left_path)
         refuse_other_size(left, left_path, camera.width, camera.height, self.measured)

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from vio.datasets.common import frame_range, merge_events
-from vio.datasets.images import UnreadableImageError, load_gray, prefetch
+from vio.datasets.images import BadFrame, UnreadableImageError, load_gray, readable_frames
 from vio.datasets.settings import DatasetSettings, Interpolation
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import StereoRig
@@ -19,8 +17,6 @@ from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.rectify import MapArray, rectified_pair, rectify
 from vio.geometry.stereo import StereoCamera
 from vio.records import Event, Image, IntArray, MotionSample, Observations, Recording, StereoFrame
-
-logger = logging.getLogger(__name__)
 
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
 
@@ -82,14 +78,6 @@ def _remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpo
 
 
 @dataclass(frozen=True, slots=True)
-class _BadFrame:
-    """A frame with an unreadable image, and why."""
-
-    index: int
-    why: str
-
-
-@dataclass(frozen=True, slots=True)
 class RectifiedDataset:
     """Implements `vio.protocols.Dataset` over image files of real cameras; its frames are rectified."""
 
@@ -110,7 +98,11 @@ class RectifiedDataset:
             DataError: the range holds no frame, an image has not the calibrated size, or too many are unreadable.
         """
         chosen = frame_range(self.recording, start, stop)
-        frames = self._frames(chosen) if images else (self._frame(k, None, None) for k in chosen)
+        frames = (
+            readable_frames(self._load, chosen, self.settings)
+            if images
+            else (self._frame(k, None, None) for k in chosen)
+        )
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def observations(self, index: int) -> Observations | None:
@@ -120,28 +112,12 @@ class RectifiedDataset:
     def _frame(self, index: int, left: Image | None, right: Image | None) -> StereoFrame:
         return StereoFrame(index, int(self.recording.frame_times_ns[index]), left, right)
 
-    def _frames(self, chosen: range) -> Generator[StereoFrame]:
-        bad = 0
-        loaded = prefetch(self._load, chosen, self.settings.prefetch_frames)
-        with contextlib.closing(loaded):
-            for frame in loaded:
-                if isinstance(frame, StereoFrame):
-                    yield frame
-                    continue
-                bad += 1
-                if bad > self.settings.max_bad_frames:
-                    raise DataError(
-                        f"{frame.why} ({bad} unreadable frames, dataset.max_bad_frames allows "
-                        f"{self.settings.max_bad_frames})"
-                    )
-                logger.warning("frame %d is skipped: %s", frame.index, frame.why)
-
-    def _load(self, index: int) -> StereoFrame | _BadFrame:
+    def _load(self, index: int) -> StereoFrame | BadFrame:
         """Read and rectify one frame; runs in the prefetch thread."""
         try:
             left, right = (load_gray(path)[0] for path in self.pairs[index])
         except UnreadableImageError as error:
-            return _BadFrame(index, str(error))
+            return BadFrame(index, str(error))
         rig = self.rectifier.rig
         for image, path, camera, calibration in zip(
             (left, right), self.pairs[index], (rig.cam0, rig.cam1), self.calibrated_in, strict=True
