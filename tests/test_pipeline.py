@@ -108,7 +108,7 @@ def test_two_runs_give_the_same_bits() -> None:
 
 def test_only_selected_stereo_rows_reach_the_filter() -> None:
     class Half:
-        def select(self, rows: Observations):  # type: ignore[no-untyped-def]
+        def select(self, rows: Observations, motion=None):  # type: ignore[no-untyped-def]
             from vio.records import Selection
 
             return Selection(rows.ids % 2 == 0, np.zeros(len(rows)), "even ids")

@@ -10,6 +10,7 @@ from vio.records import (
     Event,
     FrontendOutput,
     Landmarks,
+    MotionPrior,
     MotionSample,
     Observations,
     Recording,
@@ -52,8 +53,13 @@ class Frontend(Protocol):
 class Selector(Protocol):
     """Decides which observations enter the filter's update."""
 
-    def select(self, observations: Observations) -> Selection:
-        """Rank the observations of one frame; called once per frame, in time order."""
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
+        """Rank the observations of one frame; called once per frame, in time order.
+
+        Args:
+            observations: all that the front end saw in the frame.
+            motion: what the back end expects of the motion since the last frame, where it can tell.
+        """
 
 
 class Backend(Protocol):

@@ -115,6 +115,14 @@ class TrackPrior:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionPrior:
+    """What the back end expects of the left camera's motion from the last frame to the coming one."""
+
+    T_curr_prev: FloatArray  # (4, 4) maps the previous cam0 frame into the coming one
+    covariance: FloatArray  # (6, 6) of xi in T_curr_prev = exp(xi) T_hat, [rho; phi], m and rad
+
+
+@dataclass(frozen=True, slots=True)
 class FrontendOutput:
     """The observations of one frame and what it took to get them."""
 

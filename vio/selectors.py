@@ -15,7 +15,7 @@ import numpy as np
 from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray
 from vio.protocols import Selector
-from vio.records import BoolArray, IntArray, Observations, Selection
+from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selection
 from vio.setting import setting
 
 SelectorName = Literal["all", "visibility", "visibility_whole", "grid"]
@@ -57,7 +57,7 @@ class _VisibilityCount:
 class KeepAll:
     """Keeps every observation."""
 
-    def select(self, observations: Observations) -> Selection:
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose all rows."""
         n = len(observations)
         return Selection(np.ones(n, dtype=np.bool_), np.zeros(n), "all")
@@ -69,7 +69,7 @@ class CausalVisibility:
     def __init__(self, keep_fraction: float, minimum: int) -> None:
         self._seen, self._fraction, self._minimum = _VisibilityCount(), keep_fraction, minimum
 
-    def select(self, observations: Observations) -> Selection:
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose the most often seen rows; ties go to the older feature."""
         score = self._seen.add(observations.ids)
         budget = _budget(len(score), self._fraction, self._minimum)
@@ -87,7 +87,7 @@ class WholeRecordVisibility:
         self._rank = {feature: position for position, feature in enumerate(ranked)}
         self._kept = int(len(ranked) * keep_fraction)
 
-    def select(self, observations: Observations) -> Selection:
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose the rows whose feature belongs to the kept share of the whole record."""
         rank = np.array([self._rank[i] for i in observations.ids.tolist()], dtype=np.float64)
         return Selection(rank < self._kept, -rank, f"most seen in the record, {self._kept} of {len(self._rank)}")
@@ -99,7 +99,7 @@ class GridVisibility:
     def __init__(self, settings: SelectorSettings, width: int, height: int) -> None:
         self._seen, self._settings, self._size = _VisibilityCount(), settings, (width, height)
 
-    def select(self, observations: Observations) -> Selection:
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose rows in rounds: the best of each cell, then the second best of each, until the budget is met."""
         s, (width, height) = self._settings, self._size
         score = self._seen.add(observations.ids)
