@@ -127,6 +127,7 @@ class FrontendSettings:
     features: Path | None = setting(
         None, "observation log or feature file to take in place of the recording's own, for the precomputed front end"
     )
+    prior: bool = setting(True, "let the filter tell the front end where it expects the features")
     klt: KltSettings = field(default_factory=KltSettings, metadata={"doc": "corner tracking", "unit": ""})
     match: MatchSettings = field(default_factory=MatchSettings, metadata={"doc": "descriptor matching", "unit": ""})
     learned: LearnedSettings = field(default_factory=LearnedSettings, metadata={"doc": "kornia and torch", "unit": ""})

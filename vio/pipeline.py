@@ -152,12 +152,14 @@ def run(
                     samples.append(event)
                 continue
             marks = [clock, time.perf_counter()]
-            output = frontend.process(event)
+            expected = backend.predict(event.time_ns)
+            marks.append(time.perf_counter())
+            output = frontend.process(event, None if expected is None or not config.frontend.prior else expected.tracks)
             marks.append(time.perf_counter())
             seen = output.observations
             if config.backend == "vislam":  # the paper's filter knows stereo observations only
                 seen = seen.take(seen.has_right)
-            selection = selector.select(seen)
+            selection = selector.select(seen, None if expected is None else expected.motion)
             marks.append(time.perf_counter())
             report = backend.update(seen.take(selection.chosen))
             estimate = backend.estimate()
@@ -284,14 +286,14 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
 def _frame_log(
     frame: StereoFrame, marks: list[float], output: FrontendOutput, selection: Selection, report: UpdateReport
 ) -> FrameLog:
-    read, front, select, filtered = (1e3 * (b - a) for a, b in pairwise(marks))
+    read, predict, front, select, update = (1e3 * (b - a) for a, b in pairwise(marks))
     return FrameLog(
         index=frame.index,
         time_ns=frame.time_ns,
         read_ms=read,
         frontend_ms=front,
         select_ms=select,
-        filter_ms=filtered,
+        filter_ms=predict + update,
         detected=output.detected,
         tracked=output.tracked,
         matched=output.matched,

@@ -13,6 +13,7 @@ from vio.records import (
     MotionPrior,
     MotionSample,
     Observations,
+    Prediction,
     Recording,
     Selection,
     StereoFrame,
@@ -67,6 +68,9 @@ class Backend(Protocol):
 
     def propagate(self, sample: MotionSample) -> None:
         """Take one motion sample; samples come in time order."""
+
+    def predict(self, time_ns: int) -> Prediction | None:
+        """Tell what a frame at a coming time should show, without changing anything; None where it cannot be told."""
 
     def update(self, observations: Observations) -> UpdateReport:
         """Move to the time of the observations and take them in."""

@@ -123,6 +123,14 @@ class MotionPrior:
 
 
 @dataclass(frozen=True, slots=True)
+class Prediction:
+    """What the back end expects of the coming frame before it has seen it."""
+
+    tracks: TrackPrior
+    motion: MotionPrior
+
+
+@dataclass(frozen=True, slots=True)
 class FrontendOutput:
     """The observations of one frame and what it took to get them."""
 

@@ -40,9 +40,12 @@ from vio.records import (
     ImuSample,
     IntArray,
     Landmarks,
+    MotionPrior,
     MotionSample,
     MotionSource,
     Observations,
+    Prediction,
+    TrackPrior,
     UpdateReport,
     VelocitySample,
 )
@@ -55,6 +58,8 @@ _MIN_TRACKS_FOR_NOISE = 15
 _MAX_WAIT_FRAMES = 20
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 _VIEW_LIMIT = 23.5  # chi-square with 4 degrees of freedom, probability 0.9999
+_MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
+_NO_STEP = (np.eye(DIM), np.zeros((DIM, DIM)))
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 
 
@@ -98,6 +103,7 @@ class Msckf:
         self._waited = 0
         self._sigma2 = settings.pixel_sigma_px**2
         self._output: FloatArray = np.zeros((DIM, DIM))
+        self._since_frame: tuple[FloatArray, FloatArray] = _NO_STEP  # transition and noise since the last frame
         self._map: list[Landmarks] = []
 
     def propagate(self, sample: MotionSample) -> None:
@@ -113,6 +119,35 @@ class Msckf:
         if isinstance(sample, VelocitySample) and self._window is not None:
             self._advance(sample.time_ns)
             self._measure()
+
+    def predict(self, time_ns: int) -> Prediction | None:
+        """Tell what a coming frame should show: the pixels of all tracks with a point, and the camera's motion."""
+        window = self._window
+        if window is None or not window.clones or time_ns < self._time_ns:
+            return None
+        nav, (Phi, Q) = window.nav, self._since_frame
+        if time_ns > self._time_ns:
+            try:
+                step = self._motion.advance(nav, self._time_ns, time_ns)
+            except EstimationError:  # the update will say it
+                return None
+            nav, Phi, Q = step.nav, step.Phi @ Phi, step.Phi @ Q @ step.Phi.T + step.Q
+        T_cam0_world = self._T_cam0_imu @ se3_inverse(nav.T_world_imu)
+        T_curr_prev = T_cam0_world @ window.clones[-1].T_world_imu @ se3_inverse(self._T_cam0_imu)
+        # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world); xi_prev is the pose part of the
+        # error at the last frame, from which xi_curr grows by Phi.
+        M = se3_adjoint(T_cam0_world) @ (np.eye(6, DIM) - Phi[:6])
+        A = se3_adjoint(T_cam0_world)
+        motion = MotionPrior(T_curr_prev, M @ self._output @ M.T + A @ Q[:6, :6] @ A.T)
+        return Prediction(self._expected_tracks(window, T_cam0_world, T_curr_prev[:3, :3]), motion)
+
+    def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, R_cam_prev: FloatArray) -> TrackPrior:
+        rows = self._tracks.rows()
+        rows = rows[self._tracks.has_point[rows]]
+        ids = np.concatenate([self._tracks.ids(rows), window.landmark_ids])
+        p_cam = transform_points(T_cam0_world, np.concatenate([self._tracks.points[rows], window.landmarks]))
+        ahead = p_cam[:, 2] > _MIN_DEPTH * self._camera.baseline_m
+        return TrackPrior(ids[ahead], project(self._camera, p_cam[ahead]), R_cam_prev)
 
     def update(self, observations: Observations) -> UpdateReport:
         """Predict to the time of the frame and take in its observations.
@@ -131,6 +166,7 @@ class Msckf:
             self._advance(observations.time_ns)
         window = self._window
         window.add_clone(observations.frame_index, observations.time_ns)
+        self._since_frame = _NO_STEP
         try:
             report = self._use(window, seen)
         except np.linalg.LinAlgError as error:
@@ -212,7 +248,11 @@ class Msckf:
     def _advance(self, time_ns: int) -> None:
         if time_ns > self._time_ns:
             window = self._started()
-            window.propagate(self._motion.advance(window.nav, self._time_ns, time_ns))
+            step = self._motion.advance(window.nav, self._time_ns, time_ns)
+            self._motion.forget_before(time_ns)
+            window.propagate(step)
+            Phi, Q = self._since_frame
+            self._since_frame = step.Phi @ Phi, step.Phi @ Q @ step.Phi.T + step.Q
         self._time_ns = time_ns
 
     def _measure(self) -> None:
@@ -347,7 +387,7 @@ class Msckf:
         """Jacobian (K, 4, 3), residuals (K, 4) of the landmarks in the newest clone, and which lie ahead of it."""
         T = window.T_cam0_world(self._T_cam0_imu)[-1]
         p_cam = transform_points(T, window.landmarks)
-        ahead = p_cam[:, 2] > 0.5 * self._camera.baseline_m
+        ahead = p_cam[:, 2] > _MIN_DEPTH * self._camera.baseline_m
         p_cam = np.where(ahead[:, None], p_cam, [0.0, 0.0, 1.0])
         usable = weight * ahead[:, None]
         r = np.where(usable > 0, z - project(self._camera, p_cam), 0.0)

@@ -129,6 +129,13 @@ class ImuMotion:
         Phi, Q = self._linearise(times, dt, R, v, p)
         return Transition(replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1]), Phi, Q)
 
+    def forget_before(self, time_ns: int) -> None:
+        """Drop the samples that no interval from this time on needs."""
+        keep = 0
+        while keep + 1 < len(self._samples) and self._samples[keep + 1].time_ns <= time_ns:
+            keep += 1
+        self._samples = self._samples[keep:]
+
     def measurement(self, nav: NavState) -> Measurement | None:
         """The IMU drives the state and measures nothing."""
         return None
@@ -164,8 +171,6 @@ class ImuMotion:
             raise EstimationError(f"the IMU is silent for {np.diff(cuts).max() * 1e-9:.2f} s before {end_ns} ns")
         values = np.array([np.concatenate([x.gyro, x.accel]) for x in samples])
         at = np.stack([np.interp(cuts, t, column) for column in values.T], axis=1)
-        keep = int(np.searchsorted(all_times, end_ns, side="right")) - 1
-        self._samples = samples[max(keep, 0) :]
         return cuts, at[:, :3], at[:, 3:]
 
     def _linearise(
@@ -247,6 +252,9 @@ class TwistMotion:
         Q[6:12, 6:12] = D * tau
         Q[12:, 12:] = np.eye(3) * (self._settings.rate_bias_walk**2 * tau)
         return Transition(replace(nav, T_world_imu=moved), Phi, Q)
+
+    def forget_before(self, time_ns: int) -> None:
+        """Nothing is kept beyond the sample that is measured next."""
 
     def measurement(self, nav: NavState) -> Measurement | None:
         """The velocity sample that has just been taken, if any."""

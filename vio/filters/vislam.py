@@ -29,6 +29,7 @@ from vio.records import (
     Landmarks,
     MotionSample,
     Observations,
+    Prediction,
     UpdateReport,
     VelocitySample,
 )
@@ -177,6 +178,10 @@ class Vislam:
         if self._time_ns is not None:
             self._state = self._motion.predict(self._state, self._time_ns, time_ns)
         self._time_ns = time_ns
+
+    def predict(self, time_ns: int) -> Prediction | None:
+        """Tell nothing: the paper's filter takes observations as they come."""
+        return None
 
     def update(self, observations: Observations) -> UpdateReport:
         """Predict to the time of the frame, then update pose and landmarks with its observations.
