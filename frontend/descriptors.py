@@ -12,7 +12,7 @@ import numpy.typing as npt
 from frontend.align import align, cut_patches, rounded, shift_warps, templates
 from frontend.detect import spread_evenly
 from frontend.frames import FrameGate, Stopwatch, SwapAlarm
-from frontend.outliers import fit_motion, rigid_consensus
+from frontend.outliers import bearing_consensus, fit_motion, rigid_consensus
 from frontend.patches import FloatImage, inside
 from frontend.settings import MatchSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
@@ -304,7 +304,10 @@ class DescriptorFrontend:
         twist = memory.twist_per_s
         # The right pixel belongs to the key point; it moves along with the refinement.
         right = place[found] + np.stack([pixels[:, 0] - left.pixels[found, 0], np.zeros(len(found))], axis=1)
-        if motion is not None:
+        if motion is None:
+            agree = bearing_consensus(self._camera, old.left[rows], pixels, expected[:3, :3], R_prior, rng, settings)
+            keep[:] = True if agree is None else agree
+        else:
             keep[voters] = motion.inliers
             keep[~voters] = False
             twist = se3_log(motion.T_curr_prev) / seconds

@@ -20,7 +20,14 @@ from frontend.align import (
 )
 from frontend.detect import detect_corners, min_distance_px
 from frontend.frames import FrameGate, Stopwatch, SwapAlarm, half_mask, load_mask
-from frontend.outliers import Consensus, epipolar_distance, fit_motion, pixel_errors, rigid_consensus
+from frontend.outliers import (
+    Consensus,
+    bearing_consensus,
+    epipolar_distance,
+    fit_motion,
+    pixel_errors,
+    rigid_consensus,
+)
 from frontend.patches import FloatImage, inside
 from frontend.settings import KltSettings
 from frontend.stereo_match import RowField, half_image, match_rows
@@ -373,9 +380,12 @@ class KltFrontend:
             T_prior = fit_motion(camera, old.point[row], prior.z[given, :2], expected, settings)
         rng = np.random.default_rng((settings.seed, frame_index))
         motion = rigid_consensus(camera, old.point[known], found[known], expected, R_prior, T_prior, rng, settings)
-        if motion is None:
-            return seen, None
         keep = seen.copy()
+        if motion is None:
+            rows = np.flatnonzero(seen)
+            agree = bearing_consensus(camera, old.left[rows], found[rows], expected[:3, :3], R_prior, rng, settings)
+            keep[rows] = True if agree is None else agree
+            return keep, None
         keep[known] = motion.inliers
         flat = np.flatnonzero(seen & ~(old.has_right & old.placed))
         if len(flat):

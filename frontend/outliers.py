@@ -4,6 +4,10 @@ Points triangulated in the previous frame are fitted to their pixels in the curr
 start from an expected motion and are refined by Gauss-Newton, all sets at once; the best is refined on its inliers.
 Reference: Fischler & Bolles, Random sample consensus, CACM (1981); Torr & Zisserman, MLESAC, CVIU (2000), for the
 truncated cost; Geiger et al., StereoScan, IV (2011), for Gauss-Newton on minimal sets of stereo points.
+
+Without depth, left pixels of two frames alone agree on a rotation and a direction of translation.
+Reference: Nistér, An efficient solution to the five-point relative pose problem, PAMI (2004); Kneip et al., Finding the
+exact rotation between two images independently of the translation, ECCV (2012), for what a turning camera leaves open.
 """
 
 from __future__ import annotations
@@ -11,11 +15,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+import cv2
 import numpy as np
 
-from vio.geometry.lie import FloatArray, circledot, se3_exp, se3_from_parts, so3_log, transform_points
+from vio.geometry.lie import FloatArray, circledot, se3_exp, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
-from vio.records import BoolArray
+from vio.records import BoolArray, IntArray
 
 _MIN_DEPTH_M = 0.05
 _MIN_POINTS = 8  # with fewer, agreement by chance cannot be told from motion
@@ -24,6 +29,10 @@ _SAMPLE_ITERATIONS = 5
 _REFINE_ITERATIONS = 6
 _DAMPING = 1e-4
 _SETTLED = 3e-6  # change of a motion, in radians and metres, below which it is not refined further
+_MIN_BEARING_SHARE = 0.5  # two views constrain a track in one direction only, so that most must agree
+_SURE_BEARING_SHARE = 0.9  # share of tracks that a predicted rotation must explain for no other to be tried
+_FIVE_POINT_CONFIDENCE = 0.999
+_SCATTER = 1e-9  # added to a sum of squares before it is divided by
 
 
 class ConsensusSettings(Protocol):
@@ -246,3 +255,202 @@ def fit_motion(
     T = _refine(camera, T, p, z, settings.consensus_px, slice(0, 6))
     fits = pixel_errors(camera, T, p, z) <= settings.consensus_px
     return T if fits.mean() > 0.5 else None
+
+
+# --- two views, no depth --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Sights:
+    """What two left images show of the same features."""
+
+    before: FloatArray  # (N, 3) rays of unit depth, previous cam0 frame
+    after: FloatArray  # (N, 2) pixels, current
+    rays: FloatArray  # (N, 3) rays of unit depth through them
+
+
+def bearing_consensus(
+    camera: StereoCamera,
+    previous: FloatArray,
+    current: FloatArray,
+    expected_R: FloatArray,
+    R_prior: FloatArray | None,
+    rng: np.random.Generator,
+    settings: ConsensusSettings,
+) -> BoolArray | None:
+    """Find the tracks that one motion of the camera can explain, whatever their depths.
+
+    A rotation and a direction of translation put every feature on a ray of the image: it starts where the rotation
+    alone would put the feature and leads where nearer points go. What has moved little beyond the rotation lies near
+    the start of its ray under any translation, so that a camera that stands still or only turns loses no track.
+    With known rotation, two features give the direction; without, five give both.
+
+    Args:
+        camera: rectified camera.
+        previous: left pixels (N, 2) in the previous frame.
+        current: left pixels (N, 2) in the current frame.
+        expected_R: rotation (3, 3) from the previous to the current cam0 frame to begin with, of no authority.
+        R_prior: the same, predicted from outside, or None; see `rigid_consensus`.
+        rng: source of the samples; the same state gives the same result to the bit.
+        settings: thresholds.
+
+    Returns:
+        Mask (N,) of the tracks that agree; None where there are too few, or most do not agree.
+    """
+    if len(previous) < _MIN_POINTS:
+        return None
+    seen = _Sights(_rays(camera, previous), current, _rays(camera, current))
+    near_prior = None
+    if R_prior is not None:
+        told = _bearing_vote(camera, seen, [R_prior], rng, settings)
+        near_prior = _follows(camera, seen, told, settings)
+        if near_prior.mean() >= _SURE_BEARING_SHARE:
+            return near_prior
+    rotations = [expected_R, _turn_of(camera, seen, rng, settings)]
+    vote = _bearing_vote(camera, seen, rotations, rng, settings, _five_point(camera, previous, current, rng, settings))
+    kept = _follows(camera, seen, vote, settings)
+    if R_prior is not None and near_prior is not None and _turn_deg(vote, R_prior) > settings.prior_max_deviation_deg:
+        # A wrong rotation, too, explains a part of what the vote explains: only what the vote denies speaks for it.
+        apart = (near_prior & ~kept).sum() >= max(_MIN_POINTS, settings.prior_min_support * kept.sum())
+        kept = near_prior if apart else kept
+    return kept if kept.sum() >= max(_MIN_POINTS, _MIN_BEARING_SHARE * len(kept)) else None
+
+
+def _rays(camera: StereoCamera, pixels: FloatArray) -> FloatArray:
+    """Rays (N, 3) of unit depth through left pixels (N, 2)."""
+    x, y = (pixels[:, 0] - camera.cu) / camera.fu, (pixels[:, 1] - camera.cv) / camera.fv
+    return np.stack([x, y, np.ones(len(pixels))], axis=1)
+
+
+def _ray_distance(camera: StereoCamera, seen: _Sights, R: FloatArray, t: FloatArray) -> FloatArray:
+    """Distances (..., N) in pixels from the image rays of rotations (..., 3, 3) and directions (..., 3).
+
+    A ray is the epipolar line from infinite depth on; behind its start, the distance to the start counts.
+    """
+    turned = seen.before @ np.swapaxes(R, -1, -2)
+    ahead = turned[..., 2] > _MIN_DEPTH_M
+    depth = np.where(ahead, turned[..., 2], 1.0)
+    x, y = turned[..., 0] / depth, turned[..., 1] / depth
+    off_u = seen.after[:, 0] - camera.fu * x - camera.cu
+    off_v = seen.after[:, 1] - camera.fv * y - camera.cv
+    way_u = camera.fu * (t[..., 0, None] - x * t[..., 2, None])
+    way_v = camera.fv * (t[..., 1, None] - y * t[..., 2, None])
+    along = np.maximum(off_u * way_u + off_v * way_v, 0.0) / (way_u**2 + way_v**2 + _SCATTER)
+    distance = np.hypot(off_u - along * way_u, off_v - along * way_v)
+    return np.where(ahead, distance, np.inf)
+
+
+def _follows(camera: StereoCamera, seen: _Sights, T: FloatArray, settings: ConsensusSettings) -> BoolArray:
+    return np.asarray(_ray_distance(camera, seen, T[:3, :3], T[:3, 3]) <= settings.consensus_px)
+
+
+def _cost(camera: StereoCamera, seen: _Sights, R: FloatArray, t: FloatArray, limit: float) -> FloatArray:
+    """Truncated squared distances, summed over the tracks (...)."""
+    return np.asarray((np.minimum(_ray_distance(camera, seen, R, t), limit) ** 2).sum(axis=-1))
+
+
+def _bearing_vote(
+    camera: StereoCamera,
+    seen: _Sights,
+    rotations: list[FloatArray],
+    rng: np.random.Generator,
+    settings: ConsensusSettings,
+    others: FloatArray | None = None,
+) -> FloatArray:
+    """Best rotation and direction of translation, as a motion (4, 4) with a translation of length one.
+
+    For each rotation, pairs of tracks give the direction; `others` (K, 4, 4) are motions that compete with them.
+    """
+    models = [np.zeros((0, 4, 4)) if others is None else others]
+    pairs = _pairs(len(seen.before), rng, settings)
+    for R in rotations:
+        # The direction of translation, both rays and the rotation's normal: t . (R f x g) = 0.
+        normal = np.cross(seen.before @ R.T, seen.rays)
+        t = np.cross(normal[pairs[:, 0]], normal[pairs[:, 1]])
+        length = np.linalg.norm(t, axis=1, keepdims=True)
+        # Where a pair tells no direction, any will do: each is better than none.
+        t = np.where(length > 0.0, t / np.maximum(length, np.finfo(np.float64).tiny), [0.0, 0.0, 1.0])
+        models += [se3_from_parts(np.broadcast_to(R, (len(t), 3, 3)), sign * t) for sign in (1.0, -1.0)]
+    T = np.concatenate(models)
+    limit = settings.consensus_px
+    best = T[int(np.argmin(_cost(camera, seen, T[:, :3, :3], T[:, :3, 3], limit)))]
+    for _ in range(_REFINE_ITERATIONS):
+        better = _bearing_step(camera, seen, best, limit)
+        if _cost(camera, seen, better[:3, :3], better[:3, 3], limit) >= _cost(
+            camera, seen, best[:3, :3], best[:3, 3], limit
+        ):
+            break
+        best = better
+    return best
+
+
+def _bearing_step(camera: StereoCamera, seen: _Sights, T: FloatArray, limit: float) -> FloatArray:
+    """One Gauss-Newton step of a motion (4, 4), its translation of length one, on the distances from epipolar lines."""
+    R, t = T[:3, :3], T[:3, 3]
+    turned = seen.before @ R.T
+    line = np.cross(t, turned)
+    scale = np.hypot(line[:, 0] / camera.fu, line[:, 1] / camera.fv) + _SCATTER
+    distance = _ray_distance(camera, seen, R, t)
+    weight = np.where(distance < 1.5 * limit, 1.0 / (1.0 + (np.minimum(distance, 1e6) / limit * 2) ** 2), 0.0) / scale
+    residual = weight * np.einsum("ni,ni->n", seen.rays, line)
+    plane = np.linalg.svd(t[None])[2][1:]  # two directions across the translation
+    r_D_turn = np.cross(turned, np.cross(seen.rays, t))
+    r_D_t = np.cross(turned, seen.rays) @ plane.T
+    J = weight[:, None] * np.concatenate([r_D_turn, r_D_t], axis=1)
+    A = J.T @ J
+    step = -np.linalg.solve(A + (_DAMPING * np.trace(A) / 5 + _SCATTER) * np.eye(5), J.T @ residual)
+    moved = t + step[3:] @ plane
+    return se3_from_parts(so3_exp(step[:3]) @ R, moved / np.linalg.norm(moved))
+
+
+def _turn_of(camera: StereoCamera, seen: _Sights, rng: np.random.Generator, settings: ConsensusSettings) -> FloatArray:
+    """Rotation (3, 3) that alone explains most tracks: two tracks give one, and those that follow it mend it."""
+    f, g = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (seen.before, seen.rays))
+    pairs = _pairs(len(f), rng, settings)
+    R = _triads(g, pairs) @ np.swapaxes(_triads(f, pairs), 1, 2)
+    still = np.zeros(3)
+    R_best = R[int(np.argmin(_cost(camera, seen, R, np.broadcast_to(still, (len(R), 3)), settings.consensus_px)))]
+    near = _ray_distance(camera, seen, R_best, still) <= settings.consensus_px
+    # Reference: Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. (1976).
+    U, _, Vt = np.linalg.svd(g[near].T @ f[near])
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def _pairs(count: int, rng: np.random.Generator, settings: ConsensusSettings) -> IntArray:
+    """Random pairs (H, 2) of two different numbers below `count`."""
+    first = rng.integers(0, count, size=settings.consensus_samples)
+    return np.stack([first, (first + rng.integers(1, count, size=len(first))) % count], axis=1)
+
+
+def _triads(rays: FloatArray, pairs: IntArray) -> FloatArray:
+    """Right-handed orthonormal axes (H, 3, 3) in columns, spanned by pairs (H, 2) of unit rays (N, 3)."""
+    a, b = rays[pairs[:, 0]], rays[pairs[:, 1]]
+    across = np.cross(a, b)
+    across = across / (np.linalg.norm(across, axis=1, keepdims=True) + _SCATTER)
+    return np.stack([a, across, np.cross(a, across)], axis=2)
+
+
+def _five_point(
+    camera: StereoCamera,
+    previous: FloatArray,
+    current: FloatArray,
+    rng: np.random.Generator,
+    settings: ConsensusSettings,
+) -> FloatArray | None:
+    """Motions (K, 4, 4), translations of length one, that the best essential matrices stand for; None if none fits."""
+    K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
+    params = cv2.UsacParams()
+    params.confidence = _FIVE_POINT_CONFIDENCE
+    params.threshold = settings.consensus_px
+    params.maxIterations = 10 * settings.consensus_samples
+    params.randomGeneratorState = int(rng.integers(0, 2**31 - 1))
+    params.isParallel = False
+    none = np.zeros(4)
+    essential, _ = cv2.findEssentialMat(previous, current, K, K, none, none, params)
+    if essential is None or len(essential) < 3 or not np.isfinite(essential).all():
+        return None
+    motions = []
+    for E in np.asarray(essential, dtype=np.float64).reshape(-1, 3, 3):
+        R_a, R_b, t = cv2.decomposeEssentialMat(E)
+        motions += [se3_from_parts(R, sign * t[:, 0]) for R in (R_a, R_b) for sign in (1.0, -1.0)]
+    return np.stack(motions)

@@ -152,6 +152,36 @@ def test_features_without_a_right_view_stay_as_left_only_rows_for_a_while() -> N
     assert not outputs[1].observations.has_right.any()
 
 
+@pytest.mark.parametrize("told", [False, True])
+def test_without_depth_what_moves_against_the_rest_is_dropped(told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The right camera goes blind; two frames later a part of the left image jumps up by 8 px."""
+    gray = np.full_like(FRAMES[0].right, 128)
+    frames = [FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:4])]
+    left = frames[3].left
+    assert left is not None
+    left = left.copy()
+    left[60:180, 140:300] = left[68:188, 140:300]
+    frames[3] = replace(frames[3], left=left)
+
+    def jumped() -> tuple[float, int, int]:
+        frontend = KltFrontend(CAMERA, SETTINGS)
+        outputs = [frontend.process(frame) for frame in frames[:3]]
+        step = se3_inverse(POSES[3]) @ POSES[2]
+        prior = TrackPrior(np.zeros(0, dtype=np.int64), np.zeros((0, 4)), step[:3, :3])
+        outputs.append(frontend.process(frames[3], prior if told else None))
+        before, after = common(outputs[2], outputs[3])
+        error = np.linalg.norm(after[:, :2] - truth(SLANTED, POSES[2], before[:, :2], POSES[3])[:, :2], axis=1)
+        return float(np.median(error)), int((error < 1).sum()), int((error > 4).sum())
+
+    median, good, wrong = jumped()
+    monkeypatch.setattr("frontend.klt.bearing_consensus", lambda *_: None)
+    _, all_good, all_wrong = jumped()
+    assert all_wrong >= 15  # the trap is real
+    assert wrong <= 0.15 * all_wrong
+    assert good >= 0.97 * all_good
+    assert median < 0.05
+
+
 def test_tracks_hidden_by_a_passing_board_are_dropped() -> None:
     """A board with another texture covers a part of the next frame."""
     board = view(Wall(np.array([0.0, 0.0, 1.0]), 2.0, seed=9), POSES[1])

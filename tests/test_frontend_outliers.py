@@ -1,11 +1,11 @@
-"""Consensus on the camera's motion: exact on exact data, unmoved by outliers, not captured by a large mover."""
+"""Consensus on the camera's motion, with depth and without: unmoved by outliers, not captured by a large mover."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from frontend.outliers import epipolar_distance, fit_motion, pixel_errors, rigid_consensus
+from frontend.outliers import bearing_consensus, epipolar_distance, fit_motion, pixel_errors, rigid_consensus
 from frontend.settings import KltSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
@@ -164,3 +164,110 @@ def test_epipolar_distance_of_a_still_camera_is_the_distance_itself() -> None:
     before = scene(20, 23)[:, :2] + 100
     distance = epipolar_distance(CAMERA, np.eye(4), before, before + np.array([3.0, 4.0]), near_m=3.0)
     np.testing.assert_allclose(distance, 5.0)
+
+
+# --- two views, no depth --------------------------------------------------------------------------------------------
+
+MOTIONS = {
+    "driving": T_TRUE,
+    "turning hard": se3_exp([0.1, 0.0, -0.3, 0.0, 0.2, 0.05]),
+    "sideways": se3_exp([0.3, 0.0, 0.0, 0.0, 0.002, 0.0]),
+    "hardly moving": se3_exp([0.01, 0.0, -0.02, 0.0, 0.0, 0.0]),
+    "standing": np.eye(4),
+    "only turning": se3_exp([0.0, 0.0, 0.0, 0.01, 0.05, 0.02]),
+}
+
+
+def turned(T: FloatArray, degrees: float) -> FloatArray:
+    """The rotation (3, 3) of a motion, wrong by an angle about the vertical."""
+    return se3_exp([0.0, 0.0, 0.0, 0.0, np.radians(degrees), 0.0])[:3, :3] @ T[:3, :3]
+
+
+def two_views(T: FloatArray, seed: int, share: float, noise: float = 0.2) -> tuple[FloatArray, FloatArray, np.ndarray]:
+    """Noisy pixels in two frames, and the mask of outliers, 8 to 60 px off in all directions."""
+    p = scene(300, seed)
+    before, after = pixels(np.eye(4), p, seed + 100, noise), pixels(T, p, seed + 200, noise)
+    bad = np.arange(300) < 300 * share
+    rng = np.random.default_rng(seed + 300)
+    angle, length = rng.uniform(0, 2 * np.pi, bad.sum()), rng.uniform(8, 60, bad.sum())
+    after[bad] += length[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return before, after, bad
+
+
+def agreeing(before: FloatArray, after: FloatArray, R_prior: FloatArray | None, seed: int = 0) -> np.ndarray | None:
+    return bearing_consensus(CAMERA, before, after, np.eye(3), R_prior, np.random.default_rng(seed), SETTINGS)
+
+
+@pytest.mark.parametrize("prior_error_deg", [None, 0.0, 1.0, 5.0])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.45])
+@pytest.mark.parametrize("name", MOTIONS)
+def test_two_views_tell_outliers_and_lose_no_good_track(name: str, share: float, prior_error_deg: float | None) -> None:
+    """Not even where there is no parallax, or where the predicted rotation is wrong.
+
+    An outlier that happens to lie on its epipolar ray cannot be told: 16 of 360 degrees at 8 px, fewer further off.
+    """
+    R_prior = None if prior_error_deg is None else turned(MOTIONS[name], prior_error_deg)
+    good, missed = [], []
+    for seed in range(2):
+        before, after, bad = two_views(MOTIONS[name], seed, share)
+        kept = agreeing(before, after, R_prior)
+        assert kept is not None
+        good.append(kept[~bad].mean())
+        missed.append(kept[bad].mean() if share else 0.0)
+    assert min(good) > 0.97
+    assert np.mean(missed) < 0.1
+
+
+def test_a_known_rotation_takes_no_more_than_two_tracks_for_a_direction() -> None:
+    """With the rotation at hand the direction is found among 45 % outliers from a handful of pairs."""
+    before, after, bad = two_views(T_TRUE, 5, 0.45)
+    few = KltSettings(consensus_samples=12)
+    kept = bearing_consensus(CAMERA, before, after, np.eye(3), T_TRUE[:3, :3], np.random.default_rng(0), few)
+    assert kept is not None
+    assert kept[~bad].mean() > 0.97
+    assert kept[bad].mean() < 0.1
+
+
+def test_two_views_give_the_same_bits_again() -> None:
+    before, after, _ = two_views(T_TRUE, 6, 0.3, noise=0.6)
+    for R_prior in (None, T_TRUE[:3, :3], turned(T_TRUE, 5.0)):
+        a, b = (agreeing(before, after, R_prior) for _ in range(2))
+        assert a is not None
+        assert b is not None
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("n", [0, 1, 7])
+def test_two_views_of_too_few_tracks_say_nothing(n: int) -> None:
+    before, after, _ = two_views(T_TRUE, 7, 0.0)
+    assert agreeing(before[:n], after[:n], None) is None
+
+
+def test_scattered_pixels_in_two_views_say_nothing() -> None:
+    rng = np.random.default_rng(8)
+    before, after = rng.uniform([0, 0], [1242, 375], (2, 200, 2))
+    assert agreeing(before, after, None) is None
+    assert agreeing(before, after, np.eye(3)) is None
+
+
+def test_two_views_of_one_and_the_same_pixel_do_not_fail() -> None:
+    same = np.tile([[300.0, 200.0]], (20, 1))
+    kept = agreeing(same, same, None)
+    assert kept is None or kept.all()
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_predicted_rotation_frees_two_views_from_a_turning_truck(told: bool) -> None:
+    """The truck wins the vote of two views, too, unless the rotation is known.
+
+    The camera stands, so that its direction of translation is free, and part of the truck lies on epipolar rays then.
+    """
+    p, after, truck = turning_truck()
+    kept = agreeing(project(CAMERA, p)[:, :2], after, np.eye(3) if told else None)
+    assert kept is not None
+    if told:
+        assert kept[~truck].mean() > 0.95
+        assert kept[truck].mean() < 0.5
+    else:
+        assert kept[~truck].mean() < 0.5
+        assert kept[truck].mean() > 0.9
