@@ -55,6 +55,7 @@ log = logging.getLogger(__name__)
 _CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
 _MIN_TRACKS_FOR_NOISE = 15
+_MIN_TRACKS_TO_STAND = 15
 _MAX_WAIT_FRAMES = 20
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 _VIEW_LIMIT = 23.5  # chi-square with 4 degrees of freedom, probability 0.9999
@@ -103,6 +104,7 @@ class Msckf:
         self._waited = 0
         self._sigma2 = settings.pixel_sigma_px**2
         self._output: FloatArray = np.zeros((DIM, DIM))
+        self._gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._since_frame: tuple[FloatArray, FloatArray] = _NO_STEP  # transition and noise since the last frame
         self._map: list[Landmarks] = []
 
@@ -253,6 +255,7 @@ class Msckf:
             window.propagate(step)
             Phi, Q = self._since_frame
             self._since_frame = step.Phi @ Phi, step.Phi @ Q @ step.Phi.T + step.Q
+            self._gyro = step.gyro
         self._time_ns = time_ns
 
     def _measure(self) -> None:
@@ -269,6 +272,10 @@ class Msckf:
         z, weight = z[found], weight[found]
         self._tracks.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
 
+        if self._stands(len(window.clones)):
+            rest = self._motion.standing(window.nav, self._gyro)
+            if rest is not None:
+                window.commit_measurement(rest)
         tracks = self._linearise(window, self._choose(window), _FIRST_STEPS)
         innovation = _newest_innovation(tracks.at)
         for _ in range(self._settings.iterations):
@@ -296,6 +303,14 @@ class Msckf:
             innovation_median_px=innovation,
             nis_per_dof=float(np.median(nis)) if len(nis) else None,
         )
+
+    def _stands(self, clones: int) -> bool:
+        """Whether the image stands still: the median track, and nine tenths of all within twice its limit."""
+        limit = self._settings.still_px
+        moved = self._tracks.moved_px(clones - 1) if clones > 1 and limit > 0 else np.zeros(0)
+        if len(moved) < _MIN_TRACKS_TO_STAND:
+            return False
+        return bool(np.median(moved) < limit and np.quantile(moved, 0.9) < 2 * limit)
 
     def _choose(self, window: Window) -> IntArray:
         """Rows of the tracks that say something of the poses: two views or more, the most telling first if too many."""

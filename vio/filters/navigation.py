@@ -49,6 +49,7 @@ class Transition:
     nav: NavState
     Phi: FloatArray  # (15, 15)
     Q: FloatArray  # (15, 15)
+    gyro: FloatArray | None = None  # (3,) mean rate that the gyro measured over the step, rad/s; None without an IMU
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +128,9 @@ class ImuMotion:
         moves = v[:-1] * dt[:, None] + 0.5 * a * (dt**2)[:, None]
         p = nav.T_world_imu[:3, 3] + np.concatenate([np.zeros((1, 3)), np.cumsum(moves, axis=0)])
         Phi, Q = self._linearise(times, dt, R, v, p)
-        return Transition(replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1]), Phi, Q)
+        turned = np.sum(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None], axis=0) / max(dt.sum(), 1e-9)
+        moved = replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1])
+        return Transition(moved, Phi, Q, turned + nav.gyro_bias)
 
     def forget_before(self, time_ns: int) -> None:
         """Drop the samples that no interval from this time on needs."""
@@ -139,6 +142,24 @@ class ImuMotion:
     def measurement(self, nav: NavState) -> Measurement | None:
         """The IMU drives the state and measures nothing."""
         return None
+
+    def standing(self, nav: NavState, gyro: FloatArray | None) -> Measurement | None:
+        """Rest as a measurement, equation (N7): no velocity, and the gyro reads its bias.
+
+        None where the gyro contradicts.
+        """
+        if gyro is None:
+            return None
+        s = self._settings
+        turn = gyro - nav.gyro_bias
+        if np.abs(turn).max() > 3 * (s.zero_rate_sigma_radps + s.gyro_bias_sigma_radps):
+            return None
+        H = np.zeros((6, DIM))
+        H[:3, 3:6] = -so3_hat(nav.velocity)
+        H[:3, 6:9] = np.eye(3)
+        H[3:, 9:12] = np.eye(3)
+        sigmas = np.repeat([s.zero_velocity_sigma_mps, s.zero_rate_sigma_radps], 3)
+        return Measurement(H, np.concatenate([-nav.velocity, turn]), np.diag(sigmas**2))
 
     def velocity_world(self, nav: NavState) -> FloatArray:
         """Velocity (3,) in the world frame."""
@@ -268,6 +289,14 @@ class TwistMotion:
         residual = np.concatenate([sample.linear - nav.velocity, sample.angular - nav.rate - nav.gyro_bias])
         sigmas = np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3)
         return Measurement(H, residual, np.diag(sigmas**2))
+
+    def standing(self, nav: NavState, gyro: FloatArray | None) -> Measurement:
+        """Rest as a measurement: no twist."""
+        s = self._settings
+        H = np.zeros((6, DIM))
+        H[:, 6:12] = np.eye(6)
+        sigmas = np.repeat([s.zero_velocity_sigma_mps, s.zero_rate_sigma_radps], 3)
+        return Measurement(H, -np.concatenate([nav.velocity, nav.rate]), np.diag(sigmas**2))
 
     def velocity_world(self, nav: NavState) -> FloatArray:
         """Velocity (3,) in the world frame."""

@@ -84,6 +84,11 @@ class MsckfSettings:
     start_rate_sigma_radps: float = setting(1.0, "without IMU: doubt of the first angular rate", unit="rad/s")
     gyro_bias_sigma_radps: float = setting(0.1, "doubt of the first gyro bias", unit="rad/s")
     accel_bias_sigma_mps2: float = setting(0.3, "doubt of the first accelerometer bias", unit="m/s^2")
+    still_px: float = setting(
+        0.25, "the body is taken to stand where the median feature moves by less in a frame; 0: never", unit="px"
+    )
+    zero_velocity_sigma_mps: float = setting(0.02, "doubt of the velocity where it stands", unit="m/s")
+    zero_rate_sigma_radps: float = setting(0.01, "doubt of the angular rate where it stands", unit="rad/s")
     linear_velocity_sigma_mps: float = setting(0.5, "noise of a measured body velocity", unit="m/s")
     angular_rate_sigma_radps: float = setting(0.05, "noise of a measured angular rate", unit="rad/s")
     rate_bias_sigma_radps: float = setting(0.02, "doubt of the bias of a measured angular rate", unit="rad/s")

@@ -48,6 +48,12 @@ class TrackTable:
         """Which columns (F, N) rows were seen in."""
         return self._weight[rows, :, 0] > 0
 
+    def moved_px(self, column: int) -> FloatArray:
+        """How far (K,) the tracks seen in a column and in the one before moved in the left image between them."""
+        both = (self._weight[:, column, 0] > 0) & (self._weight[:, column - 1, 0] > 0)
+        out: FloatArray = np.linalg.norm(self._z[both, column, :2] - self._z[both, column - 1, :2], axis=1)
+        return out
+
     def shift(self) -> None:
         """Forget the oldest column; tracks that were seen there alone are removed."""
         self._z[:, :-1], self._weight[:, :-1] = self._z[:, 1:].copy(), self._weight[:, 1:].copy()

@@ -129,14 +129,18 @@ class Window:
         self.offset = self.offset - shift
 
     def measure(self, measurement: Measurement) -> None:
-        """Commit a measurement of the navigation state and move the means by it."""
+        """Commit a measurement of the navigation state and move the means to the new prior."""
+        self.commit_measurement(measurement)
+        self.relinearise(-self.offset)
+
+    def commit_measurement(self, measurement: Measurement) -> None:
+        """Commit a measurement of the navigation state; the means stay where they are."""
         RiH = np.linalg.solve(measurement.R, measurement.H)
         information = np.zeros_like(self.P)
         information[:DIM, :DIM] = measurement.H.T @ RiH
         vector = np.zeros(len(self.P))
         vector[:DIM] = RiH.T @ measurement.residual
         self.commit(information, vector)
-        self.relinearise(-self.offset)
 
     def relinearise(self, error: FloatArray) -> None:
         """Move the means by an error vector (D,); the prior stays where it is."""
