@@ -117,6 +117,7 @@ class _Memory:
 
     time_ns: int
     left: _View
+    right_half: Image
     tracks: _Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` of the last consensus, over its time
     trusted: bool  # the last motion was one that most features followed
@@ -218,7 +219,7 @@ class KltFrontend:
         twist = np.zeros(6) if before is None else before.twist_per_s
         if motion is not None:
             twist = se3_log(motion.T_curr_prev) / seconds
-        self._memory = _Memory(frame.time_ns, left, tracks, twist, motion is not None)
+        self._memory = _Memory(frame.time_ns, left, right.half, tracks, twist, motion is not None)
         old_ids = np.zeros(0, dtype=np.int64) if before is None else before.tracks.ids[before.tracks.shown]
         seen = tracks.take(tracks.shown)
         carried = int(np.isin(seen.ids, old_ids, assume_unique=True).sum())
@@ -256,7 +257,7 @@ class KltFrontend:
         watch.lap("reject")
         tracks = self._aligned(memory, left, found, seen, motion)
         watch.lap("align")
-        tracks = self._with_right(tracks, right, motion is not None)
+        tracks = self._with_right(memory, tracks, right, motion is not None)
         watch.lap("stereo")
         return tracks, motion
 
@@ -334,32 +335,12 @@ class KltFrontend:
         self, previous_half: Image, left: _View, points: FloatArray, guess: FloatArray, levels: int
     ) -> tuple[FloatArray, BoolArray]:
         """Track points (N, 2) forth and back; return the new pixels and the mask of those that came back."""
-        forth, seen = self._flow(previous_half, left.half, points, guess, levels)
-        back, seen_back = self._flow(left.half, previous_half, forth, points, levels)
+        forth, seen = flow(previous_half, left.half, points, guess, levels, self._settings)
+        back, seen_back = flow(left.half, previous_half, forth, points, levels, self._settings)
         error = np.linalg.norm(back - points, axis=1)
         margin = self._settings.anchor_radius_px + 2
         good = seen & seen_back & (error <= self._settings.max_forward_backward_px) & inside(left.full, forth, margin)
         return forth, good
-
-    def _flow(
-        self, source: Image, target: Image, points: FloatArray, guess: FloatArray, levels: int
-    ) -> tuple[FloatArray, BoolArray]:
-        """Track points (N, 2) between half-resolution images, all in pixels of the full image."""
-        settings = self._settings
-        found, status, _ = cv2.calcOpticalFlowPyrLK(
-            source,
-            target,
-            (points / 2).astype(np.float32).reshape(-1, 1, 2),
-            (guess / 2).astype(np.float32).reshape(-1, 1, 2),
-            winSize=(settings.window_px, settings.window_px),
-            maxLevel=levels,
-            criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, settings.iterations, _LK_EPSILON_PX),
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-            minEigThreshold=_LK_MIN_EIGENVALUE,
-        )
-        pixels = 2 * np.asarray(found, dtype=np.float64).reshape(-1, 2)
-        seen = (np.asarray(status).reshape(-1) == 1) & np.isfinite(pixels).all(axis=1)
-        return np.where(seen[:, None], pixels, points), seen
 
     def _consensus(
         self,
@@ -477,14 +458,29 @@ class KltFrontend:
 
     # --- the right image --------------------------------------------------------------------------------------------
 
-    def _with_right(self, tracks: _Tracks, right: _View, moved: bool) -> _Tracks:
+    def _with_right(self, memory: _Memory, tracks: _Tracks, right: _View, moved: bool) -> _Tracks:
         """Align features of known depth with the right image; with a known motion, the disparity must agree with it."""
         rows = np.flatnonzero(tracks.placed & (tracks.point[:, 2] > 0.05))
         expected = self._camera.fu * self._camera.baseline_m / tracks.point[rows, 2]
         place, skew, valid = self._right_of(tracks.take(rows), right, expected)
         if moved:
             valid &= np.abs(tracks.left[rows, 0] - place[:, 0] - expected) <= self._settings.consensus_px
+        if self._settings.circle_check:
+            valid &= self._closes_circle(memory, right, tracks.take(rows), place)
         return self._taken_in(tracks, rows[valid], place[valid], skew[valid])
+
+    def _closes_circle(self, memory: _Memory, right: _View, tracks: _Tracks, place: FloatArray) -> BoolArray:
+        """Mask (N,) of right pixels (N, 2) that tracking in time from the last right image leads to as well.
+
+        Features that had no right match in the last frame have no circle to close, and pass. The tracks hold their
+        right pixels of that frame.
+        """
+        closes = tracks.blind > 0
+        rows = np.flatnonzero(~closes)
+        previous = _as_bright(memory.right_half, right.half)
+        gap = circle_gaps(previous, right.half, tracks.right[rows], place[rows], self._settings)
+        closes[rows] = gap <= self._settings.max_circle_px
+        return closes
 
     def _right_of(
         self, tracks: _Tracks, right: _View, disparity: FloatArray
@@ -628,6 +624,48 @@ class KltFrontend:
             settings.min_peak_margin,
         )
         self._swap.check(frame, n, matched, int((unique & (disparity >= 1.0)).sum()))
+
+
+def flow(
+    source: Image, target: Image, points: FloatArray, guess: FloatArray, levels: int, settings: KltSettings
+) -> tuple[FloatArray, BoolArray]:
+    """Track points (N, 2) between half-resolution images by Lucas-Kanade, all in pixels of the full image.
+
+    Returns:
+        The new pixels (N, 2), and a mask (N,) of those found; the others stay where they were.
+    """
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        source,
+        target,
+        (points / 2).astype(np.float32).reshape(-1, 1, 2),
+        (guess / 2).astype(np.float32).reshape(-1, 1, 2),
+        winSize=(settings.window_px, settings.window_px),
+        maxLevel=levels,
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, settings.iterations, _LK_EPSILON_PX),
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        minEigThreshold=_LK_MIN_EIGENVALUE,
+    )
+    pixels = 2 * np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    seen = (np.asarray(status).reshape(-1) == 1) & np.isfinite(pixels).all(axis=1)
+    return np.where(seen[:, None], pixels, points), seen
+
+
+def circle_gaps(
+    previous: Image, current: Image, before: FloatArray, after: FloatArray, settings: KltSettings
+) -> FloatArray:
+    """Distances (N,) in pixels between right pixels and where tracking in the right images leads; infinite where lost.
+
+    Args:
+        previous: last right image at half resolution.
+        current: present one.
+        before: right pixels (N, 2) matched in the last frame.
+        after: right pixels (N, 2) matched in the present one.
+        settings: of the tracking.
+    """
+    if len(before) == 0:
+        return np.zeros(0)
+    found, seen = flow(previous, current, before, after, settings.trusted_levels, settings)
+    return np.where(seen, np.linalg.norm(found - after, axis=1), np.inf)
 
 
 def _as_bright(image: Image, other: Image) -> Image:

@@ -54,6 +54,10 @@ class KltSettings:
     max_epipolar_px: float = setting(1.0, "largest difference of the rows of a stereo match", unit="px")
     min_correlation: float = setting(0.8, "smallest normalised correlation of a stereo match")
     min_peak_margin: float = setting(0.03, "least lead in correlation over the second-best place in the row")
+    circle_check: bool = setting(
+        False, "track the right pixels in time as well; a right match that they do not lead to is dropped"
+    )
+    max_circle_px: float = setting(2.0, "largest distance between the two, for the circle check", unit="px")
     probation_frames: int = setting(
         1, "frames for which a new corner must hold, in time and stereo, before it is shown"
     )

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from frontend.detect import cell_index, grid_shape, min_distance_px
-from frontend.klt import KltFrontend
+from frontend.klt import KltFrontend, circle_gaps
 from frontend.outliers import fit_motion
 from frontend.settings import KltSettings
+from frontend.stereo_match import half_image
 from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
 from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
@@ -316,6 +317,30 @@ def test_new_features_are_shown_after_their_probation(outputs: list[FrontendOutp
     # Of the features that can live for three frames or more, fewer are seen only once.
     shares = [np.mean(counts == 1) for counts in once]
     assert shares[0] <= shares[1]
+
+
+def test_the_circle_closes_where_both_ways_lead_to_one_pixel(outputs: list[FrontendOutput]) -> None:
+    before, after = common(outputs[2], outputs[3])
+    z, z_next = (truth(SLANTED, POSES[k], rows[:, :2], POSES[k]) for k, rows in ((2, before), (3, after)))
+    halves = []
+    for frame in FRAMES[2:4]:
+        assert frame.right is not None
+        halves.append(half_image(frame.right))
+    wrong = np.arange(len(z)) % 3 == 0
+    off = np.where(wrong[:, None], [3.0, -1.5], [0.0, 0.0])
+    gap = circle_gaps(halves[0], halves[1], z[:, 2:], z_next[:, 2:] + off, SETTINGS)
+    assert np.median(gap[~wrong]) < 0.2
+    assert np.mean(gap[~wrong] <= SETTINGS.max_circle_px) > 0.98
+    assert np.mean(gap[wrong] > SETTINGS.max_circle_px) > 0.95
+    assert len(circle_gaps(halves[0], halves[1], z[:0, 2:], z[:0, 2:], SETTINGS)) == 0
+
+
+def test_the_circle_check_costs_hardly_a_good_match(outputs: list[FrontendOutput]) -> None:
+    checked = run(FRAMES, replace(SETTINGS, circle_check=True))
+    strict = run(FRAMES, replace(SETTINGS, circle_check=True, max_circle_px=0.02))
+    for plain, output in zip(outputs[1:], checked[1:], strict=True):
+        assert output.matched >= 0.98 * plain.matched
+    assert strict[-1].matched < 0.5 * outputs[-1].matched  # the setting does something
 
 
 def test_rectification_that_is_off_is_learned_and_costs_no_disparity() -> None:
