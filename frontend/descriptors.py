@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from frontend.align import align, cut_patches, rounded, shift_warps, templates
 from frontend.detect import spread_evenly
-from frontend.frames import FrameGate, Stopwatch, SwapAlarm
-from frontend.outliers import bearing_consensus, fit_motion, rigid_consensus
+from frontend.frames import FrameGate, Stopwatch, SwapAlarm, usable_prior
+from frontend.outliers import bearing_consensus, predicted_motion, rigid_consensus
 from frontend.patches import FloatImage, inside
 from frontend.settings import MatchSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
@@ -195,7 +195,7 @@ class DescriptorFrontend:
         watch.lap("extract")
         place, has_right = self._stereo(left, right, views)
         watch.lap("stereo")
-        tracks, twist, used = self._tracked(frame, left, place, has_right, views[0], prior)
+        tracks, twist, used = self._tracked(frame, left, place, has_right, views[0], usable_prior(prior))
         watch.lap("track")
         carried = len(tracks)
         tracks = self._completed(tracks, left, place, has_right, used, left_image)
@@ -274,14 +274,13 @@ class DescriptorFrontend:
         seconds = (frame.time_ns - memory.time_ns) * 1e-9
         expected = se3_exp(memory.twist_per_s * seconds)
         R_prior = None if prior is None else prior.R_cam_prev
-        if R_prior is not None:
-            expected = se3_from_parts(R_prior, expected[:3, 3])
+        told = expected if R_prior is None else se3_from_parts(R_prior, expected[:3, 3])
         p, deep = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
         deep &= old.has_right
-        guess = self._moved(old.left, np.where(deep[:, None], p, self._rays(old.left) * _FAR_M), expected)
+        guess = self._moved(old.left, np.where(deep[:, None], p, self._rays(old.left) * _FAR_M), told)
         if prior is not None and len(prior.ids):
             _, a, b = np.intersect1d(old.ids, prior.ids, assume_unique=True, return_indices=True)
-            guess[a] = np.where(np.isfinite(prior.z[b, :2]), prior.z[b, :2], guess[a])
+            guess[a] = prior.z[b, :2]
         reach = settings.search_radius * view.shape[1]
         # The last motion may be wrong, so that the old pixel is a second centre of the search.
         allowed = np.zeros((len(old), len(left)), dtype=np.bool_)
@@ -294,7 +293,7 @@ class DescriptorFrontend:
         T_prior = None
         if prior is not None:
             _, a, b = np.intersect1d(old.ids, prior.ids, assume_unique=True, return_indices=True)
-            T_prior = fit_motion(self._camera, p[a[deep[a]]], prior.z[b[deep[a]], :2], expected, settings)
+            T_prior = predicted_motion(self._camera, p[a[deep[a]]], prior.z[b[deep[a]], :2], expected, settings)
         rng = np.random.default_rng((settings.seed, frame.index))
         voters = deep[rows]
         motion = rigid_consensus(

@@ -11,9 +11,10 @@ import numpy as np
 
 from vio.errors import ConfigError, DataError
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, Image, StereoFrame
+from vio.records import BoolArray, Image, StereoFrame, TrackPrior
 
 _SWAP_FRAMES = 3  # frames without matches before the mirrored search is believed
+_ROTATION_SLACK = 1e-3  # how far a predicted rotation may be from one
 _SWAP_MANY = 0.4  # share of matches in the mirrored images that proves the swap
 
 
@@ -77,6 +78,20 @@ class FrameGate:
                 )
         self._index, self._time_ns, self._shape = frame.index, frame.time_ns, frame.left.shape
         return frame.left, frame.right
+
+
+def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
+    """The part of a prior that says something: rows of finite left pixels, one an id, and a rotation that is one."""
+    if prior is None:
+        return None
+    ids, first = np.unique(prior.ids, return_index=True)
+    finite = np.isfinite(prior.z[first, :2]).all(axis=1)
+    R = prior.R_cam_prev
+    if R is not None and not (np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_SLACK):
+        R = None
+    if R is None and not finite.any():
+        return None
+    return TrackPrior(ids[finite], prior.z[first[finite]], R)
 
 
 @dataclass(slots=True)

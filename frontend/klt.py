@@ -19,13 +19,13 @@ from frontend.align import (
     templates,
 )
 from frontend.detect import detect_corners, min_distance_px
-from frontend.frames import FrameGate, Stopwatch, SwapAlarm, half_mask, load_mask
+from frontend.frames import FrameGate, Stopwatch, SwapAlarm, half_mask, load_mask, usable_prior
 from frontend.outliers import (
     Consensus,
     bearing_consensus,
     epipolar_distance,
-    fit_motion,
     pixel_errors,
+    predicted_motion,
     rigid_consensus,
 )
 from frontend.patches import FloatImage, inside
@@ -198,7 +198,7 @@ class KltFrontend:
         if self._mask is not None and self._allowed is None:
             self._allowed = half_mask(self._mask, left.full.shape, left.half.shape)
         watch.lap("prepare")
-        tracks, motion = self._tracked(frame, left, right, prior, watch)
+        tracks, motion = self._tracked(frame, left, right, usable_prior(prior), watch)
         missing = self._settings.target_features - len(tracks)
         corners = detect_corners(
             left.half,
@@ -250,7 +250,7 @@ class KltFrontend:
         if memory is None or len(memory.tracks) == 0:
             return _newborn(np.zeros((0, 2)), nothing), None
         seconds = (frame.time_ns - memory.time_ns) * 1e-9
-        expected = self._expected_motion(memory, prior, seconds)
+        expected = se3_exp(memory.twist_per_s * seconds)
         found, seen = self._flow_all(memory, left, prior, expected)
         watch.lap("track")
         seen, motion = self._consensus(memory.tracks, found, seen, prior, expected, frame.index)
@@ -260,13 +260,6 @@ class KltFrontend:
         tracks = self._with_right(memory, tracks, right, motion is not None)
         watch.lap("stereo")
         return tracks, motion
-
-    def _expected_motion(self, memory: _Memory, prior: TrackPrior | None, seconds: float) -> FloatArray:
-        """Motion (4, 4) `T_curr_prev` expected from the last one, its rotation replaced by a predicted one."""
-        T = se3_exp(memory.twist_per_s * seconds)
-        if prior is not None and prior.R_cam_prev is not None:
-            return se3_from_parts(prior.R_cam_prev, T[:3, 3])
-        return T
 
     def _flow_all(
         self, memory: _Memory, left: _View, prior: TrackPrior | None, expected: FloatArray
@@ -296,12 +289,13 @@ class KltFrontend:
     def _predict(self, old: _Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage) -> FloatArray:
         """Guess the left pixels (N, 2) in the coming frame."""
         guess = old.left.copy()
+        if prior is not None and prior.R_cam_prev is not None:
+            expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
         if self._settings.guess == "motion" or prior is not None:
             guess = self._moved(old, self._with_neighbours(old), expected)
         if prior is not None and len(prior.ids):
             row, given = _common(old, np.arange(len(old)), prior.ids)
-            finite = np.isfinite(prior.z[given, :2]).all(axis=1)
-            guess[row[finite]] = prior.z[given[finite], :2]
+            guess[row] = prior.z[given, :2]
         # A guess outside the image cannot be tracked; the old pixel may still be found inside.
         outside = ~inside(image, guess, 0.0)
         guess[outside] = old.left[outside]
@@ -358,7 +352,7 @@ class KltFrontend:
         T_prior = None
         if prior is not None:
             row, given = _common(old, known, prior.ids)
-            T_prior = fit_motion(camera, old.point[row], prior.z[given, :2], expected, settings)
+            T_prior = predicted_motion(camera, old.point[row], prior.z[given, :2], expected, settings)
         rng = np.random.default_rng((settings.seed, frame_index))
         motion = rigid_consensus(camera, old.point[known], found[known], expected, R_prior, T_prior, rng, settings)
         keep = seen.copy()

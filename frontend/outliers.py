@@ -25,6 +25,9 @@ from vio.records import BoolArray, IntArray
 _MIN_DEPTH_M = 0.05
 _MIN_POINTS = 8  # with fewer, agreement by chance cannot be told from motion
 _MIN_SHARE = 0.2  # a consensus of fewer points says nothing
+_CONTESTED = 0.5  # points that the vote leaves over, over those that a predicted motion needs, for it to be tried
+_TOLD_POINTS = 64  # predicted pixels that are looked at
+_TOLD_PX = 2.0  # median distance of the expected motion from them at which it stands for them
 _SAMPLE_ITERATIONS = 5
 _REFINE_ITERATIONS = 6
 _DAMPING = 1e-4
@@ -180,7 +183,7 @@ def rigid_consensus(
         camera: rectified camera.
         p_prev: points (N, 3) triangulated in the previous frame, metres, previous cam0 frame.
         pixels: left pixels (N, 2) of the same points in the current frame.
-        expected: motion (4, 4) to start from, `T_curr_prev`.
+        expected: motion (4, 4) `T_curr_prev` to start from, of no authority.
         R_prior: predicted rotation (3, 3) from the previous to the current cam0 frame, or None.
         T_prior: predicted motion (4, 4) `T_curr_prev`, or None.
         rng: source of the samples; the same state gives the same result to the bit.
@@ -198,9 +201,11 @@ def rigid_consensus(
         starts.append(T_prior)
     T, inliers = _search(camera, p_prev, pixels, np.stack(starts), rng, settings, slice(0, 6))
     near_prior: list[FloatArray] = []
-    if T_prior is not None:
+    # Two motions that differ hardly explain the same points: where few are left over, no other motion can win.
+    contested = (~inliers).sum() >= _CONTESTED * settings.prior_min_support * inliers.sum()
+    if T_prior is not None and contested:
         near_prior.append(_refine(camera, T_prior, p_prev, pixels, settings.consensus_px, slice(0, 6)))
-    if R_prior is not None and _turn_deg(T, R_prior) > settings.prior_max_deviation_deg:
+    if R_prior is not None and contested and _turn_deg(T, R_prior) > settings.prior_max_deviation_deg:
         fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
         near_prior.append(_search(camera, p_prev, pixels, fixed, rng, settings, slice(0, 3))[0])
     for T_near in near_prior:
@@ -255,6 +260,17 @@ def fit_motion(
     T = _refine(camera, T, p, z, settings.consensus_px, slice(0, 6))
     fits = pixel_errors(camera, T, p, z) <= settings.consensus_px
     return T if fits.mean() > 0.5 else None
+
+
+def predicted_motion(
+    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, expected: FloatArray, settings: ConsensusSettings
+) -> FloatArray | None:
+    """Motion (4, 4) behind predicted pixels, as by `fit_motion` from some of them; `expected` where that will do."""
+    few = slice(None, None, max(1, len(p_prev) // _TOLD_POINTS))
+    p, z = p_prev[few], pixels[few]
+    if len(p) >= _MIN_POINTS and np.median(pixel_errors(camera, expected, p, z)) <= _TOLD_PX:
+        return expected
+    return fit_motion(camera, p, z, expected, settings)
 
 
 # --- two views, no depth --------------------------------------------------------------------------------------------
