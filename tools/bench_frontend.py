@@ -1,6 +1,7 @@
 """Error, track length and time per stage of every front end, on rendered and on real images.
 
-    python tools/bench_frontend.py [--names klt orb sift] [--clips room street kitti_0039] [--repeat 3] [--json FILE]
+    python tools/bench_frontend.py [--names klt orb sift] [--clips room street kitti_0039] [--repeat 3] [--edges]
+        [--json FILE]
 
 Rendered clips and TartanAir have a truth for every pixel. On KITTI the features of one frame are triangulated, moved
 by one rigid motion fitted to the pair, and compared with the pixels tracked there; and, apart, by the true motion.
@@ -260,6 +261,67 @@ def run(clip: Clip, build: Builder) -> list[tuple[FrontendOutput, float]]:
     return results
 
 
+def temporal_errors(clip: Clip, seen: list[Observations], k: int) -> tuple[FloatArray, BoolArray, BoolArray]:
+    """Errors (N,) px of the features of frame k in the next, whether each was found there, whether it could be (N,)."""
+    assert clip.in_next is not None
+    there, visible = clip.in_next(k, seen[k].z[:, :2])
+    visible &= _within(clip, there)
+    found, row = _rows(seen[k].ids, seen[k + 1].ids)
+    if len(seen[k + 1]) == 0:
+        return np.zeros(len(found)), found, visible
+    return np.linalg.norm(seen[k + 1].z[row, :2] - there, axis=1), found, visible
+
+
+def disparity_errors(clip: Clip, seen: list[Observations], k: int) -> tuple[FloatArray, BoolArray]:
+    """Signed errors (N,) px of the disparities of frame k, and the mask (N,) of those that can be judged."""
+    assert clip.in_right is not None
+    there, visible = clip.in_right(k, seen[k].z[:, :2])
+    return there[:, 0] - seen[k].z[:, 2], visible & seen[k].has_right
+
+
+EDGE_PX = (4.0, 8.0)  # the second is the reach of klt's patch
+_EDGE_STEP = 1.05  # ratio of depths between neighbouring pixels of two surfaces
+
+
+def edge_distance(clip: Clip, k: int, uv: FloatArray) -> FloatArray:
+    """Distances (N,) px of left pixels (N, 2) from the nearest step of depth between two surfaces."""
+    assert clip.simulation is not None
+    depth, surface = clip.simulation.depth(0, int(clip.simulation.simulation.taken_ns[k]))
+    square = np.ones((2, 2), np.uint8)
+    near, far, low, high = (
+        operation(image.astype(np.float32), square)
+        for image in (np.where(np.isfinite(depth), depth, 1e6), surface)
+        for operation in (cv2.erode, cv2.dilate)
+    )
+    edge = (far > _EDGE_STEP * near) & (low != high)
+    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, 5)
+    at = np.rint(uv).astype(np.int64)
+    return np.asarray(distance[at[:, 1], at[:, 0]], dtype=np.float64)
+
+
+def edge_figures(clip: Clip, seen: list[Observations]) -> dict[str, Any]:
+    """Share of the features, and of their errors above 1 px, that lie near a step of depth, by distance in px."""
+    rows: dict[str, list[FloatArray]] = {"temporal": [], "disparity": []}
+    for k in range(len(seen)):
+        distance = edge_distance(clip, k, seen[k].z[:, :2])
+        error, judged = disparity_errors(clip, seen, k)
+        rows["disparity"].append(np.stack([np.abs(error), distance], axis=1)[judged])
+        if k + 1 < len(seen):
+            error, found, visible = temporal_errors(clip, seen, k)
+            rows["temporal"].append(np.stack([error, distance], axis=1)[found & visible])
+    figures = {}
+    for name, parts in rows.items():
+        error, distance = np.concatenate(parts).T
+        wrong = error > 1
+        figures[name] = {
+            "errors": int(wrong.sum()),
+            "errors_near": {str(r): float(np.mean(distance[wrong] <= r)) for r in EDGE_PX if wrong.any()},
+            "features_near": {str(r): float(np.mean(distance <= r)) for r in EDGE_PX},
+            "wrong_elsewhere": {str(r): float(np.mean(wrong[distance > r])) for r in EDGE_PX},
+        }
+    return figures
+
+
 def accuracy(clip: Clip, outputs: list[FrontendOutput]) -> dict[str, Any]:
     """Errors against the truth, stereo counts and track lengths."""
     seen = [output.observations for output in outputs]
@@ -277,18 +339,13 @@ def accuracy(clip: Clip, outputs: list[FrontendOutput]) -> dict[str, Any]:
     if clip.in_next is not None and clip.in_right is not None:
         temporal, shown, kept = [], 0, 0
         for k in range(len(seen) - 1) if clip.judged is None else clip.judged:
-            there, visible = clip.in_next(k, seen[k].z[:, :2])
-            visible &= _within(clip, there)
-            found, row = _rows(seen[k].ids, seen[k + 1].ids)
-            temporal.append(np.linalg.norm(seen[k + 1].z[row, :2] - there, axis=1)[found & visible])
+            error, found, visible = temporal_errors(clip, seen, k)
+            temporal.append(error[found & visible])
             shown, kept = shown + int(visible.sum()), kept + int((found & visible).sum())
         figures["temporal_px"] = _summary(np.concatenate(temporal))
         figures["survived"] = kept / max(shown, 1)
-        disparity = []
-        for k, o in enumerate(seen):
-            there, visible = clip.in_right(k, o.z[:, :2])
-            disparity.append((there[:, 0] - o.z[:, 2])[visible & o.has_right])
-        figures["disparity_px"] = _summary(np.concatenate(disparity))
+        judged = [disparity_errors(clip, seen, k) for k in range(len(seen))]
+        figures["disparity_px"] = _summary(np.concatenate([error[mask] for error, mask in judged]))
     elif clip.poses is not None:
         figures |= _rigid_figures(clip, seen)
     return figures
@@ -450,6 +507,16 @@ def table(results: dict[str, dict[str, Any]]) -> str:
                 f"{ms[1]:.1f} ({ms[0]:.1f}, {ms[2]:.1f})",
             ]
             lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        for name, f in by_name.items():
+            for kind, near in f.get("edges", {}).items():
+                lines.append(
+                    f"{name}: of {near['errors']} {kind} errors above 1 px, "
+                    + ", ".join(f"{100 * share:.0f} % within {r} px" for r, share in near["errors_near"].items())
+                    + " of a step of depth; of all features "
+                    + ", ".join(f"{100 * share:.0f} %" for share in near["features_near"].values())
+                    + "; wrong elsewhere "
+                    + ", ".join(f"{100 * share:.2f} %" for share in near["wrong_elsewhere"].values())
+                )
     return "\n".join(lines)
 
 
@@ -470,6 +537,7 @@ def main() -> int:
     parser.add_argument(
         "--set", action="append", default=[], help="setting below `frontend.`, such as klt.window_px=21"
     )
+    parser.add_argument("--edges", action="store_true", help="also say which errors lie at steps of depth (rendered)")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     cv2.setNumThreads(1)
@@ -477,7 +545,7 @@ def main() -> int:
     try:
         with one_blas_thread():
             for clip in clips(set(args.clips), args.frames, args.real_frames):
-                results[clip.name] = measure(clip, builders(args.names, args.set), args.repeat)
+                results[clip.name] = measure(clip, builders(args.names, args.set), args.repeat, edges=args.edges)
     except VioError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -487,7 +555,7 @@ def main() -> int:
     return 0
 
 
-def measure(clip: Clip, build: dict[str, Builder], repeat: int) -> dict[str, Any]:
+def measure(clip: Clip, build: dict[str, Builder], repeat: int, *, edges: bool) -> dict[str, Any]:
     """Figures of each front end on one clip; repetitions take turns, so that a busy machine hits all alike."""
     runs: dict[str, list[list[tuple[FrontendOutput, float]]]] = {name: [] for name in build}
     for _ in range(repeat):
@@ -495,11 +563,15 @@ def measure(clip: Clip, build: dict[str, Builder], repeat: int) -> dict[str, Any
             if name == "oracle" and clip.simulation is None:
                 continue
             runs[name].append(run(clip, build[name]))
-    return {
-        name: accuracy(clip, [output for output, _ in results[0]]) | {"ms": timing(results)}
-        for name, results in runs.items()
-        if results
-    }
+    figures = {}
+    for name, results in runs.items():
+        if not results:
+            continue
+        outputs = [output for output, _ in results[0]]
+        figures[name] = accuracy(clip, outputs) | {"ms": timing(results)}
+        if edges and clip.simulation is not None:
+            figures[name]["edges"] = edge_figures(clip, [output.observations for output in outputs])
+    return figures
 
 
 if __name__ == "__main__":
