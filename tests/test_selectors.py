@@ -8,21 +8,53 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vio.errors import ConfigError
-from vio.records import Observations, observations
+from vio.geometry.lie import se3_exp, transform_points
+from vio.geometry.stereo import StereoCamera, project
+from vio.records import MotionPrior, Observations, observations
 from vio.selectors import Selector, SelectorSettings, build_selector
+
+CAMERA = StereoCamera(430.0, 430.0, 320.0, 180.0, 0.11, 640, 360)
+BUDGETED = ("visibility", "grid", "random", "information")
 
 
 def _frame(index: int, ids: list[int], seed: int = 0) -> Observations:
     rng = np.random.default_rng((seed, index))
-    return observations(index, index * 10**8, ids, rng.uniform(0, [640, 360, 640, 360], (len(ids), 4)))
+    z = rng.uniform(0, [640, 360, 640, 360], (len(ids), 4))
+    return observations(index, index * 10**8, ids, z, rng.random(len(ids)) < 0.9)
 
 
-def _build(name: str, record: list[Observations], fraction: float = 0.3, minimum: int = 2) -> Selector:
-    settings = SelectorSettings(name=name, keep_fraction=fraction, minimum=minimum)  # type: ignore[arg-type]
-    return build_selector(settings, image_size=(640, 360), whole_record=lambda: record)
+def _build(
+    name: str,
+    record: list[Observations],
+    fraction: float = 0.3,
+    minimum: int = 2,
+    budget: int | None = None,
+    sticky: bool = False,
+) -> Selector:
+    settings = SelectorSettings(
+        name=name,  # type: ignore[arg-type]
+        keep_fraction=fraction,
+        minimum=minimum,
+        budget=budget,
+        sticky=sticky,
+    )
+    return build_selector(settings, image_size=(640, 360), whole_record=lambda: record, camera=CAMERA)
 
 
-@pytest.mark.parametrize("name", ["all", "visibility", "visibility_whole", "grid"])
+def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
+    """A camera that moves sideways past points ahead of it; a point out of the image is not seen."""
+    rng = np.random.default_rng(seed)
+    p = rng.uniform([-6, -2, 2], [12, 2, 9], (points, 3))
+    record = []
+    for k in range(frames):
+        p_cam = transform_points(se3_exp([-0.1 * k, 0, 0, 0, 0, 0]), p)
+        z = project(CAMERA, p_cam)
+        inside = (z[:, 0] >= 0) & (z[:, 0] < 640) & (z[:, 1] >= 0) & (z[:, 1] < 360)
+        record.append(observations(k, k * 10**8, np.flatnonzero(inside), z[inside], z[inside, 2] >= 0))
+    return record
+
+
+@pytest.mark.parametrize("name", ["all", "visibility", "visibility_whole", "grid", "random", "information"])
 @given(seen=st.lists(st.lists(st.integers(0, 40), unique=True, max_size=30), min_size=1, max_size=8))
 def test_contract(name: str, seen: list[list[int]]) -> None:
     """A mask of the right length, no more than asked for, the same every time."""
@@ -32,8 +64,10 @@ def test_contract(name: str, seen: list[list[int]]) -> None:
         a, b = first.select(frame), second.select(frame)
         assert a.chosen.shape == a.score.shape == (len(frame),)
         np.testing.assert_array_equal(a.chosen, b.chosen)
-        if name in ("visibility", "grid"):
+        if name in ("visibility", "grid", "random"):
             assert a.chosen.sum() == min(len(frame), max(int(np.ceil(0.3 * len(frame))), 2))
+        if name == "information":
+            assert a.chosen.sum() <= min(len(frame), max(int(np.ceil(0.3 * len(frame))), 2))
         if name == "all":
             assert a.chosen.all()
 
@@ -90,3 +124,112 @@ def test_fraction_out_of_range(fraction: float) -> None:
 def test_cells_out_of_range() -> None:
     with pytest.raises(ConfigError, match="grid_columns"):
         build_selector(SelectorSettings(name="grid", grid_columns=0), image_size=(2, 2), whole_record=None)
+
+
+@pytest.mark.parametrize("sticky", [False, True])
+@pytest.mark.parametrize("name", [*BUDGETED, "visibility_whole"])
+def test_budget_is_an_absolute_number(name: str, sticky: bool) -> None:
+    record = _scene(6)
+    selector = _build(name, record, budget=17, sticky=sticky)
+    assert [int(selector.select(frame).chosen.sum()) for frame in record] == [17] * len(record)
+
+
+@pytest.mark.parametrize("name", BUDGETED)
+def test_a_sticky_feature_stays_chosen_while_it_is_seen(name: str) -> None:
+    record = _scene(12)
+    selector = _build(name, record, budget=25, sticky=True)
+    last: set[int] = set()
+    lost = 0
+    for frame in record:
+        chosen = set(frame.ids[selector.select(frame).chosen].tolist())
+        assert last & set(frame.ids.tolist()) <= chosen
+        lost += len(last - set(frame.ids.tolist()))
+        last = chosen
+    assert lost > 0  # some left the image, and others took their place
+    assert len(last) == 25
+
+
+@pytest.mark.parametrize("name", BUDGETED)
+def test_sticky_gives_way_to_a_smaller_budget(name: str) -> None:
+    """A share of fewer features may be less than what was chosen before; only chosen ones are then kept."""
+    record = _scene(2)
+    selector = _build(name, record, fraction=0.5, minimum=1, sticky=True)
+    first = set(record[0].ids[selector.select(record[0]).chosen].tolist())
+    few = record[1].take(np.isin(record[1].ids, sorted(first)))
+    chosen = selector.select(few).chosen
+    assert chosen.sum() == int(np.ceil(0.5 * len(few)))
+
+
+def test_random_depends_on_seed_and_frame_alone() -> None:
+    record = _scene(3)
+    build = [
+        build_selector(SelectorSettings(name="random", budget=9, seed=seed), image_size=None, whole_record=None)
+        for seed in (0, 0, 1)
+    ]
+    a, b, c = ([s.select(frame).chosen for frame in record] for s in build)
+    np.testing.assert_array_equal(np.concatenate(a), np.concatenate(b))
+    assert (np.concatenate(a) != np.concatenate(c)).any()
+    np.testing.assert_array_equal(build[0].select(record[1]).chosen, a[1])
+
+
+def test_information_spreads_over_the_image_and_takes_near_points() -> None:
+    """Many far points in one corner say little more than one of them; a near one elsewhere says of the translation."""
+    far = np.stack([np.linspace(10, 12, 30), np.linspace(-8, -7, 30), np.full(30, 30.0)], axis=1)
+    near = np.array([[-1.0, 0.5, 2.0], [0.2, 0.6, 2.0], [-0.8, -0.5, 2.0]])
+    z = project(CAMERA, np.concatenate([far, near]))
+    selector = _build("information", [], budget=6)
+    for k in range(3):
+        chosen = selector.select(observations(k, k, np.arange(33), z)).chosen
+    assert chosen[30:].all()
+    assert chosen[:30].sum() == 3
+
+
+def test_information_foresees_what_leaves_the_image() -> None:
+    """Of two points alike but for their side, the camera's turn will hide one: the other is taken."""
+    p = np.array([[-3.2, 0.0, 5.0], [3.2, 0.0, 5.0]])
+    z = project(CAMERA, p)
+    turn = MotionPrior(se3_exp([0, 0, 0, 0, 0.1, 0]), 1e-4 * np.eye(6))  # points move to the right
+    selector = _build("information", [], budget=1)
+    for k in range(2):
+        chosen = selector.select(observations(k, k, [1, 0], z), turn).chosen
+    assert chosen.tolist() == [True, False]
+
+
+def test_information_needs_no_stereo_once_the_point_is_placed() -> None:
+    record = _scene(3, points=30)
+    for placed_before in (True, False):
+        selector = _build("information", [], budget=100)
+        stereo = np.ones(len(record[0]), dtype=np.bool_)
+        first = observations(0, 0, record[0].ids, record[0].z, stereo if placed_before else ~stereo)
+        selector.select(first)
+        left_only = observations(1, 1, record[1].ids, record[1].z, np.zeros(len(record[1]), dtype=np.bool_))
+        chosen = selector.select(left_only).chosen
+        old = np.isin(record[1].ids, record[0].ids)
+        assert chosen[old].all() == placed_before
+        assert not chosen[~old].any()
+
+
+def test_information_leaves_stale_and_impossible_rows_out() -> None:
+    frame = _scene(1)[0]
+    stale = np.arange(len(frame)) % 2 == 0
+    z = frame.z.copy()
+    z[1, 2] = z[1, 0] + 5  # behind the cameras
+    selector = _build("information", [], budget=1000)
+    chosen = selector.select(observations(0, 0, frame.ids, z, frame.has_right, stale)).chosen
+    assert not chosen[stale].any()
+    assert not chosen[1]
+    assert chosen[3::2].sum() == frame.has_right[3::2].sum()
+
+
+def test_information_without_calibration_says_what_to_do() -> None:
+    with pytest.raises(ConfigError, match="calibration"):
+        build_selector(SelectorSettings(name="information"), image_size=None, whole_record=None)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"budget": 0}, "budget"), ({"horizon_frames": 0}, "horizon_frames"), ({"pixel_sigma_px": 0.0}, "pixel_sigma_px")],
+)
+def test_settings_out_of_range(change: dict[str, float], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build_selector(SelectorSettings(**change), image_size=None, whole_record=None)  # type: ignore[arg-type]

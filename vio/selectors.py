@@ -1,7 +1,9 @@
 """Selectors: which observations of a frame enter the filter's update, and why.
 
 The paper sorts features by how often they are seen and keeps the first seventh. `visibility` does that frame by
-frame with what is known so far; `visibility_whole` looks at the whole record first, as the paper does.
+frame with what is known so far; `visibility_whole` looks at the whole record first, as the paper does. `information`
+answers what the paper leaves open: it keeps those features that together say most of the camera's motion.
+docs/selection.md compares them.
 """
 
 from __future__ import annotations
@@ -13,12 +15,14 @@ from typing import Literal
 import numpy as np
 
 from vio.errors import ConfigError
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, transform_points
+from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.information import lazy_greedy, log_det_gain, motion_rows, prior_information, row_weights
 from vio.protocols import Selector
 from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selection
 from vio.setting import setting
 
-SelectorName = Literal["all", "visibility", "visibility_whole", "grid"]
+SelectorName = Literal["all", "visibility", "visibility_whole", "grid", "random", "information"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,12 +32,22 @@ class SelectorSettings:
     name: SelectorName = setting(
         "all",
         "all; visibility: the most often seen so far; visibility_whole: the most often seen in the whole record, as "
-        "the paper does (precomputed features only); grid: the most often seen of each image cell",
+        "the paper does (precomputed features only); grid: the most often seen of each image cell; random: any; "
+        "information: those that together say most of the camera's motion now and in the frames to come",
     )
+    budget: int | None = setting(None, "observations kept of a frame; null: the share below")
     keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7")
     minimum: int = setting(12, "keep at least this many observations of a frame (all but visibility_whole)")
+    sticky: bool = setting(
+        False, "a feature once chosen stays chosen while it is seen, and new ones only fill the budget"
+    )
     grid_columns: int = setting(8, "cells across the image for the grid selector")
     grid_rows: int = setting(4, "cells down the image for the grid selector")
+    horizon_frames: int = setting(
+        4, "information: beside the last motion, the next and the one so many frames ahead count"
+    )
+    pixel_sigma_px: float = setting(0.5, "information: noise of one pixel coordinate", unit="px")
+    seed: int = setting(0, "random: which of the random choices")
 
 
 class _VisibilityCount:
@@ -54,6 +68,34 @@ class _VisibilityCount:
         return [i for i, _ in sorted(self._count.items(), key=lambda item: (-item[1], item[0]))]
 
 
+class _Budget:
+    """How many rows are chosen, and which of them because they were chosen in the last frame."""
+
+    def __init__(self, settings: SelectorSettings) -> None:
+        self._settings = settings
+        self._last: IntArray = np.zeros(0, dtype=np.int64)
+
+    def rows(self, n: int) -> int:
+        """Return how many of n rows may be chosen."""
+        s = self._settings
+        return min(n, max(int(np.ceil(n * s.keep_fraction)), s.minimum) if s.budget is None else s.budget)
+
+    def kept(self, ids: IntArray) -> BoolArray:
+        """Return the rows (N,) that stay chosen; none unless the selector is sticky."""
+        return np.isin(ids, self._last) if self._settings.sticky else np.zeros(len(ids), dtype=np.bool_)
+
+    def remember(self, ids: IntArray, chosen: BoolArray) -> BoolArray:
+        """Note what was chosen (N,) of a frame and return it."""
+        self._last = ids[chosen]
+        return chosen
+
+    def best(self, score: FloatArray, ids: IntArray) -> BoolArray:
+        """Choose those that stay, then the rows of largest score; ties go to the smaller id."""
+        chosen = np.zeros(len(score), dtype=np.bool_)
+        chosen[np.lexsort((ids, -score, ~self.kept(ids)))[: self.rows(len(score))]] = True
+        return self.remember(ids, chosen)
+
+
 class KeepAll:
     """Keeps every observation."""
 
@@ -66,30 +108,37 @@ class KeepAll:
 class CausalVisibility:
     """Ranks the features of each frame by how often they have been seen up to now."""
 
-    def __init__(self, keep_fraction: float, minimum: int) -> None:
-        self._seen, self._fraction, self._minimum = _VisibilityCount(), keep_fraction, minimum
+    def __init__(self, settings: SelectorSettings) -> None:
+        self._seen, self._budget = _VisibilityCount(), _Budget(settings)
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose the most often seen rows; ties go to the older feature."""
         score = self._seen.add(observations.ids)
-        budget = _budget(len(score), self._fraction, self._minimum)
-        return Selection(_best(score, observations.ids, budget), score, f"most seen so far, {budget} of {len(score)}")
+        chosen = self._budget.best(score, observations.ids)
+        return Selection(chosen, score, f"most seen so far, {chosen.sum()} of {len(score)}")
 
 
 class WholeRecordVisibility:
-    """The paper's selection: rank all features of the record by visibility and keep the first share of them."""
+    """The paper's selection: rank all features of the record by visibility and keep the first share of them.
 
-    def __init__(self, record: Iterable[Observations], keep_fraction: float) -> None:
+    Under a budget the first of that ranking are kept in each frame.
+    """
+
+    def __init__(self, record: Iterable[Observations], settings: SelectorSettings) -> None:
         counts = _VisibilityCount()
         for frame in record:
             counts.add(frame.ids)
         ranked = counts.ranked_ids()
         self._rank = {feature: position for position, feature in enumerate(ranked)}
-        self._kept = int(len(ranked) * keep_fraction)
+        self._kept = int(len(ranked) * settings.keep_fraction)
+        self._budget = None if settings.budget is None else _Budget(settings)
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
-        """Choose the rows whose feature belongs to the kept share of the whole record."""
+        """Choose the rows whose feature belongs to the kept share of the whole record, or the first of them."""
         rank = np.array([self._rank[i] for i in observations.ids.tolist()], dtype=np.float64)
+        if self._budget is not None:
+            chosen = self._budget.best(-rank, observations.ids)
+            return Selection(chosen, -rank, f"most seen in the record, {chosen.sum()} of {len(rank)}")
         return Selection(rank < self._kept, -rank, f"most seen in the record, {self._kept} of {len(self._rank)}")
 
 
@@ -98,35 +147,183 @@ class GridVisibility:
 
     def __init__(self, settings: SelectorSettings, width: int, height: int) -> None:
         self._seen, self._settings, self._size = _VisibilityCount(), settings, (width, height)
+        self._budget = _Budget(settings)
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose rows in rounds: the best of each cell, then the second best of each, until the budget is met."""
-        s, (width, height) = self._settings, self._size
-        score = self._seen.add(observations.ids)
-        budget = _budget(len(score), s.keep_fraction, s.minimum)
+        s, (width, height), ids = self._settings, self._size, observations.ids
+        score = self._seen.add(ids)
+        fresh = ~self._budget.kept(ids)
         column = np.clip(observations.z[:, 0] * s.grid_columns // width, 0, s.grid_columns - 1)
         row = np.clip(observations.z[:, 1] * s.grid_rows // height, 0, s.grid_rows - 1)
-        order = np.lexsort((observations.ids, -score, row * s.grid_columns + column))
+        order = np.lexsort((ids, -score, fresh, row * s.grid_columns + column))
         cell = (row * s.grid_columns + column)[order]
         starts = np.flatnonzero(np.diff(cell, prepend=-1))
         place_in_cell = np.arange(len(cell)) - np.repeat(starts, np.diff(starts, append=len(cell)))
         round_of = np.empty(len(score))
         round_of[order] = place_in_cell
-        # Earlier rounds first; within a round the most often seen.
-        by_round = np.lexsort((observations.ids, -score, round_of))
+        # Those that stay, then earlier rounds; within a round the most often seen.
+        by_round = np.lexsort((ids, -score, round_of, fresh))
         chosen = np.zeros(len(score), dtype=np.bool_)
-        chosen[by_round[:budget]] = True
-        return Selection(chosen, score, f"most seen of each cell, {budget} of {len(score)}")
+        chosen[by_round[: self._budget.rows(len(score))]] = True
+        self._budget.remember(ids, chosen)
+        return Selection(chosen, score, f"most seen of each cell, {chosen.sum()} of {len(score)}")
 
 
-def _budget(n: int, fraction: float, minimum: int) -> int:
-    return min(n, max(int(np.ceil(n * fraction)), minimum))
+class RandomChoice:
+    """Any features, as a control: the same ones for the same seed and frame."""
+
+    def __init__(self, settings: SelectorSettings) -> None:
+        self._seed, self._budget = settings.seed, _Budget(settings)
+
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
+        """Choose rows at random."""
+        score = np.random.default_rng((self._seed, observations.frame_index)).random(len(observations))
+        chosen = self._budget.best(score, observations.ids)
+        return Selection(chosen, score, f"random, {chosen.sum()} of {len(score)}")
 
 
-def _best(score: FloatArray, ids: IntArray, budget: int) -> BoolArray:
-    chosen = np.zeros(len(score), dtype=np.bool_)
-    chosen[np.lexsort((ids, -score))[:budget]] = True
-    return chosen
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """What is known of the features of the last frame, in the order of their ids."""
+
+    ids: IntArray  # (N,)
+    p_cam: FloatArray  # (N, 3) in that frame's camera; arbitrary where not placed
+    age: IntArray  # (N,) frames in a row in which the feature was seen
+    sightings: IntArray  # (N,) stereo sightings in a row that were chosen
+
+    def find(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
+        """Rows (M,) of given ids, and which of them are there."""
+        if not len(self.ids):
+            return np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.bool_)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        return at, self.ids[at] == ids
+
+
+_NOTHING_SEEN = _Seen(
+    np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+)
+
+
+class _Survival:
+    """How probably a feature of a given age is seen again in the next frame, counted as the record goes."""
+
+    _AGES = 7  # ages 1, 2-3, 4-7, …, 64 and more
+    _HITS, _TRIALS = 9.0, 10.0  # what is believed before anything is counted
+
+    def __init__(self) -> None:
+        self._hits = np.full(self._AGES, self._HITS)
+        self._trials = np.full(self._AGES, self._TRIALS)
+
+    def count(self, age: IntArray, again: BoolArray) -> None:
+        """Take in which features of an age (N,) were seen again (N,)."""
+        group = self._group(age)
+        self._trials += np.bincount(group, minlength=self._AGES)
+        self._hits += np.bincount(group[again], minlength=self._AGES)
+
+    def probability(self, age: IntArray) -> FloatArray:
+        """Return the probability (N,) for features of an age (N,)."""
+        return (self._hits / self._trials)[self._group(age)]
+
+    def _group(self, age: IntArray) -> IntArray:
+        return np.minimum(np.log2(np.maximum(age, 1)).astype(np.int64), self._AGES - 1)
+
+
+class MotionInformation:
+    """What the features of each frame say of the camera's motion, given which of them the filter has used before."""
+
+    _MIN_DEPTH, _MAX_DEPTH = 0.5, 400.0  # baselines; beyond, the filters do not use a point
+
+    def __init__(self, camera: StereoCamera, horizon_frames: int, pixel_sigma_px: float) -> None:
+        self._camera, self._sigma = camera, pixel_sigma_px
+        self._steps = (0, *sorted({1, horizon_frames}))  # 0: the last motion, 1: the next one, …
+        self._seen, self._survival = _NOTHING_SEEN, _Survival()
+
+    def look(self, observations: Observations, motion: MotionPrior | None) -> FloatArray:
+        """Take in one frame and return what each row says of K motions, (N, K, 3, 6), equations (S3) and (S5).
+
+        The motions are the last one, the next one and the one at the horizon; the expected motion is taken to go on.
+        """
+        ids, last = observations.ids, self._seen
+        T_curr_prev = np.eye(4) if motion is None else motion.T_curr_prev
+        at, known = last.find(ids)
+        self._survival.count(last.age, np.isin(last.ids, ids))
+        age, sightings = np.ones(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.int64)
+        age[known] += last.age[at[known]]
+        sightings[known] = last.sightings[at[known]]
+        expected = transform_points(T_curr_prev, last.p_cam)
+        p_cam, placed = self._place(observations, expected, at, sightings > 0)
+        self._seen = _Seen(ids, p_cam, age, sightings)
+        return self._factors(observations, placed, T_curr_prev)
+
+    def use(self, observations: Observations, chosen: BoolArray) -> None:
+        """Note which rows (N,) of the frame just seen the filter uses."""
+        seen, order = self._seen, np.argsort(observations.ids)
+        stereo = observations.has_right & ~observations.stale
+        sightings = np.where(chosen & ~observations.stale, seen.sightings + stereo, 0)
+        self._seen = _Seen(seen.ids[order], seen.p_cam[order], seen.age[order], sightings[order])
+
+    def _place(
+        self, observations: Observations, p_expected: FloatArray, at: IntArray, was_used: BoolArray
+    ) -> tuple[FloatArray, BoolArray]:
+        """Points (N, 3) in the camera and which (N,) can be used: by stereo, or by the depth that is expected."""
+        camera, z = self._camera, observations.z
+        p_cam, placed = triangulate(camera, z)
+        placed &= observations.has_right
+        left_only = ~observations.has_right & was_used
+        if left_only.any():
+            depth = p_expected[at[left_only], 2:]
+            ray = (z[left_only, :2] - [camera.cu, camera.cv]) / [camera.fu, camera.fv]
+            p_cam[left_only] = np.concatenate([ray * depth, depth], axis=1)
+            placed |= left_only
+        baselines = p_cam[:, 2] / camera.baseline_m
+        return p_cam, placed & ~observations.stale & (baselines > self._MIN_DEPTH) & (baselines < self._MAX_DEPTH)
+
+    def _factors(self, observations: Observations, placed: BoolArray, T_curr_prev: FloatArray) -> FloatArray:
+        L = np.zeros((len(placed), len(self._steps), 3, 6))
+        now, right, n = self._seen.p_cam[placed], observations.has_right[placed], self._seen.sightings[placed]
+        survival = self._survival.probability(self._seen.age[placed])
+        weight = row_weights(n, right)
+        for k, step in enumerate(self._steps):
+            p = transform_points(np.linalg.matrix_power(T_curr_prev, step), now)
+            ahead = p[:, 2] > self._MIN_DEPTH * self._camera.baseline_m
+            safe = np.where(ahead[:, None], p, [0.0, 0.0, 1.0])
+            if step:
+                z = project(self._camera, safe)
+                weight = row_weights(n + step * right, right & self._inside(z[:, 2], z[:, 3]))
+                weight *= (survival**step * (ahead & self._inside(z[:, 0], z[:, 1])))[:, None]
+            L[placed, k] = motion_rows(self._camera, safe) * np.sqrt(weight)[..., None]
+        return L / self._sigma
+
+    def _inside(self, u: FloatArray, v: FloatArray) -> BoolArray:
+        """Which pixels lie in the image; where its size is unknown, the principal point is taken for its centre."""
+        width, height = self._camera.width or 2 * self._camera.cu, self._camera.height or 2 * self._camera.cv
+        return np.asarray((u >= 0) & (u < width) & (v >= 0) & (v < height))
+
+
+class InformationGain:
+    """The features that together say most of the camera's last motion and of those to come (docs/selection.md)."""
+
+    def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
+        self._settings, self._budget = settings, _Budget(settings)
+        self._model = MotionInformation(camera, settings.horizon_frames, settings.pixel_sigma_px)
+
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
+        """Choose rows one at a time, each time the one that adds most to the log-determinant."""
+        ids = observations.ids
+        L = self._model.look(observations, motion)
+        prior = np.repeat(prior_information(motion)[None], L.shape[1], axis=0)
+        budget = self._budget.rows(len(ids))
+        kept = self._budget.kept(ids) & ~observations.stale
+        if kept.sum() > budget:
+            L[~kept], kept = 0.0, np.zeros(len(ids), dtype=np.bool_)
+        greedy = lazy_greedy(prior, L, ids, budget, kept)
+        chosen = np.zeros(len(ids), dtype=np.bool_)
+        chosen[greedy.order] = True
+        self._model.use(observations, chosen)
+        self._budget.remember(ids, chosen)
+        nats = log_det_gain(prior, L[chosen])
+        return Selection(chosen, greedy.gain, f"{nats:.1f} nats from {chosen.sum()} of {len(ids)}")
 
 
 def build_selector(
@@ -134,6 +331,7 @@ def build_selector(
     *,
     image_size: tuple[int, int] | None,
     whole_record: Callable[[], Iterable[Observations]] | None,
+    camera: StereoCamera | None = None,
 ) -> Selector:
     """Build the selector named in the settings.
 
@@ -141,25 +339,47 @@ def build_selector(
         settings: the selector's section of the configuration.
         image_size: width and height in pixels; None where unknown (feature files).
         whole_record: yields all observations of the record; None where they are not known in advance.
+        camera: the rectified pair, which the information selector needs.
 
     Raises:
         ConfigError: a setting is out of range, or the selector needs what the recording cannot give.
     """
-    if not 0 < settings.keep_fraction <= 1:
-        raise ConfigError(f"selector.keep_fraction must lie in (0, 1], got {settings.keep_fraction:g}")
-    if settings.grid_columns < 1 or settings.grid_rows < 1 or settings.minimum < 0:
-        raise ConfigError("selector.grid_columns and grid_rows must be at least 1, selector.minimum at least 0")
+    _check(settings)
     if settings.name == "visibility_whole":
         if whole_record is None:
             raise ConfigError(
                 "selector visibility_whole must know the whole record in advance: run once with --save-observations "
                 "and process that file, or use selector.name=visibility"
             )
-        return WholeRecordVisibility(whole_record(), settings.keep_fraction)
+        return WholeRecordVisibility(whole_record(), settings)
     if settings.name == "grid":
         if image_size is None:
             raise ConfigError("selector grid needs the image size, which this recording does not know; use visibility")
         return GridVisibility(settings, *image_size)
+    if settings.name == "information":
+        if camera is None:
+            raise ConfigError("selector information needs the calibration of the cameras; use visibility")
+        return InformationGain(settings, camera)
     if settings.name == "visibility":
-        return CausalVisibility(settings.keep_fraction, settings.minimum)
+        return CausalVisibility(settings)
+    if settings.name == "random":
+        return RandomChoice(settings)
     return KeepAll()
+
+
+def _check(settings: SelectorSettings) -> None:
+    """Refuse values out of range.
+
+    Raises:
+        ConfigError: a setting is out of range.
+    """
+    if not 0 < settings.keep_fraction <= 1:
+        raise ConfigError(f"selector.keep_fraction must lie in (0, 1], got {settings.keep_fraction:g}")
+    if settings.grid_columns < 1 or settings.grid_rows < 1 or settings.minimum < 0:
+        raise ConfigError("selector.grid_columns and grid_rows must be at least 1, selector.minimum at least 0")
+    if settings.budget is not None and settings.budget < 1:
+        raise ConfigError(f"selector.budget must be at least 1, or null for a share, got {settings.budget}")
+    if settings.horizon_frames < 1 or settings.seed < 0:
+        raise ConfigError("selector.horizon_frames must be at least 1, selector.seed at least 0")
+    if not 0 < settings.pixel_sigma_px < float("inf"):
+        raise ConfigError(f"selector.pixel_sigma_px must be positive, got {settings.pixel_sigma_px:g}")
