@@ -19,6 +19,10 @@ _BLOCK_PX = 3
 _GRADIENT_PX = 3
 # cornerMinEigenVal takes gray levels as fractions of 255 and makes the Sobel derivative twice the gradient.
 _EIGENVALUE_OF_UNIT_GRADIENT = (2.0 / 255.0) ** 2
+_CURVATURE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)  # blind to planes and straight edges
+_CURVATURE_OF_UNIT_NOISE = 6.0 * math.sqrt(2.0 / math.pi)  # mean size; the root of the sum of squares is 6
+_ROUNDING_NOISE = 1.0 / math.sqrt(12.0)  # of whole gray levels
+_GRADIENT_OF_UNIT_NOISE = math.sqrt(12.0) / 8.0  # of the Sobel derivative, gray levels per pixel
 
 
 class GridSettings(Protocol):
@@ -70,6 +74,17 @@ def corner_response(image: Image) -> Response:
     return np.asarray(response, dtype=np.float32) / np.float32(_EIGENVALUE_OF_UNIT_GRADIENT)
 
 
+def noise_gradient(image: Image) -> float:
+    """Root mean square gradient in gray levels per pixel that the noise of an image (H, W) makes, from above.
+
+    Fine texture counts as noise, and so does the rounding to gray levels.
+    Reference: Immerkær, Fast noise variance estimation, CVIU (1996).
+    """
+    curvature = cv2.filter2D(image, cv2.CV_32F, _CURVATURE)
+    sigma = float(cv2.norm(curvature, cv2.NORM_L1)) / curvature.size / _CURVATURE_OF_UNIT_NOISE
+    return _GRADIENT_OF_UNIT_NOISE * max(sigma, _ROUNDING_NOISE)
+
+
 def local_maxima(response: Response, occupied: FloatArray, distance: int, border: int, least: float) -> IntArray:
     """Pixels (K, 2) `[u v]` that are the largest response within `distance` and not near `occupied` (N, 2).
 
@@ -96,7 +111,8 @@ def detect_corners(
 
     Corners are looked for at half resolution: what is a corner there lasts longer, and costs a quarter. The emptiest
     cells are filled first, each by its strongest corners, up to twice a cell's even share; a corner much weaker than
-    the best of its cell is none.
+    the best of its cell is none. In the dark, where too few corners are strong, the strongest of the weak ones are
+    taken as long as they stand out from the image's noise.
 
     Args:
         half: image (H/2, W/2) at half resolution.
@@ -118,6 +134,12 @@ def detect_corners(
         response = np.where(allowed, response, np.float32(0.0))
     distance = max(1, min_distance_px(2 * width, 2 * height, settings) // 2)
     candidates = local_maxima(response, occupied / 2, distance, border, settings.min_gradient**2)
+    missing = settings.target_features - len(occupied)
+    if len(candidates) < missing:
+        floor = settings.min_gradient_over_noise * noise_gradient(half) / 2.0
+        if floor < settings.min_gradient:
+            weaker = local_maxima(response, occupied / 2, distance, border, floor**2)
+            candidates = weaker[np.argsort(-response[weaker[:, 1], weaker[:, 0]], kind="stable")[:missing]]
     shape = grid_shape(2 * width, 2 * height, settings)
     cells = shape[0] * shape[1]
     cell = cell_index(2 * candidates.astype(np.float64), 2 * width, 2 * height, shape)

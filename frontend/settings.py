@@ -20,6 +20,9 @@ class KltSettings:
         1.0, "least gradient of a corner in its weakest direction, root mean square over 6x6 pixels", unit="gray/px"
     )
     min_relative_gradient: float = setting(0.15, "the same, over that of the strongest corner of its grid cell")
+    min_gradient_over_noise: float = setting(
+        5.0, "where corners are few, weaker ones are taken, down to this many times the gradient of the image's noise"
+    )
     spare_corners: float = setting(
         1.5, "corners tried beyond the missing ones, over their number; the best in stereo are kept"
     )

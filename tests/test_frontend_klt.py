@@ -379,6 +379,38 @@ def test_a_step_of_exposure_keeps_the_tracks(outputs: list[FrontendOutput]) -> N
         assert np.median(error) < 0.06
 
 
+def at_night(share: float, read_noise: float) -> list[StereoFrame]:
+    """The flight with a share of the light, and noise that stays."""
+    rng, frames = np.random.default_rng(11), []
+    for k, pose in enumerate(POSES[:4]):
+        pair = [
+            np.clip(np.rint(share * view(SLANTED, T) + read_noise * rng.standard_normal((300, 480))), 0, 255)
+            for T in (pose, right_of(pose))
+        ]
+        frames.append(StereoFrame(k, k * 50_000_000, *(image.astype(np.uint8) for image in pair)))
+    return frames
+
+
+def test_a_twentieth_of_the_light_is_enough_where_the_noise_is_low() -> None:
+    """Mean gray level 6: corners need not be strong to be good, they must stand out from the noise."""
+    frames = at_night(0.05, 0.5)
+    absolute = run(frames, replace(SETTINGS, min_gradient_over_noise=1e6))
+    outputs = run(frames)
+    assert max(output.matched for output in absolute) < 0.4 * SETTINGS.target_features
+    for k in range(3):
+        assert outputs[k + 1].matched > 0.6 * SETTINGS.target_features
+        before, after = common(outputs[k], outputs[k + 1])
+        assert len(before) > 0.7 * len(outputs[k].observations)
+        error = np.linalg.norm(after[:, :2] - truth(SLANTED, POSES[k], before[:, :2], POSES[k + 1])[:, :2], axis=1)
+        assert np.median(error) < 0.2
+        assert np.mean(error > 1) < 0.03
+
+
+def test_in_good_light_the_noise_does_not_matter(outputs: list[FrontendOutput]) -> None:
+    for a, b in zip(outputs, run(FRAMES, replace(SETTINGS, min_gradient_over_noise=1e6)), strict=True):
+        np.testing.assert_array_equal(a.observations.z, b.observations.z)
+
+
 def test_the_mask_keeps_features_away(tmp_path: Path) -> None:
     mask = np.full((300, 480), 255, dtype=np.uint8)
     mask[150:] = 0

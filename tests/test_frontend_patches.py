@@ -16,6 +16,7 @@ from frontend.detect import (
     grid_shape,
     local_maxima,
     min_distance_px,
+    noise_gradient,
 )
 from frontend.patches import inside
 from frontend.settings import KltSettings
@@ -280,3 +281,30 @@ def test_one_set_of_defaults_scales_with_the_image(width: int, height: int) -> N
     assert min_distance_px(width, height, settings) < 0.5 * feature_spacing(width, height, settings)
     corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
     np.testing.assert_array_equal(cell_index(corners, width, height, (rows, columns)), [0, rows * columns - 1])
+
+
+def noisy(level: float, sigma: float, seed: int) -> Image:
+    noise = sigma * np.random.default_rng(seed).standard_normal((240, 320))
+    return np.clip(np.rint(level + noise), 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("sigma", [1.0, 2.0, 6.0])
+def test_the_gradient_of_noise_is_told_from_the_image_alone(sigma: float) -> None:
+    """Against the Sobel derivative itself, on noise alone; a slope and straight edges add nothing."""
+    image = noisy(100, sigma, 1).astype(np.float64)
+    du = image[:, 2:] - image[:, :-2]
+    sobel = (du[:-2] + 2 * du[1:-1] + du[2:]) / 8
+    assert noise_gradient(noisy(100, sigma, 1)) == pytest.approx(np.sqrt(np.mean(sobel**2)), rel=0.05)
+    slope = np.linspace(-60, 60, 320) + np.where(np.arange(320) > 160, 30.0, 0.0)
+    sloped = np.clip(np.rint(image + slope), 0, 255).astype(np.uint8)
+    assert noise_gradient(sloped) == pytest.approx(noise_gradient(noisy(100, sigma, 1)), rel=0.1)
+
+
+def test_noise_in_the_dark_gives_hardly_a_corner() -> None:
+    """The threshold sinks with the noise, but stays above what noise makes of itself."""
+    for sigma in (0.5, 1.5, 3.0):
+        half = half_image(noisy(8, sigma, 2))
+        assert len(detect_corners(half, np.zeros((0, 2)), 1000, KltSettings())) <= 3
+        loose = KltSettings(min_gradient_over_noise=1.0)
+        found = len(detect_corners(half, np.zeros((0, 2)), 1000, loose))
+        assert found > (30 if sigma > 1 else 3)  # the setting is what keeps them away

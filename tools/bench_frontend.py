@@ -133,6 +133,7 @@ def rendered_clips(wanted: set[str], count: int) -> Iterator[Clip]:
         "room_gain_1.6": (lambda k: replace(plain, right_gain=1.6), None),
         "room_noise_5": (lambda k: replace(plain, read_noise=5.0), None),
         "room_dark": (lambda k: replace(plain, exposure=0.25), None),
+        "room_night": (lambda k: replace(plain, exposure=0.05, read_noise=0.5), None),
     }
     if wanted & (room_effects.keys() | {"room_blur_5px"}):
         scene = _room_scene()
@@ -222,6 +223,7 @@ RENDERED = (
     "room_blur_5px",
     "room_noise_5",
     "room_dark",
+    "room_night",
 )
 REAL = ("kitti_0039", "kitti_06_head", "tartanair2_clip")
 
