@@ -1,7 +1,11 @@
 # Two commands: `make demo` shows the main job, `make test` proves it. Both create the environment they need.
+# `make test LEARNED=1` also installs torch and kornia, and so tests the learned front ends instead of skipping them.
 PYTHON ?= python3
 VENV ?= .venv
+LEARNED ?=
 BIN := $(VENV)/bin
+TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: demo test lint unit clean constraints
 
@@ -10,27 +14,31 @@ demo: $(VENV)/.base
 
 test: lint unit
 
-lint: $(VENV)/.dev
+lint: $(TESTED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-unit: $(VENV)/.dev
+unit: $(TESTED)
 	$(BIN)/python -m pytest
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.base: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e .
+	$(PIP_INSTALL) -e .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(PIP_INSTALL) -e '.[dev]'
 	@touch $@ $(VENV)/.base
 
-# Take the exact versions of the present environment as the new constraints.
-constraints: $(VENV)/.dev
+$(VENV)/.learned: pyproject.toml constraints.txt | $(VENV)/bin/python
+	$(PIP_INSTALL) -e '.[dev,learned]'
+	@touch $@ $(VENV)/.dev $(VENV)/.base
+
+# Take the exact versions of the present environment, all extras included, as the new constraints.
+constraints: $(VENV)/.learned
 	$(BIN)/python tools/freeze_constraints.py > constraints.new
 	mv constraints.new constraints.txt
 

@@ -1,22 +1,29 @@
-"""Print the exact versions of this environment as a constraints file; the learned extra's pins are kept."""
+"""Print the exact versions of this environment as a constraints file; it must hold every extra of the project."""
 
 from __future__ import annotations
 
+import importlib.util
 import subprocess
 import sys
 
-# Pinned though not installed here: an open range takes several GB of CUDA packages on machines without a GPU.
-LEARNED = {"torch": "2.13.0", "kornia": "0.9.0"}
+INSTALLERS = {"pip", "wheel"}  # not the project's business
+EXTRAS = ("pytest", "torch", "kornia")  # one package, at least, of each extra
 
 
 def main() -> int:
     """Print the file to stdout."""
-    frozen = subprocess.run([sys.executable, "-m", "pip", "freeze"], check=True, capture_output=True, text=True).stdout
-    pins = dict(LEARNED)
+    missing = [name for name in EXTRAS if importlib.util.find_spec(name) is None]
+    if missing:
+        print(f"error: {', '.join(missing)} not installed here; run `make constraints`", file=sys.stderr)
+        return 1
+    command = [sys.executable, "-m", "pip", "freeze", "--all", "--exclude-editable"]
+    frozen = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    pins = {}
     for line in frozen.splitlines():
         name, equals, version = line.partition("==")
-        if equals and not line.startswith("#"):
-            pins[name] = version
+        if equals and not line.startswith("#") and name not in INSTALLERS:
+            # A build such as 2.13.0+cpu is another machine's 2.13.0.
+            pins[name] = version.partition("+")[0]
     print("# Exact versions that `make` installs; written by `make constraints` on Python", end=" ")
     print(f"{sys.version_info.major}.{sys.version_info.minor}.")
     for name in sorted(pins, key=str.lower):
