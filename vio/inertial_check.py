@@ -86,6 +86,8 @@ _DISAGREES = 0.5  # share of the turning that the best linear map leaves unexpla
 _AGREES = 0.2  # likewise: below this, explanations are judged
 _EXCESS = 0.2  # misfit over the best linear map, as a share of the turning: 11 degrees, or 20 % of scale
 _EXCESS_CLIPPED = 0.5  # likewise where readings are clipped, which turns and shortens what the gyro shows
+_EXCESS_BRIEF = 0.7  # likewise with fewer intervals than the first look has
+_CHANCE = 30.0  # over the intervals, times the unexplained share: squared excess that the map's freedom may bring
 _CLEARLY_WORSE = 2.0
 _NAMED_OFFSET_S = 0.02
 _NEAR_OFFSETS_S = np.arange(-0.1, 0.1001, 0.01)
@@ -269,7 +271,14 @@ class _Samples:
         self._values: list[FloatArray] = []
         self.first_ns: int | None = None
         self.last_ns: int | None = None
-        self.step_s: float | None = None
+        self._step_s: float | None = None
+
+    @property
+    def step_s(self) -> float:
+        """The usual time between two readings; 0.0 before there are two."""
+        if self._step_s is None and len(self._new) > 1:
+            self._step_s = float(np.median(np.diff([s.time_ns for s in self._new]))) * _NS
+        return self._step_s or 0.0
 
     def take(self, sample: ImuSample) -> None:
         if self.last_ns is not None and sample.time_ns <= self.last_ns:
@@ -286,7 +295,6 @@ class _Samples:
         values = np.array([[*s.gyro, *s.accel] for s in self._new])
         before = self._times[-1][-1:] if self._times else times[:0]
         steps = np.diff(np.concatenate([before, times])) * _NS
-        self.step_s = float(np.median(steps)) if self.step_s is None else self.step_s
         found = [*_gap(times, steps, self.step_s), *_saturation(times, values)]
         if keep:
             self._times.append(times)
@@ -424,6 +432,11 @@ class _Turning:
         misfit = total - 2 * scale * float(np.sum(C * self.S_cg)) + scale**2 * float(np.trace(self.S_gg))
         return float(np.sqrt(max(misfit / max(total, 1e-300) - self.unexplained, 0.0)))
 
+    @property
+    def tolerance(self) -> float:
+        """The excess up to which a map passes as right."""
+        return max(_EXCESS, float(np.sqrt(_CHANCE / max(self.count, 1) * self.unexplained)))
+
 
 def _turning(record: _Record, least: int) -> _Turning | None:
     """Fit the camera's rates by the gyro's at the clock offset that serves best; None: too little turning to tell."""
@@ -438,7 +451,7 @@ def _turning(record: _Record, least: int) -> _Turning | None:
     for step in (0.01, 0.003):
         near = _at_offset(record, best.offset_s + step * np.arange(-2, 3), least, noise)
         best = near if near is not None and near.unexplained <= best.unexplained else best
-    return best
+    return best if best.axes else None
 
 
 def _at_offset(record: _Record, offsets: npt.NDArray[np.floating], least: int, noise: float) -> _Turning | None:
@@ -700,104 +713,108 @@ def _judge_gyro(
         told: `force` will not come to know more; else axes are not judged without it.
         clipped: readings at the end of the range were found, which make turns look smaller.
     """
+    brief = turning.count < _FIRST_LOOKS
     if turning.unexplained > _DISAGREES:
-        return [_disagreement(turning)]
-    if turning.unexplained > _AGREES or turning.excess(R, 1.0) < (_EXCESS_CLIPPED if clipped else _EXCESS):
+        return [] if brief else [_disagreement(turning)]
+    limit = max(turning.tolerance, _EXCESS_CLIPPED if clipped else 0.0, _EXCESS_BRIEF if brief else 0.0)
+    if turning.unexplained > _AGREES or turning.excess(R, 1.0) < limit:
         return []
-    share = turning.unexplained
 
     def fits(C: FloatArray) -> bool:
         scale = turning.scale(C)
-        return scale > 0 and turning.excess(C, scale) < _EXCESS
+        return scale > 0 and turning.excess(C, scale) < turning.tolerance
 
     def units(C: FloatArray) -> list[InertialFinding]:
         scale = turning.scale(C)
-        explained = clipped and 0.5 < scale < 2.0
-        return [] if turning.excess(C, 1.0) < _EXCESS or explained else [_judge_scale(scale, share)]
+        harmless = turning.excess(C, 1.0) < turning.tolerance or (clipped and 0.5 < scale < 2.0)
+        return [] if harmless else [_judge_scale(scale, turning.unexplained)]
 
     if fits(R):
         return units(R)
     if not told:
         return []
-    about = "" if turning.axes == 3 else f" (it turns about {turning.axes} axes only, so other explanations fit, too)"
     whole = _wahba(turning.S_cg, mirrored=False)
-    angle = float(rotation_angle_deg(whole @ R.T)) if fits(whole) else None
-    best = "" if angle is None else f"; the best rotation lies {angle:.0f} deg from the given one"
+    best = f"; the best rotation lies {rotation_angle_deg(whole @ R.T):.0f} deg from the given one" * fits(whole)
+    few = {1: "one axis", 2: "two axes"}.get(turning.axes)
+    about = "" if few is None else f" (it turns about {few} only, so other explanations fit, too)"
+    share = turning.excess(R, max(turning.scale(R), 0.0))
     seen = (
-        f"with the given T_cam0_imu {100 * turning.excess(R, max(turning.scale(R), 0.0)):.0f} % of the images' turning "
-        f"contradicts the gyro{best}{about}"
+        f"with the given T_cam0_imu {100 * share:.0f} % of the images' turning contradicts the gyro{best}{about}, and "
     )
     # Where the accelerometer sides with the given rotation, the gyro alone is at fault.
-    gyro_alone = force is not None and _prefers(force, R * unit, [whole * unit])
-    if fits(R.T) and not gyro_alone:
-        return [
-            InertialFinding(
-                "extrinsics inverted",
-                f"{seen}, and the inverse of its rotation fits",
-                "T_imu_cam0 was given as T_cam0_imu; invert the transform",
-            ),
-            *units(R.T),
-        ]
-    if fits(-R):
-        return [
-            InertialFinding(
-                "gyro sign",
-                f"{seen}, and the inverted gyro fits",
-                "the gyro turns left-handed (all three rates have the wrong sign); change the sign of its readings",
-            ),
-            *units(-R),
-        ]
-    for P in _signed_permutations():
-        # The record shows P^T of the true rates, so that R P maps it to the camera.
-        C = R @ P
-        if not fits(C):
-            continue
-        mirrored = np.linalg.det(P) < 0
-        words = f"the gyro's axes read {_axes_text(P.T)} where [+x +y +z] belong"
-        if mirrored or gyro_alone:
-            left = ", a left-handed frame" if mirrored else ""
-            return [
-                InertialFinding("gyro axes", f"{seen}, and exchanged axes fit", f"{words}{left}; put them in order"),
-                *units(C),
-            ]
-        if np.array_equal(np.round(C, 6), np.eye(3)):
-            break
-        return [
-            InertialFinding(
-                "extrinsics rotation",
-                f"{seen}, and a turn by quarter circles fits",
-                f"T_cam0_imu belongs to other IMU axes, or {words}; its rotation should be {_matrix(C)}",
-            ),
-            *units(C),
-        ]
-    if angle is not None:
-        same = "the axes of IMU and camera are the same there; " if fits(np.eye(3)) else ""
-        return [
-            InertialFinding(
-                "extrinsics rotation",
-                seen,
-                f"{same}the rotation of T_cam0_imu should be {_matrix(whole)}; run `vio calibrate`",
-            ),
-            *units(whole),
-        ]
-    mirror = _wahba(turning.S_cg, mirrored=True)
-    if fits(mirror):
-        return [
-            InertialFinding(
-                "gyro axes", f"{seen}, and a mirrored frame fits", "the gyro's axes are left-handed; check their signs"
-            ),
-            *units(mirror),
-        ]
-    if clipped:
+    gyro_alone = force is not None and force.cost(R * unit) * _AXES_WORSE < force.cost(whole * unit)
+    for fault, C, what, explanation in _explanations(R, gyro_alone=gyro_alone):
+        if fits(C):
+            return [InertialFinding(fault, f"{seen}{what}", explanation), *units(C)]
+    if brief or clipped:
         return []
+    for fault, C, what, explanation in _free_explanations(turning.S_cg):
+        if fits(C):
+            return [InertialFinding(fault, f"{seen}{what}", explanation), *units(C)]
     stretch = np.linalg.svd(turning.A, compute_uv=False)
     return [
         InertialFinding(
             "gyro units",
-            f"{seen}, and no rotation fits: the best linear map stretches by {_triple(stretch)}",
+            f"{seen}no rotation fits: the best linear map stretches by {_triple(stretch)}",
             "the gyro's axes have different scales, or one of them is dead",
         )
     ]
+
+
+# A fault, the map (3, 3) from gyro to camera that it would mean, what is seen, and the explanation.
+_Explanation: TypeAlias = tuple[InertialFault, FloatArray, str, str]
+
+
+def _explanations(R: FloatArray, *, gyro_alone: bool) -> Iterator[_Explanation]:
+    """Mistakes with a name, the likeliest first."""
+    if not gyro_alone:
+        yield (
+            "extrinsics inverted",
+            R.T,
+            "the inverse of its rotation fits",
+            "T_imu_cam0 was given as T_cam0_imu; invert the transform",
+        )
+    yield (
+        "gyro sign",
+        -R,
+        "the inverted gyro fits",
+        "the gyro turns left-handed (all three rates have the wrong sign); change the sign of its readings",
+    )
+    if not gyro_alone:
+        yield (
+            "extrinsics rotation",
+            np.eye(3),
+            "the identity fits",
+            "IMU and camera have the same axes in these files; the rotation of T_cam0_imu should be the identity",
+        )
+    for P in _signed_permutations():
+        # The record shows P^T of the true rates, so that R P maps it to the camera.
+        words = f"the gyro's axes read {_axes_text(P.T)} where [+x +y +z] belong"
+        if np.linalg.det(P) < 0:
+            words = f"{words}, a left-handed frame; put them in order"
+            yield "gyro axes", R @ P, "exchanged axes fit", words
+        elif gyro_alone:
+            yield "gyro axes", R @ P, "exchanged axes fit", f"{words}; put them in order"
+        else:
+            words = f"T_cam0_imu belongs to other IMU axes, or {words}; its rotation should be {_matrix(R @ P)}"
+            yield "extrinsics rotation", R @ P, "a turn by quarter circles fits", words
+
+
+def _free_explanations(S_cg: FloatArray) -> Iterator[_Explanation]:
+    """The rotation and the reflection that fit best."""
+    whole = _wahba(S_cg, mirrored=False)
+    yield (
+        "extrinsics rotation",
+        whole,
+        "another rotation fits",
+        f"the rotation of T_cam0_imu should be about {_matrix(whole)}; run `vio calibrate`",
+    )
+    yield (
+        "gyro axes",
+        _wahba(S_cg, mirrored=True),
+        "a mirrored frame fits",
+        "the gyro's axes are left-handed; check their order and signs",
+    )
 
 
 def _disagreement(turning: _Turning) -> InertialFinding:
@@ -810,11 +827,6 @@ def _disagreement(turning: _Turning) -> InertialFinding:
         "the IMU's file may belong to another recording, the clocks may be further apart, the gyro may be dead, or the "
         "images may show something that moves with the camera",
     )
-
-
-def _prefers(force: _ForceFit, C: FloatArray, others: Sequence[FloatArray]) -> bool:
-    """Whether the accelerometer is mapped to the camera clearly better by C than by any other map."""
-    return all(force.cost(C) * _AXES_WORSE < force.cost(other) for other in others)
 
 
 def _judge_force(
@@ -882,8 +894,8 @@ def _upside_down(force: FloatArray, R: FloatArray, *, measured: bool) -> list[In
         "the camera is mounted upside down, or gravity was added with the wrong sign (a + g in place of a - g), which "
         "motion alone cannot tell"
         if measured
-        else "the camera is mounted upside down, or the accelerometer's sign or that of its gravity is wrong; the "
-        "motion is too small to tell"
+        else "the camera is mounted upside down, or the accelerometer's sign, that of its gravity, or T_cam0_imu is "
+        "wrong; the motion is too small to tell"
     )
     return [
         InertialFinding(
@@ -1033,14 +1045,14 @@ class InertialCheck:
     def _no_overlap(self) -> InertialFinding:
         first, last = self._samples.first_ns, self._samples.last_ns
         span = None if first is None or last is None else (first, last)
-        return _no_overlap(self._span_of_frames(), span, (self._samples.step_s or 0.0) / _NS)
+        return _no_overlap(self._span_of_frames(), span, self._samples.step_s / _NS)
 
     def _part_covered(self) -> list[InertialFinding]:
         first, last = self._samples.first_ns, self._samples.last_ns
         share = self._frames_covered / self._frames
         if first is None or last is None or (1 - share) * self._seconds_of_frames() < 1.0:
             return []
-        step_ns = (self._samples.step_s or 0.0) / _NS
+        step_ns = self._samples.step_s / _NS
         return [_part_overlap(self._span_of_frames(), (first, last), step_ns, share)]
 
     def _remember(self, motion: _Intervals) -> None:

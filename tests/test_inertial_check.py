@@ -1,0 +1,435 @@
+"""The watch over the IMU: every fault gives its own finding, good data none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vio.geometry.distortion import rectified_camera
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, transform_points
+from vio.geometry.stereo import StereoCamera, project
+from vio.inertial_check import InertialCheck, InertialFinding, judge_clocks
+from vio.records import ImuSample, Observations, observations
+from vio.sim.imu import ImuNoise, imu_samples, read_imu_csv, simulate_imu
+from vio.sim.motion import MotionSpline, car_loop, evaluate, fit_spline, hand_held, read_tum, turned
+from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_rectified_rig, small_rig
+
+_FRAME_NS = 50_000_000
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A recording as the check sees it."""
+
+    camera: StereoCamera
+    T_cam0_imu: FloatArray
+    samples: list[ImuSample]
+    gravity: list[FloatArray]  # (3,) each sample's part that is due to gravity
+    frames: list[Observations]
+
+
+def _observe(
+    camera: StereoCamera,
+    T_world_imu: FloatArray,
+    T_cam0_imu: FloatArray,
+    times_ns: list[int],
+    reach: float,
+    seed: int,
+    sigma_px: float = 0.5,
+) -> list[Observations]:
+    """Points on the walls of a cube `reach` metres around the path, with noise on their pixels."""
+    rng = np.random.default_rng([seed, 1])
+    centre, half = (f(T_world_imu[:, :3, 3], axis=0) for f in (np.mean, np.ptp))
+    points = rng.uniform(-1, 1, (6000, 3))
+    points[np.arange(6000), rng.integers(0, 3, 6000)] = rng.choice([-1.0, 1.0], 6000)
+    points = centre + points * (half / 2 + reach)
+    assert camera.width is not None
+    assert camera.height is not None
+    frames = []
+    for k, time_ns in enumerate(times_ns):
+        p = transform_points(T_cam0_imu @ se3_inverse(T_world_imu[k]), points)
+        ahead = np.flatnonzero(p[:, 2] > 0.5)
+        z = project(camera, p[ahead])
+        seen = (z[:, [0, 2]] > 0).all(axis=1) & (z[:, [0, 2]] < camera.width).all(axis=1)
+        seen &= (z[:, 1] > 0) & (z[:, 1] < camera.height)
+        ids = ahead[seen][:200]
+        frames.append(observations(k, time_ns, ids, z[seen][:200] + rng.normal(0, sigma_px, (len(ids), 4))))
+    return frames
+
+
+def _motion(name: str, seed: int) -> MotionSpline:
+    if name == "room":
+        return hand_held(duration_s=20, seed=seed)
+    if name == "slow":
+        return hand_held(duration_s=20, period_s=60, seed=seed)
+    if name == "still":
+        return hand_held(duration_s=6, still_s=10, seed=seed)
+    return hand_held(duration_s=16, still_s=3, period_s=8, seed=seed)
+
+
+@cache
+def _recording(name: str, seed: int = 0, mount: str = "euroc") -> Watched:
+    rig = euroc_rectified_rig() if mount == "euroc" else small_rig()
+    motion = _motion(name, seed)
+    if name == "car":
+        motion = car_loop(duration_s=25, start_m=25, seed=seed)
+    if mount == "euroc":
+        motion = turned(motion, R_FLU_EUROC_IMU)
+    imu = simulate_imu(motion, noise=ImuNoise(), seed=seed)
+    times = np.arange(motion.start_ns, motion.end_ns, _FRAME_NS)
+    T_cam0_imu = se3_inverse(rig.T_imu_cam0)
+    camera = rectified_camera(rig)
+    reach = 15.0 if name == "car" else 3.0
+    frames = _observe(camera, evaluate(motion, times).T_world_imu, T_cam0_imu, times.tolist(), reach, seed)
+    gravity = 9.81 * evaluate(motion, imu.times_ns).T_world_imu[:, 2, :3]
+    return Watched(camera, T_cam0_imu, imu_samples(imu), list(gravity), frames)
+
+
+@cache
+def _real(folder: Path, seconds: float) -> Watched:
+    """The real IMU record of a flight, and points seen along its ground truth."""
+    truth_ns, poses = read_tum(folder / "groundtruth_tum.txt")
+    used = truth_ns < truth_ns[0] + round((seconds + 1) * 1e9)
+    motion, _ = fit_spline(truth_ns[used], poses[used], knot_s=0.1)
+    start, end = motion.start_ns, motion.start_ns + round(seconds * 1e9)
+    record = read_imu_csv(folder / "imu0.csv")
+    samples = [s for s in imu_samples(record) if start <= s.time_ns <= end]
+    times = np.arange(start, end, _FRAME_NS)
+    rig = euroc_rectified_rig()
+    camera, T_cam0_imu = rectified_camera(rig), se3_inverse(rig.T_imu_cam0)
+    frames = _observe(camera, evaluate(motion, times).T_world_imu, T_cam0_imu, times.tolist(), 3.0, 0, 0.2)
+    return Watched(camera, T_cam0_imu, samples, [], frames)
+
+
+def _watch(
+    it: Watched,
+    *,
+    samples: list[ImuSample] | None = None,
+    T_cam0_imu: FloatArray | None = None,
+    frames: list[Observations] | None = None,
+) -> list[InertialFinding]:
+    """Run the check over samples and frames in time order."""
+    check = InertialCheck(it.camera, it.T_cam0_imu if T_cam0_imu is None else T_cam0_imu)
+    events: list[ImuSample | Observations] = [*(it.samples if samples is None else samples)]
+    events = sorted([*events, *(it.frames if frames is None else frames)], key=lambda e: e.time_ns)
+    found: list[InertialFinding] = []
+    for event in events:
+        if isinstance(event, ImuSample):
+            check.imu(event)
+        else:
+            found += check.frame(event)
+    return [*found, *check.finish()]
+
+
+def _faults(found: list[InertialFinding]) -> list[str]:
+    return [f.fault for f in found]
+
+
+def _gyro(it: Watched, change: Callable[[FloatArray], FloatArray]) -> list[ImuSample]:
+    return [replace(s, gyro=change(s.gyro)) for s in it.samples]
+
+
+def _accel(it: Watched, change: Callable[[FloatArray], FloatArray]) -> list[ImuSample]:
+    return [replace(s, accel=change(s.accel)) for s in it.samples]
+
+
+def _gravity(it: Watched, factor: float) -> list[ImuSample]:
+    return [replace(s, accel=s.accel + factor * g) for s, g in zip(it.samples, it.gravity, strict=True)]
+
+
+def _shifted(it: Watched, seconds: float) -> list[ImuSample]:
+    return [replace(s, time_ns=s.time_ns + round(seconds * 1e9)) for s in it.samples]
+
+
+# Good data
+
+
+@pytest.mark.parametrize("mount", ["euroc", "forward"])
+@pytest.mark.parametrize(
+    ("name", "seed"), [("room", 0), ("room", 1), ("slow", 2), ("late", 3), ("still", 4), ("car", 5)]
+)
+def test_good_recording_gives_no_finding(name: str, seed: int, mount: str) -> None:
+    assert _watch(_recording(name, seed, mount)) == []
+
+
+@pytest.mark.parametrize("count", [10, 25, 40, 80])
+@pytest.mark.parametrize("first", [0, 120, 240])
+def test_short_recording_gives_no_finding(first: int, count: int) -> None:
+    it = _recording("room", 1)
+    assert _watch(it, frames=it.frames[first : first + count]) == []
+
+
+def test_wrong_matches_and_black_images_give_no_finding() -> None:
+    it = _recording("room")
+    rng = np.random.default_rng(0)
+    frames = []
+    for k, seen in enumerate(it.frames):
+        wrong = rng.random(len(seen)) < 0.15
+        z = seen.z + np.where(wrong[:, None], rng.uniform(-40, 40, (len(seen), 4)), 0)
+        right = rng.random(len(seen)) < 0.8
+        keep = np.arange(len(seen)) < (0 if k % 100 > 90 else 150)
+        frames.append(replace(seen, z=z, has_right=right).take(keep))
+    assert _watch(it, frames=frames) == []
+    assert _faults(_watch(it, frames=frames, samples=_accel(it, lambda a: -a))) == ["accelerometer sign"]
+
+
+def test_poor_sensor_gives_no_finding() -> None:
+    it = _recording("room", 1)
+    rng = np.random.default_rng(1)
+    poor = [
+        replace(s, gyro=s.gyro + rng.normal([0.1, -0.05, 0.08], 0.05), accel=s.accel + rng.normal(0.3, 0.5, 3))
+        for s in it.samples
+    ]
+    assert _watch(it, samples=poor) == []
+
+
+# Units, signs, axes
+
+_CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
+_SPOILED: dict[str, tuple[Callable[[Watched], list[ImuSample]], list[str], str]] = {
+    "g": (lambda it: _accel(it, lambda a: a / 9.80665), ["accelerometer units"], "in g: multiply by 9.81"),
+    "mg": (lambda it: _accel(it, lambda a: a / 9.80665e-3), ["accelerometer units"], "mg"),
+    "odd": (lambda it: _accel(it, lambda a: a * 5), ["accelerometer units"], "the unit or scale is unknown"),
+    "no gravity": (lambda it: _gravity(it, -1), ["gravity removed"], "taken out"),
+    "degrees": (lambda it: _gyro(it, np.degrees), ["gyro units"], "deg/s: multiply its readings by pi/180"),
+    "half": (lambda it: _gyro(it, lambda w: 0.5 * w), ["gyro units"], "multiplied by "),
+    "left-handed": (lambda it: _gyro(it, lambda w: -w), ["gyro sign"], "left-handed"),
+    "cycled gyro": (lambda it: _gyro(it, lambda w: _CYCLE @ w), ["gyro axes"], "[+y +z +x]"),
+    "mirrored gyro": (lambda it: _gyro(it, lambda w: w * [1, 1, -1]), ["gyro axes"], "[+x +y -z]"),
+    "turned gyro": (lambda it: _gyro(it, lambda w: w * [-1, -1, 1]), ["gyro axes"], "[-x -y +z]"),
+    "dead gyro": (lambda it: _gyro(it, lambda w: 0 * w), ["gyro disagrees"], "dead"),
+    "inverted accelerometer": (lambda it: _accel(it, lambda a: -a), ["accelerometer sign"], "wrong sign"),
+    "cycled accelerometer": (lambda it: _accel(it, lambda a: _CYCLE @ a), ["accelerometer axes"], "[+y +z +x]"),
+    "gravity alone inverted": (lambda it: _gravity(it, -2), ["upside down"], "a + g in place of a - g"),
+    "g and degrees": (
+        lambda it: [replace(s, gyro=np.degrees(s.gyro), accel=s.accel / 9.80665) for s in it.samples],
+        ["accelerometer units", "gyro units"],
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize(("seed", "mount"), [(0, "euroc"), (1, "forward")])
+@pytest.mark.parametrize("name", _SPOILED)
+def test_spoiled_samples_give_exactly_their_finding(name: str, seed: int, mount: str) -> None:
+    spoil, faults, words = _SPOILED[name]
+    it = _recording("room", seed, mount)
+    found = _watch(it, samples=spoil(it))
+    assert _faults(found) == faults
+    assert words in found[0].explanation + found[0].seen
+    assert all("\n" not in f.message and f.seen in f.message and f.explanation in f.message for f in found)
+    assert [f.certain for f in found] == [f.fault != "upside down" for f in found]
+
+
+@pytest.mark.parametrize("name", ["degrees", "left-handed", "inverted accelerometer", "no gravity"])
+def test_slow_motion_is_enough(name: str) -> None:
+    spoil, faults, _ = _SPOILED[name]
+    it = _recording("slow", 2)
+    assert _faults(_watch(it, samples=spoil(it))) == faults
+
+
+def test_degrees_are_told_after_two_seconds_when_the_run_ends() -> None:
+    it = _recording("room")
+    assert _faults(_watch(it, samples=_gyro(it, np.degrees), frames=it.frames[:40])) == ["gyro units"]
+
+
+def test_nothing_is_claimed_of_motion_at_rest() -> None:
+    it = _recording("still", 4)
+    rest = [f for f in it.frames if f.time_ns < 9_900_000_000]
+    for spoil in ("degrees", "left-handed", "cycled gyro"):
+        assert _watch(it, samples=_SPOILED[spoil][0](it), frames=rest) == []
+    assert _faults(_watch(it, samples=_SPOILED["g"][0](it), frames=rest)) == ["accelerometer units"]
+    hint = _watch(it, samples=_SPOILED["inverted accelerometer"][0](it), frames=rest)
+    assert _faults(hint) == ["upside down"]
+    assert "too small to tell" in hint[0].explanation
+    assert not hint[0].certain
+
+
+# Extrinsics
+
+
+@pytest.mark.parametrize("mount", ["euroc", "forward"])
+def test_extrinsics_are_told_from_gyro_and_accelerometer(mount: str) -> None:
+    """The inverse of either mount only exchanges axes, as a wrongly wired gyro does; the accelerometer tells."""
+    it = _recording("room", 0, mount)
+    T = it.T_cam0_imu
+    assert _faults(_watch(it, T_cam0_imu=se3_inverse(T))) == ["extrinsics inverted"]
+    identity = _watch(it, T_cam0_imu=np.eye(4))
+    assert _faults(identity) == ["extrinsics rotation"]
+    assert str(np.round(T[0, 1], 1)) in identity[0].explanation
+    turned_by = _watch(it, T_cam0_imu=T @ se3_exp([0, 0, 0, 0.3, 0.4, -0.1]))
+    assert _faults(turned_by) == ["extrinsics rotation"]
+    assert "lies 29 deg" in turned_by[0].seen
+
+
+def test_small_errors_of_extrinsics_are_left_to_calibration() -> None:
+    it = _recording("room")
+    assert _watch(it, T_cam0_imu=it.T_cam0_imu @ se3_exp([0.01, 0.02, 0, 0.03, 0.03, -0.03])) == []
+
+
+def test_degrees_and_inverted_extrinsics_are_both_told() -> None:
+    it = _recording("room")
+    found = _watch(it, samples=_gyro(it, np.degrees), T_cam0_imu=se3_inverse(it.T_cam0_imu))
+    assert _faults(found) == ["extrinsics inverted", "gyro units"]
+
+
+# Clocks
+
+
+def test_offset_of_the_clocks_is_measured() -> None:
+    it = _recording("room")
+    for seconds in (0.05, -1.3):
+        found = _watch(it, samples=_shifted(it, seconds))
+        assert _faults(found) == ["clocks apart"]
+        assert f"{seconds:+.3f} s" in found[0].explanation
+    assert _watch(it, samples=_shifted(it, 0.005)) == []
+
+
+def test_no_sample_among_the_frames_is_said_before_a_filter_gives_up() -> None:
+    it = _recording("room")
+    check = InertialCheck(it.camera, it.T_cam0_imu)
+    said = [k for k, seen in enumerate(it.frames[:20]) if check.frame(seen)]
+    assert said == [9]
+    assert check.finish() == ()
+    check = InertialCheck(it.camera, it.T_cam0_imu)
+    for sample in it.samples[:100]:
+        check.imu(sample)
+    late = [replace(f, time_ns=f.time_ns + 10**15) for f in it.frames[:12]]
+    found = [f for seen in late for f in check.frame(seen)]
+    assert _faults(found) == ["clocks without overlap"]
+    assert "epochs" in found[0].explanation
+
+
+def test_part_of_the_frames_without_samples_is_counted() -> None:
+    it = _recording("room")
+    found = _watch(it, samples=[s for s in it.samples if s.time_ns < 15_000_000_000])
+    assert _faults(found) == ["clocks overlap in part"]
+    assert "75." in found[0].seen
+
+
+_EPOCH = 1_400_000_000 * 10**9
+_CAMERA_NS = _EPOCH + np.arange(400) * _FRAME_NS
+_IMU_NS = _EPOCH + np.arange(4000) * 5_000_000
+
+
+@pytest.mark.parametrize(
+    ("imu_ns", "fault", "words"),
+    [
+        (_IMU_NS // 1000, "clocks without overlap", "1e+3 the IMU's stamps cover the frames"),
+        (_IMU_NS // 10**6, "clocks without overlap", "milliseconds"),
+        (_IMU_NS - _EPOCH, "clocks without overlap", "other epochs"),
+        (_IMU_NS[:0], "clocks without overlap", "epoch"),
+        (_IMU_NS[:1000], "clocks overlap in part", "cut short"),
+        ((_IMU_NS - _EPOCH) // 1000 + _EPOCH, "clocks overlap in part", ""),
+    ],
+)
+def test_clocks_are_judged_by_their_stamps(imu_ns: np.ndarray, fault: str, words: str) -> None:
+    (finding,) = judge_clocks(_CAMERA_NS, imu_ns)
+    assert finding.fault == fault
+    assert words in finding.explanation
+    assert str(_CAMERA_NS[0]) in finding.seen
+
+
+def test_clocks_that_agree_give_no_finding() -> None:
+    assert judge_clocks(_CAMERA_NS, _IMU_NS) == ()
+    assert judge_clocks(_CAMERA_NS, _IMU_NS[50:]) == ()
+    assert judge_clocks(_CAMERA_NS[:0], _IMU_NS) == ()
+
+
+# The samples by themselves
+
+
+def test_saturation_is_told_and_no_scale_made_of_it() -> None:
+    it = _recording("room")
+    found = _watch(it, samples=_gyro(it, lambda w: np.clip(w, -0.45, 0.45)))
+    assert _faults(found) == ["saturation"]
+    assert "0.45 rad/s" in found[0].seen
+
+
+def test_coarse_and_held_samples_are_not_saturated() -> None:
+    it = _recording("room")
+    coarse = [
+        replace(s, gyro=np.round(s.gyro / 0.01) * 0.01, accel=np.round(s.accel / 0.05) * 0.05) for s in it.samples
+    ]
+    assert _watch(it, samples=coarse) == []
+    held = [replace(s, gyro=it.samples[k - k % 5].gyro) for k, s in enumerate(it.samples)]
+    assert _watch(it, samples=held) == []
+
+
+def test_silence_is_told_once() -> None:
+    it = _recording("room")
+    kept = [s for s in it.samples if not 3 <= s.time_ns * 1e-9 % 8 < 3.2]
+    found = _watch(it, samples=kept)
+    assert _faults(found) == ["IMU gap"]
+    assert "0.205 s" in found[0].seen
+
+
+# The watch itself
+
+
+def test_watch_ends_and_can_be_asked_again() -> None:
+    it = _recording("late", 3)
+    check = InertialCheck(it.camera, it.T_cam0_imu)
+
+    def feed(spoil: float, shift_ns: int) -> list[InertialFinding]:
+        found: list[InertialFinding] = []
+        samples = iter(it.samples)
+        for seen in it.frames:
+            for sample in samples:
+                check.imu(replace(sample, gyro=spoil * sample.gyro, time_ns=sample.time_ns + shift_ns))
+                if sample.time_ns >= seen.time_ns:
+                    break
+            found += check.frame(replace(seen, time_ns=seen.time_ns + shift_ns))
+        return found
+
+    length = it.samples[-1].time_ns - it.samples[0].time_ns + 5_000_000
+    assert feed(1.0, 0) == []
+    assert feed(1.0, length) == []
+    assert check.done
+    assert feed(-1.0, 2 * length) == []  # nobody looks any more
+    check.again()
+    assert not check.done
+    assert _faults(feed(-1.0, 3 * length)) == ["gyro sign"]
+    check.again()
+    assert feed(-1.0, 4 * length) == []  # said before
+    assert check.finish() == ()
+
+
+def test_memory_is_bounded() -> None:
+    it = _recording("still", 4)
+    check = InertialCheck(it.camera, it.T_cam0_imu)
+    for k in range(80 * 20):
+        for j in range(10):
+            check.imu(ImuSample(k * _FRAME_NS + j * 5_000_000, np.zeros(3), np.array([9.81, 0, 0])))
+        seen = it.frames[0]
+        check.frame(replace(seen, frame_index=k, time_ns=k * _FRAME_NS + 45_000_000))
+    times_ns, _ = check._samples.table()
+    assert 50e9 < times_ns[-1] - times_ns[0] < 65e9
+    assert check.finish() == ()
+
+
+# Real records
+
+
+@pytest.mark.parametrize("flight", ["V1_02", "MH_03"])
+def test_real_imu_is_good_until_it_is_spoiled(data_dir: Path, flight: str) -> None:
+    it = _real(data_dir / "euroc_real_imu" / flight, 30.0)
+    T = it.T_cam0_imu
+    assert _watch(it) == []
+    assert _faults(_watch(it, T_cam0_imu=se3_inverse(T))) == ["extrinsics inverted"]
+    for name in ("degrees", "g", "left-handed", "turned gyro", "inverted accelerometer", "cycled accelerometer"):
+        spoil, faults, _ = _SPOILED[name]
+        assert _faults(_watch(it, samples=spoil(it))) == faults, name
+
+
+def test_inverted_lever_arm_is_told_where_the_motion_shows_it(data_dir: Path) -> None:
+    it = _real(data_dir / "euroc_real_imu" / "V1_02", 30.0)
+    T = se3_from_parts(it.T_cam0_imu[:3, :3], -it.T_cam0_imu[:3, 3])
+    found = _watch(it, T_cam0_imu=T)
+    assert _faults(found) == ["extrinsics translation"]
+    assert "its negative fits" in found[0].seen
