@@ -226,6 +226,15 @@ def test_spoiled_samples_give_exactly_their_finding(name: str, seed: int, mount:
     assert [f.certain for f in found] == [f.fault != "upside down" for f in found]
 
 
+def test_biased_accelerations_without_gravity_are_not_taken_for_g() -> None:
+    it = _recording("room")
+    bias = np.array([0.6, -0.6, 0.55])
+    removed = [replace(s, accel=s.accel - g + bias) for s, g in zip(it.samples, it.gravity, strict=True)]
+    sizes = [np.linalg.norm(s.accel) for s in removed]
+    assert 0.8 < np.median(sizes) < 1.3  # as in g
+    assert _faults(_watch(it, samples=removed)) == ["gravity removed"]
+
+
 @pytest.mark.parametrize("name", ["degrees", "left-handed", "inverted accelerometer", "no gravity"])
 def test_slow_motion_is_enough(name: str) -> None:
     spoil, faults, _ = _SPOILED[name]

@@ -599,15 +599,20 @@ def _force_window(
 # --- verdicts -------------------------------------------------------------------------------------------------------
 
 
-def _judge_size(times_ns: IntArray, accel: FloatArray) -> tuple[InertialFinding | None, float | None]:
-    """Judge the accelerometer's unit by the size of its mean readings.
+@dataclass(frozen=True, slots=True)
+class _Size:
+    """How large the accelerometer's mean readings are, and what that means."""
 
-    Returns:
-        A finding, and the factor that makes the readings m/s^2; None where there is no such factor (gravity is gone).
-    """
+    finding: InertialFinding | None
+    unit: float | None  # factor that makes the readings m/s^2; None: there is none, as gravity is gone
+    clear: bool = True  # False: biased readings without gravity can be of this size, too
+
+
+def _judge_size(times_ns: IntArray, accel: FloatArray) -> _Size:
+    """Judge the accelerometer's unit by the size of its mean readings."""
     t = np.asarray((times_ns - times_ns[0]) * _NS, dtype=np.float64)
     if t[-1] < _LEAST_SIZE_S:
-        return None, 1.0
+        return _Size(None, 1.0)
     integral = np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (accel[1:] + accel[:-1]) / 2, axis=0)])
     edges = np.arange(0.0, t[-1], _SMOOTH_S)
     mean = np.diff(np.stack([np.interp(edges, t, integral[:, k]) for k in range(3)], axis=1), axis=0) / _SMOOTH_S
@@ -615,7 +620,7 @@ def _judge_size(times_ns: IntArray, accel: FloatArray) -> tuple[InertialFinding 
     median = float(np.median(size))
     spread = 1.4826 * float(np.median(np.abs(size - median))) / max(median, 1e-300)
     if 0.5 < median / _GRAVITY < 2.5:
-        return None, 1.0
+        return _Size(None, 1.0)
     seen = f"the accelerometer's median size is {median:.4g} where gravity alone makes 9.8 m/s^2"
     units = {
         "g": (1.0, "in g: multiply by 9.81"),
@@ -624,25 +629,38 @@ def _judge_size(times_ns: IntArray, accel: FloatArray) -> tuple[InertialFinding 
     }
     for gravity, words in units.values():
         if 0.6 < median / gravity < 1.6 and spread < 0.3:
-            return InertialFinding("accelerometer units", seen, f"the readings are {words}"), _GRAVITY / gravity
+            finding = InertialFinding("accelerometer units", seen, f"the readings are {words}")
+            clear = gravity > 1.0 or (abs(median - 1.0) < 0.1 and spread < 0.06)
+            return _Size(finding, _GRAVITY / gravity, clear)
     if median < 0.5 * _GRAVITY and (spread >= 0.3 or median < 0.5):
-        return (
-            InertialFinding(
-                "gravity removed",
-                f"{seen}, and it varies by {100 * spread:.0f} %",
-                "gravity has been taken out ('linear acceleration'), or the sensor is dead; a filter needs the raw "
-                "specific force (+9.8 m/s^2 upwards at rest)",
-            ),
-            None,
-        )
-    return (
-        InertialFinding(
-            "accelerometer units",
-            f"{seen} (spread {100 * spread:.0f} %)",
-            f"the unit or scale is unknown; a factor of {_GRAVITY / median:.4g} would make it 9.8",
-        ),
-        _GRAVITY / median,
+        return _Size(_gravity_removed(f"{seen}, and it varies by {100 * spread:.0f} %"), None)
+    finding = InertialFinding(
+        "accelerometer units",
+        f"{seen} (spread {100 * spread:.0f} %)",
+        f"the unit or scale is unknown; a factor of {_GRAVITY / median:.4g} would make it 9.8",
     )
+    return _Size(finding, _GRAVITY / median, median > 0.5 * _GRAVITY)
+
+
+def _gravity_removed(seen: str) -> InertialFinding:
+    return InertialFinding(
+        "gravity removed",
+        seen,
+        "gravity has been taken out ('linear acceleration'), or the sensor is dead; a filter needs the raw specific "
+        "force (+9.8 m/s^2 upwards at rest)",
+    )
+
+
+def _settle_size(size: _Size, force: _ForceFit | None, R: FloatArray, *, told: bool) -> _Size:
+    """Where the size alone leaves it open, ask whether the accelerations are in m/s^2 all the same."""
+    if size.clear or size.finding is None or size.unit is None:
+        return size
+    if force is not None:
+        scale, sigma = force.sign(R)
+        if 0 < scale < 0.5 * size.unit - _SIGN_SIGMAS * sigma:
+            seen = f"{size.finding.seen}, though the images' accelerations are only {scale:.2f} times its own"
+            return _Size(_gravity_removed(seen), None)
+    return size if told else _Size(None, size.unit)
 
 
 def _judge_offset(turning: _Turning, record: _Record, least: int) -> InertialFinding | None:
@@ -1078,10 +1096,10 @@ class InertialCheck:
         times_ns, values = self._samples.table()
         if len(times_ns) < 2:
             return []
-        size, unit = _judge_size(times_ns, values[:, 3:])
-        found = [] if size is None else [size]
+        size = _judge_size(times_ns, values[:, 3:])
+        by_size = [] if size.finding is None else [size.finding]
         if not self._intervals:
-            return found
+            return by_size
         intervals = _Intervals(
             np.concatenate([i.begin_ns for i in self._intervals]),
             np.concatenate([i.end_ns for i in self._intervals]),
@@ -1092,13 +1110,15 @@ class InertialCheck:
         turning = _turning(record, least)
         if turning is None:
             means, covered = record.means(np.zeros(1))
-            still = last and unit is not None and int(covered.sum()) >= least
-            return [*found, *_upside_down(means[0, covered[0], 3:], R, measured=False)] if still else found
-        offset = _judge_offset(turning, record, least)
-        found += [] if offset is None else [offset]
-        force = None if unit is None else _force_fit(record, turning, self._T[:3, 3])
+            still = last and size.unit is not None and int(covered.sum()) >= least
+            return [*by_size, *_upside_down(means[0, covered[0], 3:], R, measured=False)] if still else by_size
+        force = None if size.unit is None else _force_fit(record, turning, self._T[:3, 3])
         # Which of gyro and extrinsics is at fault, the accelerometer tells: wait for it.
-        told = force is not None or unit is None or last or turning.count >= _ENOUGH
+        told = force is not None or size.unit is None or last or turning.count >= _ENOUGH
+        size = _settle_size(size, force, R, told=told)
+        unit = size.unit
+        offset = _judge_offset(turning, record, least)
+        found = [f for f in (size.finding, offset) if f is not None]
         clipped = "saturation" in self._said
         rotation = _judge_gyro(turning, R, force, unit or 1.0, told=told, clipped=clipped)
         found += rotation
