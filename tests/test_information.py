@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, z_D_p_cam
-from vio.information import lazy_greedy, log_det_gain, motion_rows, prior_information, row_weights
-from vio.records import MotionPrior
+from vio.information import MotionInformation, lazy_greedy, log_det_gain, motion_rows, prior_information, row_weights
+from vio.records import MotionPrior, observations
 
 CAMERA = StereoCamera(430.0, 440.0, 364.0, 254.0, 0.11, 752, 480)
 BROAD = prior_information(None)
@@ -152,3 +152,35 @@ def test_features_that_say_nothing_are_left_out() -> None:
 def test_prior_of_a_motion_known_exactly_can_be_inverted() -> None:
     motion = MotionPrior(np.eye(4), np.zeros((6, 6)))
     assert np.isfinite(np.linalg.slogdet(prior_information(motion))[1])
+
+
+@pytest.mark.parametrize(("sigma_rad", "believed"), [(1e-4, False), (1e-1, True)])
+def test_a_feature_off_the_expected_motion_is_believed_less(sigma_rad: float, believed: bool) -> None:
+    """Ten pixels beside its place it says next to nothing, unless the motion is so uncertain that it may well be."""
+    z = project(CAMERA, _points(2, 11))
+    beside = z + np.array([[0.0, 0.0, 0.0, 0.0], [10.0, 0.0, 10.0, 0.0]])
+    model = MotionInformation(CAMERA, 4, 0.5)
+    motion = MotionPrior(np.eye(4), np.diag([1e-8] * 3 + [sigma_rad**2] * 3))
+    model.look(observations(0, 0, [0, 1], z), motion)
+    model.use(observations(0, 0, [0, 1], z), np.ones(2, dtype=np.bool_))
+    L = model.look(observations(1, 1, [0, 1], beside), motion)
+    strength = np.sum(L[:, 0] ** 2, axis=(1, 2))
+    alike = MotionInformation(CAMERA, 4, 0.5)
+    alike.look(observations(0, 0, [0, 1], z), None)
+    alike.use(observations(0, 0, [0, 1], z), np.ones(2, dtype=np.bool_))
+    without = np.sum(alike.look(observations(1, 1, [0, 1], beside), None)[:, 0] ** 2, axis=(1, 2))
+    ratio = strength / without
+    assert ratio[0] == pytest.approx(1.0, abs=1e-9)
+    assert ratio[1] > 0.9 if believed else ratio[1] < 0.1
+
+
+def test_only_sightings_that_were_used_count() -> None:
+    """A feature passed over says as little of the last motion as a new one."""
+    z = project(CAMERA, _points(2, 12))
+    model = MotionInformation(CAMERA, 4, 0.5)
+    for k in range(3):
+        L = model.look(observations(k, k, [0, 1], z), None)
+        assert not L[1, 0].any()
+        assert L[0, 0].any() == (k > 0)
+        assert L[:, 1].any(axis=(1, 2)).all()
+        model.use(observations(k, k, [0, 1], z), np.array([True, False]))

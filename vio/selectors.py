@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 
 from vio.errors import ConfigError
-from vio.geometry.lie import FloatArray, transform_points
-from vio.geometry.stereo import StereoCamera, project, triangulate
-from vio.information import lazy_greedy, log_det_gain, motion_rows, prior_information, row_weights
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.information import MotionInformation, lazy_greedy, log_det_gain, prior_information
 from vio.protocols import Selector
 from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selection
 from vio.setting import setting
@@ -181,124 +181,6 @@ class RandomChoice:
         score = np.random.default_rng((self._seed, observations.frame_index)).random(len(observations))
         chosen = self._budget.best(score, observations.ids)
         return Selection(chosen, score, f"random, {chosen.sum()} of {len(score)}")
-
-
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """What is known of the features of the last frame, in the order of their ids."""
-
-    ids: IntArray  # (N,)
-    p_cam: FloatArray  # (N, 3) in that frame's camera; arbitrary where not placed
-    age: IntArray  # (N,) frames in a row in which the feature was seen
-    sightings: IntArray  # (N,) stereo sightings in a row that were chosen
-
-    def find(self, ids: IntArray) -> tuple[IntArray, BoolArray]:
-        """Rows (M,) of given ids, and which of them are there."""
-        if not len(self.ids):
-            return np.zeros(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.bool_)
-        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
-        return at, self.ids[at] == ids
-
-
-_NOTHING_SEEN = _Seen(
-    np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-)
-
-
-class _Survival:
-    """How probably a feature of a given age is seen again in the next frame, counted as the record goes."""
-
-    _AGES = 7  # ages 1, 2-3, 4-7, …, 64 and more
-    _HITS, _TRIALS = 9.0, 10.0  # what is believed before anything is counted
-
-    def __init__(self) -> None:
-        self._hits = np.full(self._AGES, self._HITS)
-        self._trials = np.full(self._AGES, self._TRIALS)
-
-    def count(self, age: IntArray, again: BoolArray) -> None:
-        """Take in which features of an age (N,) were seen again (N,)."""
-        group = self._group(age)
-        self._trials += np.bincount(group, minlength=self._AGES)
-        self._hits += np.bincount(group[again], minlength=self._AGES)
-
-    def probability(self, age: IntArray) -> FloatArray:
-        """Return the probability (N,) for features of an age (N,)."""
-        return (self._hits / self._trials)[self._group(age)]
-
-    def _group(self, age: IntArray) -> IntArray:
-        return np.minimum(np.log2(np.maximum(age, 1)).astype(np.int64), self._AGES - 1)
-
-
-class MotionInformation:
-    """What the features of each frame say of the camera's motion, given which of them the filter has used before."""
-
-    _MIN_DEPTH, _MAX_DEPTH = 0.5, 400.0  # baselines; beyond, the filters do not use a point
-
-    def __init__(self, camera: StereoCamera, horizon_frames: int, pixel_sigma_px: float) -> None:
-        self._camera, self._sigma = camera, pixel_sigma_px
-        self._steps = (0, *sorted({1, horizon_frames}))  # 0: the last motion, 1: the next one, …
-        self._seen, self._survival = _NOTHING_SEEN, _Survival()
-
-    def look(self, observations: Observations, motion: MotionPrior | None) -> FloatArray:
-        """Take in one frame and return what each row says of K motions, (N, K, 3, 6), equations (S3) and (S5).
-
-        The motions are the last one, the next one and the one at the horizon; the expected motion is taken to go on.
-        """
-        ids, last = observations.ids, self._seen
-        T_curr_prev = np.eye(4) if motion is None else motion.T_curr_prev
-        at, known = last.find(ids)
-        self._survival.count(last.age, np.isin(last.ids, ids))
-        age, sightings = np.ones(len(ids), dtype=np.int64), np.zeros(len(ids), dtype=np.int64)
-        age[known] += last.age[at[known]]
-        sightings[known] = last.sightings[at[known]]
-        expected = transform_points(T_curr_prev, last.p_cam)
-        p_cam, placed = self._place(observations, expected, at, sightings > 0)
-        self._seen = _Seen(ids, p_cam, age, sightings)
-        return self._factors(observations, placed, T_curr_prev)
-
-    def use(self, observations: Observations, chosen: BoolArray) -> None:
-        """Note which rows (N,) of the frame just seen the filter uses."""
-        seen, order = self._seen, np.argsort(observations.ids)
-        stereo = observations.has_right & ~observations.stale
-        sightings = np.where(chosen & ~observations.stale, seen.sightings + stereo, 0)
-        self._seen = _Seen(seen.ids[order], seen.p_cam[order], seen.age[order], sightings[order])
-
-    def _place(
-        self, observations: Observations, p_expected: FloatArray, at: IntArray, was_used: BoolArray
-    ) -> tuple[FloatArray, BoolArray]:
-        """Points (N, 3) in the camera and which (N,) can be used: by stereo, or by the depth that is expected."""
-        camera, z = self._camera, observations.z
-        p_cam, placed = triangulate(camera, z)
-        placed &= observations.has_right
-        left_only = ~observations.has_right & was_used
-        if left_only.any():
-            depth = p_expected[at[left_only], 2:]
-            ray = (z[left_only, :2] - [camera.cu, camera.cv]) / [camera.fu, camera.fv]
-            p_cam[left_only] = np.concatenate([ray * depth, depth], axis=1)
-            placed |= left_only
-        baselines = p_cam[:, 2] / camera.baseline_m
-        return p_cam, placed & ~observations.stale & (baselines > self._MIN_DEPTH) & (baselines < self._MAX_DEPTH)
-
-    def _factors(self, observations: Observations, placed: BoolArray, T_curr_prev: FloatArray) -> FloatArray:
-        L = np.zeros((len(placed), len(self._steps), 3, 6))
-        now, right, n = self._seen.p_cam[placed], observations.has_right[placed], self._seen.sightings[placed]
-        survival = self._survival.probability(self._seen.age[placed])
-        weight = row_weights(n, right)
-        for k, step in enumerate(self._steps):
-            p = transform_points(np.linalg.matrix_power(T_curr_prev, step), now)
-            ahead = p[:, 2] > self._MIN_DEPTH * self._camera.baseline_m
-            safe = np.where(ahead[:, None], p, [0.0, 0.0, 1.0])
-            if step:
-                z = project(self._camera, safe)
-                weight = row_weights(n + step * right, right & self._inside(z[:, 2], z[:, 3]))
-                weight *= (survival**step * (ahead & self._inside(z[:, 0], z[:, 1])))[:, None]
-            L[placed, k] = motion_rows(self._camera, safe) * np.sqrt(weight)[..., None]
-        return L / self._sigma
-
-    def _inside(self, u: FloatArray, v: FloatArray) -> BoolArray:
-        """Which pixels lie in the image; where its size is unknown, the principal point is taken for its centre."""
-        width, height = self._camera.width or 2 * self._camera.cu, self._camera.height or 2 * self._camera.cv
-        return np.asarray((u >= 0) & (u < width) & (v >= 0) & (v < height))
 
 
 class InformationGain:
