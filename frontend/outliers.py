@@ -25,9 +25,9 @@ from vio.records import BoolArray, IntArray
 _MIN_DEPTH_M = 0.05
 _MIN_POINTS = 8  # with fewer, agreement by chance cannot be told from motion
 _MIN_SHARE = 0.2  # a consensus of fewer points says nothing
-_CONTESTED = 0.5  # points that the vote leaves over, over those that a predicted motion needs, for it to be tried
 _TOLD_POINTS = 64  # predicted pixels that are looked at
-_TOLD_PX = 2.0  # median distance of the expected motion from them at which it stands for them
+_TOLD_PX = 2.0  # median distance of a motion from them at which it stands for them
+_TOLD_SETTLED = 1e-4  # change of that motion, in radians and metres, below which it is not refined further
 _SAMPLE_ITERATIONS = 5
 _REFINE_ITERATIONS = 6
 _DAMPING = 1e-4
@@ -117,7 +117,13 @@ def _gauss_newton(
 
 
 def _refine(
-    camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray, scale_px: float, free: slice
+    camera: StereoCamera,
+    T: FloatArray,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    scale_px: float,
+    free: slice,
+    settled: float = _SETTLED,
 ) -> FloatArray:
     """Refine one motion (4, 4) on all points, those far from it counting little (Geman-McClure weights)."""
     for _ in range(_REFINE_ITERATIONS):
@@ -125,7 +131,7 @@ def _refine(
         weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
         before = T
         T = _gauss_newton(camera, T[None], p_prev[None], pixels[None], weight[None], iterations=1, free=free)[0]
-        if np.abs(T - before).max() < _SETTLED:
+        if np.abs(T - before).max() < settled:
             break
     return T
 
@@ -177,7 +183,7 @@ def rigid_consensus(
 
     A large moving object can win the vote. Where a rotation is predicted from outside (`R_prior`) and the vote turns
     away from it, the best motion with that rotation is preferred; where a whole motion is predicted (`T_prior`), the
-    motion nearest to it is. Either needs a share of the vote's own support.
+    motion nearest to it is. Either must explain points that the vote denies, at least a share of the vote's own.
 
     Args:
         camera: rectified camera.
@@ -201,22 +207,33 @@ def rigid_consensus(
         starts.append(T_prior)
     T, inliers = _search(camera, p_prev, pixels, np.stack(starts), rng, settings, slice(0, 6))
     near_prior: list[FloatArray] = []
-    # Two motions that differ hardly explain the same points: where few are left over, no other motion can win.
-    contested = (~inliers).sum() >= _CONTESTED * settings.prior_min_support * inliers.sum()
-    if T_prior is not None and contested:
+    # Only what the vote denies speaks for another motion: a prediction that agrees with the vote need not compete.
+    needed = max(_MIN_POINTS, settings.prior_min_support * inliers.sum())
+    contested = (~inliers).sum() >= needed
+    if T_prior is not None and contested and not _agree(camera, T, T_prior, p_prev):
         near_prior.append(_refine(camera, T_prior, p_prev, pixels, settings.consensus_px, slice(0, 6)))
     if R_prior is not None and contested and _turn_deg(T, R_prior) > settings.prior_max_deviation_deg:
         fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
         near_prior.append(_search(camera, p_prev, pixels, fixed, rng, settings, slice(0, 3))[0])
     for T_near in near_prior:
         kept = pixel_errors(camera, T_near, p_prev, pixels) <= settings.consensus_px
-        if kept.sum() >= max(_MIN_POINTS, settings.prior_min_support * inliers.sum()):
+        if (kept & ~inliers).sum() >= needed:
             T = _refine(camera, T_near, p_prev[kept], pixels[kept], settings.consensus_px / 2, slice(0, 6))
             inliers = pixel_errors(camera, T, p_prev, pixels) <= settings.consensus_px
             break
     if inliers.sum() < max(_MIN_POINTS, _MIN_SHARE * len(inliers)):
         return None
     return Consensus(T, inliers)
+
+
+def _agree(camera: StereoCamera, T: FloatArray, T_other: FloatArray, p_prev: FloatArray) -> bool:
+    """Whether two motions (4, 4) put most points (N, 3) at nearly the same pixels."""
+    moved = transform_points(T, p_prev)
+    ahead = moved[:, 2] > _MIN_DEPTH_M
+    if not ahead.any():
+        return False
+    gap = pixel_errors(camera, T_other, p_prev[ahead], project(camera, moved[ahead])[:, :2])
+    return bool(np.median(gap) <= _TOLD_PX)
 
 
 def _turn_deg(T: FloatArray, R: FloatArray) -> float:
@@ -265,12 +282,21 @@ def fit_motion(
 def predicted_motion(
     camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, expected: FloatArray, settings: ConsensusSettings
 ) -> FloatArray | None:
-    """Motion (4, 4) behind predicted pixels, as by `fit_motion` from some of them; `expected` where that will do."""
+    """Motion (4, 4) behind predicted pixels, from some of them, as a start; `expected` where that will do.
+
+    None with too few points, or where most follow no motion.
+    """
     few = slice(None, None, max(1, len(p_prev) // _TOLD_POINTS))
     p, z = p_prev[few], pixels[few]
-    if len(p) >= _MIN_POINTS and np.median(pixel_errors(camera, expected, p, z)) <= _TOLD_PX:
-        return expected
-    return fit_motion(camera, p, z, expected, settings)
+    if len(p) < _MIN_POINTS:
+        return None
+    T, weight = expected, np.ones((1, len(p)))
+    for _ in range(_SAMPLE_ITERATIONS):
+        if np.median(pixel_errors(camera, T, p, z)) <= _TOLD_PX:
+            return T
+        T = _gauss_newton(camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6))[0]
+    T = _refine(camera, T, p, z, _TOLD_PX, slice(0, 6), settled=_TOLD_SETTLED)
+    return T if np.median(pixel_errors(camera, T, p, z)) <= _TOLD_PX else None
 
 
 # --- two views, no depth --------------------------------------------------------------------------------------------

@@ -45,7 +45,8 @@ class KltSettings:
         1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"
     )
     prior_min_support: float = setting(
-        0.4, "share of the consensus' inliers that the predicted motion needs to replace it"
+        0.4,
+        "points that follow the predicted motion only, over the consensus' inliers, for it to replace the consensus",
     )
     anchor_radius_px: int = setting(7, "half side of the patch that a feature is aligned with for life", unit="px")
     min_anchor_correlation: float = setting(
@@ -97,7 +98,8 @@ class MatchSettings:
         1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"
     )
     prior_min_support: float = setting(
-        0.4, "share of the consensus' inliers that the predicted motion needs to replace it"
+        0.4,
+        "points that follow the predicted motion only, over the consensus' inliers, for it to replace the consensus",
     )
     seed: int = setting(0, "seed of the consensus sampling; equal seeds give equal bits")
 
