@@ -29,10 +29,11 @@ from vio.filters.multiview import (
     within,
 )
 from vio.filters.navigation import DIM, ImuMotion, TwistMotion
+from vio.filters.noise import MotionNoise
 from vio.filters.settings import MsckfSettings
 from vio.filters.tracks import TrackTable, latest_pixels
 from vio.filters.window import Window, posterior
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_hat, transform_points
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
 from vio.records import (
     BoolArray,
@@ -61,6 +62,9 @@ _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before an
 _VIEW_LIMIT = 23.5  # chi-square with 4 degrees of freedom, probability 0.9999
 _MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 _NO_STEP = (np.eye(DIM), np.zeros((DIM, DIM)))
+# Factors on the motion model's densities: at the start, at least, at most.
+_IMU_FACTORS = (5.0, 1.0, 50.0)
+_TWIST_FACTORS = (1.0, 0.1, 10.0)
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 
 
@@ -104,6 +108,7 @@ class Msckf:
         self._waited = 0
         self._sigma2 = settings.pixel_sigma_px**2
         self._output: FloatArray = np.zeros((DIM, DIM))
+        self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._since_frame: tuple[FloatArray, FloatArray] = _NO_STEP  # transition and noise since the last frame
         self._map: list[Landmarks] = []
@@ -130,18 +135,22 @@ class Msckf:
         nav, (Phi, Q) = window.nav, self._since_frame
         if time_ns > self._time_ns:
             try:
-                step = self._motion.advance(nav, self._time_ns, time_ns)
+                step = self._motion.advance(nav, self._time_ns, time_ns, self._noise.factors)
             except EstimationError:  # the update will say it
                 return None
             nav, Phi, Q = step.nav, step.Phi @ Phi, step.Phi @ Q @ step.Phi.T + step.Q
         T_cam0_world = self._T_cam0_imu @ se3_inverse(nav.T_world_imu)
         T_curr_prev = T_cam0_world @ window.clones[-1].T_world_imu @ se3_inverse(self._T_cam0_imu)
-        # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world); xi_prev is the pose part of the
-        # error at the last frame, from which xi_curr grows by Phi.
-        M = se3_adjoint(T_cam0_world) @ (np.eye(6, DIM) - Phi[:6])
+        # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
-        motion = MotionPrior(T_curr_prev, M @ self._output @ M.T + A @ Q[:6, :6] @ A.T)
+        motion = MotionPrior(T_curr_prev, A @ self._expected_error(Phi, Q) @ A.T)
         return Prediction(self._expected_tracks(window, T_cam0_world, T_curr_prev[:3, :3]), motion)
+
+    def _expected_error(self, Phi: FloatArray, Q: FloatArray) -> FloatArray:
+        """Covariance (6, 6) of `xi_curr - xi_prev` over a step: the error at the last frame has grown by Phi and Q."""
+        M = Phi[:6] - np.eye(6, DIM)
+        out: FloatArray = M @ self._output @ M.T + Q[:6, :6]
+        return out
 
     def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, R_cam_prev: FloatArray) -> TrackPrior:
         rows = self._tracks.rows()
@@ -168,7 +177,6 @@ class Msckf:
             self._advance(observations.time_ns)
         window = self._window
         window.add_clone(observations.frame_index, observations.time_ns)
-        self._since_frame = _NO_STEP
         try:
             report = self._use(window, seen)
         except np.linalg.LinAlgError as error:
@@ -250,7 +258,7 @@ class Msckf:
     def _advance(self, time_ns: int) -> None:
         if time_ns > self._time_ns:
             window = self._started()
-            step = self._motion.advance(window.nav, self._time_ns, time_ns)
+            step = self._motion.advance(window.nav, self._time_ns, time_ns, self._noise.factors)
             self._motion.forget_before(time_ns)
             window.propagate(step)
             Phi, Q = self._since_frame
@@ -262,7 +270,7 @@ class Msckf:
         window = self._started()
         measurement = self._motion.measurement(window.nav)
         if measurement is not None:
-            window.measure(measurement)
+            window.commit_measurement(measurement)
 
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Everything that a frame's observations do."""
@@ -276,6 +284,7 @@ class Msckf:
             rest = self._motion.standing(window.nav, self._gyro)
             if rest is not None:
                 window.commit_measurement(rest)
+        predicted, expected = window.last_move(), self._expected_error(*self._since_frame)
         tracks = self._linearise(window, self._choose(window), _FIRST_STEPS)
         innovation = _newest_innovation(tracks.at)
         for _ in range(self._settings.iterations):
@@ -294,6 +303,10 @@ class Msckf:
         tracks = self._without_wrong_views(tracks)
         good, nis = self._gate(tracks.at)
         self._follow_noise(tracks.at, nis)
+        remaining = window.last_move_covariance(self._information(window, tracks, good, z, weight)[0])
+        if predicted is not None and remaining is not None and len(tracks.rows) >= _MIN_TRACKS_FOR_NOISE:
+            self._follow_motion_noise(window, predicted, expected, remaining)
+        self._since_frame = _NO_STEP
         report = self._commit(window, tracks, good, z, weight)
         return UpdateReport(
             used=int(good.sum()) + len(z),
@@ -443,6 +456,17 @@ class Msckf:
         self._sigma2 = float(
             np.clip(self._sigma2 * ratio**_NOISE_GAIN, s.pixel_sigma_min_px**2, s.pixel_sigma_max_px**2)
         )
+
+    def _follow_motion_noise(
+        self, window: Window, predicted: FloatArray, expected: FloatArray, remaining: FloatArray
+    ) -> None:
+        """Compare the predicted with the corrected motion since the last frame, in the body frame."""
+        moved = window.last_move()
+        assert moved is not None
+        A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
+        process = A @ self._since_frame[1][:6, :6] @ A.T
+        correction = se3_log(se3_inverse(predicted) @ moved)
+        self._noise.follow(correction, A @ expected @ A.T, process, A @ remaining @ A.T)
 
     def _commit(self, window: Window, tracks: _Tracks, good: BoolArray, z: FloatArray, weight: FloatArray) -> int:
         """Commit what ends in this frame, keep the output covariance, make room; return how many landmarks are new."""

@@ -108,8 +108,8 @@ class ImuMotion:
         )
         return nav, np.diag(sigmas**2)
 
-    def advance(self, nav: NavState, start_ns: int, end_ns: int) -> Transition:
-        """Integrate from one time to another, equations (N1) to (N4).
+    def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray) -> Transition:
+        """Integrate from one time to another, equations (N1) to (N4); factors (2,) scale accelerometer and gyro noise.
 
         Raises:
             EstimationError: the IMU is silent for too long.
@@ -127,7 +127,7 @@ class ImuMotion:
         v = nav.velocity + np.concatenate([np.zeros((1, 3)), np.cumsum(a * dt[:, None], axis=0)])
         moves = v[:-1] * dt[:, None] + 0.5 * a * (dt**2)[:, None]
         p = nav.T_world_imu[:3, 3] + np.concatenate([np.zeros((1, 3)), np.cumsum(moves, axis=0)])
-        Phi, Q = self._linearise(times, dt, R, v, p)
+        Phi, Q = self._linearise(times, dt, R, v, p, factors)
         turned = np.sum(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None], axis=0) / max(dt.sum(), 1e-9)
         moved = replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1])
         return Transition(moved, Phi, Q, turned + nav.gyro_bias)
@@ -195,7 +195,7 @@ class ImuMotion:
         return cuts, at[:, :3], at[:, 3:]
 
     def _linearise(
-        self, times: FloatArray, dt: FloatArray, R: FloatArray, v: FloatArray, p: FloatArray
+        self, times: FloatArray, dt: FloatArray, R: FloatArray, v: FloatArray, p: FloatArray, factors: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Transition (15, 15) and noise (15, 15) over the interval; the navigation part depends on gravity alone."""
         s = self._settings
@@ -212,7 +212,7 @@ class ImuMotion:
         Phi = np.eye(DIM)
         Phi[:9, :9] = _free_flow(np.array([total]), self._gravity)[0]
         Phi[:9, 9:] = np.einsum("kij,k->ij", moved, dt)
-        densities = np.repeat([s.gyro_noise_density, s.accel_noise_density], 3) ** 2
+        densities = np.repeat([s.gyro_noise_density * factors[1], s.accel_noise_density * factors[0]], 3) ** 2
         Q = np.zeros((DIM, DIM))
         Q[:9, :9] = np.einsum("kij,j,klj,k->il", moved, densities, moved, dt)
         walks = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * total
@@ -255,8 +255,8 @@ class TwistMotion:
         )
         return NavState(np.eye(4), zero, zero, zero, zero), np.diag(sigmas**2)
 
-    def advance(self, nav: NavState, start_ns: int, end_ns: int) -> Transition:
-        """Carry pose and twist over a time, equations (N5) and (N6)."""
+    def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray) -> Transition:
+        """Carry pose and twist over a time, equations (N5) and (N6); factors (2,) scale linear and angular noise."""
         tau = (end_ns - start_ns) * 1e-9
         u = np.concatenate([nav.velocity, nav.rate])
         T = nav.T_world_imu
@@ -266,7 +266,7 @@ class TwistMotion:
         Phi = np.eye(DIM)
         Phi[:6, 6:12] = lever
         Q = np.zeros((DIM, DIM))
-        D = np.diag(self._density)
+        D = np.diag(self._density * np.repeat(factors, 3) ** 2)
         Q[:6, :6] = lever @ D @ lever.T * (tau / 3)
         Q[:6, 6:12] = lever @ D * (tau / 2)
         Q[6:12, :6] = Q[:6, 6:12].T

@@ -68,13 +68,13 @@ class MsckfSettings:
     max_features: int = setting(150, "tracks without a landmark of their own that enter one update")
     iterations: int = setting(4, "most Gauss-Newton steps over the window in a frame; one is the rule")
     pixel_sigma_px: float = setting(0.5, "noise of one pixel coordinate at the start; then estimated", unit="px")
-    pixel_sigma_min_px: float = setting(0.1, "the estimated noise stays above this", unit="px")
+    pixel_sigma_min_px: float = setting(0.03, "the estimated noise stays above this", unit="px")
     pixel_sigma_max_px: float = setting(2.0, "the estimated noise stays below this", unit="px")
     gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected")
     max_distance: float = setting(400.0, "tracks farther away than this many baselines are not used")
     gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2")
     gyro_noise_density: float = setting(
-        1.0e-3, "gyro white noise, five times a data sheet's, for vibration", unit="rad/s/sqrt(Hz)"
+        2.0e-4, "gyro white noise by its data sheet; what a rig adds to it is learned", unit="rad/s/sqrt(Hz)"
     )
     accel_noise_density: float = setting(1.2e-2, "accelerometer white noise, likewise", unit="m/s^2/sqrt(Hz)")
     gyro_bias_walk: float = setting(2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)")

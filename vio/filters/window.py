@@ -52,6 +52,22 @@ class Window:
         out: FloatArray = T_cam0_imu @ se3_inverse(np.array([c.T_world_imu for c in self.clones]))
         return out
 
+    def last_move(self) -> FloatArray | None:
+        """Motion (4, 4) `T_prev_newest` of the body between the two newest clones; None with one clone."""
+        if len(self.clones) < 2:
+            return None
+        out: FloatArray = se3_inverse(self.clones[-2].T_world_imu) @ self.clones[-1].T_world_imu
+        return out
+
+    def last_move_covariance(self, information: FloatArray) -> FloatArray | None:
+        """Covariance (6, 6) of `xi_newest - xi_prev` given the prior and information (D, D) on top of it."""
+        if len(self.clones) < 2:
+            return None
+        P = posterior(self.P, information, np.zeros(len(self.P)))[0]
+        a, b = self.clone_rows(len(self.clones) - 2), self.clone_rows(len(self.clones) - 1)
+        out: FloatArray = P[a, a] + P[b, b] - P[a, b] - P[b, a]
+        return out
+
     def propagate(self, step: Transition) -> None:
         """Move the navigation state by one step of its motion model."""
         self.nav = step.nav
