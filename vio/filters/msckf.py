@@ -12,6 +12,7 @@ consistency (2017); Barrau & Bonnabel (2017).
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -28,8 +29,8 @@ from vio.filters.multiview import (
     track_information,
     within,
 )
-from vio.filters.navigation import DIM, ImuMotion, TwistMotion
-from vio.filters.noise import MotionNoise
+from vio.filters.navigation import DIM, ImuMotion, Transition, TwistMotion
+from vio.filters.noise import MotionNoise, StepErrors
 from vio.filters.settings import MsckfSettings
 from vio.filters.tracks import TrackTable, latest_pixels
 from vio.filters.window import Window, posterior
@@ -61,11 +62,27 @@ _MAX_WAIT_FRAMES = 20
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 _VIEW_LIMIT = 23.5  # chi-square with 4 degrees of freedom, probability 0.9999
 _MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
-_NO_STEP = (np.eye(DIM), np.zeros((DIM, DIM)))
 # Factors on the motion model's densities: at the start, at least, at most.
 _IMU_FACTORS = (5.0, 1.0, 50.0)
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
+
+
+@dataclass(frozen=True, slots=True)
+class _Growth:
+    """How the navigation state's error grows over steps."""
+
+    Phi: FloatArray  # (15, 15)
+    Q: FloatArray  # (15, 15)
+    Q_parts: FloatArray  # (2, 15, 15)
+
+    def then(self, step: Transition) -> _Growth:
+        """Append a step."""
+        Phi = step.Phi
+        return _Growth(Phi @ self.Phi, Phi @ self.Q @ Phi.T + step.Q, Phi @ self.Q_parts @ Phi.T + step.Q_parts)
+
+
+_NO_STEP = _Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
 
 
 class _Tracks:
@@ -110,7 +127,7 @@ class Msckf:
         self._output: FloatArray = np.zeros((DIM, DIM))
         self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
-        self._since_frame: tuple[FloatArray, FloatArray] = _NO_STEP  # transition and noise since the last frame
+        self._since_frame = _NO_STEP  # how the error has grown since the last frame
         self._map: list[Landmarks] = []
 
     def propagate(self, sample: MotionSample) -> None:
@@ -132,7 +149,7 @@ class Msckf:
         window = self._window
         if window is None or not window.clones or time_ns < self._time_ns:
             return None
-        nav, (Phi, Q) = window.nav, self._since_frame
+        nav, Phi, Q = window.nav, self._since_frame.Phi, self._since_frame.Q
         if time_ns > self._time_ns:
             try:
                 step = self._motion.advance(nav, self._time_ns, time_ns, self._noise.factors)
@@ -261,8 +278,7 @@ class Msckf:
             step = self._motion.advance(window.nav, self._time_ns, time_ns, self._noise.factors)
             self._motion.forget_before(time_ns)
             window.propagate(step)
-            Phi, Q = self._since_frame
-            self._since_frame = step.Phi @ Phi, step.Phi @ Q @ step.Phi.T + step.Q
+            self._since_frame = self._since_frame.then(step)
             self._gyro = step.gyro
         self._time_ns = time_ns
 
@@ -284,9 +300,36 @@ class Msckf:
             rest = self._motion.standing(window.nav, self._gyro)
             if rest is not None:
                 window.commit_measurement(rest)
-        predicted, expected = window.last_move(), self._expected_error(*self._since_frame)
+        predicted, expected = window.last_move(), self._expected_error(self._since_frame.Phi, self._since_frame.Q)
         tracks = self._linearise(window, self._choose(window), _FIRST_STEPS)
         innovation = _newest_innovation(tracks.at)
+        tracks = self._fit(window, tracks, z, weight, innovation)
+        step = self._step_errors(window, tracks, predicted, expected, z, weight)
+        if step is not None:
+            missing = step.missing_noise()
+            if missing.any():
+                window.widen(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
+                tracks = self._fit(window, tracks, z, weight, innovation)
+            self._noise.follow(step)
+        self._since_frame = _NO_STEP
+
+        tracks = self._without_wrong_views(tracks)
+        good, nis = self._gate(tracks.at)
+        self._follow_noise(tracks.at, nis)
+        report = self._commit(window, tracks, good, z, weight)
+        return UpdateReport(
+            used=int(good.sum()) + len(z),
+            gated=int((~good).sum()),
+            initialised=report,
+            landmarks=len(window.landmarks),
+            innovation_median_px=innovation,
+            nis_per_dof=float(np.median(nis)) if len(nis) else None,
+        )
+
+    def _fit(
+        self, window: Window, tracks: _Tracks, z: FloatArray, weight: FloatArray, innovation: float | None
+    ) -> _Tracks:
+        """Gauss-Newton over the window; returns the tracks linearised at the estimate."""
         for _ in range(self._settings.iterations):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, z, weight)
@@ -299,23 +342,27 @@ class Msckf:
             # Another step pays only where this one had far to go.
             if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
                 break
+        return tracks
 
-        tracks = self._without_wrong_views(tracks)
-        good, nis = self._gate(tracks.at)
-        self._follow_noise(tracks.at, nis)
-        remaining = window.last_move_covariance(self._information(window, tracks, good, z, weight)[0])
-        if predicted is not None and remaining is not None and len(tracks.rows) >= _MIN_TRACKS_FOR_NOISE:
-            self._follow_motion_noise(window, predicted, expected, remaining)
-        self._since_frame = _NO_STEP
-        report = self._commit(window, tracks, good, z, weight)
-        return UpdateReport(
-            used=int(good.sum()) + len(z),
-            gated=int((~good).sum()),
-            initialised=report,
-            landmarks=len(window.landmarks),
-            innovation_median_px=innovation,
-            nis_per_dof=float(np.median(nis)) if len(nis) else None,
-        )
+    def _step_errors(
+        self,
+        window: Window,
+        tracks: _Tracks,
+        predicted: FloatArray | None,
+        expected: FloatArray,
+        z: FloatArray,
+        weight: FloatArray,
+    ) -> StepErrors | None:
+        """The predicted and the corrected motion since the last frame; None where too few tracks tell."""
+        moved = window.last_move()
+        if predicted is None or moved is None or len(tracks.rows) < _MIN_TRACKS_FOR_NOISE:
+            return None
+        everything = np.ones(len(tracks.rows), dtype=np.bool_)
+        remaining = window.last_move_covariance(self._information(window, tracks, everything, z, weight)[0])
+        A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
+        process = A @ self._since_frame.Q[:6, :6] @ A.T
+        correction = se3_log(se3_inverse(predicted) @ moved)
+        return StepErrors(correction, A @ expected @ A.T, process, A @ remaining @ A.T)
 
     def _stands(self, clones: int) -> bool:
         """Whether the image stands still: the median track, and nine tenths of all within twice its limit."""
@@ -456,17 +503,6 @@ class Msckf:
         self._sigma2 = float(
             np.clip(self._sigma2 * ratio**_NOISE_GAIN, s.pixel_sigma_min_px**2, s.pixel_sigma_max_px**2)
         )
-
-    def _follow_motion_noise(
-        self, window: Window, predicted: FloatArray, expected: FloatArray, remaining: FloatArray
-    ) -> None:
-        """Compare the predicted with the corrected motion since the last frame, in the body frame."""
-        moved = window.last_move()
-        assert moved is not None
-        A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
-        process = A @ self._since_frame[1][:6, :6] @ A.T
-        correction = se3_log(se3_inverse(predicted) @ moved)
-        self._noise.follow(correction, A @ expected @ A.T, process, A @ remaining @ A.T)
 
     def _commit(self, window: Window, tracks: _Tracks, good: BoolArray, z: FloatArray, weight: FloatArray) -> int:
         """Commit what ends in this frame, keep the output covariance, make room; return how many landmarks are new."""

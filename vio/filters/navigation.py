@@ -49,6 +49,7 @@ class Transition:
     nav: NavState
     Phi: FloatArray  # (15, 15)
     Q: FloatArray  # (15, 15)
+    Q_parts: FloatArray  # (2, 15, 15) of Q, what the translation's and what the rotation's noise brought
     gyro: FloatArray | None = None  # (3,) mean rate that the gyro measured over the step, rad/s; None without an IMU
 
 
@@ -127,10 +128,10 @@ class ImuMotion:
         v = nav.velocity + np.concatenate([np.zeros((1, 3)), np.cumsum(a * dt[:, None], axis=0)])
         moves = v[:-1] * dt[:, None] + 0.5 * a * (dt**2)[:, None]
         p = nav.T_world_imu[:3, 3] + np.concatenate([np.zeros((1, 3)), np.cumsum(moves, axis=0)])
-        Phi, Q = self._linearise(times, dt, R, v, p, factors)
+        Phi, Q, Q_parts = self._linearise(times, dt, R, v, p, factors)
         turned = np.sum(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None], axis=0) / max(dt.sum(), 1e-9)
         moved = replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1])
-        return Transition(moved, Phi, Q, turned + nav.gyro_bias)
+        return Transition(moved, Phi, Q, Q_parts, turned + nav.gyro_bias)
 
     def forget_before(self, time_ns: int) -> None:
         """Drop the samples that no interval from this time on needs."""
@@ -196,8 +197,8 @@ class ImuMotion:
 
     def _linearise(
         self, times: FloatArray, dt: FloatArray, R: FloatArray, v: FloatArray, p: FloatArray, factors: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        """Transition (15, 15) and noise (15, 15) over the interval; the navigation part depends on gravity alone."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Transition (15, 15), noise (15, 15) and its parts (2, 15, 15) over the interval; the navigation part depends on gravity alone."""
         s = self._settings
         total = float(times[-1]) * 1e-9
         left = (times[-1] - 0.5 * (times[:-1] + times[1:])) * 1e-9  # from the middle of each step to the end
@@ -212,12 +213,15 @@ class ImuMotion:
         Phi = np.eye(DIM)
         Phi[:9, :9] = _free_flow(np.array([total]), self._gravity)[0]
         Phi[:9, 9:] = np.einsum("kij,k->ij", moved, dt)
-        densities = np.repeat([s.gyro_noise_density * factors[1], s.accel_noise_density * factors[0]], 3) ** 2
-        Q = np.zeros((DIM, DIM))
-        Q[:9, :9] = np.einsum("kij,j,klj,k->il", moved, densities, moved, dt)
+        densities = factors * [s.accel_noise_density, s.gyro_noise_density]
+        Q_parts = np.zeros((2, DIM, DIM))
+        for part, columns, density in zip(Q_parts, (slice(3, 6), slice(0, 3)), densities, strict=True):
+            lever = moved[:, :, columns] * (density * np.sqrt(dt))[:, None, None]
+            part[:9, :9] = np.einsum("kij,klj->il", lever, lever)
+        Q = Q_parts.sum(axis=0)
         walks = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * total
         Q[9:, 9:] = np.diag(walks)
-        return Phi, Q
+        return Phi, Q, Q_parts
 
 
 class TwistMotion:
@@ -265,14 +269,18 @@ class TwistMotion:
         lever = tau * se3_adjoint(T) @ se3_left_jacobian(tau * u)
         Phi = np.eye(DIM)
         Phi[:6, 6:12] = lever
-        Q = np.zeros((DIM, DIM))
-        D = np.diag(self._density * np.repeat(factors, 3) ** 2)
-        Q[:6, :6] = lever @ D @ lever.T * (tau / 3)
-        Q[:6, 6:12] = lever @ D * (tau / 2)
-        Q[6:12, :6] = Q[:6, 6:12].T
-        Q[6:12, 6:12] = D * tau
+        Q_parts = np.zeros((2, DIM, DIM))
+        for k, part in enumerate(Q_parts):
+            density = np.zeros(6)
+            density[3 * k : 3 * k + 3] = self._density[3 * k : 3 * k + 3] * factors[k] ** 2
+            D = np.diag(density)
+            part[:6, :6] = lever @ D @ lever.T * (tau / 3)
+            part[:6, 6:12] = lever @ D * (tau / 2)
+            part[6:12, :6] = part[:6, 6:12].T
+            part[6:12, 6:12] = D * tau
+        Q = Q_parts.sum(axis=0)
         Q[12:, 12:] = np.eye(3) * (self._settings.rate_bias_walk**2 * tau)
-        return Transition(replace(nav, T_world_imu=moved), Phi, Q)
+        return Transition(replace(nav, T_world_imu=moved), Phi, Q, Q_parts)
 
     def forget_before(self, time_ns: int) -> None:
         """Nothing is kept beyond the sample that is measured next."""

@@ -59,10 +59,8 @@ class Window:
         out: FloatArray = se3_inverse(self.clones[-2].T_world_imu) @ self.clones[-1].T_world_imu
         return out
 
-    def last_move_covariance(self, information: FloatArray) -> FloatArray | None:
+    def last_move_covariance(self, information: FloatArray) -> FloatArray:
         """Covariance (6, 6) of `xi_newest - xi_prev` given the prior and information (D, D) on top of it."""
-        if len(self.clones) < 2:
-            return None
         P = posterior(self.P, information, np.zeros(len(self.P)))[0]
         a, b = self.clone_rows(len(self.clones) - 2), self.clone_rows(len(self.clones) - 1)
         out: FloatArray = P[a, a] + P[b, b] - P[a, b] - P[b, a]
@@ -76,6 +74,15 @@ class Window:
         P[:, :DIM] = P[:, :DIM] @ Phi.T
         P[:DIM, :DIM] += step.Q
         self.offset[:DIM] = Phi @ self.offset[:DIM]
+
+    def widen(self, extra: FloatArray) -> None:
+        """Add noise (15, 15) to the last step, as if its motion had been known less; the newest clone ends it."""
+        newest = self.clone_rows(len(self.clones) - 1)
+        J = np.zeros((len(self.P), DIM))
+        J[:DIM] = np.eye(DIM)
+        J[newest, :6] = np.eye(6)
+        J[self.first_landmark :, 3:6] = so3_hat(self.landmarks).reshape(-1, 3)
+        self.P = self.P + J @ extra @ J.T
 
     def add_clone(self, frame_index: int, time_ns: int) -> None:
         """Copy the pose as the newest clone; landmarks are anchored to its rotation from now on."""
