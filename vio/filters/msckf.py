@@ -65,6 +65,7 @@ _MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 # Factors on the motion model's densities: at the start, at least, at most.
 _IMU_FACTORS = (5.0, 1.0, 50.0)
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
+_AGREEMENT = 0.8
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 
 
@@ -307,7 +308,7 @@ class Msckf:
         step = self._step_errors(window, tracks, predicted, expected, z, weight)
         if step is not None:
             missing = step.missing_noise()
-            if missing.any():
+            if missing.any() and self._images_agree(tracks.at):
                 window.widen(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
                 tracks = self._fit(window, tracks, z, weight, innovation)
             self._noise.follow(step)
@@ -363,6 +364,11 @@ class Msckf:
         process = A @ self._since_frame.Q[:6, :6] @ A.T
         correction = se3_log(se3_inverse(predicted) @ moved)
         return StepErrors(correction, A @ expected @ A.T, process, A @ remaining @ A.T)
+
+    def _images_agree(self, at: Residuals) -> bool:
+        """Whether nearly all views of the newest clone fit: only then may they contradict the motion model."""
+        squares, used = np.sum(at.r[:, -1] ** 2, axis=1), np.any(at.z_D_p[:, -1] != 0, axis=(1, 2))
+        return bool(used.any() and np.mean(squares[used] < _VIEW_LIMIT * self._sigma2) > _AGREEMENT)
 
     def _stands(self, clones: int) -> bool:
         """Whether the image stands still: the median track, and nine tenths of all within twice its limit."""

@@ -28,6 +28,7 @@ from vio.geometry.lie import (
 from vio.records import ImuSample, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state
+UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _MAX_GAP_S = 0.5  # a longer silence of the IMU is an error, not an interval to integrate over
 
 
@@ -109,7 +110,7 @@ class ImuMotion:
         )
         return nav, np.diag(sigmas**2)
 
-    def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray) -> Transition:
+    def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
         """Integrate from one time to another, equations (N1) to (N4); factors (2,) scale accelerometer and gyro noise.
 
         Raises:
@@ -198,7 +199,10 @@ class ImuMotion:
     def _linearise(
         self, times: FloatArray, dt: FloatArray, R: FloatArray, v: FloatArray, p: FloatArray, factors: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Transition (15, 15), noise (15, 15) and its parts (2, 15, 15) over the interval; the navigation part depends on gravity alone."""
+        """Transition (15, 15), noise (15, 15) and its parts (2, 15, 15) over the interval.
+
+        The transition of the navigation part depends on gravity alone.
+        """
         s = self._settings
         total = float(times[-1]) * 1e-9
         left = (times[-1] - 0.5 * (times[:-1] + times[1:])) * 1e-9  # from the middle of each step to the end
@@ -259,7 +263,7 @@ class TwistMotion:
         )
         return NavState(np.eye(4), zero, zero, zero, zero), np.diag(sigmas**2)
 
-    def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray) -> Transition:
+    def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
         """Carry pose and twist over a time, equations (N5) and (N6); factors (2,) scale linear and angular noise."""
         tau = (end_ns - start_ns) * 1e-9
         u = np.concatenate([nav.velocity, nav.rate])
