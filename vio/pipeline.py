@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -13,11 +14,13 @@ from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.filters.vislam import Vislam
 from vio.geometry.lie import FloatArray
+from vio.health import RunHealth
 from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
 from vio.records import (
     BodyFrame,
     Estimate,
     FrontendOutput,
+    ImuSample,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -74,6 +77,7 @@ class RunResult:
     frames: tuple[FrameLog, ...]
     observations: tuple[Observations, ...] | None  # kept on request
     motion_samples: tuple[MotionSample, ...] | None  # kept on request
+    warnings: tuple[str, ...]  # what went wrong in the run, or with its IMU
     wall_s: float
 
     @property
@@ -136,6 +140,8 @@ def run(
     viewer = viewer or NullViewer()
     dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
 
+    watch = _Watch(recording, motion, T_cam0_body)
+
     estimates: list[Estimate] = []
     frames: list[FrameLog] = []
     kept: list[Observations] = []
@@ -144,6 +150,7 @@ def run(
     try:
         for event in dataset.events(start, stop, images=_needs_images(dataset, config)):
             if not isinstance(event, StereoFrame):
+                watch.sample(event)
                 if motion is not None:
                     backend.propagate(event)
                 if dead_reckoning is not None:
@@ -160,10 +167,12 @@ def run(
             if config.backend == "vislam":  # the paper's filter knows stereo observations only
                 seen = seen.take(seen.has_right)
             selection = selector.select(seen, None if expected is None else expected.motion)
+            watch.observations(output.observations)
             marks.append(time.perf_counter())
             report = backend.update(seen.take(selection.chosen))
             estimate = backend.estimate()
             marks.append(time.perf_counter())
+            watch.update(event.index, report, estimate)
 
             estimates.append(estimate)
             frames.append(_frame_log(event, marks, output, selection, report))
@@ -174,6 +183,7 @@ def run(
             viewer.frame(output, estimate, report)
             clock = time.perf_counter()
     finally:
+        watch.close()
         viewer.close()
     if not frames:
         raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
@@ -189,6 +199,7 @@ def run(
         frames=tuple(frames),
         observations=tuple(kept) if keep_observations else None,
         motion_samples=tuple(samples) if keep_observations else None,
+        warnings=tuple(watch.lines),
         wall_s=time.perf_counter() - began,
     )
 
@@ -216,6 +227,39 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
         held = ", ".join(sorted(recording.motion)) or "no motion sensor"
         raise ConfigError(f"{recording.path}: --motion {config.motion} asked for, but the recording holds {held}")
     return config.motion
+
+
+class _Watch:
+    """Looks on: whether the estimate stays sane and, with raw IMU, whether its readings agree with the images."""
+
+    def __init__(self, recording: Recording, motion: MotionSource | None, T_cam0_body: FloatArray) -> None:
+        self._health = RunHealth()
+        self._inertial = None
+        if motion == "imu":
+            from vio.inertial_check import InertialCheck
+
+            self._inertial = InertialCheck(recording.camera, T_cam0_body)
+        self.lines: list[str] = []
+
+    def sample(self, sample: MotionSample) -> None:
+        if self._inertial is not None and isinstance(sample, ImuSample):
+            self._inertial.imu(sample)
+
+    def observations(self, seen: Observations) -> None:
+        if self._inertial is not None:
+            self._say(finding.message for finding in self._inertial.frame(seen))
+
+    def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
+        self._say(self._health.frame(index, report, estimate))
+
+    def close(self) -> None:
+        if self._inertial is not None:
+            self._say(finding.message for finding in self._inertial.finish())
+
+    def _say(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            log.warning("%s", line)
+            self.lines.append(line)
 
 
 class _DeadReckoning:
@@ -265,6 +309,7 @@ def _build_selector(features: Dataset, config: Config) -> Selector:
         config.selector,
         image_size=None if camera.width is None or camera.height is None else (camera.width, camera.height),
         whole_record=whole_record if precomputed else None,
+        camera=camera,
     )
 
 

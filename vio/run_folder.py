@@ -126,6 +126,7 @@ def metrics_of(
         "evaluation": scores,
         "dead_reckoning": None if dead_reckoning is None else dead_reckoning.as_dict(),
         "landmark_error": landmark_error(result, evaluation),
+        "warnings": list(result.warnings),
         "T_cam0_imu": result.T_cam0_body.tolist(),
     }
 

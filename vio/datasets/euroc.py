@@ -92,9 +92,12 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
     if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
+        from vio.inertial_check import judge_clocks  # it imports readers
+
+        (finding,) = judge_clocks(times_ns, np.array([x.time_ns for x in imu.samples], dtype=np.int64))
         raise DataError(
-            f"{mav / 'imu0' / 'data.csv'}: no IMU sample falls into the time of the images "
-            f"({times_ns[0]} to {times_ns[-1]} ns); use the same clock for both, or take imu0 away"
+            f"{mav / 'imu0' / 'data.csv'}: no IMU sample falls into the time of the images; {finding.message}; or take "
+            "imu0 away"
         )
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
     recording = Recording(

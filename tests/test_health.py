@@ -1,0 +1,65 @@
+"""The watch over a run: silent on sane runs, one line per event on others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vio.health import RunHealth
+from vio.records import Estimate, UpdateReport
+
+GOOD = UpdateReport(50, 2, 1, 30, 0.3, 1.0)
+EMPTY = UpdateReport(0, 0, 0, 30, None, None)
+STEP_NS = 50_000_000
+
+
+def _estimate(k: int, x: float | None = None, **more: object) -> Estimate:
+    T = np.eye(4)
+    T[0, 3] = 0.05 * k if x is None else x
+    return replace(Estimate(k * STEP_NS, T, np.eye(6) * 1e-4), **more)  # type: ignore[arg-type]
+
+
+def _lines(reports: list[UpdateReport]) -> list[str]:
+    health = RunHealth()
+    return [line for k, report in enumerate(reports) for line in health.frame(k, report, _estimate(k))]
+
+
+def test_a_sane_run_is_silent() -> None:
+    assert _lines([GOOD] * 50 + [EMPTY] * 10 + [GOOD] * 50) == []  # half a second without features is nothing
+
+
+def test_missing_features_are_said_when_they_stay_away_and_when_they_come_back() -> None:
+    gone, back = _lines([GOOD] * 10 + [EMPTY] * 45 + [GOOD] * 10)
+    assert "no usable feature since frame 9" in gone
+    assert "uncertain by 0.02 m" in gone
+    assert back == "frame 55: features again, after 2.3 s without"
+
+
+def test_two_blackouts_are_two_events() -> None:
+    assert len(_lines([GOOD] * 5 + [EMPTY] * 30 + [GOOD] * 5 + [EMPTY] * 30 + [GOOD])) == 4
+
+
+def test_rejecting_most_features_for_long_is_said_once() -> None:
+    bad = replace(GOOD, used=10, gated=40)
+    (line,) = _lines([GOOD] * 5 + [bad] * 60)
+    assert line.startswith("frame 24: more features rejected than used for 20 frames")
+    assert _lines(([bad] * 15 + [GOOD]) * 3) == []
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"x": 400.0}, "the estimate moves at"),
+        ({"gyro_bias": np.array([0.0, 0.9, 0.0])}, "gyro bias is estimated as 0.9 rad/s"),
+        ({"accel_bias": np.array([0.0, 0.0, -6.0])}, "accelerometer bias is estimated as 6 m/s^2"),
+    ],
+)
+def test_a_state_no_vehicle_has_is_said_once(more: dict[str, object], said: str) -> None:
+    health = RunHealth()
+    assert health.frame(0, GOOD, _estimate(0)) == ()
+    (line,) = health.frame(1, GOOD, _estimate(1, **more))  # type: ignore[arg-type]
+    assert said in line
+    assert "diverged" in line
+    assert health.frame(2, GOOD, _estimate(2, **more)) == ()  # type: ignore[arg-type]

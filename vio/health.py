@@ -1,0 +1,88 @@
+"""Watch a run for divergence: what an estimator that has lost its way looks like from outside, said once per event."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.records import Estimate, UpdateReport
+
+_BLIND_S = 1.0  # without a usable feature for longer, the pose is a prediction only
+_REJECTING_FRAMES = 20
+_MAX_SPEED_MPS = 100.0
+_MAX_GYRO_BIAS_RADPS = 0.5
+_MAX_ACCEL_BIAS_MPS2 = 3.0
+
+
+class RunHealth:
+    """Reads each frame's report and estimate; tells in one line what a user should know, when it begins and ends."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, FloatArray] | None = None  # time and position of the frame before
+        self._fed: tuple[int, int] | None = None  # index and time of the last frame whose features moved the state
+        self._blind = False
+        self._rejecting = 0
+        self._said: set[str] = set()
+
+    def frame(self, index: int, report: UpdateReport, estimate: Estimate) -> tuple[str, ...]:
+        """Return the lines that this frame gives rise to.
+
+        Args:
+            index: frame number.
+            report: what the update did.
+            estimate: the belief after it.
+        """
+        lines = [*self._features(index, report, estimate), *self._rejections(index, report)]
+        lines += self._implausible(index, estimate)
+        return tuple(lines)
+
+    def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[str]:
+        """Say when features have been missing for long, and when they come back."""
+        time_ns = estimate.time_ns
+        if report.used > 0 or report.initialised > 0 or self._fed is None:
+            ended = self._blind and report.used > 0
+            away_s = 0.0 if self._fed is None else (time_ns - self._fed[1]) * 1e-9
+            self._fed, self._blind = (index, time_ns), self._blind and not ended
+            return [f"frame {index}: features again, after {away_s:.1f} s without"] if ended else []
+        seconds = (time_ns - self._fed[1]) * 1e-9
+        if self._blind or seconds < _BLIND_S:
+            return []
+        self._blind = True
+        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        return [
+            f"frame {index}: no usable feature since frame {self._fed[0]} ({seconds:.1f} s); the pose is a prediction, "
+            f"its position uncertain by {sigma:.2f} m"
+        ]
+
+    def _rejections(self, index: int, report: UpdateReport) -> list[str]:
+        """Say when more features are rejected than used for many frames in a row."""
+        self._rejecting = self._rejecting + 1 if report.gated > report.used else 0
+        if self._rejecting != _REJECTING_FRAMES:
+            return []
+        return [
+            f"frame {index}: more features rejected than used for {_REJECTING_FRAMES} frames: wrong matches, moving "
+            "objects in the majority, or a pose that has left the truth"
+        ]
+
+    def _implausible(self, index: int, estimate: Estimate) -> list[str]:
+        """Say once when the state is not that of a vehicle."""
+        lines = []
+        position = estimate.T_world_imu[:3, 3].copy()
+        if self._last is not None and estimate.time_ns > self._last[0]:
+            speed = float(np.linalg.norm(position - self._last[1])) / ((estimate.time_ns - self._last[0]) * 1e-9)
+            lines += self._once("speed", speed, _MAX_SPEED_MPS, f"frame {index}: the estimate moves at {speed:.0f} m/s")
+        self._last = estimate.time_ns, position
+        for name, bias, limit, unit in (
+            ("gyro bias", estimate.gyro_bias, _MAX_GYRO_BIAS_RADPS, "rad/s"),
+            ("accelerometer bias", estimate.accel_bias, _MAX_ACCEL_BIAS_MPS2, "m/s^2"),
+        ):
+            if bias is not None:
+                size = float(np.linalg.norm(bias))
+                lines += self._once(name, size, limit, f"frame {index}: the {name} is estimated as {size:.2g} {unit}")
+        return lines
+
+    def _once(self, what: str, value: float, limit: float, line: str) -> list[str]:
+        if value <= limit or what in self._said:
+            return []
+        self._said.add(what)
+        return [f"{line}: the filter has diverged; check calibration, units and clocks"]
