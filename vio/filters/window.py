@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
@@ -188,7 +189,7 @@ def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tup
     L = _square_root(P)
     inner = np.eye(len(P)) + L.T @ information @ L
     K = np.linalg.cholesky(0.5 * (inner + inner.T))
-    W: FloatArray = np.linalg.solve(K, L.T)
+    W: FloatArray = solve_triangular(K, L.T, lower=True, check_finite=False)
     P_new: FloatArray = W.T @ W
     return P_new, P_new @ vector
 
