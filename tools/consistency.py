@@ -1,0 +1,689 @@
+"""Consistency of the sliding-window filter, beside the two it is compared with: standard errors, first estimates.
+
+    python tools/consistency.py --out FOLDER [--motions imu none velocity] [--variants VARIANT …] [--runs 20]
+        [--seconds 7.5] [--pixel-sigma 1.0] [--features 60] [--landmarks 30] [--jobs 2]
+
+Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
+yaw of the start are drawn from the very distributions that the filter is told. Each flight is flown once by every
+variant, with the same noise. Writes FOLDER/table.md (also printed), FOLDER/figures.json and FOLDER/consistency.png.
+docs/consistency.md says what the variants are; its equation numbers are cited here.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from vio.errors import VioError
+from vio.evaluation import nees, nees_bounds
+from vio.filters.msckf import Msckf
+from vio.filters.multiview import Residuals
+from vio.filters.navigation import DIM, ImuMotion, NavState, Transition
+from vio.filters.noise import MotionNoise
+from vio.filters.settings import MsckfSettings
+from vio.filters.window import Clone, Window
+from vio.geometry.lie import (
+    FloatArray,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+    so3_exp,
+    so3_hat,
+    so3_log,
+    transform_points,
+)
+from vio.geometry.stereo import StereoCamera, project
+from vio.records import (
+    BoolArray,
+    ImuSample,
+    IntArray,
+    MotionSample,
+    MotionSource,
+    Observations,
+    VelocitySample,
+    observations,
+)
+from vio.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    from typing_extensions import Self  # in typing from Python 3.11
+
+Motion = Literal["imu", "none", "velocity"]
+Start = Literal["doubted", "known"]
+Variant = Literal["standard", "first estimates", "right-invariant", "right-invariant, noise learned"]
+
+CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
+T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
+_FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
+# Standard deviations of the first position, m, and of the first yaw, rad.
+_START: dict[Start, tuple[float, float]] = {"doubted": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
+_MOTIONS: tuple[Motion, ...] = ("imu", "none", "velocity")
+_VARIANTS: tuple[Variant, ...] = (
+    "standard",
+    "first estimates",
+    "right-invariant",
+    "right-invariant, noise learned",
+)
+_COLOURS = {
+    "standard": "#c44e52",
+    "first estimates": "#d9822b",
+    "right-invariant": "#1f5fbf",
+    "right-invariant, noise learned": "#111111",
+}
+_MEASURES = {"pose": 6, "position": 3, "orientation": 3, "yaw": 1, "velocity": 3, "gyro bias": 3, "accel bias": 3}
+
+
+# The variants of the window
+
+
+class StandardErrors(Window):
+    """The window with the prior in the usual errors: differences of positions, velocities and points.
+
+    The error vector, and `P` and `offset` over it, stay right-invariant *at the present levers*, equation (E1), so that
+    the rest of the filter need not know. When the means move, the prior in the usual errors stays the same (E2).
+    """
+
+    @classmethod
+    def over(cls, window: Window) -> Self:
+        """Take over a plain window."""
+        out = cls.__new__(cls)
+        vars(out).update(vars(window))
+        out._begin()
+        return out
+
+    def levers(self) -> tuple[NavState, FloatArray, FloatArray]:
+        """The navigation state, positions (N, 3) of the clones and landmarks (M, 3) at which (E1) is taken."""
+        return self.nav, _positions(self.clones), self.landmarks
+
+    def standard_D_error(self) -> FloatArray:
+        """Jacobian (D, D) of the usual errors with respect to the window's own, equation (E1)."""
+        nav, positions, landmarks = self.levers()
+        M = np.eye(len(self.P))
+        M[0:3, 3:6] = -so3_hat(nav.T_world_imu[:3, 3])
+        if isinstance(self.motion, ImuMotion):
+            M[6:9, 3:6] = -so3_hat(nav.velocity)
+        for k, position in enumerate(positions):
+            rows = self.clone_rows(k)
+            M[rows.start : rows.start + 3, rows.start + 3 : rows.stop] = -so3_hat(position)
+        if len(landmarks):
+            anchor = self.clone_rows(len(self.clones) - 1)
+            M[self.first_landmark :, anchor.start + 3 : anchor.stop] = -so3_hat(landmarks).reshape(-1, 3)
+        return M
+
+    def relinearise(self, error: FloatArray) -> None:
+        """Move the means by an error vector (D,), each as the usual errors say; the prior in those stays."""
+        before = self.standard_D_error()
+        change = before @ error
+        self.nav = replace(
+            self.motion.corrected(self.nav, change),
+            T_world_imu=_moved(self.nav.T_world_imu, change[:6]),
+            velocity=self.nav.velocity + change[6:9],
+        )
+        moves = change[self.clone_rows(0).start : self.first_landmark].reshape(-1, 6)
+        self.clones = [
+            replace(c, T_world_imu=_moved(c.T_world_imu, move)) for c, move in zip(self.clones, moves, strict=True)
+        ]
+        self.landmarks = self.landmarks + change[self.first_landmark :].reshape(-1, 3)
+        self.offset = self.offset + error
+        self._follow(before)
+
+    def right_invariant(self, P: FloatArray) -> FloatArray:
+        """Covariance (15, 15) of the navigation state's right-invariant error at the present means."""
+        return P
+
+    def _begin(self) -> None:
+        """Set up what the window has beyond a plain one."""
+
+    def _follow(self, before: FloatArray) -> None:
+        """Write the prior in right-invariant errors at the new levers, equation (E2)."""
+        # M = I + L with L L = 0, so the inverse is I - L.
+        change = np.eye(len(before)) + before - self.standard_D_error()
+        self.P = change @ self.P @ change.T
+        self.offset = change @ self.offset
+
+
+class FirstEstimates(StandardErrors):
+    """The usual errors with every lever at the first estimate of what it belongs to, so the levers never change."""
+
+    def _begin(self) -> None:
+        self._first_nav = self.nav
+        self._first_clones = list(self.clones)
+        self._first_landmarks = self.landmarks
+
+    def levers(self) -> tuple[NavState, FloatArray, FloatArray]:
+        """As above, at the first estimates."""
+        return self._first_nav, _positions(self._first_clones), self._first_landmarks
+
+    def propagate(self, step: Transition) -> None:
+        """Move the navigation state; the prediction is its first estimate."""
+        super().propagate(step)
+        self._first_nav = step.nav
+
+    def add_clone(self, frame_index: int, time_ns: int, *rest: float) -> None:
+        """Copy the pose; where it is now is its first estimate."""
+        with self._landmarks_at_first():
+            super().add_clone(frame_index, time_ns, *rest)
+        self._first_clones = [*self._first_clones, self.clones[-1]]
+
+    def widen(self, extra: FloatArray) -> None:
+        """Add noise to the last step."""
+        with self._landmarks_at_first():
+            super().widen(extra)
+
+    def drop_oldest_clone(self) -> None:
+        """Forget the oldest clone."""
+        super().drop_oldest_clone()
+        self._first_clones = self._first_clones[1:]
+
+    def keep_landmarks(self, chosen: BoolArray) -> None:
+        """Forget the landmarks outside a mask (M,)."""
+        super().keep_landmarks(chosen)
+        self._first_landmarks = self._first_landmarks[chosen]
+
+    def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
+        """Add landmarks (K, 3); where they are now is their first estimate."""
+        super().add_landmarks(ids, p_world, A, covariance)
+        self._first_landmarks = np.concatenate([self._first_landmarks, p_world])
+
+    def right_invariant(self, P: FloatArray) -> FloatArray:
+        """Covariance (15, 15) of the navigation state's right-invariant error at the present means, not the first."""
+        first = self.standard_D_error()[:DIM, :DIM]
+        now = StandardErrors.standard_D_error(_at_means(self))[:DIM, :DIM]
+        change = np.eye(DIM) + first - now
+        out: FloatArray = change @ P @ change.T
+        return out
+
+    def _follow(self, before: FloatArray) -> None:
+        """Nothing: the levers stayed."""
+
+    @contextmanager
+    def _landmarks_at_first(self) -> Iterator[None]:
+        now, self.landmarks = self.landmarks, self._first_landmarks
+        yield
+        self.landmarks = now
+
+
+def _at_means(window: Window) -> StandardErrors:
+    """The navigation state of a window alone, with its levers at its means."""
+    return StandardErrors(window.motion, window.nav, np.eye(DIM))
+
+
+def _positions(clones: list[Clone]) -> FloatArray:
+    """Positions (N, 3) of clones."""
+    return np.array([c.T_world_imu[:3, 3] for c in clones]).reshape(-1, 3)
+
+
+def _moved(T: FloatArray, change: FloatArray) -> FloatArray:
+    """A pose (4, 4) whose position and world-side rotation change by (6,)."""
+    return se3_from_parts(so3_exp(change[3:]) @ T[:3, :3], T[:3, 3] + change[:3])
+
+
+class Ablation(Msckf):
+    """The sliding-window filter over a window of choice, in doubt of its first place and yaw."""
+
+    def __init__(
+        self,
+        settings: MsckfSettings,
+        motion: MotionSource | None,
+        kind: type[StandardErrors] | None,
+        *,
+        start: Start,
+        learn_noise: bool,
+    ) -> None:
+        super().__init__(CAMERA, T_CAM0_IMU, settings, motion=motion)
+        self._kind, self._start, self._begun = kind, _START[start], False
+        if not learn_noise:
+            self._noise = MotionNoise(1.0, 1.0, 1.0)
+        self.nis: list[float] = []  # of every frame, the tracks' mean squared residual per degree of freedom
+
+    def _measure(self) -> None:
+        """Right after the start, once, doubt the place and the yaw and take the window of choice."""
+        window = self._started()
+        if not self._begun:
+            position_sigma, yaw_sigma = self._start
+            window.P[:3, :3] += np.eye(3) * position_sigma**2
+            window.P[5, 5] += yaw_sigma**2
+            if self._kind is not None:
+                self._window = self._kind.over(window)
+            self._begun = True
+        super()._measure()
+
+    @property
+    def nav(self) -> NavState:
+        """The navigation state."""
+        return self._started().nav
+
+    @property
+    def nav_covariance(self) -> FloatArray:
+        """Covariance (15, 15) of the navigation state's right-invariant error."""
+        return self._output
+
+    def _gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
+        good, nis = super()._gate(at)
+        self.nis.append(float(nis.mean()) if len(nis) else float("nan"))
+        return good, nis
+
+    def _commit(self, window: Window, *rest: Any) -> int:
+        new = super()._commit(window, *rest)
+        if isinstance(window, StandardErrors):
+            self._output = window.right_invariant(self._output)
+        return new
+
+
+# The flights
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """What every flight shares."""
+
+    seconds: float = 7.5
+    pixel_sigma_px: float = 1.0
+    features: int = 60
+    landmarks: int = 30
+
+    @property
+    def frames(self) -> int:
+        """How many."""
+        return round(self.seconds * 1e9 / _FRAME_NS)
+
+    def settings(self, *, learn_noise: bool) -> MsckfSettings:
+        """What the filter is told: the truth about all noise, or, to learn it, where learning starts."""
+        s = MsckfSettings(
+            max_landmarks=self.landmarks,
+            pixel_sigma_px=self.pixel_sigma_px,
+            start_tilt_sigma_deg=1.0,
+            start_velocity_sigma_mps=2.0,
+            gyro_bias_sigma_radps=0.02,
+            accel_bias_sigma_mps2=0.05,
+            rate_bias_sigma_radps=0.02,
+        )
+        if learn_noise:
+            return s
+        return replace(s, pixel_sigma_min_px=self.pixel_sigma_px, pixel_sigma_max_px=self.pixel_sigma_px)
+
+
+class Flight:
+    """Rounds through a room, looking ahead, with a nodding and rolling body."""
+
+    def __init__(self) -> None:
+        rng = np.random.default_rng(0)
+        walls = rng.uniform([-7, -7, -2], [7, 7, 3], (3000, 3))
+        side = rng.integers(0, 4, len(walls))
+        for k, (axis, value) in enumerate([(0, -7.0), (0, 7.0), (1, -7.0), (1, 7.0)]):
+            walls[side == k, axis] = value + rng.uniform(-1.5, 1.5, int((side == k).sum()))
+        self.points = walls
+
+    def state(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Rotations (K, 3, 3), positions (K, 3) and velocities (K, 3) at times (K,), s."""
+        w, h = 2 * np.pi / 16.0, 1e-4
+
+        def position(s: FloatArray) -> FloatArray:
+            x, y = 3.5 * np.sin(w * s), 1.7 * np.sin(2 * w * s)
+            return np.stack([x, y, 0.5 * np.sin(0.9 * s)], axis=1)
+
+        yaw = 2 * np.pi * t / 25.0 + 0.3 * np.sin(0.7 * t)
+        zero = np.zeros_like(t)
+        tilt = np.stack([0.1 * np.sin(1.1 * t), 0.12 * np.sin(0.9 * t), zero], axis=1)
+        R = so3_exp(np.stack([zero, zero, yaw], axis=1)) @ so3_exp(tilt)
+        return R, position(t), (position(t + h) - position(t - h)) / (2 * h)
+
+    def rates(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Angular rates (K, 3), rad/s, and specific forces (K, 3), m/s^2, of the body at times (K,)."""
+        h = 1e-4
+        R, _, _ = self.state(t)
+        (R0, _, v0), (R1, _, v1) = self.state(t - h), self.state(t + h)
+        omega = so3_log(np.swapaxes(R0, 1, 2) @ R1) / (2 * h)
+        a = (v1 - v0) / (2 * h) + [0.0, 0.0, 9.81]
+        return omega, (np.swapaxes(R, 1, 2) @ a[..., None])[..., 0]
+
+    def imu(self, frames: int, noise: np.random.Generator, s: MsckfSettings) -> tuple[list[ImuSample], FloatArray]:
+        """Samples at 200 Hz, and the biases (K, 6) in them: drawn from the prior, then walking."""
+        n, dt = frames * (_FRAME_NS // _IMU_NS) + 1, _IMU_NS * 1e-9
+        walk = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) * np.sqrt(dt)
+        steps = noise.normal(0, 1, (n, 6)) * walk
+        steps[0] = noise.normal(0, np.repeat([s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2], 3))
+        bias = np.cumsum(steps, axis=0)
+        white = np.repeat([s.gyro_noise_density, s.accel_noise_density], 3) / np.sqrt(dt)
+        read = (
+            np.concatenate(self.rates(np.arange(n, dtype=np.float64) * dt), axis=1)
+            + bias
+            + noise.normal(0, 1, (n, 6)) * white
+        )
+        return [ImuSample(k * _IMU_NS, x[:3], x[3:]) for k, x in enumerate(read)], bias
+
+    def velocities(self, frames: int, noise: np.random.Generator, s: MsckfSettings) -> list[VelocitySample]:
+        """Samples at the frames, with white noise and a constant bias of the rate."""
+        t = _times(frames)
+        R, _, v = self.state(t)
+        linear = (np.swapaxes(R, 1, 2) @ v[..., None])[..., 0] + noise.normal(0, s.linear_velocity_sigma_mps, v.shape)
+        bias = noise.normal(0, s.rate_bias_sigma_radps, 3)
+        angular = self.rates(t)[0] + bias + noise.normal(0, s.angular_rate_sigma_radps, v.shape)
+        return [VelocitySample(k * _FRAME_NS, linear[k], angular[k]) for k in range(frames)]
+
+    def frame(self, k: int, T_world_imu: FloatArray, scenario: Scenario, noise: np.random.Generator) -> Observations:
+        """What the cameras see: of the points in view those with the lowest numbers, so that tracks last."""
+        p = transform_points(T_CAM0_IMU @ se3_inverse(T_world_imu), self.points)
+        near = (p[:, 2] > 0.8) & (p[:, 2] < 14)
+        z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
+        inside = near & (z[:, 2] > 5) & (z[:, 0] < 747) & (z[:, 1] > 5) & (z[:, 1] < 475)
+        ids = np.flatnonzero(inside)[: scenario.features]
+        return observations(k, k * _FRAME_NS, ids, z[ids] + noise.normal(0, scenario.pixel_sigma_px, (len(ids), 4)))
+
+
+def _times(frames: int) -> FloatArray:
+    """Times (F,) of the frames, s."""
+    return np.arange(frames, dtype=np.float64) * (_FRAME_NS * 1e-9)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One flight by one variant."""
+
+    scenario: Scenario
+    motion: Motion
+    start: Start
+    variant: Variant
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What one flight showed; arrays hold an entry per frame."""
+
+    job: Job
+    nees: dict[str, FloatArray]  # (F,) by measure
+    nis: FloatArray  # (F,) mean squared residual of the tracks per degree of freedom
+    yaw_sigma_deg: FloatArray  # (F,)
+    yaw_error_deg: FloatArray  # (F,)
+    position_m: FloatArray  # (F,) error, the drawn start included
+    orientation_deg: FloatArray  # (F,)
+    drift_m: float  # error of the last position as seen from the first pose
+
+
+def fly(job: Job) -> Record:
+    """Fly once."""
+    scenario, flight = job.scenario, Flight()
+    learn = job.variant == "right-invariant, noise learned"
+    settings = scenario.settings(learn_noise=learn)
+    kind = {"standard": StandardErrors, "first estimates": FirstEstimates}.get(job.variant)
+    source = None if job.motion == "none" else job.motion
+    filt = Ablation(settings, source, kind, start=job.start, learn_noise=learn)
+    noise = np.random.default_rng(job.seed)
+    R, p, v = flight.state(_times(scenario.frames))
+    T = se3_from_parts(R, p)
+    samples: list[MotionSample] = []
+    bias: FloatArray = np.zeros((scenario.frames, 6))
+    if job.motion == "imu":
+        imu, walked = flight.imu(scenario.frames, noise, settings)
+        samples, bias = list(imu), walked[:: _FRAME_NS // _IMU_NS][: scenario.frames]
+    elif job.motion == "velocity":
+        samples = list(flight.velocities(scenario.frames, noise, settings))
+    start = np.zeros(6)
+    position_sigma, yaw_sigma = _START[job.start]
+    start[:3], start[5] = noise.normal(0, position_sigma, 3), noise.normal(0, yaw_sigma)
+
+    navs, covariances, poses = [], [], []
+    for k in range(scenario.frames):
+        while samples and samples[0].time_ns <= k * _FRAME_NS:
+            filt.propagate(samples.pop(0))
+        filt.update(flight.frame(k, T[k], scenario, noise))
+        navs.append(filt.nav)
+        covariances.append(filt.nav_covariance)
+        poses.append(filt.estimate())
+    shift = se3_exp(start) @ _start_shift(T[0], navs[0].T_world_imu, upright=job.motion == "imu")
+    T, v = shift @ T, v @ shift[:3, :3].T
+    return _record(job, T, v, bias, navs, np.array(covariances), np.array([e.covariance for e in poses]), filt.nis)
+
+
+def _start_shift(T_true: FloatArray, T_estimate: FloatArray, *, upright: bool) -> FloatArray:
+    """The transform that puts the first true pose onto the estimate's; upright: by position and yaw alone."""
+    shift = T_estimate @ se3_inverse(T_true)
+    if not upright:
+        return shift
+    # The estimate's first yaw is an exact choice; its tilt is an estimate like any other.
+    yaw = np.arctan2(shift[1, 0] - shift[0, 1], shift[0, 0] + shift[1, 1])
+    R = so3_exp([0.0, 0.0, yaw])
+    return se3_from_parts(R, T_estimate[:3, 3] - R @ T_true[:3, 3])
+
+
+def _record(
+    job: Job,
+    T: FloatArray,
+    v: FloatArray,
+    bias: FloatArray,
+    navs: list[NavState],
+    P: FloatArray,
+    pose_covariance: FloatArray,
+    nis: list[float],
+) -> Record:
+    """Errors against what the filter said of them; P (F, 15, 15), pose_covariance as in `Estimate`."""
+    T_hat = np.array([n.T_world_imu for n in navs])
+    xi = se3_log(se3_inverse(T) @ T_hat)
+    world = se3_log(T @ se3_inverse(T_hat))
+    values = {
+        "pose": nees(xi, pose_covariance),
+        "position": nees(xi[:, :3], pose_covariance[:, :3, :3]),
+        "orientation": nees(xi[:, 3:], pose_covariance[:, 3:, 3:]),
+        "yaw": world[:, 5] ** 2 / P[:, 5, 5],
+    }
+    if job.motion == "imu":
+        v_hat = np.array([n.velocity for n in navs])
+        H = np.concatenate([-so3_hat(v_hat), np.tile(np.eye(3), (len(navs), 1, 1))], axis=2)
+        values["velocity"] = nees(v - v_hat, H @ P[:, 3:9, 3:9] @ np.swapaxes(H, 1, 2))
+        values["gyro bias"] = nees(bias[:, :3] - np.array([n.gyro_bias for n in navs]), P[:, 9:12, 9:12])
+        values["accel bias"] = nees(bias[:, 3:] - np.array([n.accel_bias for n in navs]), P[:, 12:, 12:])
+    last = se3_log(se3_inverse(se3_inverse(T[0]) @ T[-1]) @ se3_inverse(T_hat[0]) @ T_hat[-1])
+    return Record(
+        job,
+        values,
+        np.array(nis),
+        np.degrees(np.sqrt(P[:, 5, 5])),
+        np.degrees(np.abs(world[:, 5])),
+        np.linalg.norm(xi[:, :3], axis=1),
+        np.degrees(np.linalg.norm(xi[:, 3:], axis=1)),
+        float(np.linalg.norm(last[:3])),
+    )
+
+
+# The comparison
+
+
+def main() -> int:
+    """Fly everything and write the tables, the figures of all groups and the picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    usual = Scenario()
+    parser.add_argument("--out", type=Path, required=True, help="folder for the results")
+    parser.add_argument("--motions", nargs="+", default=list(_MOTIONS), choices=_MOTIONS)
+    parser.add_argument("--variants", nargs="+", default=list(_VARIANTS[:3]), choices=_VARIANTS)
+    parser.add_argument("--runs", type=int, default=20, help="flights per motion model and variant")
+    parser.add_argument("--seconds", type=float, default=usual.seconds, help="length of a flight")
+    parser.add_argument("--pixel-sigma", type=float, default=usual.pixel_sigma_px, help="noise of a pixel")
+    parser.add_argument("--features", type=int, default=usual.features, help="points seen in a frame")
+    parser.add_argument("--landmarks", type=int, default=usual.landmarks, help="most landmarks in the state")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    args = parser.parse_args()
+    scenario = Scenario(args.seconds, args.pixel_sigma, args.features, args.landmarks)
+    groups = list(_groups(args.motions, args.variants))
+    jobs = [Job(scenario, *group, seed) for seed, group in product(range(args.runs), groups)]
+    try:
+        records = _fly_all(jobs, args.jobs)
+        summaries = [_summary([r for r in records if _group(r.job) == group]) for group in groups]
+    except VioError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    args.out.mkdir(parents=True, exist_ok=True)
+    table = _tables(summaries)
+    (args.out / "table.md").write_text(table, encoding="utf-8")
+    plain = json.dumps([asdict(s) for s in summaries], default=lambda a: np.round(a, 5).tolist())
+    (args.out / "figures.json").write_text(plain + "\n", encoding="utf-8")
+    _plot(args.out / "consistency.png", summaries)
+    print(table)
+    return 0
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """All runs of one motion model, start and variant; arrays hold one entry per frame but the first."""
+
+    motion: Motion
+    start: Start
+    variant: Variant
+    runs: int
+    nees: dict[str, FloatArray]  # (F - 1,) by measure, mean over the runs
+    nees_se: dict[str, float]  # by measure, standard error over the runs of the mean over all frames
+    inside: dict[str, float]  # by measure, share of the frames in which the mean lies in its 95 % band
+    nis: float
+    yaw_sigma_deg: FloatArray  # (F - 1,) root mean square over the runs
+    yaw_error_deg: FloatArray  # (F - 1,) likewise
+    position_rmse_m: float
+    orientation_rmse_deg: float
+    drift_rms_m: float
+
+
+def _groups(motions: list[Motion], variants: list[Variant]) -> Iterator[tuple[Motion, Start, Variant]]:
+    """What is compared: every motion model from a doubted start, the IMU from a known one too."""
+    for motion, variant in product(motions, variants):
+        yield motion, "doubted", variant
+    for variant in variants if "imu" in motions else []:
+        yield "imu", "known", variant
+
+
+def _group(job: Job) -> tuple[Motion, Start, Variant]:
+    return job.motion, job.start, job.variant
+
+
+def _fly_all(jobs: list[Job], processes: int) -> list[Record]:
+    records: list[Record] = []
+    with ProcessPoolExecutor(max(processes, 1)) as pool:
+        for record in pool.map(_fly_alone, jobs):
+            records.append(record)
+            print(f"{len(records)}/{len(jobs)} {' '.join(_group(record.job))} {record.job.seed}", file=sys.stderr)
+    return records
+
+
+def _fly_alone(job: Job) -> Record:
+    with one_blas_thread():
+        return fly(job)
+
+
+def _summary(records: list[Record]) -> Summary:
+    """One group; the first frame, where the pose is what was drawn, is left out."""
+    runs = len(records)
+    every = {m: np.array([r.nees[m][1:] for r in records]) for m in records[0].nees}
+    mean: dict[str, FloatArray] = {m: values.mean(axis=0) for m, values in every.items()}
+    inside = {}
+    for measure, values in mean.items():
+        low, high = nees_bounds(_MEASURES[measure], runs)
+        inside[measure] = float(np.mean((values >= low) & (values <= high)))
+    return Summary(
+        *_group(records[0].job),
+        runs,
+        mean,
+        {m: float(v.mean(axis=1).std(ddof=min(runs - 1, 1)) / np.sqrt(runs)) for m, v in every.items()},
+        inside,
+        float(np.nanmean([r.nis[1:] for r in records])),
+        _rms([r.yaw_sigma_deg[1:] for r in records]),
+        _rms([r.yaw_error_deg[1:] for r in records]),
+        float(np.sqrt(np.mean([r.position_m[1:] ** 2 for r in records]))),
+        float(np.sqrt(np.mean([r.orientation_deg[1:] ** 2 for r in records]))),
+        float(np.sqrt(np.mean([r.drift_m**2 for r in records]))),
+    )
+
+
+def _rms(rows: list[FloatArray]) -> FloatArray:
+    out: FloatArray = np.sqrt(np.mean(np.square(rows), axis=0))
+    return out
+
+
+def _tables(summaries: list[Summary]) -> str:
+    """Markdown: NEES by measure, then what the filter says of yaw beside the errors."""
+    names = list(_MEASURES)
+    lines = [
+        "Mean NEES ± its standard error over the runs (share of the frames inside the 95 % band)",
+        "",
+        "| motion, start | variant | " + " | ".join(f"{m} ({d})" for m, d in _MEASURES.items()) + " | NIS (1) |",
+        "|---|---" + "|---:" * (len(names) + 1) + "|",
+    ]
+    for s in summaries:
+        cells = [_nees_cell(s, m) if m in s.nees else "–" for m in names]
+        lines.append(f"| {s.motion}, {s.start} | {s.variant} | {' | '.join(cells)} | {s.nis:.2f} |")
+    lines += [
+        "",
+        "| motion, start | variant | yaw sigma at 1 s (deg) | least | at the end | yaw error at the end, RMS "
+        "| position RMSE (m) | orientation RMSE (deg) | drift at the end, RMS (m) |",
+        "|---|---" + "|---:" * 7 + "|",
+    ]
+    for s in summaries:
+        sigma = s.yaw_sigma_deg
+        second = min(round(1e9 / _FRAME_NS), len(sigma)) - 1
+        cells = [f"{x:.3f}" for x in (sigma[second], sigma.min(), sigma[-1], s.yaw_error_deg[-1])]
+        cells += [f"{s.position_rmse_m:.4f}", f"{s.orientation_rmse_deg:.3f}", f"{s.drift_rms_m:.4f}"]
+        lines.append(f"| {s.motion}, {s.start} | {s.variant} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _nees_cell(summary: Summary, measure: str) -> str:
+    mean, error = float(summary.nees[measure].mean()), summary.nees_se[measure]
+    digits = 1 if mean >= 20 else 2
+    return f"{mean:.{digits}f} ± {error:.{digits}f} ({100 * summary.inside[measure]:.0f} %)"
+
+
+def _plot(path: Path, summaries: list[Summary]) -> None:
+    """Columns: motion and start; above the pose NEES over time, below what the filter says of yaw and its error."""
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+
+    columns = list(dict.fromkeys((s.motion, s.start) for s in summaries))
+    figure = Figure(figsize=(3.1 * len(columns) + 0.6, 5.4), dpi=90, layout="constrained")
+    grid = figure.subplots(2, len(columns), squeeze=False, sharey="row")
+    for (motion, start), (above, below) in zip(columns, grid.T, strict=True):
+        above.set_title(f"{motion}, start {start}", fontsize=9)
+        low, high = nees_bounds(_MEASURES["pose"], summaries[0].runs)
+        above.axhspan(low, high, color="#cfd8e3", lw=0)
+        for s in summaries:
+            if (s.motion, s.start) != (motion, start):
+                continue
+            t = _times(len(s.yaw_sigma_deg) + 1)[1:]
+            style: dict[str, Any] = {"color": _COLOURS[s.variant], "lw": 1.2}
+            above.plot(t, s.nees["pose"], **style)
+            below.plot(t, s.yaw_sigma_deg, **style)
+            below.plot(t, s.yaw_error_deg, ls=":", **style)
+        above.set_yscale("log")
+        below.set_yscale("log")
+        below.set_ylim(bottom=0.02)
+        below.set_xlabel("time (s)", fontsize=8)
+        for axes in (above, below):
+            axes.tick_params(labelsize=7, which="both")
+            axes.grid(alpha=0.25)
+            axes.yaxis.set_major_formatter("{x:g}")
+    grid[0, 0].set_ylabel("pose NEES, 6 expected", fontsize=8)
+    grid[1, 0].set_ylabel("yaw (deg)", fontsize=8)
+    used = [v for v in _VARIANTS if any(s.variant == v for s in summaries)]
+    handles = [Line2D([], [], color=_COLOURS[v], label=v) for v in used]
+    handles += [
+        Line2D([], [], color="#cfd8e3", lw=6, label="95 % band"),
+        Line2D([], [], color="#666666", label="sigma told"),
+        Line2D([], [], color="#666666", ls=":", label="error, RMS"),
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8)
+    figure.savefig(path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
