@@ -54,6 +54,7 @@ _VERY_FEW = 0.25  # share below which new features are shown at once
 _RETRY_SHARE = 0.25  # share of failures at which tracking is tried again with all pyramid levels
 _SPARSE = 4  # every so many pixels of the half image tell its brightness
 _SPARSE_CONTRAST = 1.0  # gray levels; less is no contrast to compare
+_BLIND_CONTRAST = 0.1  # share of the last image's contrast below which an image shows nothing
 _SAME_GAIN = 0.06  # change of contrast, and
 _SAME_LEVEL = 6.0  # of the mean gray level, that tracking bears
 _MAX_GAIN = 4.0
@@ -173,6 +174,7 @@ class KltFrontend:
         self._memory: _Memory | None = None
         self._rows: RowField | None = None
         self._next_id = 0
+        self._blind = 0  # frames in a row that were passed over
 
     @property
     def settings(self) -> KltSettings:
@@ -198,6 +200,10 @@ class KltFrontend:
         if self._mask is not None and self._allowed is None:
             self._allowed = half_mask(self._mask, left.full.shape, left.half.shape)
         watch.lap("prepare")
+        if self._blinded(left):
+            return FrontendOutput(
+                observations(frame.index, frame.time_ns, [], np.zeros((0, 4))), 0, 0, 0, watch.stages_ms
+            )
         tracks, motion = self._tracked(frame, left, right, usable_prior(prior), watch)
         missing = self._settings.target_features - len(tracks)
         corners = detect_corners(
@@ -232,6 +238,19 @@ class KltFrontend:
             detected=len(seen) - carried,
             stages_ms=watch.stages_ms,
         )
+
+    def _blinded(self, left: _View) -> bool:
+        """Whether the image shows nothing where the one before did: black, saturated or covered for a moment.
+
+        Such a frame is passed over, and tracking goes on from the one before, for as many frames as the setting says.
+        """
+        memory, before = self._memory, self._blind
+        self._blind = 0
+        if memory is None or len(memory.tracks) == 0 or before >= self._settings.max_blind_frames:
+            return False
+        if _contrast(left.half) < _BLIND_CONTRAST * _contrast(memory.left.half):
+            self._blind = before + 1
+        return self._blind > 0
 
     def _view(self, image: Image) -> _View:
         """Equalise an image and convert it; nothing of the result shares memory with it."""
@@ -660,6 +679,11 @@ def circle_gaps(
         return np.zeros(0)
     found, seen = flow(previous, current, before, after, settings.trusted_levels, settings)
     return np.where(seen, np.linalg.norm(found - after, axis=1), np.inf)
+
+
+def _contrast(image: Image) -> float:
+    """Standard deviation of an image's gray levels, from a sparse grid of them."""
+    return float(image[::_SPARSE, ::_SPARSE].astype(np.float64).std())
 
 
 def _as_bright(image: Image, other: Image) -> Image:

@@ -69,6 +69,9 @@ class KltSettings:
     least_features: float = setting(
         0.7, "share of the features to keep alive, below which corners that leave sooner are taken too"
     )
+    max_blind_frames: int = setting(
+        5, "frames without contrast that are passed over before all tracks are given up; 0: none"
+    )
     max_left_only_frames: int = setting(10, "frames that a feature may go on without a right match")
     seed: int = setting(0, "seed of the consensus sampling; equal seeds give equal bits")
 

@@ -137,7 +137,8 @@ def test_tracks_and_disparities_are_right(name: str, ran: Ran) -> None:
 
 @pytest.mark.parametrize("name", LOOKING)
 @pytest.mark.parametrize("level", [0, 255])
-def test_black_and_saturated_images_give_nothing_and_end_all_tracks(name: str, level: int, ran: Ran) -> None:
+def test_black_and_saturated_images_give_nothing(name: str, level: int, ran: Ran) -> None:
+    """A moment later there are features again; old ids among them name the same points."""
     flat = np.full((300, 480), level, dtype=np.uint8)
     blind = StereoFrame(1, FRAMES[1].time_ns, flat, flat)
     outputs = run(name, [FRAMES[0], blind, *FRAMES[2:4]])
@@ -145,7 +146,14 @@ def test_black_and_saturated_images_give_nothing_and_end_all_tracks(name: str, l
     assert len(outputs[1].observations) == 0
     assert outputs[1].observations.z.shape == (0, 4)
     assert len(outputs[2].observations) > 50
-    assert outputs[2].observations.ids.min() > outputs[0].observations.ids.max()
+    first, later = outputs[0].observations, outputs[2].observations
+    _, a, b = np.intersect1d(first.ids, later.ids, return_indices=True)
+    if name == "klt":
+        assert len(a) > 0.5 * len(first)
+        expected = truth(SLANTED, POSES[0], first.z[a, :2], POSES[2])[:, :2]
+        assert np.mean(np.linalg.norm(later.z[b, :2] - expected, axis=1) > 1) < 0.02
+    else:
+        assert len(a) == 0
 
 
 @pytest.mark.parametrize("name", LOOKING)

@@ -98,12 +98,31 @@ def test_two_runs_agree_to_the_bit(outputs: list[FrontendOutput]) -> None:
         np.testing.assert_array_equal(a.observations.has_right, b.observations.has_right)
 
 
+def _with_black_frames(n: int) -> list[StereoFrame]:
+    """Two frames, n black ones, and the second frame again."""
+    black = np.zeros_like(FRAMES[0].left)
+    dark = [StereoFrame(2 + k, (2 + k) * 50_000_000, black, black) for k in range(n)]
+    return [FRAMES[0], FRAMES[1], *dark, replace(FRAMES[1], index=2 + n, time_ns=(2 + n) * 50_000_000)]
+
+
+@pytest.mark.parametrize("n", [1, 5])
+def test_tracks_go_on_over_black_frames(n: int) -> None:
+    outputs = run(_with_black_frames(n))
+    assert [len(output.observations) for output in outputs[2:-1]] == [0] * n
+    before, after = common(outputs[1], outputs[-1])
+    assert len(before) > 0.95 * len(outputs[1].observations)
+    assert np.abs(before - after).max() < 0.2  # the picture is the same
+
+
+def test_tracks_are_given_up_when_the_camera_stays_black() -> None:
+    outputs = run(_with_black_frames(6))
+    assert len(outputs[-1].observations) > 100
+    assert outputs[-1].observations.ids.min() > outputs[1].observations.ids.max()
+
+
 def test_ids_are_never_reused() -> None:
     """A black frame kills every track; what is found afterwards is new, even where the picture is the same."""
-    black = np.zeros_like(FRAMES[0].left)
-    frames = [FRAMES[0], FRAMES[1], StereoFrame(2, 100_000_000, black, black), replace(FRAMES[1], index=3)]
-    frames[3] = replace(frames[3], time_ns=150_000_000)
-    outputs = run(frames)
+    outputs = run(_with_black_frames(1), replace(SETTINGS, max_blind_frames=0))
     assert len(outputs[2].observations) == 0
     early = np.concatenate([output.observations.ids for output in outputs[:2]])
     assert len(outputs[3].observations) > 100
