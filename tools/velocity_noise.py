@@ -94,7 +94,7 @@ def main() -> int:
         rows: dict[str, list[Evaluation]] = {"images alone": [score(first)], "velocities alone": [], "both": []}
         for seed in range(args.seeds):
             noisy = NoisyVelocities(dataset, seed)
-            for name, more in (("velocities alone", ["vislam.mode=dead_reckoning"]), ("both", [])):
+            for name, more in (("velocities alone", ["backend=vislam", "vislam.mode=dead_reckoning"]), ("both", [])):
                 rows[name].append(score(run(noisy, config("velocity", *more), frontend=Replay(first.observations))))
     table = {
         name: {
