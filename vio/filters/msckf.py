@@ -16,16 +16,23 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from vio.errors import ConfigError, EstimationError
+from vio.filters.extrinsics import first_calibration
 from vio.filters.multiview import (
+    CAUCHY,
+    MIN_DEPTH,
     Residuals,
     TrackInformation,
+    Views,
     eliminate_points,
     first_points,
+    landmark_information,
     refine_points,
     residuals,
+    robust_weights,
     track_information,
     within,
 )
@@ -35,7 +42,7 @@ from vio.filters.settings import MsckfSettings
 from vio.filters.tracks import TrackTable, latest_pixels
 from vio.filters.window import Window, posterior
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat, transform_points
-from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, project
 from vio.records import (
     BoolArray,
     Estimate,
@@ -54,14 +61,12 @@ from vio.records import (
 
 log = logging.getLogger(__name__)
 
-_CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
 _MIN_TRACKS_FOR_NOISE = 15
 _MIN_TRACKS_TO_STAND = 15
 _MAX_WAIT_FRAMES = 20
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 _VIEW_LIMIT = 23.5  # chi-square with 4 degrees of freedom, probability 0.9999
-_MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 # Factors on the motion model's densities: at the start, at least, at most.
 _IMU_FACTORS = (5.0, 1.0, 50.0)
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
@@ -117,15 +122,19 @@ class Msckf:
         """
         if settings.clones < 3 or settings.iterations < 1 or settings.max_features < 1 or settings.max_landmarks < 0:
             raise ConfigError("msckf: clones must be at least 3, iterations and max_features 1, max_landmarks 0")
-        self._camera, self._T_cam0_imu, self._settings = camera, np.asarray(T_cam0_imu, dtype=np.float64), settings
+        if settings.calibrate != "none" and motion != "imu":
+            raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to none")
+        self._camera, self._settings = camera, settings
+        self._calibration = first_calibration(T_cam0_imu, settings)
         self._source = motion
         self._motion: ImuMotion | TwistMotion = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
         self._window: Window | None = None
         self._tracks = TrackTable(settings.clones + 1)
         self._time_ns = 0
+        self._body_ns = 0  # time of the navigation state, on the IMU's clock
         self._waited = 0
         self._sigma2 = settings.pixel_sigma_px**2
-        self._output: FloatArray = np.zeros((DIM, DIM))
+        self._output: FloatArray = np.zeros((DIM, DIM))  # covariance (15 + C, 15 + C) with all that is seen
         self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._since_frame = _NO_STEP  # how the error has grown since the last frame
@@ -151,14 +160,16 @@ class Msckf:
         if window is None or not window.clones or time_ns < self._time_ns:
             return None
         nav, Phi, Q = window.nav, self._since_frame.Phi, self._since_frame.Q
-        if time_ns > self._time_ns:
+        body_ns = self._body_time(time_ns)
+        if body_ns > self._body_ns:
             try:
-                step = self._motion.advance(nav, self._time_ns, time_ns, self._noise.factors)
+                step = self._motion.advance(nav, self._body_ns, body_ns, self._noise.factors)
             except EstimationError:  # the update will say it
                 return None
             nav, Phi, Q = step.nav, step.Phi @ Phi, step.Phi @ Q @ step.Phi.T + step.Q
-        T_cam0_world = self._T_cam0_imu @ se3_inverse(nav.T_world_imu)
-        T_curr_prev = T_cam0_world @ window.clones[-1].T_world_imu @ se3_inverse(self._T_cam0_imu)
+        T_cam0_imu = window.calibration.T_cam0_imu
+        T_cam0_world = T_cam0_imu @ se3_inverse(window.exposure(nav, (body_ns - time_ns) * 1e-9))
+        T_curr_prev = T_cam0_world @ window.exposures()[-1] @ se3_inverse(T_cam0_imu)
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
         motion = MotionPrior(T_curr_prev, A @ self._expected_error(Phi, Q) @ A.T)
@@ -167,7 +178,7 @@ class Msckf:
     def _expected_error(self, Phi: FloatArray, Q: FloatArray) -> FloatArray:
         """Covariance (6, 6) of `xi_curr - xi_prev` over a step: the error at the last frame has grown by Phi and Q."""
         M = Phi[:6] - np.eye(6, DIM)
-        out: FloatArray = M @ self._output @ M.T + Q[:6, :6]
+        out: FloatArray = M @ self._output[:DIM, :DIM] @ M.T + Q[:6, :6]
         return out
 
     def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, R_cam_prev: FloatArray) -> TrackPrior:
@@ -175,7 +186,7 @@ class Msckf:
         rows = rows[self._tracks.has_point[rows]]
         ids = np.concatenate([self._tracks.ids(rows), window.landmark_ids])
         p_cam = transform_points(T_cam0_world, np.concatenate([self._tracks.points[rows], window.landmarks]))
-        ahead = p_cam[:, 2] > _MIN_DEPTH * self._camera.baseline_m
+        ahead = p_cam[:, 2] > MIN_DEPTH * self._camera.baseline_m
         return TrackPrior(ids[ahead], project(self._camera, p_cam[ahead]), R_cam_prev)
 
     def update(self, observations: Observations) -> UpdateReport:
@@ -189,12 +200,15 @@ class Msckf:
             if not self._motion.ready:
                 return self._wait(observations)
             nav, P = self._motion.start(observations.time_ns)
-            self._window, self._time_ns = Window(self._motion, nav, P), observations.time_ns
+            calibration, P_calibration = self._calibration
+            self._window = Window(self._motion, nav, np.asarray(block_diag(P, P_calibration)), calibration)
+            self._time_ns = self._body_ns = observations.time_ns
             self._measure()
         else:
             self._advance(observations.time_ns)
         window = self._window
-        window.add_clone(observations.frame_index, observations.time_ns)
+        late_s = (self._body_ns - observations.time_ns) * 1e-9
+        window.add_clone(observations.frame_index, observations.time_ns, late_s)
         try:
             report = self._use(window, seen)
         except np.linalg.LinAlgError as error:
@@ -208,17 +222,18 @@ class Msckf:
         if self._window is None:
             return Estimate(self._time_ns, np.eye(4), np.eye(6))
         window = self._window
-        T = window.nav.T_world_imu
+        T, covariance = window.present(self._output)
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
         A = se3_adjoint(se3_inverse(T))
-        return Estimate(
+        estimate = Estimate(
             self._time_ns,
             T,
-            A @ self._output[:6, :6] @ A.T,
+            A @ covariance @ A.T,
             velocity_world=self._motion.velocity_world(window.nav),
             gyro_bias=window.nav.gyro_bias,
             accel_bias=window.nav.accel_bias,
         )
+        return window.calibration.tell(estimate, self._output[DIM:, DIM:])
 
     def landmarks(self) -> Landmarks:
         """Return the points of all tracks that have been used, with their covariance given the poses.
@@ -274,14 +289,23 @@ class Msckf:
         return f"msckf diverged at frame {frame_index}: too few features for too long, or too many wrong ones"
 
     def _advance(self, time_ns: int) -> None:
-        if time_ns > self._time_ns:
+        body_ns = self._body_time(time_ns)
+        if body_ns > self._body_ns:
             window = self._started()
-            step = self._motion.advance(window.nav, self._time_ns, time_ns, self._noise.factors)
-            self._motion.forget_before(time_ns)
+            step = self._motion.advance(window.nav, self._body_ns, body_ns, self._noise.factors)
+            self._motion.forget_before(body_ns)
             window.propagate(step)
             self._since_frame = self._since_frame.then(step)
             self._gyro = step.gyro
+            self._body_ns = body_ns
         self._time_ns = time_ns
+
+    def _body_time(self, time_ns: int) -> int:
+        """The time on the IMU's clock to which the navigation state is carried for a frame."""
+        calibration = self._started().calibration
+        if not calibration.timing or not isinstance(self._motion, ImuMotion):
+            return time_ns
+        return self._motion.covered(time_ns + round(1e9 * calibration.time_offset_s))
 
     def _measure(self) -> None:
         window = self._started()
@@ -294,7 +318,7 @@ class Msckf:
         z, weight, found = latest_pixels(seen, window.landmark_ids)
         self._remember_landmarks(window, ~found)
         window.keep_landmarks(found)
-        z, weight = z[found], weight[found]
+        pixels = Views(z[found], weight[found])
         self._tracks.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
 
         if self._stands(len(window.clones)):
@@ -304,22 +328,22 @@ class Msckf:
         predicted, expected = window.last_move(), self._expected_error(self._since_frame.Phi, self._since_frame.Q)
         tracks = self._linearise(window, self._choose(window), _FIRST_STEPS)
         innovation = _newest_innovation(tracks.at)
-        tracks = self._fit(window, tracks, z, weight, innovation)
-        step = self._step_errors(window, tracks, predicted, expected, z, weight)
+        tracks = self._fit(window, tracks, pixels, innovation)
+        step = self._step_errors(window, tracks, predicted, expected, pixels)
         if step is not None:
             missing = step.missing_noise()
             if missing.any() and self._images_agree(tracks.at):
                 window.widen(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
-                tracks = self._fit(window, tracks, z, weight, innovation)
+                tracks = self._fit(window, tracks, pixels, innovation)
             self._noise.follow(step)
         self._since_frame = _NO_STEP
 
         tracks = self._without_wrong_views(tracks)
         good, nis = self._gate(tracks.at)
         self._follow_noise(tracks.at, nis)
-        report = self._commit(window, tracks, good, z, weight)
+        report = self._commit(window, tracks, good, pixels)
         return UpdateReport(
-            used=int(good.sum()) + len(z),
+            used=int(good.sum()) + len(pixels.z),
             gated=int((~good).sum()),
             initialised=report,
             landmarks=len(window.landmarks),
@@ -327,16 +351,14 @@ class Msckf:
             nis_per_dof=float(np.median(nis)) if len(nis) else None,
         )
 
-    def _fit(
-        self, window: Window, tracks: _Tracks, z: FloatArray, weight: FloatArray, innovation: float | None
-    ) -> _Tracks:
+    def _fit(self, window: Window, tracks: _Tracks, pixels: Views, innovation: float | None) -> _Tracks:
         """Gauss-Newton over the window; returns the tracks linearised at the estimate."""
         for _ in range(self._settings.iterations):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
-            A, b = self._information(window, tracks, everything, z, weight)
+            A, b = self._information(window, tracks, everything, pixels)
             _, shift = posterior(window.P, A, b + A @ window.offset)
             error = shift - window.offset
-            self._move_points(tracks, error[DIM : window.first_landmark])
+            self._move_points(tracks, window.exposure_errors(error))
             window.relinearise(error)
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = _newest_innovation(tracks.at)
@@ -351,15 +373,14 @@ class Msckf:
         tracks: _Tracks,
         predicted: FloatArray | None,
         expected: FloatArray,
-        z: FloatArray,
-        weight: FloatArray,
+        pixels: Views,
     ) -> StepErrors | None:
         """The predicted and the corrected motion since the last frame; None where too few tracks tell."""
         moved = window.last_move()
         if predicted is None or moved is None or len(tracks.rows) < _MIN_TRACKS_FOR_NOISE:
             return None
         everything = np.ones(len(tracks.rows), dtype=np.bool_)
-        remaining = window.last_move_covariance(self._information(window, tracks, everything, z, weight)[0])
+        remaining = window.last_move_covariance(self._information(window, tracks, everything, pixels)[0])
         A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
         process = A @ self._since_frame.Q[:6, :6] @ A.T
         correction = se3_log(se3_inverse(predicted) @ moved)
@@ -395,84 +416,41 @@ class Msckf:
         """Triangulate tracks, from where their points were last, and linearise them at the present estimate."""
         camera, table = self._camera, self._tracks
         views = table.views(rows, len(window.clones))
-        T = window.T_cam0_world(self._T_cam0_imu)
+        T = window.T_cam0_world()
         fresh = ~table.has_point[rows]
         if fresh.any():
             start, known = first_points(camera, T, views.take(fresh))
             table.points[rows[fresh]], table.has_point[rows[fresh]] = start, known
             rows = rows[table.has_point[rows]]
             views = table.views(rows, len(window.clones))
-        p = refine_points(camera, T, table.points[rows], views, steps, _CAUCHY * self.pixel_sigma_px)
+        p = refine_points(camera, T, table.points[rows], views, steps, CAUCHY * self.pixel_sigma_px)
         at = residuals(camera, T, p, views)
         keep = at.ahead & within(camera, T, p, self._settings.max_distance * camera.baseline_m)
         table.points[rows], table.has_point[rows] = p, keep
         rows, p = rows[keep], p[keep]
         at = Residuals(at.r[keep], at.z_D_p[keep], at.ahead[keep])
-        return _Tracks(rows, p, at, track_information(at, p, self._robust_weights(at)))
+        return _Tracks(rows, p, at, track_information(at, p, robust_weights(at, self._sigma2)))
 
-    def _move_points(self, tracks: _Tracks, clones_error: FloatArray) -> None:
+    def _move_points(self, tracks: _Tracks, exposure_errors: FloatArray) -> None:
         """Move each point as its own normal equations say once the clones have moved (6N,): back-substitution."""
         info = tracks.information
-        right = info.point_gradient - np.einsum("fik,i->fk", info.G, clones_error)
+        right = info.point_gradient - np.einsum("fik,i->fk", info.G, exposure_errors)
         step = np.linalg.solve(info.C, right[..., None])[..., 0]
         self._tracks.points[tracks.rows] = tracks.p_world + step
 
-    def _robust_weights(self, at: Residuals) -> FloatArray:
-        """Cauchy weights (F, N) of all views; the scale is each clone's own, as a predicted pose is off as a whole."""
-        squares = np.sum(at.r**2, axis=2)
-        used: BoolArray = np.any(at.z_D_p[:, :, 1, :], axis=2)  # the row of vl is measured in every view
-        weights = np.zeros(squares.shape)
-        for n in range(squares.shape[1]):
-            of_clone = squares[used[:, n], n]
-            if len(of_clone):
-                scale2 = max(self._sigma2, float(np.median(of_clone)) / 3.36)  # 3.36: median of chi-square, 4 degrees
-                weights[:, n] = used[:, n] / (1 + squares[:, n] / (4 * scale2 * _CAUCHY**2))
-        return weights
-
     def _information(
-        self, window: Window, tracks: _Tracks, chosen: BoolArray, z: FloatArray, weight: FloatArray
+        self, window: Window, tracks: _Tracks, chosen: BoolArray, pixels: Views | None
     ) -> tuple[FloatArray, FloatArray]:
         """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
-        D = len(window.P)
-        A, b = np.zeros((D, D)), np.zeros(D)
-        clones = slice(DIM, window.first_landmark)
+        poses, size = 6 * len(window.clones), 6 * len(window.clones) + 3 * len(window.landmarks)
+        A, b = np.zeros((size, size)), np.zeros(size)
         if chosen.any():
-            A[clones, clones], b[clones] = eliminate_points(tracks.information, chosen)
-        self._add_landmarks(window, z, weight, A, b)
-        return A / self._sigma2, b / self._sigma2
-
-    def _add_landmarks(self, window: Window, z: FloatArray, weight: FloatArray, A: FloatArray, b: FloatArray) -> None:
-        """Add the landmarks' pixels in the newest clone: `dz = J (xi_f - xi_rho)`, as the anchor is that clone."""
-        if not len(z):
-            return
-        J, r, _ = self._landmark_residuals(window, z, weight)
-        scale2 = max(self._sigma2, float(np.median(np.sum(r**2, axis=1))) / 3.36)
-        w = 1 / (1 + np.sum(r**2, axis=1) / (4 * scale2 * _CAUCHY**2))
-        C = np.einsum("k,kai,kaj->kij", w, J, J)
-        g = np.einsum("k,kai,ka->ki", w, J, r)
-        rho = slice(
-            window.clone_rows(len(window.clones) - 1).start, window.clone_rows(len(window.clones) - 1).start + 3
-        )
-        A[rho, rho] += C.sum(axis=0)
-        b[rho] -= g.sum(axis=0)
-        for k in range(len(z)):
-            own = slice(window.first_landmark + 3 * k, window.first_landmark + 3 * k + 3)
-            A[own, own] += C[k]
-            A[own, rho] -= C[k]
-            A[rho, own] -= C[k]
-            b[own] += g[k]
-
-    def _landmark_residuals(
-        self, window: Window, z: FloatArray, weight: FloatArray
-    ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Jacobian (K, 4, 3), residuals (K, 4) of the landmarks in the newest clone, and which lie ahead of it."""
-        T = window.T_cam0_world(self._T_cam0_imu)[-1]
-        p_cam = transform_points(T, window.landmarks)
-        ahead = p_cam[:, 2] > _MIN_DEPTH * self._camera.baseline_m
-        p_cam = np.where(ahead[:, None], p_cam, [0.0, 0.0, 1.0])
-        usable = weight * ahead[:, None]
-        r = np.where(usable > 0, z - project(self._camera, p_cam), 0.0)
-        return (z_D_p_cam(self._camera, p_cam) @ T[:3, :3]) * usable[..., None], r, ahead
+            A[:poses, :poses], b[:poses] = eliminate_points(tracks.information, chosen)
+        if pixels is not None and len(pixels.z):
+            T = window.T_cam0_world()[-1]
+            C, g = landmark_information(self._camera, T, window.landmarks, pixels, self._sigma2)
+            window.add_landmark_information(A, b, C, g)
+        return window.spread(A / self._sigma2, b / self._sigma2)
 
     def _without_wrong_views(self, tracks: _Tracks) -> _Tracks:
         """Drop single views that contradict the rest of their track, for good, and linearise what is left."""
@@ -488,7 +466,7 @@ class Msckf:
         enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
         at = Residuals(at.r[enough], at.z_D_p[enough], at.ahead[enough])
         p = tracks.p_world[enough]
-        return _Tracks(tracks.rows[enough], p, at, track_information(at, p, self._robust_weights(at)))
+        return _Tracks(tracks.rows[enough], p, at, track_information(at, p, robust_weights(at, self._sigma2)))
 
     def _gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
         """Which tracks (F,) pass the chi-square gate, and their squared residual over its degrees of freedom (F,)."""
@@ -510,14 +488,14 @@ class Msckf:
             np.clip(self._sigma2 * ratio**_NOISE_GAIN, s.pixel_sigma_min_px**2, s.pixel_sigma_max_px**2)
         )
 
-    def _commit(self, window: Window, tracks: _Tracks, good: BoolArray, z: FloatArray, weight: FloatArray) -> int:
+    def _commit(self, window: Window, tracks: _Tracks, good: BoolArray, pixels: Views) -> int:
         """Commit what ends in this frame, keep the output covariance, make room; return how many landmarks are new."""
         newest = len(window.clones) - 1
         full = len(window.clones) > self._settings.clones
         seen = self._tracks.seen(tracks.rows)
         lost, leaving = ~seen[:, newest], seen[:, 0] & full
         ending = lost | leaving
-        A, b = self._information(window, tracks, ending & good, z, weight)
+        A, b = self._information(window, tracks, ending & good, pixels)
         window.commit(A, b)
 
         done = ending & good
@@ -525,13 +503,12 @@ class Msckf:
         self._remember(self._tracks.ids(tracks.rows[done]), tracks.p_world[done], told)
 
         going_on = good & ~ending
-        A_on = np.zeros_like(A)
-        clones = slice(DIM, window.first_landmark)
+        own = slice(0, window.first_clone)
         if going_on.any():
-            A_on[clones, clones] = eliminate_points(tracks.information, going_on)[0] / self._sigma2
-            self._output = posterior(window.P, A_on, np.zeros(len(A)))[0][:DIM, :DIM]
+            A_on = self._information(window, tracks, going_on, None)[0]
+            self._output = posterior(window.P, A_on, np.zeros(len(A)))[0][own, own]
         else:
-            self._output = window.P[:DIM, :DIM].copy()
+            self._output = window.P[own, own].copy()
 
         promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
         self._tracks.remove(tracks.rows[promoted])
@@ -558,10 +535,9 @@ class Msckf:
         chosen = chosen[np.lexsort((self._tracks.ids(tracks.rows[chosen]), worst))[:room]]
         C_inverse = np.linalg.inv(info.C[chosen])
         p = tracks.p_world[chosen]
-        A = np.zeros((len(chosen), 3, len(window.P)))
-        A[:, :, DIM : window.first_landmark] = -C_inverse @ np.swapaxes(info.G[chosen], 1, 2)
-        rotation = window.clone_rows(len(window.clones) - 1).start + 3
-        A[:, :, rotation : rotation + 3] += so3_hat(p)
+        point_D_poses = -C_inverse @ np.swapaxes(info.G[chosen], 1, 2)
+        point_D_poses[:, :, -3:] += so3_hat(p)  # the anchor: rotation of the newest exposure
+        A = window.chain(point_D_poses)
         ids = self._tracks.ids(tracks.rows[chosen])
         covariance = np.asarray(self._sigma2 * C_inverse, dtype=np.float64)
         window.add_landmarks(ids, p, A.reshape(-1, len(window.P)), covariance)

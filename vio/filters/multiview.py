@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, so3_hat
+from vio.geometry.lie import FloatArray, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
 from vio.records import BoolArray
 
-_MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
+MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
+CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
+_MEDIAN = 3.36  # of chi-square with 4 degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,7 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
     F, N = len(p_world), len(T_cam0_world)
     p_cam = (p_world @ R.reshape(-1, 3).T).reshape(F, N, 3) + t
     seen = views.weight[..., 0] > 0
-    ok = p_cam[..., 2] > _MIN_DEPTH * camera.baseline_m
+    ok = p_cam[..., 2] > MIN_DEPTH * camera.baseline_m
     safe = np.where((ok & seen)[..., None], p_cam, [0.0, 0.0, 1.0])
     usable = views.weight * ok[..., None]
     r = (np.where(usable > 0, views.z, 0.0) - project(camera, safe)) * usable
@@ -104,6 +106,47 @@ def within(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, 
     """Which points (F,) lie ahead of the newest clone's camera plane by no more than a distance, and are finite."""
     depth = p_world @ T_cam0_world[-1, 2, :3] + T_cam0_world[-1, 2, 3]
     return np.isfinite(p_world).all(axis=1) & (np.abs(depth) < max_distance_m)
+
+
+def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
+    """Cauchy weights (F, N) of all views; the scale is each clone's own, as a predicted pose is off as a whole.
+
+    Args:
+        at: residuals and Jacobians.
+        sigma2: the pixel noise's variance, the smallest scale.
+    """
+    squares = np.sum(at.r**2, axis=2)
+    used: BoolArray = np.any(at.z_D_p[:, :, 1, :], axis=2)  # the row of vl is measured in every view
+    weights = np.zeros(squares.shape)
+    for n in range(squares.shape[1]):
+        of_clone = squares[used[:, n], n]
+        if len(of_clone):
+            scale2 = max(sigma2, float(np.median(of_clone)) / _MEDIAN)
+            weights[:, n] = used[:, n] / (1 + squares[:, n] / (4 * scale2 * CAUCHY**2))
+    return weights
+
+
+def landmark_information(
+    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, sigma2: float
+) -> tuple[FloatArray, FloatArray]:
+    """Information (K, 3, 3) and vector (K, 3) of landmarks' pixels in one camera about `dp` in `dz = J dp`.
+
+    Args:
+        camera: rectified pair.
+        T_cam0_world: (4, 4).
+        p_world: (K, 3).
+        views: what was seen, (K, 4) each.
+        sigma2: the pixel noise's variance, for the robust weights; the information is that of one pixel of noise.
+    """
+    p_cam = transform_points(T_cam0_world, p_world)
+    ahead = p_cam[:, 2] > MIN_DEPTH * camera.baseline_m
+    p_cam = np.where(ahead[:, None], p_cam, [0.0, 0.0, 1.0])
+    usable = views.weight * ahead[:, None]
+    r = np.where(usable > 0, views.z - project(camera, p_cam), 0.0)
+    J = (z_D_p_cam(camera, p_cam) @ T_cam0_world[:3, :3]) * usable[..., None]
+    scale2 = max(sigma2, float(np.median(np.sum(r**2, axis=1))) / _MEDIAN)
+    w = 1 / (1 + np.sum(r**2, axis=1) / (4 * scale2 * CAUCHY**2))
+    return np.einsum("k,kai,kaj->kij", w, J, J), np.einsum("k,kai,ka->ki", w, J, r)
 
 
 @dataclass(frozen=True, slots=True)

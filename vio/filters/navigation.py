@@ -29,6 +29,7 @@ from vio.records import ImuSample, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
+_EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
 _MAX_GAP_S = 0.5  # a longer silence of the IMU is an error, not an interval to integrate over
 
 
@@ -38,7 +39,7 @@ class NavState:
 
     T_world_imu: FloatArray  # (4, 4)
     velocity: FloatArray  # (3,) IMU model: world frame; twist model: body frame; m/s
-    rate: FloatArray  # (3,) twist model: body frame, rad/s; IMU model: unused, zero
+    rate: FloatArray  # (3,) body frame, rad/s; IMU model: what the gyro reads now less its bias, no state of its own
     gyro_bias: FloatArray  # (3,) rad/s
     accel_bias: FloatArray  # (3,) m/s^2; twist model: unused, zero
 
@@ -97,7 +98,7 @@ class ImuMotion:
             raise EstimationError("the accelerometer reads zero; is it in m/s^2, with gravity in it?")
         up = accel / np.linalg.norm(accel)
         T = se3_from_parts(_rotation_to_up(up), np.zeros(3))
-        nav = NavState(T, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+        nav = NavState(T, np.zeros(3), recent[-1].gyro, np.zeros(3), np.zeros(3))
         sigmas = np.concatenate(
             [
                 np.zeros(3),
@@ -131,7 +132,7 @@ class ImuMotion:
         p = nav.T_world_imu[:3, 3] + np.concatenate([np.zeros((1, 3)), np.cumsum(moves, axis=0)])
         Phi, Q, Q_parts = self._linearise(times, dt, R, v, p, factors)
         turned = np.sum(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None], axis=0) / max(dt.sum(), 1e-9)
-        moved = replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1])
+        moved = replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1], rate=gyro[-1])
         return Transition(moved, Phi, Q, Q_parts, turned + nav.gyro_bias)
 
     def forget_before(self, time_ns: int) -> None:
@@ -173,10 +174,22 @@ class ImuMotion:
         return NavState(
             se3_exp(error[:6]) @ nav.T_world_imu,
             so3_exp(phi) @ nav.velocity + so3_left_jacobian(phi) @ error[6:9],
-            nav.rate,
+            nav.rate - error[9:12],
             nav.gyro_bias + error[9:12],
             nav.accel_bias + error[12:15],
         )
+
+    def corrected_earlier(self, velocities: FloatArray, ages_s: FloatArray, error: FloatArray) -> FloatArray:
+        """Return velocities (N, 3), some seconds old, as an error (15,) of the present state moves them: (N2) back."""
+        phi = error[3:6]
+        xi_v = (_free_flow(-ages_s, self._gravity) @ error[:9])[:, 6:9]
+        out: FloatArray = velocities @ so3_exp(phi).T + xi_v @ so3_left_jacobian(phi).T
+        return out
+
+    def covered(self, time_ns: int) -> int:
+        """The latest time, up to a given one, that the samples reach; the given one where they end long before."""
+        latest = self._samples[-1].time_ns
+        return time_ns if time_ns - latest > _EXTRAPOLATE_NS else min(time_ns, latest)
 
     def _interval(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Times relative to the start (K,) in ns, gyro (K, 3), accel (K, 3), interpolated at both ends."""

@@ -99,3 +99,9 @@ class MsckfSettings:
     angular_acceleration_density: float = setting(
         0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)"
     )
+    calibrate: Literal["none", "extrinsics", "time_offset", "both"] = setting(
+        "none", "what is estimated besides the motion, with IMU only: T_cam0_imu, the clocks' difference, or both"
+    )
+    extrinsic_rotation_sigma_deg: float = setting(1.0, "calibrate: doubt of T_cam0_imu's rotation", unit="deg")
+    extrinsic_translation_sigma_m: float = setting(0.03, "calibrate: doubt of T_cam0_imu's translation", unit="m")
+    time_offset_sigma_s: float = setting(0.01, "calibrate: doubt that the clocks agree at the start", unit="s")

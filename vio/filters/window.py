@@ -1,17 +1,19 @@
 """The window: navigation state, clones and landmarks, and the one covariance over all their errors.
 
-Layout of an error vector of length D: navigation state (15), clones (6 each, oldest first), landmarks (3 each). Only
-this module knows it. The means are the newest estimates, at which everything is linearised; `P` and `offset` describe
-the prior: what has been committed says that the true error of the means has mean `-offset` and covariance `P`.
+Layout of an error vector of length D: navigation state (15), calibration (C = 0, 1, 6 or 7), clones (6 each, oldest
+first), landmarks (3 each). Only this module knows it. The means are the newest estimates, at which everything is
+linearised; `P` and `offset` describe the prior: what has been committed says that the true error of the means has mean
+`-offset` and covariance `P`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from vio.filters.extrinsics import Calibration, body_twists, pose_D_calibration, with_calibration
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
 from vio.records import BoolArray, IntArray
@@ -19,19 +21,32 @@ from vio.records import BoolArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Clone:
-    """The body at the time of a frame."""
+    """The body at the time of a frame, as the IMU's clock was thought to tell it."""
 
     frame_index: int
-    time_ns: int
+    time_ns: int  # the frame's stamp
     T_world_imu: FloatArray  # (4, 4)
+    velocity: FloatArray  # (3,) as in NavState; follows corrections only where the time offset is estimated
+    rate: FloatArray  # (3,) likewise
+    late_s: float = 0.0  # the pose's time on the IMU's clock minus the frame's stamp
+
+
+_NO_CALIBRATION = Calibration(np.eye(4))
 
 
 class Window:
     """State and covariance of the sliding-window filter; every change of the covariance happens here."""
 
-    def __init__(self, motion: ImuMotion | TwistMotion, nav: NavState, P: FloatArray) -> None:
+    def __init__(
+        self,
+        motion: ImuMotion | TwistMotion,
+        nav: NavState,
+        P: FloatArray,
+        calibration: Calibration = _NO_CALIBRATION,
+    ) -> None:
         self.motion = motion
         self.nav = nav
+        self.calibration = calibration
         self.clones: list[Clone] = []
         self.landmark_ids: IntArray = np.zeros(0, dtype=np.int64)
         self.landmarks: FloatArray = np.zeros((0, 3))
@@ -39,19 +54,105 @@ class Window:
         self.offset: FloatArray = np.zeros(len(P))
 
     @property
+    def first_clone(self) -> int:
+        """Row of the first clone, the one after the calibration's."""
+        return DIM + self.calibration.dim
+
+    @property
     def first_landmark(self) -> int:
         """Row of the first landmark."""
-        return DIM + 6 * len(self.clones)
+        return self.first_clone + 6 * len(self.clones)
 
     def clone_rows(self, index: int) -> slice:
         """Rows of a clone."""
-        start = DIM + 6 * index
+        start = self.first_clone + 6 * index
         return slice(start, start + 6)
 
-    def T_cam0_world(self, T_cam0_imu: FloatArray) -> FloatArray:
-        """Camera poses (N, 4, 4) of all clones."""
-        out: FloatArray = T_cam0_imu @ se3_inverse(np.array([c.T_world_imu for c in self.clones]))
+    def exposures(self) -> FloatArray:
+        """Poses (N, 4, 4) of the body when the frames were exposed, by the present time offset, equation (C1)."""
+        T = np.array([c.T_world_imu for c in self.clones])
+        if not self.calibration.timing:
+            return T
+        late = np.array([c.late_s for c in self.clones])
+        out: FloatArray = T @ se3_exp(self._twists() * (self.calibration.time_offset_s - late)[:, None])
         return out
+
+    def exposure(self, nav: NavState, late_s: float) -> FloatArray:
+        """Pose (4, 4) at the exposure of a frame whose stamp a navigation state is late by, on the IMU's clock."""
+        if not self.calibration.timing:
+            return nav.T_world_imu
+        twist = body_twists(nav.T_world_imu, nav.velocity, nav.rate)
+        out: FloatArray = nav.T_world_imu @ se3_exp(twist * (self.calibration.time_offset_s - late_s))
+        return out
+
+    def T_cam0_world(self) -> FloatArray:
+        """Camera poses (N, 4, 4) at all exposures."""
+        out: FloatArray = self.calibration.T_cam0_imu @ se3_inverse(self.exposures())
+        return out
+
+    def _twists(self) -> FloatArray:
+        """Body twists (N, 6) of the clones."""
+        T = np.array([c.T_world_imu for c in self.clones])
+        return body_twists(T, np.array([c.velocity for c in self.clones]), np.array([c.rate for c in self.clones]))
+
+    def _lever(self) -> FloatArray:
+        """What the calibration's errors do to the exposures' poses (6N, C)."""
+        full = pose_D_calibration(self.exposures(), self._twists())
+        return full[:, :, self.calibration.columns].reshape(6 * len(full), -1)
+
+    def present(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pose (4, 4) at the newest exposure and its covariance (6, 6).
+
+        Args:
+            covariance: of the errors of navigation state and calibration (15 + C, 15 + C).
+        """
+        if not self.calibration.timing:
+            return self.nav.T_world_imu, covariance[:6, :6]
+        J = np.eye(6, self.first_clone)
+        J[:, -1] = self._lever()[-6:, -1]
+        return self.exposures()[-1], J @ covariance @ J.T
+
+    def exposure_errors(self, error: FloatArray) -> FloatArray:
+        """How an error vector (D,) moves the exposures' poses (6N,), up to where they move pixels."""
+        clones = error[self.first_clone : self.first_landmark]
+        return clones + self._lever() @ error[DIM : self.first_clone] if self.calibration.dim else clones
+
+    def chain(self, out_D_exposures: FloatArray) -> FloatArray:
+        """Turn Jacobians (..., 6N) by the exposures' poses into Jacobians (..., D) by the error vector."""
+        out = np.zeros((*out_D_exposures.shape[:-1], len(self.P)))
+        out[..., self.first_clone : self.first_landmark] = out_D_exposures
+        if self.calibration.dim:
+            out[..., DIM : self.first_clone] = out_D_exposures @ self._lever()
+        return out
+
+    def add_landmark_information(self, A: FloatArray, b: FloatArray, C: FloatArray, g: FloatArray) -> None:
+        """Add what the landmarks' pixels in their anchor, the newest clone, say: `dp = xi_f - xi_rho`; in place.
+
+        Args:
+            A: information about exposures' poses and landmarks (6N + 3M, 6N + 3M).
+            b: its vector (6N + 3M,).
+            C: information about `dp` of each landmark (M, 3, 3).
+            g: its vector (M, 3).
+        """
+        first = 6 * len(self.clones)
+        rho = slice(first - 6, first - 3)
+        A[rho, rho] += C.sum(axis=0)
+        b[rho] -= g.sum(axis=0)
+        for k in range(len(C)):
+            own = slice(first + 3 * k, first + 3 * k + 3)
+            A[own, own] += C[k]
+            A[own, rho] -= C[k]
+            A[rho, own] -= C[k]
+            b[own] += g[k]
+
+    def spread(self, A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Turn information about exposures' poses and landmarks (6N + 3M) into that about the error vector (D)."""
+        out, vector = np.zeros_like(self.P), np.zeros(len(self.P))
+        if self.calibration.dim:
+            landmarks = np.zeros((3 * len(self.landmarks), self.calibration.dim))
+            A, b = with_calibration(A, b, np.concatenate([self._lever(), landmarks]))
+        out[DIM:, DIM:], vector[DIM:] = A, b
+        return out, vector
 
     def last_move(self) -> FloatArray | None:
         """Motion (4, 4) `T_prev_newest` of the body between the two newest clones; None with one clone."""
@@ -85,19 +186,26 @@ class Window:
         J[self.first_landmark :, 3:6] = so3_hat(self.landmarks).reshape(-1, 3)
         self.P = self.P + J @ extra @ J.T
 
-    def add_clone(self, frame_index: int, time_ns: int) -> None:
-        """Copy the pose as the newest clone; landmarks are anchored to its rotation from now on."""
+    def add_clone(self, frame_index: int, time_ns: int, late_s: float = 0.0) -> None:
+        """Copy the pose as the newest clone; landmarks are anchored to its rotation from now on.
+
+        Args:
+            frame_index: the frame's number.
+            time_ns: the frame's stamp.
+            late_s: the navigation state's time on the IMU's clock minus that stamp.
+        """
         at = self.first_landmark
         rows = np.concatenate([np.arange(at), np.arange(6), np.arange(at, len(self.P))])
         self.P = self.P[np.ix_(rows, rows)]
         self.offset = self.offset[rows]
         previous = len(self.clones) - 1
-        self.clones.append(Clone(frame_index, time_ns, self.nav.T_world_imu))
+        nav = self.nav
+        self.clones.append(Clone(frame_index, time_ns, nav.T_world_imu, nav.velocity, nav.rate, late_s))
         if len(self.landmarks):
             self._anchor_to_newest(self.clone_rows(previous).start + 3)
 
     def _anchor_to_newest(self, previous_rotation: int) -> None:
-        """Measure the landmarks' errors from the newest clone's rotation: xi_f += p^ (phi_new - phi_old)."""
+        """Measure the landmarks' errors from the newest exposure's rotation: xi_f += p^ (phi_new - phi_old)."""
         first, newest = self.first_landmark, self.clone_rows(len(self.clones) - 1).start + 3
         A = np.eye(len(self.P))
         lever = so3_hat(self.landmarks)
@@ -105,6 +213,9 @@ class Window:
             rows = slice(first + 3 * k, first + 3 * k + 3)
             A[rows, newest : newest + 3] += lever[k]
             A[rows, previous_rotation : previous_rotation + 3] -= lever[k]
+        if self.calibration.dim:
+            M = self._lever()
+            A[first:, DIM : self.first_clone] += lever.reshape(-1, 3) @ (M[-3:] - M[-9:-6])
         changed = A[first:]
         moved = changed @ self.P
         self.P[first:] = moved
@@ -169,15 +280,29 @@ class Window:
     def relinearise(self, error: FloatArray) -> None:
         """Move the means by an error vector (D,); the prior stays where it is."""
         self.nav = self.motion.corrected(self.nav, error[:DIM])
-        moves = se3_exp(error[DIM : self.first_landmark].reshape(-1, 6))
+        moves = se3_exp(error[self.first_clone : self.first_landmark].reshape(-1, 6))
         if len(self.landmarks):
-            phi = error[self.clone_rows(len(self.clones) - 1)][3:]
+            phi = self.exposure_errors(error)[-3:]
             own = error[self.first_landmark :].reshape(-1, 3)
             self.landmarks = self.landmarks @ so3_exp(phi).T + own @ so3_left_jacobian(phi).T
         self.clones = [
-            Clone(c.frame_index, c.time_ns, move @ c.T_world_imu) for c, move in zip(self.clones, moves, strict=True)
+            Clone(c.frame_index, c.time_ns, move @ c.T_world_imu, c.velocity, c.rate, c.late_s)
+            for c, move in zip(self.clones, moves, strict=True)
         ]
+        if self.calibration.dim:
+            self.calibration = self.calibration.corrected(error[DIM : self.first_clone])
+            self._correct_twists(error[:DIM])
         self.offset = self.offset + error
+
+    def _correct_twists(self, error: FloatArray) -> None:
+        """Let the clones' velocities and rates follow the navigation state's error (15,)."""
+        if not isinstance(self.motion, ImuMotion) or not self.clones:
+            return
+        ages = np.array([self.clones[-1].time_ns - c.time_ns for c in self.clones]) * 1e-9
+        velocities = self.motion.corrected_earlier(np.array([c.velocity for c in self.clones]), ages, error)
+        self.clones = [
+            replace(c, velocity=v, rate=c.rate - error[9:12]) for c, v in zip(self.clones, velocities, strict=True)
+        ]
 
 
 def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:

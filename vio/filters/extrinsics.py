@@ -1,0 +1,114 @@
+"""Online calibration: how the camera sits on the IMU and how their clocks differ, as states of the filter.
+
+A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error sits on the IMU's side,
+`T_cam0_imu = T_hat exp(delta)`. Either error then moves the pixels of a frame exactly as an error of its pose would,
+so all that is known about poses carries over by one small matrix per frame, equations (C1) to (C3) of docs/math.md.
+References: Li & Mourikis, Online temporal calibration for camera-IMU systems (2014); Qin & Shen, Online temporal
+calibration for monocular visual-inertial systems (2018).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.filters.settings import MsckfSettings
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp
+from vio.records import Estimate, IntArray
+
+_DELTA, _OFFSET = np.arange(6), np.array([6])  # columns of the full error [delta; time offset]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """What the filter believes of the rig, and which of it is estimated."""
+
+    T_cam0_imu: FloatArray  # (4, 4)
+    time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
+    extrinsics: bool = False  # whether T_cam0_imu is estimated
+    timing: bool = False  # whether the offset is estimated
+
+    @property
+    def dim(self) -> int:
+        """Error dimensions C: 0, 1, 6 or 7."""
+        return 6 * self.extrinsics + self.timing
+
+    @property
+    def columns(self) -> IntArray:
+        """Which entries (C,) of the full error `[delta; time offset]`, m, rad and s, are estimated."""
+        return np.concatenate([_DELTA[: 6 * self.extrinsics], _OFFSET[: 1 * self.timing]])
+
+    def corrected(self, error: FloatArray) -> Calibration:
+        """Return the calibration moved by an error (C,)."""
+        full = self.full(error)
+        return replace(
+            self,
+            T_cam0_imu=self.T_cam0_imu @ se3_exp(full[:6]) if self.extrinsics else self.T_cam0_imu,
+            time_offset_s=self.time_offset_s + float(full[6]),
+        )
+
+    def tell(self, estimate: Estimate, covariance: FloatArray) -> Estimate:
+        """Return an estimate with what is estimated of the calibration, whose errors have a covariance (C, C)."""
+        if self.extrinsics:
+            estimate = replace(estimate, T_cam0_imu=self.T_cam0_imu, T_cam0_imu_covariance=covariance[:6, :6])
+        if self.timing:
+            sigma = float(np.sqrt(covariance[-1, -1]))
+            estimate = replace(estimate, time_offset_s=self.time_offset_s, time_offset_sigma_s=sigma)
+        return estimate
+
+    def full(self, error: FloatArray) -> FloatArray:
+        """Fill an error (..., C) up to (..., 7) with zeros."""
+        out = np.zeros((*error.shape[:-1], 7))
+        out[..., self.columns] = error
+        return out
+
+
+def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings) -> tuple[Calibration, FloatArray]:
+    """Return the calibration (C error dimensions) at the start and its covariance (C, C)."""
+    extrinsics, timing = settings.calibrate in ("extrinsics", "both"), settings.calibrate in ("time_offset", "both")
+    calibration = Calibration(np.asarray(T_cam0_imu, dtype=np.float64), 0.0, extrinsics, timing)
+    rotation = np.radians(settings.extrinsic_rotation_sigma_deg)
+    sigmas = np.concatenate(
+        [
+            np.full(3, settings.extrinsic_translation_sigma_m),
+            np.full(3, rotation),
+            [settings.time_offset_sigma_s],
+        ]
+    )
+    return calibration, np.diag(sigmas[calibration.columns] ** 2)
+
+
+def body_twists(T_world_imu: FloatArray, velocity_world: FloatArray, rate: FloatArray) -> FloatArray:
+    """Twists (..., 6) `[v; omega]` in the body frame of poses (..., 4, 4), world velocities and body rates (..., 3)."""
+    v = np.einsum("...ji,...j->...i", T_world_imu[..., :3, :3], velocity_world)
+    return np.concatenate([v, rate], axis=-1)
+
+
+def pose_D_calibration(T_world_imu: FloatArray, twists: FloatArray) -> FloatArray:
+    """What errors `[delta; time offset]` of the calibration do to poses, equation (C2).
+
+    Args:
+        T_world_imu: poses (N, 4, 4) of the body at the exposures.
+        twists: their body twists (N, 6), m/s and rad/s.
+
+    Returns:
+        Jacobians (N, 6, 7): the world-side pose errors that move the pixels as the calibration's errors do.
+    """
+    A = se3_adjoint(T_world_imu)
+    return np.concatenate([-A, A @ twists[..., None]], axis=-1)
+
+
+def with_calibration(A: FloatArray, b: FloatArray, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Turn information about poses into information about calibration and poses, equation (C3).
+
+    Args:
+        A: information matrix (6N, 6N).
+        b: information vector (6N,).
+        lever: what the calibration does to the poses (6N, C).
+
+    Returns:
+        Information matrix (C + 6N, C + 6N) and vector (C + 6N,).
+    """
+    AM = A @ lever
+    return np.block([[lever.T @ AM, AM.T], [AM, A]]), np.concatenate([lever.T @ b, b])
