@@ -660,7 +660,8 @@ def _plot(path: Path, summaries: list[Summary]) -> None:
             if (s.motion, s.start) != (motion, start):
                 continue
             t = _times(len(s.yaw_sigma_deg) + 1)[1:]
-            style: dict[str, Any] = {"color": _COLOURS[s.variant], "lw": 1.2}
+            # Broad, as it lies under the right-invariant line.
+            style: dict[str, Any] = {"color": _COLOURS[s.variant], "lw": 3.0 if s.variant == "first estimates" else 1.2}
             above.plot(t, s.nees["pose"], **style)
             below.plot(t, s.yaw_sigma_deg, **style)
             below.plot(t, s.yaw_error_deg, ls=":", **style)
@@ -675,7 +676,7 @@ def _plot(path: Path, summaries: list[Summary]) -> None:
     grid[0, 0].set_ylabel("pose NEES, 6 expected", fontsize=8)
     grid[1, 0].set_ylabel("yaw (deg)", fontsize=8)
     used = [v for v in _VARIANTS if any(s.variant == v for s in summaries)]
-    handles = [Line2D([], [], color=_COLOURS[v], label=v) for v in used]
+    handles = [Line2D([], [], color=_COLOURS[v], lw=3.0 if v == "first estimates" else 1.2, label=v) for v in used]
     handles += [
         Line2D([], [], color="#cfd8e3", lw=6, label="95 % band"),
         Line2D([], [], color="#666666", label="sigma told"),
