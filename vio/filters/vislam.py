@@ -201,13 +201,14 @@ class Vislam:
         observations = observations.take(usable)
         slots = self._map.slots(observations.ids)
         known = slots < len(self._map)
-        used, gated, innovation, nis_per_dof = self._update_known(observations.z[known], slots[known], step_s)
+        try:
+            used, gated, innovation, nis_per_dof = self._update_known(observations.z[known], slots[known], step_s)
+        except np.linalg.LinAlgError as error:
+            raise EstimationError(self._lost(observations.frame_index)) from error
         fresh = observations.take(~known)
         initialised = self._initialise(fresh.ids, fresh.z)
         if not np.isfinite(self._state.U).all() or not np.isfinite(self._state.Sigma).all():
-            raise EstimationError(
-                f"vislam diverged at frame {observations.frame_index}: the pose is not finite any more"
-            )
+            raise EstimationError(self._lost(observations.frame_index))
         return UpdateReport(
             used=used,
             gated=gated,
