@@ -64,19 +64,15 @@ class Calibration:
         return out
 
 
-def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings) -> tuple[Calibration, FloatArray]:
-    """Return the calibration (C error dimensions) at the start and its covariance (C, C)."""
-    extrinsics, timing = settings.calibrate in ("extrinsics", "both"), settings.calibrate in ("time_offset", "both")
+def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings) -> tuple[Calibration, FloatArray, FloatArray]:
+    """Return the calibration at the start, its covariance (C, C), and what a second of random walk adds (C, C)."""
+    s = settings
+    extrinsics, timing = s.calibrate in ("extrinsics", "both"), s.calibrate in ("time_offset", "both")
     calibration = Calibration(np.asarray(T_cam0_imu, dtype=np.float64), 0.0, extrinsics, timing)
-    rotation = np.radians(settings.extrinsic_rotation_sigma_deg)
-    sigmas = np.concatenate(
-        [
-            np.full(3, settings.extrinsic_translation_sigma_m),
-            np.full(3, rotation),
-            [settings.time_offset_sigma_s],
-        ]
-    )
-    return calibration, np.diag(sigmas[calibration.columns] ** 2)
+    rotation, rotation_walk = np.radians([s.extrinsic_rotation_sigma_deg, s.extrinsic_rotation_walk])
+    sigmas = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
+    walks = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])
+    return calibration, np.diag(sigmas[calibration.columns] ** 2), np.diag(walks[calibration.columns] ** 2)
 
 
 def body_twists(T_world_imu: FloatArray, velocity_world: FloatArray, rate: FloatArray) -> FloatArray:

@@ -131,6 +131,7 @@ class Msckf:
         self._window: Window | None = None
         self._tracks = TrackTable(settings.clones + 1)
         self._time_ns = 0
+        self._began_ns = 0
         self._body_ns = 0  # time of the navigation state, on the IMU's clock
         self._waited = 0
         self._sigma2 = settings.pixel_sigma_px**2
@@ -200,9 +201,9 @@ class Msckf:
             if not self._motion.ready:
                 return self._wait(observations)
             nav, P = self._motion.start(observations.time_ns)
-            calibration, P_calibration = self._calibration
+            calibration, P_calibration, _ = self._calibration
             self._window = Window(self._motion, nav, np.asarray(block_diag(P, P_calibration)), calibration)
-            self._time_ns = self._body_ns = observations.time_ns
+            self._time_ns = self._body_ns = self._began_ns = observations.time_ns
             self._measure()
         else:
             self._advance(observations.time_ns)
@@ -295,10 +296,19 @@ class Msckf:
             step = self._motion.advance(window.nav, self._body_ns, body_ns, self._noise.factors)
             self._motion.forget_before(body_ns)
             window.propagate(step)
+            self._let_calibration_walk(window, (body_ns - self._body_ns) * 1e-9)
             self._since_frame = self._since_frame.then(step)
             self._gyro = step.gyro
             self._body_ns = body_ns
         self._time_ns = time_ns
+
+    def _let_calibration_walk(self, window: Window, step_s: float) -> None:
+        """Estimate the calibration once the motion is known, and let it walk from then on."""
+        if window.calibration.dim:
+            if not window.calibrating and self._time_ns - self._began_ns >= 1e9 * self._settings.calibrate_after_s:
+                window.begin_calibration()
+            if window.calibrating:
+                window.let_calibration_walk(self._calibration[2] * step_s)
 
     def _body_time(self, time_ns: int) -> int:
         """The time on the IMU's clock to which the navigation state is carried for a frame."""

@@ -105,3 +105,7 @@ class MsckfSettings:
     extrinsic_rotation_sigma_deg: float = setting(1.0, "calibrate: doubt of T_cam0_imu's rotation", unit="deg")
     extrinsic_translation_sigma_m: float = setting(0.03, "calibrate: doubt of T_cam0_imu's translation", unit="m")
     time_offset_sigma_s: float = setting(0.01, "calibrate: doubt that the clocks agree at the start", unit="s")
+    calibrate_after_s: float = setting(3.0, "calibrate: time from the start until the motion is known enough", unit="s")
+    extrinsic_rotation_walk: float = setting(0.02, "calibrate: random walk, which forgets", unit="deg/sqrt(s)")
+    extrinsic_translation_walk: float = setting(1.0e-3, "calibrate: random walk, likewise", unit="m/sqrt(s)")
+    time_offset_walk: float = setting(2.0e-5, "calibrate: random walk, likewise", unit="s/sqrt(s)")

@@ -31,6 +31,7 @@ class Clone:
     late_s: float = 0.0  # the pose's time on the IMU's clock minus the frame's stamp
 
 
+_VELOCITY_DOUBT = 0.05  # m/s, for what a wrong calibration did to the velocity
 _NO_CALIBRATION = Calibration(np.eye(4))
 
 
@@ -47,6 +48,7 @@ class Window:
         self.motion = motion
         self.nav = nav
         self.calibration = calibration
+        self.calibrating = False  # until then the calibration counts as known, its covariance stays
         self.clones: list[Clone] = []
         self.landmark_ids: IntArray = np.zeros(0, dtype=np.int64)
         self.landmarks: FloatArray = np.zeros((0, 3))
@@ -97,6 +99,8 @@ class Window:
 
     def _lever(self) -> FloatArray:
         """What the calibration's errors do to the exposures' poses (6N, C)."""
+        if not self.calibrating:
+            return np.zeros((6 * len(self.clones), self.calibration.dim))
         full = pose_D_calibration(self.exposures(), self._twists())
         return full[:, :, self.calibration.columns].reshape(6 * len(full), -1)
 
@@ -176,6 +180,29 @@ class Window:
         P[:, :DIM] = P[:, :DIM] @ Phi.T
         P[:DIM, :DIM] += step.Q
         self.offset[:DIM] = Phi @ self.offset[:DIM]
+
+    def begin_calibration(self) -> None:
+        """Take the calibration for uncertain from now on, equation (C4).
+
+        What has been learned with a calibration that counted as known is how exposures and landmarks lie to each other
+        and how fast they pass; all of it moves with the calibration's error as one, and body and IMU do not.
+        """
+        self.calibrating = True
+        M, first = self._lever(), self.first_clone
+        J = np.zeros((len(self.P), self.calibration.dim))
+        J[6:9] = -so3_hat(self.nav.velocity) @ M[-3:]
+        J[first : self.first_landmark] = np.tile(M[-6:], (len(self.clones), 1)) - M
+        J[self.first_landmark :] = np.tile(M[-6:-3], (len(self.landmarks), 1))
+        S = np.eye(len(self.P))
+        S[:, DIM:first] += J
+        P = S @ self.P @ S.T
+        P[6:9, 6:9] += np.eye(3) * _VELOCITY_DOUBT**2
+        self.P, self.offset = 0.5 * (P + P.T), S @ self.offset
+
+    def let_calibration_walk(self, extra: FloatArray) -> None:
+        """Add noise (C, C) to the calibration's errors."""
+        rows = slice(DIM, self.first_clone)
+        self.P[rows, rows] += extra
 
     def widen(self, extra: FloatArray) -> None:
         """Add noise (15, 15) to the last step, as if its motion had been known less; the newest clone ends it."""
