@@ -536,6 +536,23 @@ def test_biases_are_found() -> None:
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.08
 
 
+@pytest.mark.parametrize("motion", [None, "velocity", "imu"])
+def test_a_frame_that_shows_nothing_ends_no_track(motion: str | None) -> None:
+    """Every tenth frame is empty: the others lose nothing, and the covariance says that the empty ones do."""
+
+    def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
+        return seen.take(np.zeros(len(seen), dtype=np.bool_)) if k % 10 == 9 else seen
+
+    errors, covariances, filt = Flight().run(MsckfSettings(), motion, spoil=spoil)
+    whole, _, filt_whole = Flight().run(MsckfSettings(), motion)
+    seeing = np.arange(len(errors)) % 10 != 9
+    assert np.isin(filt_whole.landmarks().ids, filt.landmarks().ids).mean() > 0.9
+    rms, rms_whole = (np.sqrt(np.mean(e[seeing, :3] ** 2)) for e in (errors, whole))
+    assert rms < 1.3 * rms_whole
+    traces = np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2)
+    assert np.all(traces[19::10] > traces[18::10])
+
+
 def test_wrong_matches_do_not_capture_it() -> None:
     """Three rows in ten jump by tens of pixels at random, in every frame."""
 

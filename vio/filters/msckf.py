@@ -134,6 +134,7 @@ class Msckf:
         self._began_ns = 0
         self._body_ns = 0  # time of the navigation state, on the IMU's clock
         self._waited = 0
+        self._blind = False  # the last frame showed nothing
         self._sigma2 = settings.pixel_sigma_px**2
         self._output: FloatArray = np.zeros((DIM, DIM))  # covariance (15 + C, 15 + C) with all that is seen
         self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
@@ -208,6 +209,11 @@ class Msckf:
         else:
             self._advance(observations.time_ns)
         window = self._window
+        if window.clones and not len(seen):
+            # A frame that shows nothing ends no track; what is seen next decides.
+            self._blind = True
+            return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
+        self._blind = False
         late_s = (self._body_ns - observations.time_ns) * 1e-9
         window.add_clone(observations.frame_index, observations.time_ns, late_s)
         try:
@@ -223,7 +229,8 @@ class Msckf:
         if self._window is None:
             return Estimate(self._time_ns, np.eye(4), np.eye(6))
         window = self._window
-        T, covariance = window.present(self._output)
+        output = self._grown_output()
+        T, covariance = window.present(output)
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
         A = se3_adjoint(se3_inverse(T))
         estimate = Estimate(
@@ -234,7 +241,17 @@ class Msckf:
             gyro_bias=window.nav.gyro_bias,
             accel_bias=window.nav.accel_bias,
         )
-        return window.calibration.tell(estimate, self._output[DIM:, DIM:])
+        return window.calibration.tell(estimate, output[DIM:, DIM:])
+
+    def _grown_output(self) -> FloatArray:
+        """Covariance of navigation state and calibration at the time of the last event."""
+        if not self._blind:
+            return self._output
+        grow = np.eye(len(self._output))
+        grow[:DIM, :DIM] = self._since_frame.Phi
+        out: FloatArray = grow @ self._output @ grow.T
+        out[:DIM, :DIM] += self._since_frame.Q
+        return out
 
     def landmarks(self) -> Landmarks:
         """Return the points of all tracks that have been used, with their covariance given the poses.
@@ -320,8 +337,11 @@ class Msckf:
     def _measure(self) -> None:
         window = self._started()
         measurement = self._motion.measurement(window.nav)
-        if measurement is not None:
-            window.commit_measurement(measurement)
+        if measurement is None:
+            return
+        window.commit_measurement(measurement)
+        if self._blind:  # else the frame's fit will move the means, and better
+            window.relinearise(-window.offset)
 
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Everything that a frame's observations do."""
@@ -338,13 +358,13 @@ class Msckf:
         predicted, expected = window.last_move(), self._expected_error(self._since_frame.Phi, self._since_frame.Q)
         tracks = self._linearise(window, self._choose(window), _FIRST_STEPS)
         innovation = _newest_innovation(tracks.at)
-        tracks = self._fit(window, tracks, pixels, innovation)
-        step = self._step_errors(window, tracks, predicted, expected, pixels)
+        tracks, P = self._fit(window, tracks, pixels, innovation)
+        step = self._step_errors(window, tracks, predicted, expected, P)
         if step is not None:
             missing = step.missing_noise()
             if missing.any() and self._images_agree(tracks.at):
                 window.widen(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
-                tracks = self._fit(window, tracks, pixels, innovation)
+                tracks, _ = self._fit(window, tracks, pixels, innovation)
             self._noise.follow(step)
         self._since_frame = _NO_STEP
 
@@ -361,12 +381,15 @@ class Msckf:
             nis_per_dof=float(np.median(nis)) if len(nis) else None,
         )
 
-    def _fit(self, window: Window, tracks: _Tracks, pixels: Views, innovation: float | None) -> _Tracks:
-        """Gauss-Newton over the window; returns the tracks linearised at the estimate."""
+    def _fit(
+        self, window: Window, tracks: _Tracks, pixels: Views, innovation: float | None
+    ) -> tuple[_Tracks, FloatArray]:
+        """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the covariance (D, D)."""
+        P = window.P
         for _ in range(self._settings.iterations):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
-            _, shift = posterior(window.P, A, b + A @ window.offset)
+            P, shift = posterior(window.P, A, b + A @ window.offset)
             error = shift - window.offset
             self._move_points(tracks, window.exposure_errors(error))
             window.relinearise(error)
@@ -375,7 +398,7 @@ class Msckf:
             # Another step pays only where this one had far to go.
             if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
                 break
-        return tracks
+        return tracks, P
 
     def _step_errors(
         self,
@@ -383,14 +406,16 @@ class Msckf:
         tracks: _Tracks,
         predicted: FloatArray | None,
         expected: FloatArray,
-        pixels: Views,
+        P: FloatArray,
     ) -> StepErrors | None:
-        """The predicted and the corrected motion since the last frame; None where too few tracks tell."""
+        """The predicted and the corrected motion since the last frame, whose fit left the covariance P (D, D).
+
+        None where too few tracks tell.
+        """
         moved = window.last_move()
         if predicted is None or moved is None or len(tracks.rows) < _MIN_TRACKS_FOR_NOISE:
             return None
-        everything = np.ones(len(tracks.rows), dtype=np.bool_)
-        remaining = window.last_move_covariance(self._information(window, tracks, everything, pixels)[0])
+        remaining = window.last_move_covariance(P)
         A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
         process = A @ self._since_frame.Q[:6, :6] @ A.T
         correction = se3_log(se3_inverse(predicted) @ moved)

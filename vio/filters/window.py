@@ -165,9 +165,8 @@ class Window:
         out: FloatArray = se3_inverse(self.clones[-2].T_world_imu) @ self.clones[-1].T_world_imu
         return out
 
-    def last_move_covariance(self, information: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of `xi_newest - xi_prev` given the prior and information (D, D) on top of it."""
-        P = posterior(self.P, information, np.zeros(len(self.P)))[0]
+    def last_move_covariance(self, P: FloatArray) -> FloatArray:
+        """Covariance (6, 6) of `xi_newest - xi_prev` where all errors have the covariance P (D, D)."""
         a, b = self.clone_rows(len(self.clones) - 2), self.clone_rows(len(self.clones) - 1)
         out: FloatArray = P[a, a] + P[b, b] - P[a, b] - P[b, a]
         return out
