@@ -398,6 +398,7 @@ class Msckf:
             # Another step pays only where this one had far to go.
             if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
                 break
+            innovation = residual
         return tracks, P
 
     def _step_errors(
