@@ -106,6 +106,21 @@ def test_two_runs_give_the_same_bits() -> None:
     np.testing.assert_array_equal(a.trajectory.T_world_body, b.trajectory.T_world_body)
 
 
+def test_a_lag_gives_each_pose_what_later_frames_know() -> None:
+    drive = FakeDrive(velocity=False)
+    causal = run(drive, Config())
+    late = run(FakeDrive(velocity=False), replace(Config(), lag_frames=3))
+    np.testing.assert_allclose(late.trajectory.T_world_body[-1], causal.trajectory.T_world_body[-1], atol=1e-9)
+    revised = np.any(late.trajectory.T_world_body != causal.trajectory.T_world_body, axis=(1, 2))
+    assert revised[1:-1].all()
+    shift = np.linalg.norm(late.trajectory.positions - causal.trajectory.positions, axis=1)
+    assert shift.max() < 0.05
+    with pytest.raises(ConfigError, match="lag_frames=11"):
+        run(drive, replace(Config(), lag_frames=11))
+    with pytest.raises(ConfigError, match="needs backend msckf"):
+        run(drive, replace(Config(), lag_frames=1, backend="vislam"))
+
+
 def test_only_selected_stereo_rows_reach_the_filter() -> None:
     class Half:
         def select(self, rows: Observations, motion=None):  # type: ignore[no-untyped-def]

@@ -42,6 +42,9 @@ class Config:
     backend: BackendName = setting(
         "msckf", "the estimator: msckf, the sliding-window filter, or vislam, the paper's filter"
     )
+    lag_frames: int = setting(
+        0, "report each pose this many frames late, as the window then has it (msckf, up to its clones); 0: causal"
+    )
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
     frontend: FrontendSettings = field(default_factory=FrontendSettings)
     selector: SelectorSettings = field(default_factory=SelectorSettings)

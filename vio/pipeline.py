@@ -129,6 +129,8 @@ def run(
         raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
     if start >= len(recording.frame_times_ns):
         raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
+    if config.lag_frames and (config.backend != "msckf" or not 0 < config.lag_frames < config.msckf.clones):
+        raise ConfigError(f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones")
     motion = resolve_motion(recording, config)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
@@ -173,6 +175,7 @@ def run(
             estimate = backend.estimate()
             marks.append(time.perf_counter())
             watch.update(event.index, report, estimate)
+            _revise(estimates, frames, backend, config.lag_frames)
 
             estimates.append(estimate)
             frames.append(_frame_log(event, marks, output, selection, report))
@@ -185,6 +188,8 @@ def run(
     finally:
         watch.close()
         viewer.close()
+    if frames:
+        _revise(estimates, frames, backend, config.lag_frames, all_of_them=True)
     if not frames:
         raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
     return RunResult(
@@ -227,6 +232,18 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
         held = ", ".join(sorted(recording.motion)) or "no motion sensor"
         raise ConfigError(f"{recording.path}: --motion {config.motion} asked for, but the recording holds {held}")
     return config.motion
+
+
+def _revise(
+    estimates: list[Estimate], frames: list[FrameLog], backend: Backend, lag: int, *, all_of_them: bool = False
+) -> None:
+    """Give the estimate of `lag` frames ago, or all since then, the pose that the back end has now."""
+    if lag == 0:
+        return
+    for k in range(max(len(estimates) - lag, 0), len(estimates) if all_of_them else len(estimates) - lag + 1):
+        T = backend.pose_of(frames[k].index)
+        if T is not None:
+            estimates[k] = replace(estimates[k], T_world_imu=T)
 
 
 class _Watch:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
+from vio.geometry.lie import FloatArray
 from vio.records import (
     Estimate,
     Event,
@@ -77,6 +78,9 @@ class Backend(Protocol):
 
     def estimate(self) -> Estimate:
         """Return the current belief."""
+
+    def pose_of(self, frame_index: int) -> FloatArray | None:
+        """Return `T_world_imu` (4, 4) of a past frame as it is known now; None where it is not kept."""
 
     def landmarks(self) -> Landmarks:
         """Return the current map."""

@@ -253,6 +253,11 @@ class Msckf:
         out[:DIM, :DIM] += self._since_frame.Q
         return out
 
+    def pose_of(self, frame_index: int) -> FloatArray | None:
+        """Return `T_world_imu` (4, 4) of a past frame as the window has it now; None where it has left the window."""
+        clones = [] if self._window is None else self._window.clones
+        return next((clone.T_world_imu for clone in clones if clone.frame_index == frame_index), None)
+
     def landmarks(self) -> Landmarks:
         """Return the points of all tracks that have been used, with their covariance given the poses.
 

@@ -222,6 +222,10 @@ class Vislam:
         remedy = "" if self._settings.motion_model == "input" else "; give it velocities, or stop before that frame"
         return f"vislam diverged at frame {frame_index}: too few features for too long, or too many wrong ones{remedy}"
 
+    def pose_of(self, frame_index: int) -> FloatArray | None:
+        """Return nothing: the paper's filter keeps no past pose."""
+        return None
+
     def estimate(self) -> Estimate:
         """Return the pose at the time of the last frame."""
         U, twist = self._state.U, self._state.twist
