@@ -37,6 +37,12 @@ def test_missing_features_are_said_when_they_stay_away_and_when_they_come_back()
     assert back == "frame 55: features again, after 2.3 s without"
 
 
+def test_new_landmarks_alone_do_not_end_a_blackout() -> None:
+    fresh = replace(EMPTY, initialised=5)
+    _, back = _lines([GOOD] * 10 + [EMPTY] * 30 + [fresh] * 10 + [GOOD])
+    assert back == "frame 50: features again, after 2.1 s without"
+
+
 def test_two_blackouts_are_two_events() -> None:
     assert len(_lines([GOOD] * 5 + [EMPTY] * 30 + [GOOD] * 5 + [EMPTY] * 30 + [GOOD])) == 4
 

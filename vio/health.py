@@ -39,10 +39,11 @@ class RunHealth:
     def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[str]:
         """Say when features have been missing for long, and when they come back."""
         time_ns = estimate.time_ns
-        if report.used > 0 or report.initialised > 0 or self._fed is None:
-            ended = self._blind and report.used > 0
+        starts = report.initialised > 0 and not self._blind
+        if report.used > 0 or starts or self._fed is None:
+            ended = self._blind
             away_s = 0.0 if self._fed is None else (time_ns - self._fed[1]) * 1e-9
-            self._fed, self._blind = (index, time_ns), self._blind and not ended
+            self._fed, self._blind = (index, time_ns), False
             return [f"frame {index}: features again, after {away_s:.1f} s without"] if ended else []
         seconds = (time_ns - self._fed[1]) * 1e-9
         if self._blind or seconds < _BLIND_S:
