@@ -16,7 +16,7 @@ from frontend.outliers import bearing_consensus, predicted_motion, rigid_consens
 from frontend.patches import FloatImage, inside
 from frontend.settings import MatchSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
-from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.geometry.stereo import StereoCamera, left_rays, project, triangulate
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior, observations
 
 Descriptors: TypeAlias = npt.NDArray[np.float32] | npt.NDArray[np.uint8]
@@ -277,7 +277,7 @@ class DescriptorFrontend:
         told = expected if R_prior is None else se3_from_parts(R_prior, expected[:3, 3])
         p, deep = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
         deep &= old.has_right
-        guess = self._moved(old.left, np.where(deep[:, None], p, self._rays(old.left) * _FAR_M), told)
+        guess = self._moved(old.left, np.where(deep[:, None], p, left_rays(self._camera, old.left) * _FAR_M), told)
         if prior is not None and len(prior.ids):
             _, a, b = np.intersect1d(old.ids, prior.ids, assume_unique=True, return_indices=True)
             guess[a] = prior.z[b, :2]
@@ -318,11 +318,6 @@ class DescriptorFrontend:
         used[found] = True
         tracks = _Tracks(old.ids[rows], pixels[keep], right[keep], agrees[keep], left.take(found))
         return tracks, twist, used
-
-    def _rays(self, pixels: FloatArray) -> FloatArray:
-        camera = self._camera
-        x, y = (pixels[:, 0] - camera.cu) / camera.fu, (pixels[:, 1] - camera.cv) / camera.fv
-        return np.stack([x, y, np.ones(len(pixels))], axis=1)
 
     def _moved(self, left: FloatArray, point: FloatArray, T_curr_prev: FloatArray) -> FloatArray:
         moved = transform_points(T_curr_prev, point)

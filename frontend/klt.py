@@ -32,7 +32,7 @@ from frontend.patches import FloatImage, inside
 from frontend.settings import KltSettings
 from frontend.stereo_match import RowField, half_image, match_rows
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
-from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.geometry.stereo import StereoCamera, left_rays, project, triangulate
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior, observations
 
 logger = logging.getLogger(__name__)
@@ -324,18 +324,12 @@ class KltFrontend:
         """Points (N, 3) of the features, those of unknown depth as deep as their nearest neighbours in the image."""
         known, unknown = np.flatnonzero(old.placed), np.flatnonzero(~old.placed)
         if len(unknown) == 0 or len(known) < _NEIGHBOURS:
-            return np.where(old.placed[:, None], old.point, self._rays(old.left) * 1e6)
+            return np.where(old.placed[:, None], old.point, left_rays(self._camera, old.left) * 1e6)
         gap = np.abs(old.left[unknown, None] - old.left[known]).sum(axis=2)
         nearest = known[np.argpartition(gap, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]]
         point = old.point.copy()
-        point[unknown] = self._rays(old.left[unknown]) * np.median(old.point[nearest, 2], axis=1)[:, None]
+        point[unknown] = left_rays(self._camera, old.left[unknown]) * np.median(old.point[nearest, 2], axis=1)[:, None]
         return point
-
-    def _rays(self, pixels: FloatArray) -> FloatArray:
-        """Rays (N, 3) of unit depth through left pixels (N, 2)."""
-        camera = self._camera
-        x, y = (pixels[:, 0] - camera.cu) / camera.fu, (pixels[:, 1] - camera.cv) / camera.fv
-        return np.stack([x, y, np.ones(len(pixels))], axis=1)
 
     def _moved(self, old: _Tracks, point: FloatArray, T_curr_prev: FloatArray) -> FloatArray:
         """Pixels (N, 2) of old points (N, 3) after a camera motion; those that end up behind stay where they were."""
@@ -605,7 +599,7 @@ class KltFrontend:
             return np.ones(len(corners), dtype=np.bool_)
         T = np.linalg.matrix_power(motion.T_curr_prev, self._settings.wanted_life_frames)
         depth = self._camera.fu * self._camera.baseline_m / np.maximum(disparity, 0.1)
-        moved = transform_points(T, self._rays(corners) * depth[:, None])
+        moved = transform_points(T, left_rays(self._camera, corners) * depth[:, None])
         ahead = moved[:, 2] > 0.5
         pixels = project(self._camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
         return np.asarray(ahead & inside(image, pixels, 0.0))

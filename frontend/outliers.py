@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from vio.geometry.lie import FloatArray, circledot, se3_exp, se3_from_parts, so3_exp, so3_log, transform_points
-from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
 from vio.records import BoolArray, IntArray
 
 _MIN_DEPTH_M = 0.05
@@ -249,10 +249,7 @@ def epipolar_distance(
     `previous` and `current` are left pixels (N, 2). Unlike the epipolar line, the segment stays defined when the
     camera only turns or stands still: it shrinks to a point.
     """
-    rays = np.stack(
-        [(previous[:, 0] - camera.cu) / camera.fu, (previous[:, 1] - camera.cv) / camera.fv, np.ones(len(previous))],
-        axis=1,
-    )
+    rays = left_rays(camera, previous)
     ends = []
     for p in (rays @ T_curr_prev[:3, :3].T, transform_points(T_curr_prev, rays * near_m)):
         depth = np.maximum(p[:, 2:], 1e-3)
@@ -341,7 +338,7 @@ def bearing_consensus(
     """
     if len(previous) < _MIN_POINTS:
         return None
-    seen = _Sights(_rays(camera, previous), current, _rays(camera, current))
+    seen = _Sights(left_rays(camera, previous), current, left_rays(camera, current))
     near_prior = None
     if R_prior is not None:
         told = _bearing_vote(camera, seen, [R_prior], rng, settings)
@@ -356,12 +353,6 @@ def bearing_consensus(
         apart = (near_prior & ~kept).sum() >= max(_MIN_POINTS, settings.prior_min_support * kept.sum())
         kept = near_prior if apart else kept
     return kept if kept.sum() >= max(_MIN_POINTS, _MIN_BEARING_SHARE * len(kept)) else None
-
-
-def _rays(camera: StereoCamera, pixels: FloatArray) -> FloatArray:
-    """Rays (N, 3) of unit depth through left pixels (N, 2)."""
-    x, y = (pixels[:, 0] - camera.cu) / camera.fu, (pixels[:, 1] - camera.cv) / camera.fv
-    return np.stack([x, y, np.ones(len(pixels))], axis=1)
 
 
 def _ray_distance(camera: StereoCamera, seen: _Sights, R: FloatArray, t: FloatArray) -> FloatArray:

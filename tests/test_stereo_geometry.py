@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.numerics import numeric_jacobian
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, left_rays, p_cam_D_z, project, triangulate, z_D_p_cam
 
 properties = settings(max_examples=60, deadline=None)
 
@@ -31,6 +31,13 @@ def test_triangulate_undoes_project(camera: StereoCamera, p: FloatArray) -> None
     back, valid = triangulate(camera, project(camera, p)[None], min_disparity_px=1e-3)
     assert valid.all()
     np.testing.assert_allclose(back[0], p, rtol=1e-8, atol=1e-8)
+
+
+@properties
+@given(cameras, points)
+def test_left_rays_lead_to_the_points(camera: StereoCamera, p: FloatArray) -> None:
+    pixels = np.broadcast_to(project(camera, p)[:2], (2, 3, 2))
+    np.testing.assert_allclose(left_rays(camera, pixels) * p[2], np.broadcast_to(p, (2, 3, 3)), rtol=1e-8, atol=1e-8)
 
 
 @properties

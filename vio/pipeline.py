@@ -188,10 +188,9 @@ def run(
     finally:
         watch.close()
         viewer.close()
-    if frames:
-        _revise(estimates, frames, backend, config.lag_frames, all_of_them=True)
     if not frames:
         raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
+    _revise(estimates, frames, backend, config.lag_frames, all_of_them=True)
     return RunResult(
         recording=recording,
         config=config,

@@ -161,26 +161,26 @@ class Msckf:
         window = self._window
         if window is None or not window.clones or time_ns < self._time_ns:
             return None
-        nav, Phi, Q = window.nav, self._since_frame.Phi, self._since_frame.Q
+        nav, growth = window.nav, self._since_frame
         body_ns = self._body_time(time_ns)
         if body_ns > self._body_ns:
             try:
                 step = self._motion.advance(nav, self._body_ns, body_ns, self._noise.factors)
             except EstimationError:  # the update will say it
                 return None
-            nav, Phi, Q = step.nav, step.Phi @ Phi, step.Phi @ Q @ step.Phi.T + step.Q
+            nav, growth = step.nav, growth.then(step)
         T_cam0_imu = window.calibration.T_cam0_imu
         T_cam0_world = T_cam0_imu @ se3_inverse(window.exposure(nav, (body_ns - time_ns) * 1e-9))
         T_curr_prev = T_cam0_world @ window.exposures()[-1] @ se3_inverse(T_cam0_imu)
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
-        motion = MotionPrior(T_curr_prev, A @ self._expected_error(Phi, Q) @ A.T)
+        motion = MotionPrior(T_curr_prev, A @ self._expected_error(growth) @ A.T)
         return Prediction(self._expected_tracks(window, T_cam0_world, T_curr_prev[:3, :3]), motion)
 
-    def _expected_error(self, Phi: FloatArray, Q: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of `xi_curr - xi_prev` over a step: the error at the last frame has grown by Phi and Q."""
-        M = Phi[:6] - np.eye(6, DIM)
-        out: FloatArray = M @ self._output[:DIM, :DIM] @ M.T + Q[:6, :6]
+    def _expected_error(self, growth: _Growth) -> FloatArray:
+        """Covariance (6, 6) of `xi_curr - xi_prev` where the error at the last frame, xi_prev, has grown to xi_curr."""
+        M = growth.Phi[:6] - np.eye(6, DIM)
+        out: FloatArray = M @ self._output[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
         return out
 
     def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, R_cam_prev: FloatArray) -> TrackPrior:
@@ -344,9 +344,10 @@ class Msckf:
         measurement = self._motion.measurement(window.nav)
         if measurement is None:
             return
-        window.commit_measurement(measurement)
-        if self._blind:  # else the frame's fit will move the means, and better
-            window.relinearise(-window.offset)
+        if self._blind:
+            window.measure(measurement)
+        else:  # the frame's fit will move the means, and better
+            window.commit_measurement(measurement)
 
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Everything that a frame's observations do."""
@@ -360,7 +361,7 @@ class Msckf:
             rest = self._motion.standing(window.nav, self._gyro)
             if rest is not None:
                 window.commit_measurement(rest)
-        predicted, expected = window.last_move(), self._expected_error(self._since_frame.Phi, self._since_frame.Q)
+        predicted, expected = window.last_move(), self._expected_error(self._since_frame)
         tracks = self._linearise(window, self._choose(window), _FIRST_STEPS)
         innovation = _newest_innovation(tracks.at)
         tracks, P = self._fit(window, tracks, pixels, innovation)

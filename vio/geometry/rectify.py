@@ -15,7 +15,7 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, left_rays
 
 MapArray = npt.NDArray[np.float32]
 
@@ -153,8 +153,8 @@ def _inner_rectangle(camera: CameraModel, R_rect_cam: FloatArray) -> tuple[Float
 def _lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray) -> tuple[MapArray, MapArray]:
     assert rectified.width is not None
     assert rectified.height is not None
-    u, v = np.meshgrid(np.arange(rectified.width), np.arange(rectified.height))
-    rays = np.stack([(u - rectified.cu) / rectified.fu, (v - rectified.cv) / rectified.fv, np.ones(u.shape)], axis=-1)
+    pixels = np.stack(np.meshgrid(np.arange(rectified.width), np.arange(rectified.height)), axis=-1)
+    rays = left_rays(rectified, pixels)
     uv, valid = project_point(camera, rays @ R_rect_cam)
     uv = np.where(valid[..., None], uv, -1e4)
     return uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)

@@ -62,6 +62,13 @@ def project(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
     return np.stack([ul, v, ul - camera.fu * camera.baseline_m / depth, v], axis=-1)
 
 
+def left_rays(camera: StereoCamera, pixels: npt.ArrayLike) -> FloatArray:
+    """Rays (..., 3) of unit depth in the cam0 frame through left pixels (..., 2)."""
+    uv = np.asarray(pixels, dtype=np.float64)
+    x, y = (uv[..., 0] - camera.cu) / camera.fu, (uv[..., 1] - camera.cv) / camera.fv
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
 def z_D_p_cam(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
     """Jacobian (..., 4, 3) of `project` with respect to the point in the cam0 frame (pixels per metre)."""
     p = np.asarray(p_cam, dtype=np.float64)
