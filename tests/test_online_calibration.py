@@ -11,15 +11,15 @@ import pytest
 from tests.numerics import numeric_jacobian
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight, _world_points
 from vio.errors import ConfigError
-from vio.filters.extrinsics import (
+from vio.filters.msckf import Msckf
+from vio.filters.multiview import Views, landmark_information, point_lever, residuals
+from vio.filters.navigation import DIM, ImuMotion, NavState
+from vio.filters.online_calibration import (
     body_twists,
     first_calibration,
     pose_D_calibration,
     with_calibration,
 )
-from vio.filters.msckf import Msckf
-from vio.filters.multiview import Views, landmark_information, point_lever, residuals
-from vio.filters.navigation import DIM, ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.geometry.lie import (

@@ -10,9 +10,9 @@ import pytest
 
 from tests.numerics import numeric_jacobian
 from vio.errors import ConfigError, EstimationError
-from vio.filters.motion import predict, predict_twist
 from vio.filters.settings import VislamSettings
 from vio.filters.vislam import Vislam, update_landmarks, update_pose, z_D_landmark, z_D_xi
+from vio.filters.vislam_motion import predict, predict_twist
 from vio.geometry.lie import FloatArray, se3_curly_hat, se3_exp, se3_from_parts, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.records import ImuSample, Observations, VelocitySample, observations

@@ -49,11 +49,12 @@ def main() -> int:
 def _measure(source: str, args: argparse.Namespace) -> dict[str, Any]:
     from vio.config import load_config
     from vio.datasets import open_dataset
-    from vio.pipeline import run
+    from vio.pipeline import FrameLog, run
     from vio.threads import one_blas_thread
 
     config = load_config(None, [*args.set, f'motion="{args.motion}"'])
-    frames, wall_s, count = [], 0.0, 0
+    frames: list[FrameLog] = []
+    wall_s, count = 0.0, 0
     for _ in range(args.repeat):
         with one_blas_thread():
             result = run(open_dataset(source, config.dataset), config, stop=args.stop)

@@ -36,6 +36,7 @@ from vio.filters.navigation import DIM, ImuMotion, NavState, Transition
 from vio.filters.noise import MotionNoise
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Clone, Window
+from vio.filters.window_tracks import WindowTracks
 from vio.geometry.lie import (
     FloatArray,
     se3_exp,
@@ -233,6 +234,20 @@ def _moved(T: FloatArray, change: FloatArray) -> FloatArray:
     return se3_from_parts(so3_exp(change[3:]) @ T[:3, :3], T[:3, 3] + change[:3])
 
 
+class JudgedTracks(WindowTracks):
+    """Remembers how well the tracks of each frame fit."""
+
+    def __init__(self, camera: StereoCamera, settings: MsckfSettings) -> None:
+        super().__init__(camera, settings)
+        self.nis: list[float] = []
+
+    def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
+        """Gate as always, and note the mean."""
+        good, nis = super().gate(at)
+        self.nis.append(float(nis.mean()) if len(nis) else float("nan"))
+        return good, nis
+
+
 class Ablation(Msckf):
     """The sliding-window filter over a window of choice, in doubt of its first place and yaw."""
 
@@ -249,7 +264,12 @@ class Ablation(Msckf):
         self._kind, self._start, self._begun = kind, _START[start], False
         if not learn_noise:
             self._noise = MotionNoise(1.0, 1.0, 1.0)
-        self.nis: list[float] = []  # of every frame, the tracks' mean squared residual per degree of freedom
+        self._tracks = self._judged = JudgedTracks(CAMERA, settings)
+
+    @property
+    def nis(self) -> list[float]:
+        """Of every frame, the tracks' mean squared residual per degree of freedom."""
+        return self._judged.nis
 
     def _measure(self) -> None:
         """Right after the start, once, doubt the place and the yaw and take the window of choice."""
@@ -272,11 +292,6 @@ class Ablation(Msckf):
     def nav_covariance(self) -> FloatArray:
         """Covariance (15, 15) of the navigation state's right-invariant error."""
         return self._output
-
-    def _gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
-        good, nis = super()._gate(at)
-        self.nis.append(float(nis.mean()) if len(nis) else float("nan"))
-        return good, nis
 
     def _commit(self, window: Window, *rest: Any) -> int:
         new = super()._commit(window, *rest)

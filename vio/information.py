@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray, so3_hat, transform_points
-from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, left_rays, project, triangulate, z_D_p_cam
 from vio.records import BoolArray, IntArray, MotionPrior, Observations
 
 _BATCH = 6  # candidates evaluated exactly at first; doubled until the best is certain
@@ -239,9 +239,7 @@ class MotionInformation:
         placed &= observations.has_right
         left_only = ~observations.has_right & was_used
         if left_only.any():
-            depth = expected[left_only, 2:]
-            ray = (z[left_only, :2] - [camera.cu, camera.cv]) / [camera.fu, camera.fv]
-            p_cam[left_only] = np.concatenate([ray * depth, depth], axis=1)
+            p_cam[left_only] = left_rays(camera, z[left_only, :2]) * expected[left_only, 2:]
             placed |= left_only
         baselines = p_cam[:, 2] / camera.baseline_m
         return p_cam, placed & ~observations.stale & (baselines > self._MIN_DEPTH) & (baselines < self._MAX_DEPTH)

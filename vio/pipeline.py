@@ -10,8 +10,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from vio.config import Config
+from vio.config import BackendName, Config
 from vio.errors import ConfigError, DataError
+from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
 from vio.geometry.lie import FloatArray
 from vio.health import RunHealth
@@ -35,8 +36,7 @@ from vio.selectors import build_selector
 
 log = logging.getLogger(__name__)
 
-# Motion sources that a back end has a model for, the best first.
-_TAKES: dict[str, tuple[MotionSource, ...]] = {"vislam": ("velocity",), "msckf": ("imu", "velocity")}
+_BACKENDS: dict[BackendName, type[Vislam] | type[Msckf]] = {"vislam": Vislam, "msckf": Msckf}
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ def run(
             output = frontend.process(event, None if expected is None or not config.frontend.prior else expected.tracks)
             marks.append(time.perf_counter())
             seen = output.observations
-            if config.backend == "vislam":  # the paper's filter knows stereo observations only
+            if backend.stereo_only:
                 seen = seen.take(seen.has_right)
             selection = selector.select(seen, None if expected is None else expected.motion)
             watch.observations(output.observations)
@@ -214,7 +214,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     Raises:
         ConfigError: the recording lacks what was asked for, or the back end has no model for it.
     """
-    taken = _TAKES[config.backend]
+    taken = _BACKENDS[config.backend].motion_sources
     if config.motion == "none":
         return None
     if config.motion == "auto":
@@ -333,8 +333,6 @@ def _build_backend(
     recording: Recording, config: Config, motion: MotionSource | None, T_cam0_body: FloatArray
 ) -> Backend:
     if config.backend == "msckf":
-        from vio.filters.msckf import Msckf
-
         return Msckf(recording.camera, T_cam0_body, config.msckf, motion=motion)
     return Vislam(recording.camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
 

@@ -67,6 +67,10 @@ class Selector(Protocol):
 class Backend(Protocol):
     """An estimator fed with motion samples and observations in time order."""
 
+    @property
+    def stereo_only(self) -> bool:
+        """Whether observations without a right match are of no use to it."""
+
     def propagate(self, sample: MotionSample) -> None:
         """Take one motion sample; samples come in time order."""
 

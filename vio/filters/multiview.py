@@ -40,6 +40,10 @@ class Residuals:
     z_D_p: FloatArray  # (F, N, 4, 3) with respect to the point in the world frame, zero where unseen
     ahead: BoolArray  # (F,) the point lies in front of every camera that saw it
 
+    def take(self, index: BoolArray) -> Residuals:
+        """Return the tracks of a mask (F,)."""
+        return Residuals(self.r[index], self.z_D_p[index], self.ahead[index])
+
 
 def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views) -> Residuals:
     """Compare predicted with seen pixels, equation (M1).

@@ -56,6 +56,23 @@ class Transition:
 
 
 @dataclass(frozen=True, slots=True)
+class Growth:
+    """How the navigation state's error has grown over some steps."""
+
+    Phi: FloatArray  # (15, 15)
+    Q: FloatArray  # (15, 15)
+    Q_parts: FloatArray  # (2, 15, 15) as in Transition
+
+    def then(self, step: Transition) -> Growth:
+        """Append a step."""
+        Phi = step.Phi
+        return Growth(Phi @ self.Phi, Phi @ self.Q @ Phi.T + step.Q, Phi @ self.Q_parts @ Phi.T + step.Q_parts)
+
+
+NO_STEP = Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
+
+
+@dataclass(frozen=True, slots=True)
 class Measurement:
     """A linear measurement of the navigation state's error: residual = H error + noise."""
 
@@ -244,7 +261,7 @@ class ImuMotion:
 class TwistMotion:
     """The body twist is a state that drifts with white acceleration; velocity samples, if any, measure it.
 
-    This is `vio.filters.motion.DriftingTwist` with the error on the world side and a bias of the angular rate.
+    This is `vio.filters.vislam_motion.DriftingTwist` with the error on the world side and a bias of the angular rate.
     """
 
     def __init__(self, settings: MsckfSettings) -> None:

@@ -6,21 +6,15 @@ Equation numbers (P1) … (P9) are those of docs/math.md. In the paper's letters
 
 from __future__ import annotations
 
-import logging
+from typing import ClassVar
 
 import numpy as np
 from scipy.stats import chi2
 
 from vio.errors import ConfigError, EstimationError
-from vio.filters.motion import DriftingTwist, HeldInput
 from vio.filters.settings import VislamSettings
-from vio.geometry.lie import (
-    FloatArray,
-    circledot,
-    se3_inverse,
-    se3_log,
-    transform_points,
-)
+from vio.filters.vislam_motion import DriftingTwist, HeldInput
+from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
 from vio.records import (
     BoolArray,
@@ -28,13 +22,12 @@ from vio.records import (
     IntArray,
     Landmarks,
     MotionSample,
+    MotionSource,
     Observations,
     Prediction,
     UpdateReport,
     VelocitySample,
 )
-
-log = logging.getLogger(__name__)
 
 _MIN_DEPTH_M = 0.3
 _MIN_FEATURES = 3  # fewer points leave a pose undetermined, and a single wrong one would steer it
@@ -120,6 +113,9 @@ class _Map:
 
 class Vislam:
     """The paper's filter as a back end: `propagate` takes velocities, `update` takes stereo observations."""
+
+    motion_sources: ClassVar[tuple[MotionSource, ...]] = ("velocity",)  # what it has a model for, the best first
+    stereo_only = True
 
     def __init__(
         self,

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from vio.filters.extrinsics import Calibration, body_twists, pose_D_calibration, with_calibration
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
+from vio.filters.online_calibration import Calibration, body_twists, pose_D_calibration, with_calibration
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
 from vio.records import BoolArray, IntArray
 
