@@ -1,21 +1,370 @@
-"""The documentation's Python blocks run as they stand."""
+"""The documentation as a stranger would use it: commands and Python blocks run, and what they name exists.
+
+The README's commands run word for word in a folder where every path that they name exists, small. A line added to the
+README therefore fails here unless it works, and a line that is too long for a test needs an entry in `_SMALLER` or
+`_ELSEWHERE`.
+"""
 
 from __future__ import annotations
 
+import argparse
+import logging
 import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
+
+import vio.sim.demo
+from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_npz
+from vio.cli import build_parser, main
+from vio.cli.render import scenario_from
+from vio.cli.run import config_from
+from vio.config import Config, describe, merge
+from vio.geometry.lie import se3_inverse
+from vio.records import ImuSample, StereoFrame
 
 ROOT = Path(__file__).resolve().parent.parent
+README = "README.md"
+DOCS = (README, "CHANGELOG.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))))
+
+# Options behind a command of the README that make it small; what stands in front of them is run as written.
+_SMALLER = {
+    "vio render --scene room --trajectory handheld --duration 10 --out room": "--duration 0.2 --rig small --width 200",
+    "vio calibrate FOLDER": "--pairs 3",
+    "vio check RUN": "--keyframes 4",
+}
 
 
-@pytest.mark.parametrize("name", ["docs/conventions.md"])
-def test_python_blocks_run(name: str) -> None:
-    text = (ROOT / name).read_text(encoding="utf-8")
-    blocks = list(re.finditer(r"```python\n(.*?)```", text, re.DOTALL))
-    assert len(blocks) >= 5
+def _make(target: str) -> list[str]:
+    """What `make TARGET` would do, line by line."""
+    if shutil.which("make") is None:
+        pytest.skip("needs make")
+    argv = ["make", "--dry-run", "--always-make", target]
+    return subprocess.run(argv, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+def _make_demo() -> None:
+    """The environment, then the command that `workshop` has run."""
+    *before, last = _make("demo")
+    assert any("-m venv" in line for line in before)
+    assert any("pip install" in line and line.endswith("-e .") for line in before)
+    assert last.endswith("/vio demo --out demo")
+
+
+def _make_test() -> None:
+    """Style, types, tests."""
+    recipe = "\n".join(_make("test"))
+    for part in ("pip install", "ruff check .", "ruff format --check .", "/mypy", "-m pytest"):
+        assert part in recipe
+
+
+def _pytest_renders() -> None:
+    """The file that the README names holds tests; they run by themselves."""
+    argv = [sys.executable, "-m", "pytest", "tests/test_frontend_renders.py", "--collect-only", "-q"]
+    done = subprocess.run(argv, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+    assert done.stdout.count("::test_") > 5
+
+
+# Commands of the README that are no `vio …`, and what is tested of them here.
+_ELSEWHERE: dict[str, Callable[[], None]] = {
+    "make demo": _make_demo,
+    "make test": _make_test,
+    "python -m pytest tests/test_frontend_renders.py": _pytest_renders,
+}
+
+
+# --- what stands in the documents -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """A block of code."""
+
+    language: str  # of the fence; empty for a plain fence or an indented block
+    line: int  # of its first line, from 0
+    text: str
+
+
+def _text(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def _blocks(name: str) -> Iterator[_Block]:
+    """Yield fenced blocks, and indented ones that stand between empty lines."""
+    text = _text(name)
+    for found in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
+        yield _Block(found.group(1), text[: found.start(2)].count("\n"), found.group(2))
+    without = re.sub(r"^```.*?^```$", lambda m: "\n" * m.group().count("\n"), text, flags=re.DOTALL | re.MULTILINE)
+    for found in re.finditer(r"(?<=\n\n)((?: {4}\S.*\n)+)(?=\n)", without):
+        yield _Block("", without[: found.start()].count("\n"), re.sub(r"^ {4}", "", found.group(), flags=re.MULTILINE))
+
+
+def _commands(name: str) -> list[str]:
+    """Every command line of a document's blocks, without its comment; `a ; b` are two."""
+    lines = [line for block in _blocks(name) if block.language in ("", "bash") for line in block.text.splitlines()]
+    bare = (re.sub(r"\s+# .*", "", line) for line in lines)
+    return [part.strip() for line in bare for part in line.split(" ; ") if re.match(r"(vio|make|python)\b", part)]
+
+
+def _snippets(name: str) -> list[str]:
+    """Inline code outside blocks."""
+    text = re.sub(r"^```.*?^```$", "", _text(name), flags=re.DOTALL | re.MULTILINE)
+    return [" ".join(found.split()) for found in re.findall(r"`([^`]+)`", text)]
+
+
+# --- the README, executed -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with everything that the README's commands name: a short drive, a short flight, a course file, runs."""
+    root = tmp_path_factory.mktemp("workshop")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(root)
+        # A second of the demo's drive in place of fourteen; the rest of it is the demo.
+        patch.setattr(vio.sim.demo, "_DURATION_S", 1.2)
+        patch.setattr(vio.sim.demo, "_WIDTH_PX", 400)
+        assert main(["demo", "--out", "demo"]) == 0
+        flight = "vio render --rig euroc --width 320 --duration 0.5 --out path/to/MH_03_medium"
+        assert main(shlex.split(flight)[1:]) == 0
+        drive = Path("demo/street")
+        sequence = Path("path/to/sequences/07")
+        sequence.mkdir(parents=True)
+        Path("path/to/poses").mkdir()
+        for part in ("image_0", "image_1", "calib.txt", "times.txt"):  # as KITTI publishes it: no motion, no extrinsics
+            Path(sequence / part).symlink_to((drive / part).resolve())
+        shutil.copy(drive / "poses.txt", "path/to/poses/07.txt")
+        Path("path/to/folder").symlink_to(drive.resolve())
+        Path("FOLDER").symlink_to(drive.resolve())
+        shutil.copy(drive / "poses.txt", "poses.txt")
+        shutil.copy(drive / "poses.txt", "truth.txt")
+        course = make_drive(25)
+        make_npz(Path("0027.npz"), ece276a_arrays(course))
+        cam0 = course.T_world_imu @ se3_inverse(T_CAM0_IMU)
+        np.savetxt("poses_07.txt", (se3_inverse(cam0[0]) @ cam0)[:, :3].reshape(-1, 12))
+        assert main(["run", "FOLDER", "--save-observations", "--out", "RUN"]) == 0
+        shutil.copytree("RUN", "results")  # of the lines before; made here so that each test runs alone
+        shutil.copytree("RUN", "first")
+    return root
+
+
+@pytest.mark.parametrize("command", dict.fromkeys(_commands(README)))
+def test_readme_commands_run(
+    command: str, workshop: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.chdir(workshop)
+    program, *argv = shlex.split(f"{command} {_SMALLER.get(command, '')}")
+    if program == "vio":
+        assert main(argv) == 0
+        complaints = [r.getMessage() for r in caplog.records if "not used" in r.getMessage()]
+        assert not complaints, "the reference that the README gives does not fit"
+    else:
+        assert command in _ELSEWHERE, f"no test runs '{command}': add it to _ELSEWHERE with one"
+        _ELSEWHERE[command]()
+
+
+def test_entries_stand_in_the_readme() -> None:
+    assert set(_SMALLER) | set(_ELSEWHERE) <= set(_commands(README))
+
+
+def test_readme_blocks_hold_commands_or_the_demos_output() -> None:
+    """So that no line escapes the tests above because it looks like none."""
+    commands = _commands(README)
+    plain = [block.text for block in _blocks(README) if block.language not in ("python", "bibtex")]
+    outputs = [text for text in plain if text.startswith("frames ")]
+    lines = [line for text in plain if text not in outputs for line in text.splitlines()]
+    assert len(outputs) == 1
+    assert all(any(line.startswith(command) for command in commands) for line in lines), lines
+
+
+def test_readme_shows_what_the_demo_prints(
+    workshop: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Line by line, numbers apart; the small demo is too short for the line `drift`."""
+    from vio.cli.running import report
+
+    monkeypatch.chdir(workshop)
+    metrics = yaml.safe_load((workshop / "demo/run/metrics.json").read_text(encoding="utf-8"))
+    report({**metrics, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039}, as_json=False)
+    shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
+    assert re.sub(r"[\d.]+\d", "#", capsys.readouterr().out) == re.sub(r"[\d.]+\d", "#", shown)
+
+
+def test_readme_python_runs(
+    workshop: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(workshop)
+    blocks = [block for block in _blocks(README) if block.language == "python"]
+    assert len(blocks) == 1
+    _execute(README, blocks[0], {})
+    told = re.search(r"ATE (\d\.\d+) m over (\d+\.\d) m", capsys.readouterr().out)
+    assert told is not None
+    assert float(told.group(1)) < 0.1
+    assert float(told.group(2)) > 5
+
+
+def test_readme_names_what_a_run_leaves_behind(workshop: Path) -> None:
+    text = _text(README).partition("## What a run leaves behind")[2].partition("```")[0]
+    named = set(re.findall(r"`(\w+\.\w+)`", text))
+    assert len(named) > 5
+    assert named <= {path.name for path in (workshop / "RUN").iterdir()}
+
+
+# --- Python blocks of the other documents ---------------------------------------------------------------------------
+
+
+def _execute(name: str, block: _Block, scope: dict[str, object]) -> None:
+    exec(compile("\n" * block.line + block.text, name, "exec"), scope)  # so that a failure names its line
+
+
+@pytest.fixture(scope="module")
+def simulation() -> dict[str, object]:
+    """What the example of docs/simulation.md leaves behind."""
+    scope: dict[str, object] = {}
+    _execute("docs/simulation.md", next(b for b in _blocks("docs/simulation.md") if b.language == "python"), scope)
+    return scope
+
+
+def test_conventions_run() -> None:
+    blocks = [block for block in _blocks("docs/conventions.md") if block.language == "python"]
     scope: dict[str, object] = {}
     for block in blocks:
-        lines_before = text[: block.start(1)].count("\n")
-        exec(compile("\n" * lines_before + block.group(1), name, "exec"), scope)  # so that a failure names its line
+        _execute("docs/conventions.md", block, scope)
+
+
+def test_simulation_example_runs(simulation: dict[str, object]) -> None:
+    assert len(simulation["seen"].ids) > 50  # type: ignore[attr-defined]
+    assert simulation["in_right"].shape == (2, 2)  # type: ignore[attr-defined]
+
+
+def test_simulation_along_a_flight_runs(data_dir: Path) -> None:
+    blocks = [block for block in _blocks("docs/simulation.md") if block.language == "python"]
+    scope: dict[str, object] = {"folder": data_dir / "euroc_real_imu" / "V1_02"}
+    _execute("docs/simulation.md", blocks[1], scope)
+    assert len(scope["simulation"].stamps_ns) == 1670  # type: ignore[attr-defined]
+
+
+def test_inertial_check_runs(simulation: dict[str, object], caplog: pytest.LogCaptureFixture) -> None:
+    from vio.inertial_check import InertialCheck
+
+    dataset, oracle = simulation["recording"], simulation["oracle"]
+    events = list(dataset.events(images=False))  # type: ignore[attr-defined]
+    frame = next(event for event in events if isinstance(event, StereoFrame))
+    scope: dict[str, object] = {
+        "InertialCheck": InertialCheck,
+        "camera": dataset.recording.camera,  # type: ignore[attr-defined]
+        "T_cam0_imu": dataset.recording.T_cam0_imu,  # type: ignore[attr-defined]
+        "sample": next(event for event in events if isinstance(event, ImuSample)),
+        "seen": oracle.process(frame).observations,  # type: ignore[attr-defined]
+        "log": logging.getLogger("doc"),
+    }
+    (block,) = [block for block in _blocks("docs/inertial.md") if block.language == "python"]
+    _execute("docs/inertial.md", block, scope)
+    assert not caplog.records
+
+
+def test_every_python_block_is_run_by_one_of_the_tests_above() -> None:
+    counts = {name: sum(block.language == "python" for block in _blocks(name)) for name in DOCS}
+    tested = {README: 1, "docs/simulation.md": 2, "docs/inertial.md": 1, "docs/conventions.md": 8}
+    assert {name: count for name, count in counts.items() if count} == tested
+
+
+# --- what the documents name exists ---------------------------------------------------------------------------------
+
+
+def _subcommands() -> dict[str, argparse.ArgumentParser]:
+    parser = build_parser()
+    (commands,) = (a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    return dict(commands.choices)
+
+
+_ALL_COMMANDS = [(name, command) for name in DOCS for command in _commands(name)]
+_SETTINGS = {row.key for row in describe(Config())}
+
+
+@pytest.mark.parametrize(("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("vio ")])
+def test_commands_of_the_docs_parse(name: str, command: str) -> None:
+    """Options exist, and every `--set` names a setting and a value that it takes."""
+    args = build_parser().parse_args(shlex.split(command)[1:])
+    if args.command == "render":
+        if not (args.trajectory in ("handheld", "car") or Path(args.trajectory).exists()):
+            args.trajectory = "handheld"  # a placeholder of the document
+        scenario_from(args)
+    elif hasattr(args, "set"):
+        config_from(args)
+
+
+@pytest.mark.parametrize(("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("python tools")])
+def test_tools_of_the_docs_take_their_options(name: str, command: str) -> None:
+    _, tool, *argv = shlex.split(command)
+    source = (ROOT / tool).read_text(encoding="utf-8")
+    assert [option for option in argv if option.startswith("--") and f'"{option}"' not in source] == []
+
+
+@pytest.mark.parametrize("name", DOCS)
+def test_inline_code_names_what_exists(name: str) -> None:
+    """Subcommands with their options, settings, files, tools with their options, make's targets."""
+    commands = _subcommands()
+    sections = {key.rpartition(".")[0] for key in _SETTINGS} - {""}
+    wrong = []
+    for code in _snippets(name):
+        words = code.split()
+        if words[0] == "vio" and len(words) > 1:
+            known = commands.get(words[1])
+            options = [] if known is None else [o for action in known._actions for o in action.option_strings]
+            if known is None or any(word.startswith("--") and word not in options for word in words):
+                wrong.append(code)
+        elif words[0] == "python" and len(words) > 1 and words[1].startswith("tools/"):
+            source = (ROOT / words[1]).read_text(encoding="utf-8") if (ROOT / words[1]).is_file() else ""
+            if any(f'"{option}"' not in source for option in re.findall(r"--[\w-]+", code)) or not source:
+                wrong.append(code)
+        elif words[0] == "make":
+            if not re.search(rf"^{words[1]}:", _text("Makefile"), re.MULTILINE):
+                wrong.append(code)
+        elif found := re.fullmatch(r"((?:frontend|selector|vislam|msckf|dataset)(?:\.[a-z]\w*)+)(?:[=:].*)?", code):
+            is_module = (ROOT / (found.group(1).replace(".", "/") + ".py")).is_file()
+            if found.group(1) not in _SETTINGS | sections and not is_module:
+                wrong.append(code)
+        elif found := re.fullmatch(r"((?:vio|frontend|tools|tests|docs|configs)/[\w./]*)(?:::\w+)?", code):
+            if not (ROOT / found.group(1)).exists():
+                wrong.append(code)
+        elif (found := re.fullmatch(r"(\w+): \S+", code)) and found.group(1) not in {
+            key.rpartition(".")[2] for key in _SETTINGS
+        }:
+            wrong.append(code)
+    assert not wrong
+
+
+@pytest.mark.parametrize("name", [name for name in DOCS if any(b.language == "yaml" for b in _blocks(name))])
+def test_yaml_of_the_docs_is_a_configuration(name: str) -> None:
+    for block in _blocks(name):
+        if block.language == "yaml":
+            merge(Config(), yaml.safe_load(block.text), where=name)
+
+
+@pytest.mark.parametrize("name", DOCS)
+def test_links_lead_somewhere(name: str) -> None:
+    broken = []
+    for target in re.findall(r"\]\(([^)\s]+)\)", _text(name)):
+        path, _, heading = target.partition("#")
+        if path.startswith("https://"):
+            continue
+        file = (ROOT / name).parent / path if path else ROOT / name
+        if not file.is_file() or (heading and heading not in _anchors(file)):
+            broken.append(target)
+    assert not broken
+
+
+def _anchors(file: Path) -> set[str]:
+    """The anchors of a document's headings, as GitHub forms them."""
+    headings = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
