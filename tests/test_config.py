@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from vio.config import Config, as_dict, describe, load_config, to_yaml
+from vio.config import Config, SettingInfo, as_dict, describe, load_config, to_yaml
 from vio.errors import ConfigError
+from vio.filters.settings import MsckfSettings
 
 
 def _write(tmp_path: Path, text: str) -> Path:
@@ -98,3 +99,32 @@ def test_shipped_files_are_valid_and_hold_deviations_only() -> None:
     defaults = as_dict(Config())
     for file in files:
         assert as_dict(load_config(file)) != defaults
+
+
+def _numbers() -> list[SettingInfo]:
+    numbers = (s for s in describe(Config()) if isinstance(s.default, (int, float)) and not isinstance(s.default, bool))
+    return [s for s in numbers if not s.key.startswith("frontend.")]
+
+
+@pytest.mark.parametrize("info", _numbers(), ids=lambda info: info.key)
+def test_every_number_has_a_range_and_leaving_it_is_refused_by_name(info: SettingInfo) -> None:
+    assert info.range, "say what values it may have"
+    for word in info.range.split(" and "):
+        name, bound = word.rsplit(" ", 1)
+        outward = -1 if name in ("at least", "above") else 1
+        step = outward if isinstance(info.default, int) else outward * max(abs(float(bound)), 1.0) * 1e-6
+        outside = float(bound) + (step if name.startswith("at") else 0)
+        text = str(int(outside)) if isinstance(info.default, int) else f"{outside:.9f}"
+        with pytest.raises(ConfigError, match=rf"--set {info.key}.*{info.key} must be {info.range}, got"):
+            load_config(None, [f"{info.key}={text}"])
+        if name.startswith("at"):
+            load_config(None, [f"{info.key}={bound if isinstance(info.default, int) else float(bound)}"])
+
+
+def test_numbers_must_be_finite_and_ranges_hold_in_code_too() -> None:
+    with pytest.raises(ConfigError, match=r"msckf\.max_distance must be finite"):
+        load_config(None, ["msckf.max_distance=.inf"])
+    with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3, got 2"):
+        MsckfSettings(clones=2)
+    with pytest.raises(ConfigError, match=r"pixel_sigma_min_px, 3, must not be above"):
+        MsckfSettings(pixel_sigma_min_px=3.0)

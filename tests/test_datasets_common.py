@@ -221,7 +221,7 @@ def test_pickles_are_never_loaded(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["max_bad_frames", "prefetch_frames"])
 def test_settings_are_checked(name: str) -> None:
     values: dict[str, Any] = {name: -1}
-    with pytest.raises(ConfigError, match=f"dataset.{name} must not be negative"):
+    with pytest.raises(ConfigError, match=f"dataset.{name} must be at least 0"):
         DatasetSettings(**values)
 
 

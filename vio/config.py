@@ -22,7 +22,7 @@ from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError
 from vio.filters.settings import MsckfSettings, VislamSettings
 from vio.selectors import SelectorSettings
-from vio.setting import setting
+from vio.setting import Range, Section, setting
 
 BackendName = Literal["vislam", "msckf"]
 MotionName = Literal["auto", "imu", "velocity", "none"]
@@ -31,7 +31,7 @@ _Section = TypeVar("_Section")
 
 
 @dataclass(frozen=True, slots=True)
-class Config:
+class Config(Section):
     """Every setting of a run."""
 
     motion: MotionName = setting(
@@ -43,7 +43,9 @@ class Config:
         "msckf", "the estimator: msckf, the sliding-window filter, or vislam, the paper's filter"
     )
     lag_frames: int = setting(
-        0, "report each pose this many frames late, as the window then has it (msckf, up to its clones); 0: causal"
+        0,
+        "report each pose this many frames late, as the window then has it (msckf, up to its clones); 0: causal",
+        at_least=0,
     )
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
     frontend: FrontendSettings = field(default_factory=FrontendSettings)
@@ -86,7 +88,7 @@ def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: s
         prefix: the path of the section, ending in a dot, for messages.
 
     Raises:
-        ConfigError: a key is unknown or a value has the wrong type.
+        ConfigError: a key is unknown, or a value has the wrong type or is out of range.
     """
     hints = get_type_hints(type(section))
     names = [f.name for f in fields(section)]  # type: ignore[arg-type]
@@ -104,7 +106,10 @@ def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: s
             changes[key] = merge(current, value, where=where, prefix=f"{path}.")
         else:
             changes[key] = _checked(value, hints[key], path, where)
-    return dataclasses.replace(section, **changes)  # type: ignore[type-var]
+    try:
+        return dataclasses.replace(section, **changes)  # type: ignore[type-var]
+    except ConfigError as error:  # a value out of range
+        raise ConfigError(f"{where}: {error}") from error
 
 
 def as_dict(section: Any) -> dict[str, Any]:
@@ -128,6 +133,7 @@ class SettingInfo:
     default: Any
     unit: str
     choices: tuple[str, ...]
+    range: str  # "at least 3", "above 0 and below 1", …; empty: any number
     doc: str
 
 
@@ -142,7 +148,7 @@ def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
             hint = hints[f.name]
             choices = tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else ()
             unit, doc = f.metadata.get("unit", ""), f.metadata.get("doc", "")
-            yield SettingInfo(f"{prefix}{f.name}", value, unit, choices, doc)
+            yield SettingInfo(f"{prefix}{f.name}", value, unit, choices, str(f.metadata.get("range", Range())), doc)
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:

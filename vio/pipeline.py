@@ -129,7 +129,7 @@ def run(
         raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
     if start >= len(recording.frame_times_ns):
         raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
-    if config.lag_frames and (config.backend != "msckf" or not 0 < config.lag_frames < config.msckf.clones):
+    if config.lag_frames and (config.backend != "msckf" or config.lag_frames >= config.msckf.clones):
         raise ConfigError(f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones")
     motion = resolve_motion(recording, config)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -20,14 +20,16 @@ from vio.geometry.stereo import StereoCamera
 from vio.information import MotionInformation, lazy_greedy, log_det_gain, prior_information
 from vio.protocols import Selector
 from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selection
-from vio.setting import setting
+from vio.setting import Section, setting
 
 SelectorName = Literal["all", "visibility", "visibility_whole", "grid", "random", "information"]
 
 
 @dataclass(frozen=True, slots=True)
-class SelectorSettings:
+class SelectorSettings(Section):
     """Which observations enter the update."""
+
+    section: ClassVar[str] = "selector"
 
     name: SelectorName = setting(
         "all",
@@ -35,19 +37,21 @@ class SelectorSettings:
         "the paper does (precomputed features only); grid: the most often seen of each image cell; random: any; "
         "information: those that together say most of the camera's motion now and in the frames to come",
     )
-    budget: int | None = setting(None, "observations kept of a frame; null: the share below")
-    keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7")
-    minimum: int = setting(12, "keep at least this many observations of a frame (all but visibility_whole)")
+    budget: int | None = setting(None, "observations kept of a frame; null: the share below", at_least=1)
+    keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7", above=0, at_most=1)
+    minimum: int = setting(12, "keep at least this many observations of a frame (all but visibility_whole)", at_least=0)
     sticky: bool = setting(
         False, "a feature once chosen stays chosen while it is seen, and new ones only fill the budget"
     )
-    grid_columns: int = setting(8, "cells across the image for the grid selector")
-    grid_rows: int = setting(4, "cells down the image for the grid selector")
+    grid_columns: int = setting(8, "cells across the image for the grid selector", at_least=1)
+    grid_rows: int = setting(4, "cells down the image for the grid selector", at_least=1)
     horizon_frames: int = setting(
-        4, "information: beside the last motion, the next and the one so many frames ahead count"
+        4,
+        "information: beside the last motion, the next and the one so many frames ahead count",
+        at_least=1,
     )
-    pixel_sigma_px: float = setting(0.5, "information: noise of one pixel coordinate", unit="px")
-    seed: int = setting(0, "random: which of the random choices")
+    pixel_sigma_px: float = setting(0.5, "information: noise of one pixel coordinate", unit="px", above=0)
+    seed: int = setting(0, "random: which of the random choices", at_least=0)
 
 
 class _VisibilityCount:
@@ -224,9 +228,8 @@ def build_selector(
         camera: the rectified pair, which the information selector needs.
 
     Raises:
-        ConfigError: a setting is out of range, or the selector needs what the recording cannot give.
+        ConfigError: the selector needs what the recording cannot give.
     """
-    _check(settings)
     if settings.name == "visibility_whole":
         if whole_record is None:
             raise ConfigError(
@@ -247,21 +250,3 @@ def build_selector(
     if settings.name == "random":
         return RandomChoice(settings)
     return KeepAll()
-
-
-def _check(settings: SelectorSettings) -> None:
-    """Refuse values out of range.
-
-    Raises:
-        ConfigError: a setting is out of range.
-    """
-    if not 0 < settings.keep_fraction <= 1:
-        raise ConfigError(f"selector.keep_fraction must lie in (0, 1], got {settings.keep_fraction:g}")
-    if settings.grid_columns < 1 or settings.grid_rows < 1 or settings.minimum < 0:
-        raise ConfigError("selector.grid_columns and grid_rows must be at least 1, selector.minimum at least 0")
-    if settings.budget is not None and settings.budget < 1:
-        raise ConfigError(f"selector.budget must be at least 1, or null for a share, got {settings.budget}")
-    if settings.horizon_frames < 1 or settings.seed < 0:
-        raise ConfigError("selector.horizon_frames must be at least 1, selector.seed at least 0")
-    if not 0 < settings.pixel_sigma_px < float("inf"):
-        raise ConfigError(f"selector.pixel_sigma_px must be positive, got {settings.pixel_sigma_px:g}")

@@ -35,6 +35,8 @@ def execute(args: argparse.Namespace) -> int:
         lines = textwrap.wrap(row.doc, 100)
         if row.choices:
             lines.append(f"one of: {', '.join(row.choices)}")
+        if row.range:
+            lines.append(row.range)
         for line in lines:
             print(f"    {line}")
     return 0

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
-from vio.errors import ConfigError
-from vio.setting import setting
+from vio.setting import Section, setting
 
 Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
 ExtrinsicsMode: TypeAlias = Literal["auto", "literal", "corrected"]
@@ -14,8 +13,10 @@ RepeatsMode: TypeAlias = Literal["auto", "split", "flag", "literal"]
 
 
 @dataclass(frozen=True, slots=True)
-class DatasetSettings:
+class DatasetSettings(Section):
     """How recordings are read."""
+
+    section: ClassVar[str] = "dataset"
 
     colour: bool | None = setting(
         None,
@@ -37,11 +38,9 @@ class DatasetSettings:
         "unrectified images: how gray values between pixels are found in rectifying (cubic and lanczos4 cost 5 and 15 "
         "times as much for hardly better tracks)",
     )
-    max_bad_frames: int = setting(5, "image folders: unreadable stereo frames skipped before the reader gives up")
-    prefetch_frames: int = setting(4, "image folders: stereo frames decoded ahead in a thread; 0: no thread")
-
-    def __post_init__(self) -> None:
-        if self.max_bad_frames < 0:
-            raise ConfigError(f"dataset.max_bad_frames must not be negative, got {self.max_bad_frames}")
-        if self.prefetch_frames < 0:
-            raise ConfigError(f"dataset.prefetch_frames must not be negative, got {self.prefetch_frames}")
+    max_bad_frames: int = setting(
+        5, "image folders: unreadable stereo frames skipped before the reader gives up", at_least=0
+    )
+    prefetch_frames: int = setting(
+        4, "image folders: stereo frames decoded ahead in a thread; 0: no thread", at_least=0
+    )

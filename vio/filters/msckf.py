@@ -74,10 +74,8 @@ class Msckf:
             motion: which motion samples will come; None: images alone.
 
         Raises:
-            ConfigError: a value is out of range.
+            ConfigError: the calibration is to be estimated without an IMU.
         """
-        if settings.clones < 3 or settings.iterations < 1 or settings.max_features < 1 or settings.max_landmarks < 0:
-            raise ConfigError("msckf: clones must be at least 3, iterations and max_features 1, max_landmarks 0")
         if settings.calibrate != "none" and motion != "imu":
             raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to none")
         self._camera, self._settings = camera, settings

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
-from vio.setting import setting
+from vio.errors import ConfigError
+from vio.setting import Section, setting
 
 
 @dataclass(frozen=True, slots=True)
-class VislamSettings:
+class VislamSettings(Section):
     """The paper's visual-inertial SLAM by EKF (docs/math.md, section 1)."""
+
+    section: ClassVar[str] = "vislam"
 
     mode: Literal["slam", "mapping", "dead_reckoning"] = setting(
         "slam", "what runs: pose and landmark updates, landmark updates along the predicted pose, or prediction alone"
@@ -29,19 +32,26 @@ class VislamSettings:
         "midpoint",
         "model 'input': which input carries the pose from one frame to the next; the paper holds the one at the start",
     )
-    linear_velocity_sigma_mps: float = setting(0.5, "noise of the measured body velocity", unit="m/s")
-    angular_rate_sigma_radps: float = setting(0.05, "noise of the measured angular rate", unit="rad/s")
+    linear_velocity_sigma_mps: float = setting(0.5, "noise of the measured body velocity", unit="m/s", above=0)
+    angular_rate_sigma_radps: float = setting(0.05, "noise of the measured angular rate", unit="rad/s", above=0)
     acceleration_density: float = setting(
-        1.0, "model 'twist': spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)"
+        1.0, "model 'twist': spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)", at_least=0
     )
     angular_acceleration_density: float = setting(
-        0.1, "model 'twist': spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)"
+        0.1, "model 'twist': spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
     )
-    start_velocity_sigma_mps: float = setting(10.0, "model 'twist': unknown velocity at the start", unit="m/s")
-    start_rate_sigma_radps: float = setting(1.0, "model 'twist': unknown rate at the start", unit="rad/s")
-    pixel_sigma_px: float = setting(0.75, "noise of one pixel coordinate; V is its square, 15 in the paper", unit="px")
+    start_velocity_sigma_mps: float = setting(
+        10.0, "model 'twist': unknown velocity at the start", unit="m/s", at_least=0
+    )
+    start_rate_sigma_radps: float = setting(1.0, "model 'twist': unknown rate at the start", unit="rad/s", at_least=0)
+    pixel_sigma_px: float = setting(
+        0.75, "noise of one pixel coordinate; V is its square, 15 in the paper", unit="px", above=0
+    )
     gate_probability: float | None = setting(
-        0.95, "observations outside this chi-square quantile are rejected; null keeps all, as the paper does"
+        0.95,
+        "observations outside this chi-square quantile are rejected; null keeps all, as the paper does",
+        above=0,
+        below=1,
     )
     landmark_uncertainty: bool = setting(
         True, "let the landmarks' covariance widen the innovation of the pose update; the paper takes them as known"
@@ -49,63 +59,101 @@ class VislamSettings:
     landmark_prior: Literal["stereo", "isotropic"] = setting(
         "stereo", "covariance of a new landmark: propagated from its first pixels and pose, or the same for all"
     )
-    landmark_prior_sigma_m: float = setting(1.0, "the isotropic prior's standard deviation", unit="m")
+    landmark_prior_sigma_m: float = setting(1.0, "the isotropic prior's standard deviation", unit="m", above=0)
     iterations: int = setting(
-        3, "Gauss-Newton iterations of the pose update; 1 is the paper's filter, more help a start in motion"
+        3,
+        "Gauss-Newton iterations of the pose update; 1 is the paper's filter, more help a start in motion",
+        at_least=1,
     )
     use_stale: bool = setting(False, "take in observations flagged as stale; the paper knows no such flag")
     max_landmark_distance_m: float = setting(
-        150.0, "observations farther away are neither initialised nor used", unit="m"
+        150.0, "observations farther away are neither initialised nor used", unit="m", above=0
     )
 
 
 @dataclass(frozen=True, slots=True)
-class MsckfSettings:
+class MsckfSettings(Section):
     """The sliding-window filter (docs/math.md, section 3)."""
 
-    clones: int = setting(11, "poses kept in the window")
-    max_landmarks: int = setting(30, "long-lived landmarks kept in the state")
-    max_features: int = setting(150, "tracks without a landmark of their own that enter one update")
-    iterations: int = setting(4, "most Gauss-Newton steps over the window in a frame; one is the rule")
-    pixel_sigma_px: float = setting(0.5, "noise of one pixel coordinate at the start; then estimated", unit="px")
-    pixel_sigma_min_px: float = setting(0.03, "the estimated noise stays above this", unit="px")
-    pixel_sigma_max_px: float = setting(2.0, "the estimated noise stays below this", unit="px")
-    gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected")
-    max_distance: float = setting(400.0, "tracks farther away than this many baselines are not used")
-    gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2")
+    section: ClassVar[str] = "msckf"
+
+    clones: int = setting(11, "poses kept in the window", at_least=3)
+    max_landmarks: int = setting(30, "long-lived landmarks kept in the state", at_least=0)
+    max_features: int = setting(150, "tracks without a landmark of their own that enter one update", at_least=1)
+    iterations: int = setting(4, "most Gauss-Newton steps over the window in a frame; one is the rule", at_least=1)
+    pixel_sigma_px: float = setting(
+        0.5, "noise of one pixel coordinate at the start; then estimated", unit="px", above=0
+    )
+    pixel_sigma_min_px: float = setting(0.03, "the estimated noise stays above this", unit="px", above=0)
+    pixel_sigma_max_px: float = setting(2.0, "the estimated noise stays below this", unit="px", above=0)
+    gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected", above=0, below=1)
+    max_distance: float = setting(400.0, "tracks farther away than this many baselines are not used", above=0)
+    gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2", above=0)
     gyro_noise_density: float = setting(
-        2.0e-4, "gyro white noise by its data sheet; what a rig adds to it is learned", unit="rad/s/sqrt(Hz)"
+        2.0e-4, "gyro white noise by its data sheet; what a rig adds to it is learned", unit="rad/s/sqrt(Hz)", above=0
     )
-    accel_noise_density: float = setting(1.2e-2, "accelerometer white noise, likewise", unit="m/s^2/sqrt(Hz)")
-    gyro_bias_walk: float = setting(2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)")
-    accel_bias_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)")
-    start_tilt_sigma_deg: float = setting(8.0, "doubt of the first roll and pitch", unit="deg")
-    start_velocity_sigma_mps: float = setting(10.0, "doubt of the first velocity", unit="m/s")
-    start_rate_sigma_radps: float = setting(1.0, "without IMU: doubt of the first angular rate", unit="rad/s")
-    gyro_bias_sigma_radps: float = setting(0.1, "doubt of the first gyro bias", unit="rad/s")
-    accel_bias_sigma_mps2: float = setting(0.3, "doubt of the first accelerometer bias", unit="m/s^2")
+    accel_noise_density: float = setting(1.2e-2, "accelerometer white noise, likewise", unit="m/s^2/sqrt(Hz)", above=0)
+    gyro_bias_walk: float = setting(2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)", at_least=0)
+    accel_bias_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)", at_least=0)
+    start_tilt_sigma_deg: float = setting(8.0, "doubt of the first roll and pitch", unit="deg", at_least=0)
+    start_velocity_sigma_mps: float = setting(10.0, "doubt of the first velocity", unit="m/s", at_least=0)
+    start_rate_sigma_radps: float = setting(
+        1.0, "without IMU: doubt of the first angular rate", unit="rad/s", at_least=0
+    )
+    gyro_bias_sigma_radps: float = setting(0.1, "doubt of the first gyro bias", unit="rad/s", at_least=0)
+    accel_bias_sigma_mps2: float = setting(0.3, "doubt of the first accelerometer bias", unit="m/s^2", at_least=0)
     still_px: float = setting(
-        0.25, "the body is taken to stand where the median feature moves by less in a frame; 0: never", unit="px"
+        0.25,
+        "the body is taken to stand where the median feature moves by less in a frame; 0: never",
+        unit="px",
+        at_least=0,
     )
-    zero_velocity_sigma_mps: float = setting(0.02, "doubt of the velocity where it stands", unit="m/s")
-    zero_rate_sigma_radps: float = setting(0.01, "doubt of the angular rate where it stands", unit="rad/s")
-    linear_velocity_sigma_mps: float = setting(0.5, "noise of a measured body velocity", unit="m/s")
-    angular_rate_sigma_radps: float = setting(0.05, "noise of a measured angular rate", unit="rad/s")
-    rate_bias_sigma_radps: float = setting(0.02, "doubt of the bias of a measured angular rate", unit="rad/s")
-    rate_bias_walk: float = setting(1.0e-4, "random walk of that bias", unit="rad/s/sqrt(s)")
+    zero_velocity_sigma_mps: float = setting(0.02, "doubt of the velocity where it stands", unit="m/s", above=0)
+    zero_rate_sigma_radps: float = setting(0.01, "doubt of the angular rate where it stands", unit="rad/s", above=0)
+    linear_velocity_sigma_mps: float = setting(0.5, "noise of a measured body velocity", unit="m/s", above=0)
+    angular_rate_sigma_radps: float = setting(0.05, "noise of a measured angular rate", unit="rad/s", above=0)
+    rate_bias_sigma_radps: float = setting(
+        0.02, "doubt of the bias of a measured angular rate", unit="rad/s", at_least=0
+    )
+    rate_bias_walk: float = setting(1.0e-4, "random walk of that bias", unit="rad/s/sqrt(s)", at_least=0)
     acceleration_density: float = setting(
-        1.0, "without IMU: spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)"
+        1.0, "without IMU: spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)", at_least=0
     )
     angular_acceleration_density: float = setting(
-        0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)"
+        0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
     )
     calibrate: Literal["none", "extrinsics", "time_offset", "both"] = setting(
         "none", "what is estimated besides the motion, with IMU only: T_cam0_imu, the clocks' difference, or both"
     )
-    extrinsic_rotation_sigma_deg: float = setting(1.0, "calibrate: doubt of T_cam0_imu's rotation", unit="deg")
-    extrinsic_translation_sigma_m: float = setting(0.03, "calibrate: doubt of T_cam0_imu's translation", unit="m")
-    time_offset_sigma_s: float = setting(0.01, "calibrate: doubt that the clocks agree at the start", unit="s")
-    calibrate_after_s: float = setting(3.0, "calibrate: time from the start until the motion is known enough", unit="s")
-    extrinsic_rotation_walk: float = setting(0.02, "calibrate: random walk, which forgets", unit="deg/sqrt(s)")
-    extrinsic_translation_walk: float = setting(1.0e-3, "calibrate: random walk, likewise", unit="m/sqrt(s)")
-    time_offset_walk: float = setting(2.0e-5, "calibrate: random walk, likewise", unit="s/sqrt(s)")
+    extrinsic_rotation_sigma_deg: float = setting(
+        1.0, "calibrate: doubt of T_cam0_imu's rotation", unit="deg", at_least=0
+    )
+    extrinsic_translation_sigma_m: float = setting(
+        0.03, "calibrate: doubt of T_cam0_imu's translation", unit="m", at_least=0
+    )
+    time_offset_sigma_s: float = setting(
+        0.01, "calibrate: doubt that the clocks agree at the start", unit="s", at_least=0
+    )
+    calibrate_after_s: float = setting(
+        3.0, "calibrate: time from the start until the motion is known enough", unit="s", at_least=0
+    )
+    extrinsic_rotation_walk: float = setting(
+        0.02, "calibrate: random walk, which forgets", unit="deg/sqrt(s)", at_least=0
+    )
+    extrinsic_translation_walk: float = setting(
+        1.0e-3, "calibrate: random walk, likewise", unit="m/sqrt(s)", at_least=0
+    )
+    time_offset_walk: float = setting(2.0e-5, "calibrate: random walk, likewise", unit="s/sqrt(s)", at_least=0)
+
+    def __post_init__(self) -> None:
+        """Check every number, and that the pixel noise's bounds leave room for it.
+
+        Raises:
+            ConfigError: a value is out of range.
+        """
+        Section.__post_init__(self)
+        if self.pixel_sigma_min_px > self.pixel_sigma_max_px:
+            raise ConfigError(
+                f"msckf.pixel_sigma_min_px, {self.pixel_sigma_min_px:g}, must not be above msckf.pixel_sigma_max_px, "
+                f"{self.pixel_sigma_max_px:g}"
+            )

@@ -136,15 +136,13 @@ class Vislam:
             T_world_imu: start pose (4, 4); identity if None.
 
         Raises:
-            ConfigError: the settings need a motion sensor and there is none, or a value is out of range.
+            ConfigError: the settings need a motion sensor and there is none.
         """
         if not motion_sensor and (settings.motion_model == "input" or settings.mode == "dead_reckoning"):
             raise ConfigError(
                 "the paper's motion model needs velocities, and there are none: use vislam.motion_model=twist, "
                 "and a mode other than dead_reckoning"
             )
-        if settings.iterations < 1:
-            raise ConfigError(f"vislam.iterations must be at least 1, got {settings.iterations}")
         self._camera, self._T_cam0_imu, self._settings = camera, np.asarray(T_cam0_imu, dtype=np.float64), settings
         dead_reckoning = settings.mode == "dead_reckoning"
         self._motion: HeldInput | DriftingTwist = (
