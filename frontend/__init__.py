@@ -4,38 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from frontend.settings import FrontendSettings, KltSettings, LearnedSettings, MatchSettings
+from frontend.settings import FrontendSettings
 from vio.errors import ConfigError
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Dataset, Frontend
 
-__all__ = ["BUILDERS", "FrontendSettings", "KltSettings", "LearnedSettings", "MatchSettings", "build_frontend"]
+__all__ = ["BUILDERS", "FrontendSettings", "build_frontend"]
 
 
 def _build_klt(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
     from frontend.klt import KltFrontend
 
-    return KltFrontend(camera, settings.klt)
+    return KltFrontend(camera, settings)
 
 
 def _build_orb(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
     from frontend.descriptors import DescriptorFrontend, MutualNearest, orb_extractor
 
     match = settings.match
-    return DescriptorFrontend(camera, match, "orb", orb_extractor(match), MutualNearest(match.ratio))
+    return DescriptorFrontend(camera, settings, "orb", orb_extractor(match), MutualNearest(match.ratio))
 
 
 def _build_sift(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
     from frontend.descriptors import DescriptorFrontend, MutualNearest, sift_extractor
 
     match = settings.match
-    return DescriptorFrontend(camera, match, "sift", sift_extractor(match), MutualNearest(match.ratio))
+    return DescriptorFrontend(camera, settings, "sift", sift_extractor(match), MutualNearest(match.ratio))
 
 
 def _build_kornia(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
     from frontend.learned import build_learned
 
-    return build_learned(camera, settings.match, settings.learned)
+    return build_learned(camera, settings)
 
 
 def _build_precomputed(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from frontend.align import align, cut_patches, rounded, shift_warps, templates
 from frontend.detect import spread_evenly
 from frontend.frames import FrameGate, Stopwatch, SwapAlarm, usable_prior
-from frontend.outliers import bearing_consensus, predicted_motion, rigid_consensus
+from frontend.outliers import Vote, predicted_motion, static_tracks
 from frontend.patches import FloatImage, inside
-from frontend.settings import MatchSettings
+from frontend.settings import FrontendSettings, MatchSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project, triangulate
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior, observations
@@ -162,10 +162,11 @@ class DescriptorFrontend:
     """
 
     def __init__(
-        self, camera: StereoCamera, settings: MatchSettings, name: str, extract: Extractor, match: Matcher
+        self, camera: StereoCamera, settings: FrontendSettings, name: str, extract: Extractor, match: Matcher
     ) -> None:
         self._camera = camera
-        self._settings = settings
+        self._settings, self._grid = settings.match, settings.grid
+        self._disparity, self._consensus = settings.disparity, settings.consensus
         self._extract = extract
         self._match = match
         self._gate = FrameGate(camera, name)
@@ -213,12 +214,12 @@ class DescriptorFrontend:
 
     def _allowed(self, left: Keypoints, right: Keypoints, width: int) -> BoolArray:
         """Pairs (N, M) near one row with a disparity in range."""
-        settings = self._settings
+        limits = self._disparity
         disparity = left.pixels[:, :1] - right.pixels[:, 0]
         return np.asarray(
-            (np.abs(left.pixels[:, 1:] - right.pixels[:, 1]) <= settings.epipolar_band_px)
-            & (disparity >= settings.min_disparity_px)
-            & (disparity <= settings.max_disparity * width)
+            (np.abs(left.pixels[:, 1:] - right.pixels[:, 1]) <= self._settings.max_epipolar_px)
+            & (disparity >= limits.min_disparity_px)
+            & (disparity <= limits.max_disparity * width)
         )
 
     def _stereo(
@@ -231,7 +232,7 @@ class DescriptorFrontend:
         target = right.pixels[pairs[:, 1]]
         place[rows], alike = self._refined(views[0], left.pixels[rows], views[1], target, target[:, 1])
         disparity = left.pixels[rows, 0] - place[rows, 0]
-        has_right[rows] = alike & (disparity >= self._settings.min_disparity_px)
+        has_right[rows] = alike & (disparity >= self._disparity.min_disparity_px)
         return place, has_right
 
     def _refined(
@@ -293,21 +294,15 @@ class DescriptorFrontend:
         T_prior = None
         if prior is not None:
             _, a, b = np.intersect1d(old.ids, prior.ids, assume_unique=True, return_indices=True)
-            T_prior = predicted_motion(self._camera, p[a[deep[a]]], prior.z[b[deep[a]], :2], expected, settings)
-        rng = np.random.default_rng((settings.seed, frame.index))
+            T_prior = predicted_motion(self._camera, p[a[deep[a]]], prior.z[b[deep[a]], :2], expected)
+        rng = np.random.default_rng((self._consensus.seed, frame.index))
+        vote = Vote(self._camera, self._consensus, settings.consensus_px, rng)
         voters = deep[rows]
-        motion = rigid_consensus(
-            self._camera, p[rows[voters]], pixels[voters], expected, R_prior, T_prior, rng, settings
-        )
-        keep, agrees = np.ones(len(rows), dtype=np.bool_), has_right[found].copy()
-        twist = memory.twist_per_s
+        keep, motion = static_tracks(vote, old.left[rows], p[rows], voters, pixels, expected, R_prior, T_prior)
+        agrees, twist = has_right[found].copy(), memory.twist_per_s
         # The right pixel belongs to the key point; it moves along with the refinement.
         right = place[found] + np.stack([pixels[:, 0] - left.pixels[found, 0], np.zeros(len(found))], axis=1)
-        if motion is None:
-            agree = bearing_consensus(self._camera, old.left[rows], pixels, expected[:3, :3], R_prior, rng, settings)
-            keep[:] = True if agree is None else agree
-        else:
-            keep[voters] = motion.inliers
+        if motion is not None:
             keep[~voters] = False
             twist = se3_log(motion.T_curr_prev) / seconds
             depth = np.maximum(transform_points(motion.T_curr_prev, p[rows])[:, 2], 0.05)
@@ -337,7 +332,7 @@ class DescriptorFrontend:
         """Add new features from key points with a right match, evenly over the image."""
         height, width = image.shape
         free = np.flatnonzero(~used & has_right)
-        chosen = free[spread_evenly(left.pixels[free], tracks.left, (width, height), self._settings)]
+        chosen = free[spread_evenly(left.pixels[free], tracks.left, (width, height), self._grid)]
         ids = np.arange(len(chosen), dtype=np.int64) + self._next_id
         self._next_id += len(chosen)
         return _Tracks(

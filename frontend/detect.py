@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from frontend.settings import KltSettings
+from frontend.settings import GridSettings, KltSettings
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
@@ -25,35 +24,19 @@ _ROUNDING_NOISE = 1.0 / math.sqrt(12.0)  # of whole gray levels
 _GRADIENT_OF_UNIT_NOISE = math.sqrt(12.0) / 8.0  # of the Sobel derivative, gray levels per pixel
 
 
-class GridSettings(Protocol):
-    """The settings that say how densely and evenly features should lie."""
-
-    @property
-    def target_features(self) -> int:
-        """Features to keep alive."""
-
-    @property
-    def cell_features(self) -> int:
-        """Features wanted in one grid cell."""
-
-    @property
-    def min_distance(self) -> float:
-        """Least distance between features, over the spacing of a uniform grid of them."""
-
-
-def feature_spacing(width: int, height: int, settings: GridSettings) -> float:
+def feature_spacing(width: int, height: int, grid: GridSettings) -> float:
     """Spacing in pixels of `target_features` points spread evenly over the image."""
-    return math.sqrt(width * height / settings.target_features)
+    return math.sqrt(width * height / grid.target_features)
 
 
-def min_distance_px(width: int, height: int, settings: GridSettings) -> int:
+def min_distance_px(width: int, height: int, grid: GridSettings) -> int:
     """Least distance in pixels between features in an image of this size."""
-    return max(2, round(settings.min_distance * feature_spacing(width, height, settings)))
+    return max(2, round(grid.min_distance * feature_spacing(width, height, grid)))
 
 
-def grid_shape(width: int, height: int, settings: GridSettings) -> tuple[int, int]:
+def grid_shape(width: int, height: int, grid: GridSettings) -> tuple[int, int]:
     """Rows and columns of the balancing grid: nearly square cells that hold `cell_features` features each."""
-    cell = feature_spacing(width, height, settings) * math.sqrt(settings.cell_features)
+    cell = feature_spacing(width, height, grid) * math.sqrt(grid.cell_features)
     return max(1, round(height / cell)), max(1, round(width / cell))
 
 
@@ -105,7 +88,12 @@ def local_maxima(response: Response, occupied: FloatArray, distance: int, border
 
 
 def detect_corners(
-    half: Image, occupied: FloatArray, wanted: int, settings: KltSettings, allowed: BoolArray | None = None
+    half: Image,
+    occupied: FloatArray,
+    wanted: int,
+    grid: GridSettings,
+    settings: KltSettings,
+    allowed: BoolArray | None = None,
 ) -> FloatArray:
     """Find up to `wanted` new corners (K, 2), sub-pixel, where the grid has few tracked points `occupied` (N, 2).
 
@@ -118,7 +106,8 @@ def detect_corners(
         half: image (H/2, W/2) at half resolution.
         occupied: tracked points in pixels of the full image.
         wanted: largest number of corners.
-        settings: sizes and thresholds.
+        grid: how densely and evenly features should lie.
+        settings: what a corner is.
         allowed: mask (H/2, W/2) of pixels that may hold corners; None: all.
 
     Returns:
@@ -132,15 +121,15 @@ def detect_corners(
     response = corner_response(half) / np.float32(4.0)
     if allowed is not None:
         response = np.where(allowed, response, np.float32(0.0))
-    distance = max(1, min_distance_px(2 * width, 2 * height, settings) // 2)
+    distance = max(1, min_distance_px(2 * width, 2 * height, grid) // 2)
     candidates = local_maxima(response, occupied / 2, distance, border, settings.min_gradient**2)
-    missing = settings.target_features - len(occupied)
+    missing = grid.target_features - len(occupied)
     if len(candidates) < missing:
         floor = settings.min_gradient_over_noise * noise_gradient(half) / 2.0
         if floor < settings.min_gradient:
             weaker = local_maxima(response, occupied / 2, distance, border, floor**2)
             candidates = weaker[np.argsort(-response[weaker[:, 1], weaker[:, 0]], kind="stable")[:missing]]
-    shape = grid_shape(2 * width, 2 * height, settings)
+    shape = grid_shape(2 * width, 2 * height, grid)
     cells = shape[0] * shape[1]
     cell = cell_index(2 * candidates.astype(np.float64), 2 * width, 2 * height, shape)
     strength = response[candidates[:, 1], candidates[:, 0]]
@@ -154,29 +143,29 @@ def detect_corners(
     level = np.arange(len(order)) - first[cell[order]] + held[cell[order]]  # features that the cell then holds already
     # Cells are filled evenly, emptiest first; among equals the strongest corner wins.
     queue = np.lexsort((-strength[order], level))
-    queue = queue[level[queue] < 2 * settings.cell_features][:wanted]
+    queue = queue[level[queue] < 2 * grid.cell_features][:wanted]
     chosen = candidates[order[queue]]
     return 2.0 * (chosen + _peak_offset(response, chosen))
 
 
-def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int], settings: GridSettings) -> IntArray:
+def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int], grid: GridSettings) -> IntArray:
     """Rows of points (N, 2), strongest first, that fill the grid evenly beside `occupied` (M, 2).
 
     At most what `target_features` leaves room for; none closer than the least distance to another or to an occupied
     one; the emptiest cells are filled first. `size` is the image's width and height.
     """
     width, height = size
-    wanted = settings.target_features - len(occupied)
+    wanted = grid.target_features - len(occupied)
     if wanted <= 0 or len(points) == 0:
         return np.zeros(0, dtype=np.int64)
-    distance = min_distance_px(width, height, settings)
+    distance = min_distance_px(width, height, grid)
     together = np.concatenate([occupied, points])
     near = np.abs(points[:, :1] - together[:, 0]) < distance
     near &= np.abs(points[:, 1:] - together[:, 1]) < distance
     # A point counts as too close to stronger ones only, itself and weaker ones excepted.
     near[:, len(occupied) :] &= np.tril(np.ones((len(points), len(points)), dtype=np.bool_), -1)
     candidates = np.flatnonzero(~near.any(axis=1))
-    shape = grid_shape(width, height, settings)
+    shape = grid_shape(width, height, grid)
     cells = shape[0] * shape[1]
     cell = cell_index(points[candidates], width, height, shape)
     held = np.bincount(cell_index(occupied, width, height, shape), minlength=cells)

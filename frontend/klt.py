@@ -22,14 +22,14 @@ from frontend.detect import detect_corners, min_distance_px
 from frontend.frames import FrameGate, Stopwatch, SwapAlarm, half_mask, load_mask, usable_prior
 from frontend.outliers import (
     Consensus,
-    bearing_consensus,
+    Vote,
     epipolar_distance,
     pixel_errors,
     predicted_motion,
-    rigid_consensus,
+    static_tracks,
 )
 from frontend.patches import FloatImage, inside
-from frontend.settings import KltSettings
+from frontend.settings import FrontendSettings, KltSettings
 from frontend.stereo_match import RowField, half_image, match_rows
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project, triangulate
@@ -162,24 +162,21 @@ class KltFrontend:
     the priors and the settings only, to the bit.
     """
 
-    def __init__(self, camera: StereoCamera, settings: KltSettings | None = None) -> None:
+    def __init__(self, camera: StereoCamera, settings: FrontendSettings | None = None) -> None:
+        settings = FrontendSettings() if settings is None else settings
         self._camera = camera
-        self._settings = KltSettings() if settings is None else settings
+        self._settings, self._grid = settings.klt, settings.grid
+        self._disparity, self._consensus = settings.disparity, settings.consensus
         self._clahe = cv2.createCLAHE(2.0, (8, 8)) if self._settings.equalise == "clahe" else None
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._allowed: BoolArray | None = None
         self._gate = FrameGate(camera, "klt")
         self._swap = SwapAlarm()
-        self._bank = _AnchorBank(_BANK_SPARE * self._settings.target_features, self._settings.anchor_radius_px)
+        self._bank = _AnchorBank(_BANK_SPARE * self._grid.target_features, self._settings.anchor_radius_px)
         self._memory: _Memory | None = None
         self._rows: RowField | None = None
         self._next_id = 0
         self._blind = 0  # frames in a row that were passed over
-
-    @property
-    def settings(self) -> KltSettings:
-        """The settings in effect."""
-        return self._settings
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Track, match and detect in one rectified stereo pair; frames come in time order.
@@ -205,11 +202,12 @@ class KltFrontend:
                 observations(frame.index, frame.time_ns, [], np.zeros((0, 4))), 0, 0, 0, watch.stages_ms
             )
         tracks, motion = self._tracked(frame, left, right, usable_prior(prior), watch)
-        missing = self._settings.target_features - len(tracks)
+        missing = self._grid.target_features - len(tracks)
         corners = detect_corners(
             left.half,
             tracks.left,
             round(missing * (1.0 + self._settings.spare_corners)),
+            self._grid,
             self._settings,
             self._allowed,
         )
@@ -272,7 +270,7 @@ class KltFrontend:
         expected = se3_exp(memory.twist_per_s * seconds)
         found, seen = self._flow_all(memory, left, prior, expected)
         watch.lap("track")
-        seen, motion = self._consensus(memory.tracks, found, seen, prior, expected, frame.index)
+        seen, motion = self._vote(memory.tracks, found, seen, prior, expected, frame.index)
         watch.lap("reject")
         tracks = self._aligned(memory, left, found, seen, motion)
         watch.lap("align")
@@ -349,7 +347,7 @@ class KltFrontend:
         good = seen & seen_back & (error <= self._settings.max_forward_backward_px) & inside(left.full, forth, margin)
         return forth, good
 
-    def _consensus(
+    def _vote(
         self,
         old: _Tracks,
         found: FloatArray,
@@ -359,27 +357,24 @@ class KltFrontend:
         frame_index: int,
     ) -> tuple[BoolArray, Consensus | None]:
         """Mask (N,) of the found features that move as the static world does, and that motion where there is one."""
-        camera, settings = self._camera, self._settings
-        known = np.flatnonzero(old.has_right & old.placed & seen)
-        R_prior = None if prior is None else prior.R_cam_prev
-        T_prior = None
+        camera, limit_px = self._camera, self._settings.consensus_px
+        rows = np.flatnonzero(seen)
+        deep = (old.has_right & old.placed)[rows]
+        R_prior = T_prior = None
         if prior is not None:
-            row, given = _common(old, known, prior.ids)
-            T_prior = predicted_motion(camera, old.point[row], prior.z[given, :2], expected, settings)
-        rng = np.random.default_rng((settings.seed, frame_index))
-        motion = rigid_consensus(camera, old.point[known], found[known], expected, R_prior, T_prior, rng, settings)
-        keep = seen.copy()
-        if motion is None:
-            rows = np.flatnonzero(seen)
-            agree = bearing_consensus(camera, old.left[rows], found[rows], expected[:3, :3], R_prior, rng, settings)
-            keep[rows] = True if agree is None else agree
-            return keep, None
-        keep[known] = motion.inliers
-        flat = np.flatnonzero(seen & ~(old.has_right & old.placed))
-        if len(flat):
+            row, given = _common(old, rows[deep], prior.ids)
+            R_prior = prior.R_cam_prev
+            T_prior = predicted_motion(camera, old.point[row], prior.z[given, :2], expected)
+        rng = np.random.default_rng((self._consensus.seed, frame_index))
+        vote = Vote(camera, self._consensus, limit_px, rng)
+        before, after = old.left[rows], found[rows]
+        kept, motion = static_tracks(vote, before, old.point[rows], deep, after, expected, R_prior, T_prior)
+        if motion is not None and not deep.all():
             near_m = camera.fu * camera.baseline_m / self._max_disparity(self._width())
-            distance = epipolar_distance(camera, motion.T_curr_prev, old.left[flat], found[flat], near_m)
-            keep[flat] = distance <= settings.consensus_px
+            distance = epipolar_distance(camera, motion.T_curr_prev, before[~deep], after[~deep], near_m)
+            kept[~deep] = distance <= limit_px
+        keep = np.zeros(len(old), dtype=np.bool_)
+        keep[rows[kept]] = True
         return keep, motion
 
     def _width(self) -> int:
@@ -387,7 +382,7 @@ class KltFrontend:
         return int(self._memory.left.full.shape[1])
 
     def _max_disparity(self, width: int) -> float:
-        return self._settings.max_disparity * width
+        return self._disparity.max_disparity * width
 
     def _aligned(
         self, memory: _Memory, left: _View, found: FloatArray, seen: BoolArray, motion: Consensus | None
@@ -442,7 +437,7 @@ class KltFrontend:
             age=old.age[rows] + 1,
             has_right=np.zeros(len(rows), dtype=np.bool_),
         )
-        return now.take(_apart(place, 0.5 * min_distance_px(left.full.shape[1], left.full.shape[0], settings)))
+        return now.take(_apart(place, 0.5 * min_distance_px(left.full.shape[1], left.full.shape[0], self._grid)))
 
     def _cut(self, left: _View, centres: FloatArray) -> Templates:
         return templates(cut_patches(left.full, centres, self._settings.anchor_radius_px))
@@ -513,7 +508,7 @@ class KltFrontend:
             & (np.abs(place - start).max(axis=1) <= _ALIGN_MAX_PX)
             & (np.abs(skew).max(axis=(1, 2)) <= _MAX_STRETCH)
             & (np.abs(rows - place[:, 1]) <= settings.max_epipolar_px)
-            & (found >= settings.min_disparity_px)
+            & (found >= self._disparity.min_disparity_px)
             & (found <= self._max_disparity(right.full.shape[1]))
         )
         return place, skew, valid
@@ -572,15 +567,15 @@ class KltFrontend:
         Wanted are those with depth that will stay in the image. Those that will soon leave are taken only while less
         than the least number of features is there; those without depth only while few are.
         """
-        settings = self._settings
-        room = max(0, settings.target_features - len(tracks))
-        least = settings.least_features * settings.target_features - int(tracks.has_right.sum())
+        target, matched = self._grid.target_features, int(tracks.has_right.sum())
+        room = max(0, target - len(tracks))
+        least = self._settings.least_features * target
         stays = self._stays(corners, disparity, motion, left.full)
         tried = round(_TRIED * room)
         lasting, leaving = np.flatnonzero(unique & stays)[:tried], np.flatnonzero(unique & ~stays)[:tried]
-        leaving = leaving[: max(0, round(_TRIED * (least - len(lasting) / _TRIED)))]
+        leaving = leaving[: max(0, round(_TRIED * (least - matched - len(lasting) / _TRIED)))]
         flat = np.flatnonzero(~unique)[:room]
-        if int(tracks.has_right.sum()) > _FEW * settings.least_features * settings.target_features:
+        if matched > _FEW * least:
             flat = flat[:0]
         chosen = np.concatenate([lasting, leaving, flat])
         centres = rounded(corners[chosen])
@@ -607,7 +602,7 @@ class KltFrontend:
     def _with_shown(self, tracks: _Tracks) -> _Tracks:
         """Show features that outlived their probation, under new ids; all of them where few would be left."""
         proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & tracks.has_right)
-        if proven.sum() < _VERY_FEW * self._settings.target_features:
+        if proven.sum() < _VERY_FEW * self._grid.target_features:
             proven[:] = True
         ids, first = tracks.ids.copy(), proven & ~tracks.shown
         ids[first] = np.arange(int(first.sum())) + self._next_id

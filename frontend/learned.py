@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from frontend.descriptors import DescriptorFrontend, Extractor, Keypoints, Matcher, MutualNearest
-from frontend.settings import LearnedSettings, MatchSettings
+from frontend.settings import FrontendSettings, LearnedSettings, MatchSettings
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, Image, IntArray
@@ -30,11 +30,10 @@ _SECTION = "frontend.learned"
 _PATCH_RADIUS_PX = 12.0  # of what sift, mkd, ... describe around a corner
 _PATCH_PX = {"sift": 41}
 _NMS_PX = 5
-_KEYNET_SCALE = 1.0
 _LIGHTGLUE = {"aliked": "aliked", "disk": "disk", "xfeat": "xfeat"}  # detector to kornia's name of the weights
 
 
-def build_learned(camera: StereoCamera, match: MatchSettings, learned: LearnedSettings) -> DescriptorFrontend:
+def build_learned(camera: StereoCamera, settings: FrontendSettings) -> DescriptorFrontend:
     """Build the front end that the settings describe.
 
     Raises:
@@ -43,12 +42,13 @@ def build_learned(camera: StereoCamera, match: MatchSettings, learned: LearnedSe
         DataError: a file of weights cannot be read, or is of another network.
     """
     _require_torch()
+    match, learned = settings.match, settings.learned
     device = pick_device(learned.device)
     extract = _extractor(learned, match, device)
     matcher: Matcher = MutualNearest(match.ratio)
     if learned.matcher == "lightglue":
         matcher = _lightglue(learned, camera, device)
-    return DescriptorFrontend(camera, match, "kornia", extract, matcher)
+    return DescriptorFrontend(camera, settings, "kornia", extract, matcher)
 
 
 def _require_torch() -> None:

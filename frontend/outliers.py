@@ -13,11 +13,11 @@ exact rotation between two images independently of the translation, ECCV (2012),
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import cv2
 import numpy as np
 
+from frontend.settings import ConsensusSettings
 from vio.geometry.lie import FloatArray, circledot, se3_exp, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
 from vio.records import BoolArray, IntArray
@@ -38,28 +38,14 @@ _FIVE_POINT_CONFIDENCE = 0.999
 _SCATTER = 1e-9  # added to a sum of squares before it is divided by
 
 
-class ConsensusSettings(Protocol):
-    """The settings that every front end with a vote on the motion has."""
+@dataclass(frozen=True, slots=True)
+class Vote:
+    """What a vote on the motion goes by."""
 
-    @property
-    def consensus_px(self) -> float:
-        """Largest distance from where the consensus motion puts a feature."""
-
-    @property
-    def consensus_samples(self) -> int:
-        """Random minimal sets tried."""
-
-    @property
-    def sure_share(self) -> float:
-        """Share of features that must follow the refined expected motion for no samples to be tried."""
-
-    @property
-    def prior_max_deviation_deg(self) -> float:
-        """Turn away from the predicted rotation beyond which a consensus is distrusted."""
-
-    @property
-    def prior_min_support(self) -> float:
-        """Share of the consensus' inliers that the predicted motion needs to replace it."""
+    camera: StereoCamera
+    settings: ConsensusSettings
+    limit_px: float  # largest distance from where the motion puts a feature, for the feature to agree
+    rng: np.random.Generator  # source of the samples; the same state gives the same result to the bit
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,22 +123,16 @@ def _refine(
 
 
 def _search(
-    camera: StereoCamera,
-    p_prev: FloatArray,
-    pixels: FloatArray,
-    starts: FloatArray,
-    rng: np.random.Generator,
-    settings: ConsensusSettings,
-    free: slice,
+    vote: Vote, p_prev: FloatArray, pixels: FloatArray, starts: FloatArray, free: slice
 ) -> tuple[FloatArray, BoolArray]:
     """Best motion (4, 4) over minimal sets and over the starts (S, 4, 4) themselves, with its inliers (N,)."""
-    limit = settings.consensus_px
+    camera, limit = vote.camera, vote.limit_px
     begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
     sure = _refine(camera, begin, p_prev, pixels, limit / 2, free)
     inliers = pixel_errors(camera, sure, p_prev, pixels) <= limit
-    if inliers.mean() >= settings.sure_share:
+    if inliers.mean() >= vote.settings.sure_share:
         return sure, inliers
-    sets = rng.integers(0, len(p_prev), size=(settings.consensus_samples, 3))
+    sets = vote.rng.integers(0, len(p_prev), size=(vote.settings.samples, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
     T = _gauss_newton(
         camera, T, p_prev[sets], pixels[sets], np.ones(sets.shape), iterations=_SAMPLE_ITERATIONS, free=free
@@ -169,15 +149,48 @@ def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pi
     return int(np.argmin(np.median(error, axis=1)))
 
 
+def static_tracks(
+    vote: Vote,
+    left: FloatArray,
+    p_prev: FloatArray,
+    deep: BoolArray,
+    pixels: FloatArray,
+    expected: FloatArray,
+    R_prior: FloatArray | None,
+    T_prior: FloatArray | None,
+) -> tuple[BoolArray, Consensus | None]:
+    """Tell which tracks move as the static world does: by those of known depth, else by both left images alone.
+
+    Args:
+        vote: camera, thresholds and samples.
+        left: left pixels (N, 2) in the previous frame.
+        p_prev: points (N, 3) triangulated there, metres, previous cam0 frame; arbitrary where `deep` is False.
+        deep: mask (N,) of tracks of known depth.
+        pixels: left pixels (N, 2) in the current frame.
+        expected: motion (4, 4) `T_curr_prev` to start from, of no authority.
+        R_prior: predicted rotation (3, 3) from the previous to the current cam0 frame, or None.
+        T_prior: predicted motion (4, 4) `T_curr_prev`, or None.
+
+    Returns:
+        Mask (N,) of the tracks to keep, and the motion that those of known depth agree on (its inliers are among them
+        alone), or None. With a motion, tracks without depth are all kept: the caller may hold them against it.
+    """
+    motion = rigid_consensus(vote, p_prev[deep], pixels[deep], expected, R_prior, T_prior)
+    keep = np.ones(len(left), dtype=np.bool_)
+    if motion is not None:
+        keep[deep] = motion.inliers
+    elif (agree := bearing_consensus(vote, left, pixels, expected[:3, :3], R_prior)) is not None:
+        keep = agree
+    return keep, motion
+
+
 def rigid_consensus(
-    camera: StereoCamera,
+    vote: Vote,
     p_prev: FloatArray,
     pixels: FloatArray,
     expected: FloatArray,
     R_prior: FloatArray | None,
     T_prior: FloatArray | None,
-    rng: np.random.Generator,
-    settings: ConsensusSettings,
 ) -> Consensus | None:
     """Find the motion that most static points follow.
 
@@ -186,14 +199,12 @@ def rigid_consensus(
     motion nearest to it is. Either must explain points that the vote denies, at least a share of the vote's own.
 
     Args:
-        camera: rectified camera.
+        vote: camera, thresholds and samples.
         p_prev: points (N, 3) triangulated in the previous frame, metres, previous cam0 frame.
         pixels: left pixels (N, 2) of the same points in the current frame.
         expected: motion (4, 4) `T_curr_prev` to start from, of no authority.
         R_prior: predicted rotation (3, 3) from the previous to the current cam0 frame, or None.
         T_prior: predicted motion (4, 4) `T_curr_prev`, or None.
-        rng: source of the samples; the same state gives the same result to the bit.
-        settings: thresholds.
 
     Returns:
         None where there are too few points, or too few that agree.
@@ -205,25 +216,38 @@ def rigid_consensus(
         starts.append(se3_from_parts(R_prior, expected[:3, 3]))
     if T_prior is not None:
         starts.append(T_prior)
-    T, inliers = _search(camera, p_prev, pixels, np.stack(starts), rng, settings, slice(0, 6))
-    near_prior: list[FloatArray] = []
+    T, inliers = _search(vote, p_prev, pixels, np.stack(starts), slice(0, 6))
     # Only what the vote denies speaks for another motion: a prediction that agrees with the vote need not compete.
-    needed = max(_MIN_POINTS, settings.prior_min_support * inliers.sum())
-    contested = (~inliers).sum() >= needed
-    if T_prior is not None and contested and not _agree(camera, T, T_prior, p_prev):
-        near_prior.append(_refine(camera, T_prior, p_prev, pixels, settings.consensus_px, slice(0, 6)))
-    if R_prior is not None and contested and _turn_deg(T, R_prior) > settings.prior_max_deviation_deg:
-        fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
-        near_prior.append(_search(camera, p_prev, pixels, fixed, rng, settings, slice(0, 3))[0])
-    for T_near in near_prior:
-        kept = pixel_errors(camera, T_near, p_prev, pixels) <= settings.consensus_px
-        if (kept & ~inliers).sum() >= needed:
-            T = _refine(camera, T_near, p_prev[kept], pixels[kept], settings.consensus_px / 2, slice(0, 6))
-            inliers = pixel_errors(camera, T, p_prev, pixels) <= settings.consensus_px
-            break
+    needed = max(_MIN_POINTS, vote.settings.prior_min_support * inliers.sum())
+    if (~inliers).sum() >= needed:
+        for T_near in _near_prior(vote, p_prev, pixels, T, expected, R_prior, T_prior):
+            kept = pixel_errors(vote.camera, T_near, p_prev, pixels) <= vote.limit_px
+            if (kept & ~inliers).sum() >= needed:
+                T = _refine(vote.camera, T_near, p_prev[kept], pixels[kept], vote.limit_px / 2, slice(0, 6))
+                inliers = pixel_errors(vote.camera, T, p_prev, pixels) <= vote.limit_px
+                break
     if inliers.sum() < max(_MIN_POINTS, _MIN_SHARE * len(inliers)):
         return None
     return Consensus(T, inliers)
+
+
+def _near_prior(
+    vote: Vote,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    T: FloatArray,
+    expected: FloatArray,
+    R_prior: FloatArray | None,
+    T_prior: FloatArray | None,
+) -> list[FloatArray]:
+    """Motions (4, 4) near to what is predicted, where the voted motion `T` (4, 4) is not: they compete with it."""
+    near: list[FloatArray] = []
+    if T_prior is not None and not _agree(vote.camera, T, T_prior, p_prev):
+        near.append(_refine(vote.camera, T_prior, p_prev, pixels, vote.limit_px, slice(0, 6)))
+    if R_prior is not None and _turn_deg(T, R_prior) > vote.settings.prior_max_deviation_deg:
+        fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
+        near.append(_search(vote, p_prev, pixels, fixed, slice(0, 3))[0])
+    return near
 
 
 def _agree(camera: StereoCamera, T: FloatArray, T_other: FloatArray, p_prev: FloatArray) -> bool:
@@ -261,9 +285,12 @@ def epipolar_distance(
 
 
 def fit_motion(
-    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, start: FloatArray, settings: ConsensusSettings
+    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, start: FloatArray, limit_px: float
 ) -> FloatArray | None:
-    """Motion (4, 4) `T_curr_prev` that predicted pixels (N, 2) of points (N, 3) stand for; None with too few points."""
+    """Motion (4, 4) `T_curr_prev` that pixels (N, 2) of points (N, 3) stand for, from a start (4, 4).
+
+    None with too few points, or where half of them lie further than the limit from where the motion puts them.
+    """
     finite = np.isfinite(pixels).all(axis=1)
     if finite.sum() < _MIN_POINTS:
         return None
@@ -271,13 +298,13 @@ def fit_motion(
     T = _gauss_newton(
         camera, start[None], p[None], z[None], np.ones((1, len(p))), iterations=_SAMPLE_ITERATIONS, free=slice(0, 6)
     )[0]
-    T = _refine(camera, T, p, z, settings.consensus_px, slice(0, 6))
-    fits = pixel_errors(camera, T, p, z) <= settings.consensus_px
+    T = _refine(camera, T, p, z, limit_px, slice(0, 6))
+    fits = pixel_errors(camera, T, p, z) <= limit_px
     return T if fits.mean() > 0.5 else None
 
 
 def predicted_motion(
-    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, expected: FloatArray, settings: ConsensusSettings
+    camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, expected: FloatArray
 ) -> FloatArray | None:
     """Motion (4, 4) behind predicted pixels, from some of them, as a start; `expected` where that will do.
 
@@ -309,13 +336,7 @@ class _Sights:
 
 
 def bearing_consensus(
-    camera: StereoCamera,
-    previous: FloatArray,
-    current: FloatArray,
-    expected_R: FloatArray,
-    R_prior: FloatArray | None,
-    rng: np.random.Generator,
-    settings: ConsensusSettings,
+    vote: Vote, previous: FloatArray, current: FloatArray, expected_R: FloatArray, R_prior: FloatArray | None
 ) -> BoolArray | None:
     """Find the tracks that one motion of the camera can explain, whatever their depths.
 
@@ -325,30 +346,28 @@ def bearing_consensus(
     With known rotation, two features give the direction; without, five give both.
 
     Args:
-        camera: rectified camera.
+        vote: camera, thresholds and samples.
         previous: left pixels (N, 2) in the previous frame.
         current: left pixels (N, 2) in the current frame.
         expected_R: rotation (3, 3) from the previous to the current cam0 frame to begin with, of no authority.
         R_prior: the same, predicted from outside, or None; see `rigid_consensus`.
-        rng: source of the samples; the same state gives the same result to the bit.
-        settings: thresholds.
 
     Returns:
         Mask (N,) of the tracks that agree; None where there are too few, or most do not agree.
     """
     if len(previous) < _MIN_POINTS:
         return None
+    camera, settings = vote.camera, vote.settings
     seen = _Sights(left_rays(camera, previous), current, left_rays(camera, current))
     near_prior = None
     if R_prior is not None:
-        told = _bearing_vote(camera, seen, [R_prior], rng, settings)
-        near_prior = _follows(camera, seen, told, settings)
+        near_prior = _follows(vote, seen, _bearing_vote(vote, seen, [R_prior]))
         if near_prior.mean() >= _SURE_BEARING_SHARE:
             return near_prior
-    rotations = [expected_R, _turn_of(camera, seen, rng, settings)]
-    vote = _bearing_vote(camera, seen, rotations, rng, settings, _five_point(camera, previous, current, rng, settings))
-    kept = _follows(camera, seen, vote, settings)
-    if R_prior is not None and near_prior is not None and _turn_deg(vote, R_prior) > settings.prior_max_deviation_deg:
+    rotations = [expected_R, _turn_of(vote, seen)]
+    T = _bearing_vote(vote, seen, rotations, _five_point(vote, previous, current))
+    kept = _follows(vote, seen, T)
+    if R_prior is not None and near_prior is not None and _turn_deg(T, R_prior) > settings.prior_max_deviation_deg:
         # A wrong rotation, too, explains a part of what the vote explains: only what the vote denies speaks for it.
         apart = (near_prior & ~kept).sum() >= max(_MIN_POINTS, settings.prior_min_support * kept.sum())
         kept = near_prior if apart else kept
@@ -373,29 +392,25 @@ def _ray_distance(camera: StereoCamera, seen: _Sights, R: FloatArray, t: FloatAr
     return np.where(ahead, distance, np.inf)
 
 
-def _follows(camera: StereoCamera, seen: _Sights, T: FloatArray, settings: ConsensusSettings) -> BoolArray:
-    return np.asarray(_ray_distance(camera, seen, T[:3, :3], T[:3, 3]) <= settings.consensus_px)
+def _follows(vote: Vote, seen: _Sights, T: FloatArray) -> BoolArray:
+    """Mask (N,) of the tracks that a motion (4, 4) explains."""
+    return np.asarray(_ray_distance(vote.camera, seen, T[:3, :3], T[:3, 3]) <= vote.limit_px)
 
 
-def _cost(camera: StereoCamera, seen: _Sights, R: FloatArray, t: FloatArray, limit: float) -> FloatArray:
+def _cost(vote: Vote, seen: _Sights, R: FloatArray, t: FloatArray) -> FloatArray:
     """Truncated squared distances, summed over the tracks (...)."""
-    return np.asarray((np.minimum(_ray_distance(camera, seen, R, t), limit) ** 2).sum(axis=-1))
+    return np.asarray((np.minimum(_ray_distance(vote.camera, seen, R, t), vote.limit_px) ** 2).sum(axis=-1))
 
 
 def _bearing_vote(
-    camera: StereoCamera,
-    seen: _Sights,
-    rotations: list[FloatArray],
-    rng: np.random.Generator,
-    settings: ConsensusSettings,
-    others: FloatArray | None = None,
+    vote: Vote, seen: _Sights, rotations: list[FloatArray], others: FloatArray | None = None
 ) -> FloatArray:
     """Best rotation and direction of translation, as a motion (4, 4) with a translation of length one.
 
     For each rotation, pairs of tracks give the direction; `others` (K, 4, 4) are motions that compete with them.
     """
     models = [np.zeros((0, 4, 4)) if others is None else others]
-    pairs = _pairs(len(seen.before), rng, settings)
+    pairs = _pairs(len(seen.before), vote)
     for R in rotations:
         # The direction of translation, both rays and the rotation's normal: t . (R f x g) = 0.
         normal = np.cross(seen.before @ R.T, seen.rays)
@@ -405,20 +420,18 @@ def _bearing_vote(
         t = np.where(length > 0.0, t / np.maximum(length, np.finfo(np.float64).tiny), [0.0, 0.0, 1.0])
         models += [se3_from_parts(np.broadcast_to(R, (len(t), 3, 3)), sign * t) for sign in (1.0, -1.0)]
     T = np.concatenate(models)
-    limit = settings.consensus_px
-    best = T[int(np.argmin(_cost(camera, seen, T[:, :3, :3], T[:, :3, 3], limit)))]
+    best = T[int(np.argmin(_cost(vote, seen, T[:, :3, :3], T[:, :3, 3])))]
     for _ in range(_REFINE_ITERATIONS):
-        better = _bearing_step(camera, seen, best, limit)
-        if _cost(camera, seen, better[:3, :3], better[:3, 3], limit) >= _cost(
-            camera, seen, best[:3, :3], best[:3, 3], limit
-        ):
+        better = _bearing_step(vote, seen, best)
+        if _cost(vote, seen, better[:3, :3], better[:3, 3]) >= _cost(vote, seen, best[:3, :3], best[:3, 3]):
             break
         best = better
     return best
 
 
-def _bearing_step(camera: StereoCamera, seen: _Sights, T: FloatArray, limit: float) -> FloatArray:
+def _bearing_step(vote: Vote, seen: _Sights, T: FloatArray) -> FloatArray:
     """One Gauss-Newton step of a motion (4, 4), its translation of length one, on the distances from epipolar lines."""
+    camera, limit = vote.camera, vote.limit_px
     R, t = T[:3, :3], T[:3, 3]
     turned = seen.before @ R.T
     line = np.cross(t, turned)
@@ -436,23 +449,23 @@ def _bearing_step(camera: StereoCamera, seen: _Sights, T: FloatArray, limit: flo
     return se3_from_parts(so3_exp(step[:3]) @ R, moved / np.linalg.norm(moved))
 
 
-def _turn_of(camera: StereoCamera, seen: _Sights, rng: np.random.Generator, settings: ConsensusSettings) -> FloatArray:
+def _turn_of(vote: Vote, seen: _Sights) -> FloatArray:
     """Rotation (3, 3) that alone explains most tracks: two tracks give one, and those that follow it mend it."""
     f, g = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (seen.before, seen.rays))
-    pairs = _pairs(len(f), rng, settings)
+    pairs = _pairs(len(f), vote)
     R = _triads(g, pairs) @ np.swapaxes(_triads(f, pairs), 1, 2)
     still = np.zeros(3)
-    R_best = R[int(np.argmin(_cost(camera, seen, R, np.broadcast_to(still, (len(R), 3)), settings.consensus_px)))]
-    near = _ray_distance(camera, seen, R_best, still) <= settings.consensus_px
+    R_best = R[int(np.argmin(_cost(vote, seen, R, np.broadcast_to(still, (len(R), 3)))))]
+    near = _ray_distance(vote.camera, seen, R_best, still) <= vote.limit_px
     # Reference: Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. (1976).
     U, _, Vt = np.linalg.svd(g[near].T @ f[near])
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
-def _pairs(count: int, rng: np.random.Generator, settings: ConsensusSettings) -> IntArray:
+def _pairs(count: int, vote: Vote) -> IntArray:
     """Random pairs (H, 2) of two different numbers below `count`."""
-    first = rng.integers(0, count, size=settings.consensus_samples)
-    return np.stack([first, (first + rng.integers(1, count, size=len(first))) % count], axis=1)
+    first = vote.rng.integers(0, count, size=vote.settings.samples)
+    return np.stack([first, (first + vote.rng.integers(1, count, size=len(first))) % count], axis=1)
 
 
 def _triads(rays: FloatArray, pairs: IntArray) -> FloatArray:
@@ -463,20 +476,15 @@ def _triads(rays: FloatArray, pairs: IntArray) -> FloatArray:
     return np.stack([a, across, np.cross(a, across)], axis=2)
 
 
-def _five_point(
-    camera: StereoCamera,
-    previous: FloatArray,
-    current: FloatArray,
-    rng: np.random.Generator,
-    settings: ConsensusSettings,
-) -> FloatArray | None:
+def _five_point(vote: Vote, previous: FloatArray, current: FloatArray) -> FloatArray | None:
     """Motions (K, 4, 4), translations of length one, that the best essential matrices stand for; None if none fits."""
+    camera = vote.camera
     K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
     params = cv2.UsacParams()
     params.confidence = _FIVE_POINT_CONFIDENCE
-    params.threshold = settings.consensus_px
-    params.maxIterations = 10 * settings.consensus_samples
-    params.randomGeneratorState = int(rng.integers(0, 2**31 - 1))
+    params.threshold = vote.limit_px
+    params.maxIterations = 10 * vote.settings.samples
+    params.randomGeneratorState = int(vote.rng.integers(0, 2**31 - 1))
     params.isParallel = False
     none = np.zeros(4)
     essential, _ = cv2.findEssentialMat(previous, current, K, K, none, none, params)

@@ -10,12 +10,44 @@ from vio.setting import setting
 
 
 @dataclass(frozen=True, slots=True)
+class GridSettings:
+    """How many features every front end that looks at images keeps, and how evenly they lie."""
+
+    target_features: int = setting(400, "features to keep alive; new ones are added below this number")
+    cell_features: int = setting(4, "features wanted in one grid cell; the cell size follows from it")
+    min_distance: float = setting(0.15, "least distance between features, over the spacing of a uniform grid of them")
+
+
+@dataclass(frozen=True, slots=True)
+class DisparitySettings:
+    """Which disparities a stereo match may have."""
+
+    max_disparity: float = setting(0.16, "largest disparity, over the image width")
+    min_disparity_px: float = setting(0.3, "smallest disparity of a stereo match", unit="px")
+
+
+@dataclass(frozen=True, slots=True)
+class ConsensusSettings:
+    """The vote on the camera's motion; how far a feature may lie from it is each front end's `consensus_px`."""
+
+    samples: int = setting(96, "random minimal sets tried for the consensus motion")
+    sure_share: float = setting(
+        0.7, "share of features that must follow the expected motion, refined, for no samples to be tried"
+    )
+    prior_max_deviation_deg: float = setting(
+        1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"
+    )
+    prior_min_support: float = setting(
+        0.4,
+        "points that follow the predicted motion only, over the consensus' inliers, for it to replace the consensus",
+    )
+    seed: int = setting(0, "seed of the sampling; equal seeds give equal bits")
+
+
+@dataclass(frozen=True, slots=True)
 class KltSettings:
     """Corners tracked by pyramidal Lucas-Kanade; one set of defaults serves 640x360 to 1242x375."""
 
-    target_features: int = setting(400, "features to keep alive; new corners are added below this number")
-    cell_features: int = setting(4, "features wanted in one grid cell; the cell size follows from it")
-    min_distance: float = setting(0.15, "least distance between features, over the spacing of a uniform grid of them")
     min_gradient: float = setting(
         1.0, "least gradient of a corner in its weakest direction, root mean square over 6x6 pixels", unit="gray/px"
     )
@@ -37,24 +69,11 @@ class KltSettings:
     )
     max_forward_backward_px: float = setting(1.5, "largest error after tracking there and back", unit="px")
     consensus_px: float = setting(1.0, "largest distance from where the consensus motion puts a feature", unit="px")
-    consensus_samples: int = setting(96, "random minimal sets tried for the consensus motion")
-    sure_share: float = setting(
-        0.7, "share of features that must follow the expected motion, refined, for no samples to be tried"
-    )
-    prior_max_deviation_deg: float = setting(
-        1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"
-    )
-    prior_min_support: float = setting(
-        0.4,
-        "points that follow the predicted motion only, over the consensus' inliers, for it to replace the consensus",
-    )
     anchor_radius_px: int = setting(7, "half side of the patch that a feature is aligned with for life", unit="px")
     min_anchor_correlation: float = setting(
         0.8, "smallest normalised correlation with that patch; below, it is renewed"
     )
     max_anchor_scale: float = setting(1.25, "change of scale at which that patch is renewed")
-    max_disparity: float = setting(0.16, "largest disparity, over the image width")
-    min_disparity_px: float = setting(0.3, "smallest disparity of a stereo match", unit="px")
     max_epipolar_px: float = setting(1.0, "largest difference of the rows of a stereo match", unit="px")
     min_correlation: float = setting(0.8, "smallest normalised correlation of a stereo match")
     min_peak_margin: float = setting(0.03, "least lead in correlation over the second-best place in the row")
@@ -73,7 +92,6 @@ class KltSettings:
         5, "frames without contrast that are passed over before all tracks are given up; 0: none"
     )
     max_left_only_frames: int = setting(10, "frames that a feature may go on without a right match")
-    seed: int = setting(0, "seed of the consensus sampling; equal seeds give equal bits")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,30 +99,13 @@ class MatchSettings:
     """Key points matched by descriptor; for the front ends orb, sift and kornia."""
 
     max_keypoints: int = setting(1200, "key points extracted from each image")
-    target_features: int = setting(400, "features to keep alive; new key points are added below this number")
-    cell_features: int = setting(4, "features wanted in one grid cell; the cell size follows from it")
-    min_distance: float = setting(0.15, "least distance between features, over the spacing of a uniform grid of them")
     ratio: float = setting(0.8, "largest distance of descriptors, over that of the second-nearest")
     search_radius: float = setting(0.06, "half side of the search about the predicted pixel, over the image width")
-    epipolar_band_px: float = setting(1.5, "largest difference of the rows of a stereo match", unit="px")
-    min_disparity_px: float = setting(0.3, "smallest disparity of a stereo match", unit="px")
-    max_disparity: float = setting(0.16, "largest disparity, over the image width")
+    max_epipolar_px: float = setting(1.5, "largest difference of the rows of a stereo match", unit="px")
     refine: Literal["none", "align"] = setting(
         "align", "align the patches of matched key points to a fraction of a pixel"
     )
     consensus_px: float = setting(1.5, "largest distance from where the consensus motion puts a feature", unit="px")
-    consensus_samples: int = setting(96, "random minimal sets tried for the consensus motion")
-    sure_share: float = setting(
-        0.7, "share of features that must follow the expected motion, refined, for no samples to be tried"
-    )
-    prior_max_deviation_deg: float = setting(
-        1.0, "a consensus that turns away from the predicted rotation by more is distrusted", unit="deg"
-    )
-    prior_min_support: float = setting(
-        0.4,
-        "points that follow the predicted motion only, over the consensus' inliers, for it to replace the consensus",
-    )
-    seed: int = setting(0, "seed of the consensus sampling; equal seeds give equal bits")
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +141,9 @@ class FrontendSettings:
         None, "observation log or feature file to take in place of the recording's own, for the precomputed front end"
     )
     prior: bool = setting(True, "let the filter tell the front end where it expects the features")
-    klt: KltSettings = field(default_factory=KltSettings, metadata={"doc": "corner tracking", "unit": ""})
-    match: MatchSettings = field(default_factory=MatchSettings, metadata={"doc": "descriptor matching", "unit": ""})
-    learned: LearnedSettings = field(default_factory=LearnedSettings, metadata={"doc": "kornia and torch", "unit": ""})
+    grid: GridSettings = field(default_factory=GridSettings)
+    disparity: DisparitySettings = field(default_factory=DisparitySettings)
+    consensus: ConsensusSettings = field(default_factory=ConsensusSettings)
+    klt: KltSettings = field(default_factory=KltSettings)
+    match: MatchSettings = field(default_factory=MatchSettings)
+    learned: LearnedSettings = field(default_factory=LearnedSettings)

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontend import BUILDERS, FrontendSettings, LearnedSettings, MatchSettings, build_frontend
+from frontend import BUILDERS, FrontendSettings, build_frontend
 from frontend.klt import KltFrontend
 from frontend.precomputed import PrecomputedFrontend
-from frontend.settings import KltSettings
+from frontend.settings import GridSettings, LearnedSettings, MatchSettings
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
 from vio.errors import DataError
 from vio.geometry.stereo import StereoCamera
@@ -27,8 +27,8 @@ from vio.sim.world import room
 POSES = flight(5)
 FRAMES = [stereo_frame(k, pose) for k, pose in enumerate(POSES)]
 SETTINGS = FrontendSettings(
-    klt=KltSettings(target_features=200),
-    match=MatchSettings(target_features=200, max_keypoints=400),
+    grid=GridSettings(target_features=200),
+    match=MatchSettings(max_keypoints=400),
     learned=LearnedSettings(detector="gftt", descriptor="sift"),
 )
 needs_torch = pytest.mark.skipif(
@@ -51,7 +51,7 @@ def make(name: str, camera: StereoCamera = CAMERA) -> Frontend:
         simulation = simulate(room(seed=1), small_rig(320, 180), hand_held(duration_s=3.0), rate_hz=10.0)
         return OracleFrontend(simulation, OracleSettings(max_features=60, left_only_fraction=0.1), seed=2)
     if name == "precomputed":
-        klt = KltFrontend(CAMERA, SETTINGS.klt)
+        klt = KltFrontend(CAMERA, SETTINGS)
         rows = [klt.process(frame).observations for frame in FRAMES]
         return PrecomputedFrontend(lambda index: rows[index])
     settings = SETTINGS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from frontend.detect import cell_index, grid_shape, min_distance_px
 from frontend.klt import KltFrontend, circle_gaps
 from frontend.outliers import fit_motion
-from frontend.settings import KltSettings
+from frontend.settings import FrontendSettings, GridSettings, KltSettings
 from frontend.stereo_match import half_image
 from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
 from vio.errors import ConfigError, DataError
@@ -20,14 +21,19 @@ from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import FrontendOutput, StereoFrame, TrackPrior
 
-SETTINGS = KltSettings(target_features=200)
+GRID = GridSettings(target_features=200)
+SETTINGS = FrontendSettings(grid=GRID)
 POSES = flight(6)
 FRAMES = [stereo_frame(k, pose) for k, pose in enumerate(POSES)]
 
 
-def run(frames: list[StereoFrame], settings: KltSettings = SETTINGS) -> list[FrontendOutput]:
+def run(frames: list[StereoFrame], settings: FrontendSettings = SETTINGS) -> list[FrontendOutput]:
     frontend = KltFrontend(CAMERA, settings)
     return [frontend.process(frame) for frame in frames]
+
+
+def with_klt(**changes: Any) -> FrontendSettings:
+    return replace(SETTINGS, klt=KltSettings(**changes))
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +84,9 @@ def test_most_features_are_kept_and_the_counts_add_up(outputs: list[FrontendOutp
     for output in outputs:
         assert len(output.observations) == output.tracked + output.detected
         assert output.matched == output.observations.has_right.sum()
-        assert output.matched > 0.7 * SETTINGS.target_features
-        assert len(output.observations) <= SETTINGS.target_features
-    assert all(output.tracked > 0.8 * SETTINGS.target_features for output in outputs[1:])
+        assert output.matched > 0.7 * GRID.target_features
+        assert len(output.observations) <= GRID.target_features
+    assert all(output.tracked > 0.8 * GRID.target_features for output in outputs[1:])
     assert {"prepare", "track", "reject", "align", "detect", "stereo"} <= set(outputs[-1].stages_ms)
 
 
@@ -88,7 +94,7 @@ def test_disparity_is_positive_wherever_there_is_a_right_pixel(outputs: list[Fro
     for output in outputs:
         z = output.observations.z[output.observations.has_right]
         assert (z[:, 0] - z[:, 2] > 0).all()
-        assert (np.abs(z[:, 1] - z[:, 3]) <= SETTINGS.max_epipolar_px).all()
+        assert (np.abs(z[:, 1] - z[:, 3]) <= SETTINGS.klt.max_epipolar_px).all()
 
 
 def test_two_runs_agree_to_the_bit(outputs: list[FrontendOutput]) -> None:
@@ -122,7 +128,7 @@ def test_tracks_are_given_up_when_the_camera_stays_black() -> None:
 
 def test_ids_are_never_reused() -> None:
     """A black frame kills every track; what is found afterwards is new, even where the picture is the same."""
-    outputs = run(_with_black_frames(1), replace(SETTINGS, max_blind_frames=0))
+    outputs = run(_with_black_frames(1), with_klt(max_blind_frames=0))
     assert len(outputs[2].observations) == 0
     early = np.concatenate([output.observations.ids for output in outputs[:2]])
     assert len(outputs[3].observations) > 100
@@ -147,20 +153,20 @@ def test_noise_alone_gives_no_tracks() -> None:
 
 
 def test_features_keep_their_distance_and_fill_the_grid(outputs: list[FrontendOutput]) -> None:
-    shape = grid_shape(480, 300, SETTINGS)
+    shape = grid_shape(480, 300, GRID)
     for output in outputs:
         left = output.observations.z[:, :2]
         gap = np.abs(left[:, None] - left[None]).max(axis=2)
         np.fill_diagonal(gap, np.inf)
-        assert gap.min() >= 0.5 * min_distance_px(480, 300, SETTINGS)
+        assert gap.min() >= 0.5 * min_distance_px(480, 300, GRID)
         held = np.bincount(cell_index(left, 480, 300, shape), minlength=shape[0] * shape[1])
-        assert held.max() <= 3 * SETTINGS.cell_features
+        assert held.max() <= 3 * GRID.cell_features
         assert np.mean(held > 0) > 0.85
 
 
 def test_features_without_a_right_view_stay_as_left_only_rows_for_a_while() -> None:
     """The right camera goes blind; tracks go on in the left image, for the configured number of frames."""
-    settings = replace(SETTINGS, max_left_only_frames=2)
+    settings = with_klt(max_left_only_frames=2)
     gray = np.full_like(FRAMES[0].right, 128)
     frames = [FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:5])]
     outputs = run(frames, settings)
@@ -194,7 +200,7 @@ def test_without_depth_what_moves_against_the_rest_is_dropped(told: bool, monkey
         return float(np.median(error)), int((error < 1).sum()), int((error > 4).sum())
 
     median, good, wrong = jumped()
-    monkeypatch.setattr("frontend.klt.bearing_consensus", lambda *_: None)
+    monkeypatch.setattr("frontend.outliers.bearing_consensus", lambda *_: None)
     _, all_good, all_wrong = jumped()
     assert all_wrong >= 15  # the trap is real
     assert wrong <= 0.15 * all_wrong
@@ -228,7 +234,7 @@ def test_a_prior_bridges_a_jump_that_tracking_alone_cannot() -> None:
     angle = np.radians(12.0)
     second[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     frames = [stereo_frame(0, first), stereo_frame(1, second)]
-    settings = replace(SETTINGS, pyramid_levels=1)
+    settings = with_klt(pyramid_levels=1)
     blind = run(frames, settings)[1]
     frontend = KltFrontend(CAMERA, settings)
     seen = frontend.process(frames[0]).observations
@@ -309,7 +315,7 @@ def test_a_darker_right_camera_changes_little() -> None:
         dark.append(replace(frame, right=(0.6 * frame.right.astype(np.float64) + 5).astype(np.uint8)))
     for pose, output in zip(POSES[:3], run(dark), strict=True):
         seen = output.observations.take(output.observations.has_right)
-        assert output.matched > 0.7 * SETTINGS.target_features
+        assert output.matched > 0.7 * GRID.target_features
         error = seen.z[:, 2] - truth(SLANTED, pose, seen.z[:, :2], pose)[:, 2]
         assert np.median(np.abs(error)) < 0.05
 
@@ -327,8 +333,8 @@ def test_the_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutp
 
 def test_new_features_are_shown_after_their_probation(outputs: list[FrontendOutput]) -> None:
     """Every id that appears after the first frame was found in an earlier frame: it was never new and fresh at once."""
-    held = run(FRAMES, replace(SETTINGS, target_features=300, probation_frames=1))
-    free = run(FRAMES, replace(SETTINGS, target_features=300, probation_frames=0))
+    held = run(FRAMES, replace(with_klt(probation_frames=1), grid=GridSettings(target_features=300)))
+    free = run(FRAMES, replace(with_klt(probation_frames=0), grid=GridSettings(target_features=300)))
     late = [later.observations.ids[later.observations.ids > held[0].observations.ids.max()] for later in held[1:]]
     assert sum(map(len, late)) > 0
     assert held[1].detected <= free[1].detected + free[0].detected
@@ -347,16 +353,16 @@ def test_the_circle_closes_where_both_ways_lead_to_one_pixel(outputs: list[Front
         halves.append(half_image(frame.right))
     wrong = np.arange(len(z)) % 3 == 0
     off = np.where(wrong[:, None], [3.0, -1.5], [0.0, 0.0])
-    gap = circle_gaps(halves[0], halves[1], z[:, 2:], z_next[:, 2:] + off, SETTINGS)
+    gap = circle_gaps(halves[0], halves[1], z[:, 2:], z_next[:, 2:] + off, SETTINGS.klt)
     assert np.median(gap[~wrong]) < 0.2
-    assert np.mean(gap[~wrong] <= SETTINGS.max_circle_px) > 0.98
-    assert np.mean(gap[wrong] > SETTINGS.max_circle_px) > 0.95
-    assert len(circle_gaps(halves[0], halves[1], z[:0, 2:], z[:0, 2:], SETTINGS)) == 0
+    assert np.mean(gap[~wrong] <= SETTINGS.klt.max_circle_px) > 0.98
+    assert np.mean(gap[wrong] > SETTINGS.klt.max_circle_px) > 0.95
+    assert len(circle_gaps(halves[0], halves[1], z[:0, 2:], z[:0, 2:], SETTINGS.klt)) == 0
 
 
 def test_the_circle_check_costs_hardly_a_good_match(outputs: list[FrontendOutput]) -> None:
-    checked = run(FRAMES, replace(SETTINGS, circle_check=True))
-    strict = run(FRAMES, replace(SETTINGS, circle_check=True, max_circle_px=0.02))
+    checked = run(FRAMES, with_klt(circle_check=True))
+    strict = run(FRAMES, with_klt(circle_check=True, max_circle_px=0.02))
     for plain, output in zip(outputs[1:], checked[1:], strict=True):
         assert output.matched >= 0.98 * plain.matched
     assert strict[-1].matched < 0.5 * outputs[-1].matched  # the setting does something
@@ -375,7 +381,7 @@ def test_rectification_that_is_off_is_learned_and_costs_no_disparity() -> None:
         frames.append(replace(frame, right=np.asarray(rolled, dtype=np.uint8)))
     for pose, output in list(zip(POSES, run(frames), strict=True))[2:]:
         seen = output.observations.take(output.observations.has_right)
-        assert len(seen) > 0.7 * SETTINGS.target_features
+        assert len(seen) > 0.7 * GRID.target_features
         expected = truth(SLANTED, pose, seen.z[:, :2], pose)[:, 2:]
         turned = expected @ turn[:, :2].T + turn[:, 2]
         assert np.median(np.abs(seen.z[:, 3] - turned[:, 1])) < 0.06
@@ -413,11 +419,11 @@ def at_night(share: float, read_noise: float) -> list[StereoFrame]:
 def test_a_twentieth_of_the_light_is_enough_where_the_noise_is_low() -> None:
     """Mean gray level 6: corners need not be strong to be good, they must stand out from the noise."""
     frames = at_night(0.05, 0.5)
-    absolute = run(frames, replace(SETTINGS, min_gradient_over_noise=1e6))
+    absolute = run(frames, with_klt(min_gradient_over_noise=1e6))
     outputs = run(frames)
-    assert max(output.matched for output in absolute) < 0.4 * SETTINGS.target_features
+    assert max(output.matched for output in absolute) < 0.4 * GRID.target_features
     for k in range(3):
-        assert outputs[k + 1].matched > 0.6 * SETTINGS.target_features
+        assert outputs[k + 1].matched > 0.6 * GRID.target_features
         before, after = common(outputs[k], outputs[k + 1])
         assert len(before) > 0.7 * len(outputs[k].observations)
         error = np.linalg.norm(after[:, :2] - truth(SLANTED, POSES[k], before[:, :2], POSES[k + 1])[:, :2], axis=1)
@@ -426,7 +432,7 @@ def test_a_twentieth_of_the_light_is_enough_where_the_noise_is_low() -> None:
 
 
 def test_in_good_light_the_noise_does_not_matter(outputs: list[FrontendOutput]) -> None:
-    for a, b in zip(outputs, run(FRAMES, replace(SETTINGS, min_gradient_over_noise=1e6)), strict=True):
+    for a, b in zip(outputs, run(FRAMES, with_klt(min_gradient_over_noise=1e6)), strict=True):
         np.testing.assert_array_equal(a.observations.z, b.observations.z)
 
 
@@ -435,7 +441,7 @@ def test_the_mask_keeps_features_away(tmp_path: Path) -> None:
     mask[150:] = 0
     path = tmp_path / "mask.png"
     cv2.imwrite(str(path), mask)
-    first = run(FRAMES[:1], replace(SETTINGS, mask=path))[0].observations
+    first = run(FRAMES[:1], with_klt(mask=path))[0].observations
     assert len(first) > 50
     assert first.z[:, 1].max() < 151
 
@@ -444,9 +450,9 @@ def test_a_wrong_mask_is_named(tmp_path: Path) -> None:
     small = tmp_path / "small.png"
     cv2.imwrite(str(small), np.zeros((20, 30), dtype=np.uint8))
     with pytest.raises(ConfigError, match="mask is 30x20, but the images are 480x300"):
-        run(FRAMES[:1], replace(SETTINGS, mask=small))
+        run(FRAMES[:1], with_klt(mask=small))
     with pytest.raises(ConfigError, match="cannot be read as an image"):
-        KltFrontend(CAMERA, replace(SETTINGS, mask=tmp_path / "none.png"))
+        KltFrontend(CAMERA, with_klt(mask=tmp_path / "none.png"))
 
 
 def test_a_wrong_prediction_is_given_up() -> None:
@@ -500,7 +506,7 @@ def test_real_drive_moves_as_the_ground_truth_says(data_dir: Path) -> None:
         p, valid = triangulate(camera, before)
         assert valid.all()
         T_true = se3_inverse(poses[k + 1]) @ poses[k]
-        T = fit_motion(camera, p, after[:, :2], T_true, frontend.settings)
+        T = fit_motion(camera, p, after[:, :2], T_true, SETTINGS.klt.consensus_px)
         assert T is not None
         difference = se3_log(T @ se3_inverse(T_true))
         assert np.linalg.norm(difference[:3]) < 0.08

@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
-from frontend import LearnedSettings, MatchSettings
 from frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
 from frontend.detect import detect_corners
-from frontend.settings import KltSettings
+from frontend.settings import FrontendSettings, GridSettings, KltSettings, LearnedSettings, MatchSettings
 from frontend.stereo_match import half_image
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
 from vio.datasets.images import load_gray
@@ -24,7 +23,7 @@ from vio.geometry.lie import FloatArray
 from vio.records import Image, StereoFrame
 
 REASON = "not installed: pip install 'stereo-vio[learned]'"
-MATCH = MatchSettings(max_keypoints=250, target_features=200)
+MATCH = MatchSettings(max_keypoints=250)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +38,8 @@ SMALL = replace(CAMERA, width=240, height=160)
 def build(settings: LearnedSettings, match: MatchSettings = MATCH) -> DescriptorFrontend:
     from frontend.learned import build_learned
 
-    return build_learned(SMALL, match, settings)
+    grid = GridSettings(target_features=200)
+    return build_learned(SMALL, FrontendSettings(grid=grid, match=match, learned=settings))
 
 
 def small_frame(index: int, pose: FloatArray) -> StereoFrame:
@@ -319,7 +319,7 @@ def compare(images: list[Image]) -> None:
     """Time, left to right and right to left in one call, against OpenCV call by call: [left, next left, right]."""
     from frontend.torch_klt import TorchFlow
 
-    points = detect_corners(half_image(images[0]), np.zeros((0, 2)), 200, KltSettings())
+    points = detect_corners(half_image(images[0]), np.zeros((0, 2)), 200, GridSettings(), KltSettings())
     legs = [(0, 1), (0, 2), (2, 0)]
     engine = TorchFlow()
     n = len(points)

@@ -5,14 +5,27 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from frontend.outliers import bearing_consensus, epipolar_distance, fit_motion, pixel_errors, rigid_consensus
-from frontend.settings import KltSettings
+from frontend.outliers import (
+    Vote,
+    bearing_consensus,
+    epipolar_distance,
+    fit_motion,
+    pixel_errors,
+    rigid_consensus,
+    static_tracks,
+)
+from frontend.settings import ConsensusSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
 
 CAMERA = StereoCamera(fu=720.0, fv=720.0, cu=610.0, cv=170.0, baseline_m=0.54)
-SETTINGS = KltSettings()
+LIMIT_PX = 1.0
 T_TRUE = se3_exp([0.05, -0.02, -1.1, 0.004, -0.02, 0.003])  # a car driving 1.1 m forward and turning
+
+
+def vote(seed: int = 0, settings: ConsensusSettings | None = None) -> Vote:
+    settings = ConsensusSettings() if settings is None else settings
+    return Vote(CAMERA, settings, LIMIT_PX, np.random.default_rng(seed))
 
 
 def scene(n: int, seed: int, depth: tuple[float, float] = (5.0, 40.0)) -> FloatArray:
@@ -34,7 +47,7 @@ def test_outliers_are_told_from_inliers(share: float) -> None:
     uv = pixels(T_TRUE, p, 2)
     bad = np.arange(300) < 300 * share
     uv[bad] += np.random.default_rng(3).choice([-1, 1], (bad.sum(), 2)) * np.linspace(8, 60, bad.sum())[:, None]
-    found = rigid_consensus(CAMERA, p, uv, np.eye(4), None, None, np.random.default_rng(0), SETTINGS)
+    found = rigid_consensus(vote(), p, uv, np.eye(4), None, None)
     assert found is not None
     assert not found.inliers[bad].any()
     assert found.inliers[~bad].mean() > 0.99
@@ -46,7 +59,7 @@ def test_outliers_are_told_from_inliers(share: float) -> None:
 def test_the_same_seed_gives_the_same_bits() -> None:
     p = scene(200, 4)
     uv = pixels(T_TRUE, p, 5, noise=1.0)
-    a, b = (rigid_consensus(CAMERA, p, uv, np.eye(4), None, None, np.random.default_rng(7), SETTINGS) for _ in range(2))
+    a, b = (rigid_consensus(vote(7), p, uv, np.eye(4), None, None) for _ in range(2))
     assert a is not None
     assert b is not None
     np.testing.assert_array_equal(a.T_curr_prev, b.T_curr_prev)
@@ -55,7 +68,7 @@ def test_the_same_seed_gives_the_same_bits() -> None:
 
 def test_standing_still_is_a_motion_too() -> None:
     p = scene(100, 6)
-    found = rigid_consensus(CAMERA, p, pixels(np.eye(4), p, 7), T_TRUE, None, None, np.random.default_rng(0), SETTINGS)
+    found = rigid_consensus(vote(), p, pixels(np.eye(4), p, 7), T_TRUE, None, None)
     assert found is not None
     assert np.linalg.norm(se3_log(found.T_curr_prev)) < 0.02
     assert found.inliers.all()
@@ -64,14 +77,13 @@ def test_standing_still_is_a_motion_too() -> None:
 @pytest.mark.parametrize("n", [0, 1, 7])
 def test_too_few_points_give_no_consensus(n: int) -> None:
     p = scene(n, 8)
-    rng = np.random.default_rng(0)
-    assert rigid_consensus(CAMERA, p, pixels(T_TRUE, p, 9), np.eye(4), None, None, rng, SETTINGS) is None
+    assert rigid_consensus(vote(), p, pixels(T_TRUE, p, 9), np.eye(4), None, None) is None
 
 
 def test_scattered_pixels_give_no_consensus() -> None:
     p = scene(100, 10)
     uv = np.random.default_rng(11).uniform([0, 0], [1242, 375], (100, 2))
-    assert rigid_consensus(CAMERA, p, uv, np.eye(4), None, None, np.random.default_rng(0), SETTINGS) is None
+    assert rigid_consensus(vote(), p, uv, np.eye(4), None, None) is None
 
 
 def crossing_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
@@ -86,7 +98,7 @@ def crossing_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
 def test_a_crossing_truck_wins_the_vote_when_nothing_is_predicted() -> None:
     """Shows that the trap is real: the next test would pass for free otherwise."""
     p, uv, truck = crossing_truck()
-    found = rigid_consensus(CAMERA, p, uv, np.eye(4), None, None, np.random.default_rng(0), SETTINGS)
+    found = rigid_consensus(vote(), p, uv, np.eye(4), None, None)
     assert found is not None
     assert found.inliers[truck].mean() > 0.9
 
@@ -104,7 +116,7 @@ def test_a_prediction_frees_the_consensus_from_a_truck(turning: bool, predicted:
     p, uv, truck = turning_truck() if turning else crossing_truck()
     R_prior = None if predicted == "motion" else np.eye(3)
     T_prior = None if predicted == "rotation" else se3_exp([0.05, 0.0, -0.1, 0.0, 0.002, 0.0])
-    found = rigid_consensus(CAMERA, p, uv, np.eye(4), R_prior, T_prior, np.random.default_rng(0), SETTINGS)
+    found = rigid_consensus(vote(), p, uv, np.eye(4), R_prior, T_prior)
     assert found is not None
     if predicted == "rotation" and not turning:
         # A truck that only slides sideways contradicts no rotation; known limit.
@@ -118,9 +130,7 @@ def test_a_prediction_frees_the_consensus_from_a_truck(turning: bool, predicted:
 def test_a_wrong_predicted_rotation_does_not_win_against_all_points() -> None:
     p = scene(200, 17)
     wrong = se3_exp([0.0, 0.0, 0.0, 0.0, 0.1, 0.0])[:3, :3]
-    found = rigid_consensus(
-        CAMERA, p, pixels(T_TRUE, p, 18), np.eye(4), wrong, None, np.random.default_rng(0), SETTINGS
-    )
+    found = rigid_consensus(vote(), p, pixels(T_TRUE, p, 18), np.eye(4), wrong, None)
     assert found is not None
     assert found.inliers.mean() > 0.99
 
@@ -129,7 +139,7 @@ def test_a_wrong_predicted_motion_does_not_win_against_all_points() -> None:
     p = scene(200, 17)
     wrong = se3_exp([0.5, 0.0, 0.0, 0.0, 0.1, 0.0])
     uv = pixels(T_TRUE, p, 18)
-    found = rigid_consensus(CAMERA, p, uv, np.eye(4), None, wrong, np.random.default_rng(0), SETTINGS)
+    found = rigid_consensus(vote(), p, uv, np.eye(4), None, wrong)
     assert found is not None
     assert found.inliers.mean() > 0.99
 
@@ -142,11 +152,11 @@ def test_points_behind_the_camera_are_infinitely_wrong() -> None:
 
 def test_fit_recovers_a_motion_from_predicted_pixels() -> None:
     p = scene(50, 20)
-    T = fit_motion(CAMERA, p, pixels(T_TRUE, p, 21, noise=0.0), np.eye(4), SETTINGS)
+    T = fit_motion(CAMERA, p, pixels(T_TRUE, p, 21, noise=0.0), np.eye(4), LIMIT_PX)
     assert T is not None
     np.testing.assert_allclose(T, T_TRUE, atol=1e-6)
-    assert fit_motion(CAMERA, p[:5], np.zeros((5, 2)), np.eye(4), SETTINGS) is None
-    assert fit_motion(CAMERA, p, np.full((50, 2), np.nan), np.eye(4), SETTINGS) is None
+    assert fit_motion(CAMERA, p[:5], np.zeros((5, 2)), np.eye(4), LIMIT_PX) is None
+    assert fit_motion(CAMERA, p, np.full((50, 2), np.nan), np.eye(4), LIMIT_PX) is None
 
 
 def test_epipolar_distance_is_zero_at_any_allowed_depth_and_grows_across_the_line() -> None:
@@ -195,7 +205,7 @@ def two_views(T: FloatArray, seed: int, share: float, noise: float = 0.2) -> tup
 
 
 def agreeing(before: FloatArray, after: FloatArray, R_prior: FloatArray | None, seed: int = 0) -> np.ndarray | None:
-    return bearing_consensus(CAMERA, before, after, np.eye(3), R_prior, np.random.default_rng(seed), SETTINGS)
+    return bearing_consensus(vote(seed), before, after, np.eye(3), R_prior)
 
 
 @pytest.mark.parametrize("prior_error_deg", [None, 0.0, 1.0, 5.0])
@@ -221,8 +231,8 @@ def test_two_views_tell_outliers_and_lose_no_good_track(name: str, share: float,
 def test_a_known_rotation_takes_no_more_than_two_tracks_for_a_direction() -> None:
     """With the rotation at hand the direction is found among 45 % outliers from a handful of pairs."""
     before, after, bad = two_views(T_TRUE, 5, 0.45)
-    few = KltSettings(consensus_samples=12)
-    kept = bearing_consensus(CAMERA, before, after, np.eye(3), T_TRUE[:3, :3], np.random.default_rng(0), few)
+    few = vote(settings=ConsensusSettings(samples=12))
+    kept = bearing_consensus(few, before, after, np.eye(3), T_TRUE[:3, :3])
     assert kept is not None
     assert kept[~bad].mean() > 0.97
     assert kept[bad].mean() < 0.1
@@ -271,3 +281,26 @@ def test_a_predicted_rotation_frees_two_views_from_a_turning_truck(told: bool) -
     else:
         assert kept[~truck].mean() < 0.5
         assert kept[truck].mean() > 0.9
+
+
+# --- both in turn ---------------------------------------------------------------------------------------------------
+
+
+def test_depth_votes_where_there_is_enough_and_the_images_alone_where_not() -> None:
+    """With depth, tracks without it all stay; without, the two views drop what moves against the rest."""
+    before, after, bad = two_views(T_TRUE, 9, 0.3)
+    p = scene(300, 9)
+    deep = np.arange(300) % 2 == 0
+    kept, motion = static_tracks(vote(), before, p, deep, after, np.eye(4), None, None)
+    assert motion is not None
+    np.testing.assert_array_equal(kept[deep], motion.inliers)
+    assert not kept[deep & bad].any()
+    assert kept[~deep].all()
+    few = np.arange(300) < 5
+    kept, motion = static_tracks(vote(), before, p, few, after, np.eye(4), None, None)
+    assert motion is None
+    assert kept[bad].mean() < 0.15
+    assert kept[~bad].mean() > 0.97
+    kept, motion = static_tracks(vote(), before[:5], p[:5], few[:5], after[:5], np.eye(4), None, None)
+    assert motion is None
+    assert kept.all()  # too few to say anything: nothing is dropped

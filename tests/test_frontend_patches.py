@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -19,7 +17,7 @@ from frontend.detect import (
     noise_gradient,
 )
 from frontend.patches import inside
-from frontend.settings import KltSettings
+from frontend.settings import GridSettings, KltSettings
 from frontend.stereo_match import RowField, half_image, match_rows, row_correlation
 from vio.geometry.lie import FloatArray
 from vio.records import Image
@@ -218,10 +216,10 @@ HALF = half_image(PLAIN)
 
 
 def test_new_corners_go_where_tracks_are_missing() -> None:
-    settings = KltSettings(target_features=120)
-    left_side = detect_corners(HALF, np.zeros((0, 2)), 120, settings)
+    grid = GridSettings(target_features=120)
+    left_side = detect_corners(HALF, np.zeros((0, 2)), 120, grid, KltSettings())
     left_side = left_side[left_side[:, 0] < 150]
-    new = detect_corners(HALF, left_side, 30, settings)
+    new = detect_corners(HALF, left_side, 30, grid, KltSettings())
     assert len(new) == 30
     assert np.mean(new[:, 0] > 150) > 0.9
 
@@ -232,7 +230,7 @@ def test_corners_lie_where_the_image_has_them() -> None:
     for v in range(30, 170, 50):
         for u in range(30, 270, 60):
             image[v : v + 20, u : u + 24] = 200
-    found = detect_corners(half_image(image), np.zeros((0, 2)), 200, KltSettings(target_features=200))
+    found = detect_corners(half_image(image), np.zeros((0, 2)), 200, GridSettings(target_features=200), KltSettings())
     true = np.array(
         [
             [u + a, v + b]
@@ -250,7 +248,7 @@ def test_corners_lie_where_the_image_has_them() -> None:
 def test_no_corner_lies_where_the_mask_forbids_it() -> None:
     allowed = np.ones(HALF.shape, dtype=np.bool_)
     allowed[:, :75] = False
-    found = detect_corners(HALF, np.zeros((0, 2)), 200, KltSettings(), allowed)
+    found = detect_corners(HALF, np.zeros((0, 2)), 200, GridSettings(), KltSettings(), allowed)
     assert len(found) > 20
     assert found[:, 0].min() >= 149.0
 
@@ -260,25 +258,25 @@ def test_a_weak_corner_beside_a_strong_one_is_not_taken() -> None:
     image[60:80, 60:80] = 250
     image[60:80, 100:120] = 75
     nothing = np.zeros((0, 2))
-    wide = KltSettings(target_features=4, min_distance=0.05)  # one cell is nearly half of the image
-    strict = detect_corners(half_image(image), nothing, 50, wide)
-    loose = detect_corners(half_image(image), nothing, 50, replace(wide, min_relative_gradient=0.0))
+    wide = GridSettings(target_features=4, min_distance=0.05)  # one cell is nearly half of the image
+    strict = detect_corners(half_image(image), nothing, 50, wide, KltSettings())
+    loose = detect_corners(half_image(image), nothing, 50, wide, KltSettings(min_relative_gradient=0.0))
     assert np.abs(strict - [70, 70]).max(axis=1).max() < 16
     assert np.mean(np.abs(loose - [110, 70]).max(axis=1) < 16) > 0.3
 
 
 def test_nothing_wanted_or_a_tiny_image_gives_no_corners() -> None:
-    assert detect_corners(HALF, POINTS, 0, KltSettings()).shape == (0, 2)
-    assert detect_corners(HALF[:10, :10], np.zeros((0, 2)), 10, KltSettings()).shape == (0, 2)
+    assert detect_corners(HALF, POINTS, 0, GridSettings(), KltSettings()).shape == (0, 2)
+    assert detect_corners(HALF[:10, :10], np.zeros((0, 2)), 10, GridSettings(), KltSettings()).shape == (0, 2)
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 360), (752, 480), (1242, 375)])
 def test_one_set_of_defaults_scales_with_the_image(width: int, height: int) -> None:
-    settings = KltSettings()
-    rows, columns = grid_shape(width, height, settings)
-    assert rows * columns * settings.cell_features == pytest.approx(settings.target_features, rel=0.15)
+    grid = GridSettings()
+    rows, columns = grid_shape(width, height, grid)
+    assert rows * columns * grid.cell_features == pytest.approx(grid.target_features, rel=0.15)
     assert 0.75 < (width / columns) / (height / rows) < 1.35
-    assert min_distance_px(width, height, settings) < 0.5 * feature_spacing(width, height, settings)
+    assert min_distance_px(width, height, grid) < 0.5 * feature_spacing(width, height, grid)
     corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
     np.testing.assert_array_equal(cell_index(corners, width, height, (rows, columns)), [0, rows * columns - 1])
 
@@ -304,7 +302,7 @@ def test_noise_in_the_dark_gives_hardly_a_corner() -> None:
     """The threshold sinks with the noise, but stays above what noise makes of itself."""
     for sigma in (0.5, 1.5, 3.0):
         half = half_image(noisy(8, sigma, 2))
-        assert len(detect_corners(half, np.zeros((0, 2)), 1000, KltSettings())) <= 3
+        assert len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings(), KltSettings())) <= 3
         loose = KltSettings(min_gradient_over_noise=1.0)
-        found = len(detect_corners(half, np.zeros((0, 2)), 1000, loose))
+        found = len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings(), loose))
         assert found > (30 if sigma > 1 else 3)  # the setting is what keeps them away

@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from frontend import FrontendSettings, KltSettings, MatchSettings, build_frontend
+from frontend import FrontendSettings, build_frontend
 from frontend.frames import usable_prior
 from frontend.outliers import pixel_errors, predicted_motion, rigid_consensus
-from tests.test_frontend_outliers import CAMERA, T_TRUE, pixels, scene
+from frontend.settings import ConsensusSettings, GridSettings, MatchSettings
+from tests.test_frontend_outliers import CAMERA, T_TRUE, pixels, scene, vote
 from tools.frontend_accuracy import accuracy_scenario
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse
@@ -23,9 +24,7 @@ from vio.sim.sequence import SimulatedRecording, Simulation, views
 FRAMES = 7
 NOISE_PX = 0.7
 OFF_PX = 30.0
-SETTINGS = FrontendSettings(
-    klt=KltSettings(target_features=150), match=MatchSettings(target_features=150, max_keypoints=400)
-)
+SETTINGS = FrontendSettings(grid=GridSettings(target_features=150), match=MatchSettings(max_keypoints=400))
 NAMES = ["klt", "orb", "sift"]
 
 Spoil = Callable[[TrackPrior, np.random.Generator], TrackPrior]
@@ -185,25 +184,24 @@ def test_only_the_usable_part_of_a_prior_is_used() -> None:
 
 
 def test_the_expected_motion_stands_for_predicted_pixels_near_it() -> None:
-    settings = KltSettings()
     p = scene(300, 30)
     near = se3_exp([0.01, 0.0, -0.02, 0.0, 0.0005, 0.0]) @ T_TRUE
     uv = pixels(T_TRUE, p, 31, noise=0.0)
-    assert predicted_motion(CAMERA, p, uv, near, settings) is near
+    assert predicted_motion(CAMERA, p, uv, near) is near
     hard_turn = se3_exp([0.1, 0.0, -0.3, 0.0, 0.2, 0.05])
     for T in (T_TRUE, hard_turn):  # from far away it is a start near the truth, to be refined on the tracks
-        far = predicted_motion(CAMERA, p, pixels(T, p, 31, noise=0.0), np.eye(4), settings)
+        far = predicted_motion(CAMERA, p, pixels(T, p, 31, noise=0.0), np.eye(4))
         assert far is not None
         assert np.median(pixel_errors(CAMERA, far, p, pixels(T, p, 31, noise=0.0))) < 2.0
     scattered = np.random.default_rng(36).uniform([0, 0], [1242, 375], (300, 2))
-    assert predicted_motion(CAMERA, p, scattered, np.eye(4), settings) is None
-    assert predicted_motion(CAMERA, p[:5], uv[:5], near, settings) is None
+    assert predicted_motion(CAMERA, p, scattered, np.eye(4)) is None
+    assert predicted_motion(CAMERA, p[:5], uv[:5], near) is None
 
 
 @pytest.mark.parametrize("share", [0.5, 0.65, 0.75])
 def test_a_prior_wins_against_a_truck_of_any_size_that_leaves_it_enough_points(share: float) -> None:
     """With a needed support of 30 %, a third of the truck's own points is enough."""
-    settings = KltSettings(prior_min_support=0.3)
+    settings = ConsensusSettings(prior_min_support=0.3)
     wall, truck = scene(200, 32, (15.0, 40.0)), scene(200, 33, (7.0, 8.0))
     still, passing = round(200 * (1 - share)), round(200 * share)
     p = np.concatenate([wall[:still], truck[:passing]])
@@ -212,7 +210,7 @@ def test_a_prior_wins_against_a_truck_of_any_size_that_leaves_it_enough_points(s
     )
     predicted = se3_exp([0.05, 0.0, -0.1, 0.0, 0.002, 0.0])
     for R_prior, T_prior in ((np.eye(3), None), (None, predicted)):
-        found = rigid_consensus(CAMERA, p, uv, np.eye(4), R_prior, T_prior, np.random.default_rng(0), settings)
+        found = rigid_consensus(vote(settings=settings), p, uv, np.eye(4), R_prior, T_prior)
         assert found is not None
         assert found.inliers[:still].mean() > 0.95
         assert not found.inliers[still:].any()

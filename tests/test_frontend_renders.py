@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from frontend import FrontendSettings, KltSettings, build_frontend
+from frontend import FrontendSettings, build_frontend
+from frontend.settings import GridSettings
 from tools.frontend_accuracy import Tally, accuracy_scenario, figures, judge
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import se3_from_parts
@@ -54,7 +55,7 @@ class Case:
 
 def run(simulation: Simulation, frames: list[StereoFrame]) -> Case:
     recording = SimulatedRecording(simulation)
-    settings = FrontendSettings(klt=KltSettings(target_features=FEATURES))
+    settings = FrontendSettings(grid=GridSettings(target_features=FEATURES))
     recorder = Recorder(build_frontend("klt", rectified_camera(simulation.rig), settings, recording))
     tally = judge(simulation, frames, recorder)
     return Case(simulation, frames, recorder.outputs, tally, figures(tally))

@@ -27,7 +27,6 @@ import numpy as np
 
 from frontend import build_frontend
 from frontend.outliers import fit_motion, pixel_errors
-from frontend.settings import KltSettings
 from vio.config import load_config
 from vio.datasets import open_dataset
 from vio.datasets.images import load_gray
@@ -371,10 +370,13 @@ def _rows(ids: Any, later: Any) -> tuple[BoolArray, Any]:
     return later[row] == ids, row
 
 
+_FIT_PX = 1.0  # distance from where the fitted motion puts a feature, beyond which it counts little
+
+
 def _rigid_figures(clip: Clip, seen: list[Observations]) -> dict[str, Any]:
     """Reprojection of stereo points into the next frame, under a motion fitted to each pair and under the truth."""
     assert clip.poses is not None
-    settings, fitted, raw = KltSettings(), [], []
+    fitted, raw = [], []
     for k in range(len(seen) - 1):
         stereo = seen[k].take(seen[k].has_right)
         found, row = _rows(stereo.ids, seen[k + 1].ids)
@@ -382,7 +384,7 @@ def _rigid_figures(clip: Clip, seen: list[Observations]) -> dict[str, Any]:
         used = found & valid
         pixels = seen[k + 1].z[row[used], :2]
         T_true = se3_inverse(clip.poses[k + 1]) @ clip.poses[k]
-        T = fit_motion(clip.camera, p[used], pixels, T_true, settings)
+        T = fit_motion(clip.camera, p[used], pixels, T_true, _FIT_PX)
         raw.append(pixel_errors(clip.camera, T_true, p[used], pixels))
         if T is not None:
             fitted.append(pixel_errors(clip.camera, T, p[used], pixels))

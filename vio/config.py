@@ -78,7 +78,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     return config
 
 
-def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: str = "") -> _Section:
+def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: str = "", root: Any = None) -> _Section:
     """Return a copy of a section with some settings replaced.
 
     Args:
@@ -86,24 +86,26 @@ def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: s
         values: deviations, nested by section.
         where: the source of the values, for messages.
         prefix: the path of the section, ending in a dot, for messages.
+        root: the whole that the section is a part of, for messages; None: the section itself.
 
     Raises:
         ConfigError: a key is unknown, or a value has the wrong type or is out of range.
     """
     hints = get_type_hints(type(section))
+    root = section if root is None else root
     names = [f.name for f in fields(section)]  # type: ignore[arg-type]
     changes: dict[str, Any] = {}
     for key, value in values.items():
         path = f"{prefix}{key}"
         if key not in names:
-            raise ConfigError(f"{where}: unknown setting '{path}'{_suggestion(str(key), names, prefix)}")
+            raise ConfigError(f"{where}: unknown setting '{path}'{_suggestion(str(key), names, prefix, root)}")
         current = getattr(section, key)
         if is_dataclass(current):
             if not isinstance(value, Mapping):
                 raise ConfigError(
                     f"{where}: '{path}' is a section; give its settings, such as {path}.{_first(current)}"
                 )
-            changes[key] = merge(current, value, where=where, prefix=f"{path}.")
+            changes[key] = merge(current, value, where=where, prefix=f"{path}.", root=root)
         else:
             changes[key] = _checked(value, hints[key], path, where)
     try:
@@ -215,9 +217,18 @@ def _type_name(hint: Any) -> str:
     )
 
 
-def _suggestion(key: str, names: Sequence[str], prefix: str) -> str:
-    near = difflib.get_close_matches(key, names, 1, cutoff=0.4)
-    return f"; did you mean '{prefix}{near[0]}'?" if near else f"; valid here: {', '.join(prefix + n for n in names)}"
+def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
+    """Name the setting that was probably meant: the same one in a sister section, a similar one here, or any namesake.
+
+    A name may be split over section and setting: `consensus_samples` is `consensus.samples`.
+    """
+    namesakes = [row.key for row in describe(root) if f".{row.key}".replace(".", "_").endswith(f"_{key}")]
+    sisters = [name for name in namesakes if name.startswith(prefix[: prefix.find(".") + 1])]
+    similar = [prefix + name for name in difflib.get_close_matches(key, names, 1, cutoff=0.4)]
+    for found in (sisters, similar, namesakes):
+        if found:
+            return f"; did you mean '{found[0]}'?"
+    return f"; valid here: {', '.join(prefix + name for name in names)}"
 
 
 def _first(section: Any) -> str:
