@@ -1,0 +1,149 @@
+"""Break the code on purpose, one line at a time, and name the test that notices.
+
+    python tools/mutate.py [WORD …] [--list]
+
+Each mutation of `tools/mutations.py` (with WORDs, those whose name or file contains one) is applied to a copy of the
+repository, and its test files run there until the first failure. The table says which test that was. A mutation that
+no test notices is a survivor: the exit status is then 1, and a test is missing. At the end the tests that caught
+something run on an unchanged copy, where all must pass. Recordings are taken from VIO_DATA.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+if __package__:
+    from tools.mutations import MUTATIONS, Mutation
+else:
+    from mutations import MUTATIONS, Mutation
+
+ROOT = Path(__file__).resolve().parent.parent
+_COPIED = ("configs", "docs", "frontend", "tests", "tools", "vio", "Makefile", "README.md", "pyproject.toml")
+_MOST_S = 900.0
+# The warning: hypothesis is imported before pytest here.
+_PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+
+
+class MutationError(Exception):
+    """The list or the repository is not fit for mutations; the message says what to mend."""
+
+
+def mutated(mutation: Mutation, text: str) -> str:
+    """Return the text of the mutation's file with the mistake in it.
+
+    Raises:
+        MutationError: the text to replace is not there, or not only once.
+    """
+    count = text.count(mutation.old)
+    if count != 1:
+        raise MutationError(
+            f"{mutation.name!r}: {mutation.old!r} occurs {count} times in {mutation.file}; mend tools/mutations.py"
+        )
+    return text.replace(mutation.old, mutation.new)
+
+
+@contextmanager
+def repository_copy() -> Iterator[Path]:
+    """A copy of the code, the tests, and what they read, gone at the end."""
+    with tempfile.TemporaryDirectory(prefix="vio-mutant-") as folder:
+        for name in _COPIED:
+            source = ROOT / name
+            if source.is_dir():
+                shutil.copytree(source, Path(folder, name), ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                shutil.copy2(source, Path(folder, name))
+        yield Path(folder)
+
+
+def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str], float]:
+    """Run tests in a copy; return the ids of those that failed, and the seconds it took.
+
+    Raises:
+        MutationError: the copy is not what is imported, or pytest could not run.
+    """
+    data = os.environ.get("VIO_DATA", str(ROOT.parent / "shared" / "data"))
+    environment = {**os.environ, "PYTHONPATH": str(copy), "VIO_DATA": data}
+    # The process that tests says which packages it would test. Examples are the same each time, and not simplified.
+    code = (
+        "import frontend, pytest, sys, vio; from hypothesis import Phase, settings; "
+        "settings.register_profile('once', phases=[Phase.explicit, Phase.generate], derandomize=True); "
+        "settings.load_profile('once'); print(vio.__file__, frontend.__file__); "
+        f"sys.exit(pytest.main({[*_PYTEST, *options, *tests]!r}))"
+    )
+    begin = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=copy,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=_MOST_S,
+    )
+    seconds = time.perf_counter() - begin
+    imported = done.stdout.partition("\n")[0].split()
+    if len(imported) != 2 or not all(Path(file).is_relative_to(copy) for file in imported):
+        raise MutationError(f"{' '.join(imported) or done.stderr.strip()[-300:]} was imported instead of {copy}")
+    failed = re.findall(r"^(?:FAILED|ERROR) (tests/\S+?::.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
+    if done.returncode not in (0, 1) or (done.returncode == 1) != bool(failed):
+        raise MutationError(f"pytest ended with status {done.returncode}: {(done.stdout + done.stderr).strip()[-900:]}")
+    return failed, seconds
+
+
+def main() -> int:
+    """Run the mutations and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("words", nargs="*", metavar="WORD", help="only mutations whose name or file contains it")
+    parser.add_argument("--list", action="store_true", help="name the mutations and change nothing")
+    args = parser.parse_args()
+    chosen = [m for m in MUTATIONS if not args.words or any(w in f"{m.name} {m.file}" for w in args.words)]
+    if not chosen:
+        parser.error("no mutation has such a name or file; see --list")
+    if args.list:
+        print("\n".join(f"{m.file}: {m.name}" for m in chosen))
+        return 0
+    try:
+        return _run(chosen)
+    except MutationError as error:
+        print("error:", error, file=sys.stderr)
+        return 2
+
+
+def _run(chosen: Sequence[Mutation]) -> int:
+    for mutation in chosen:  # a list that has rotted is told before an hour is spent
+        mutated(mutation, (ROOT / mutation.file).read_text(encoding="utf-8"))
+    print("| mutation | file | caught by | s |\n|---|---|---|---:|", flush=True)
+    caught, survivors = set[str](), list[str]()
+    for mutation in chosen:
+        with repository_copy() as copy:
+            file = copy / mutation.file
+            file.write_text(mutated(mutation, file.read_text(encoding="utf-8")), encoding="utf-8")
+            failed, seconds = run_tests(copy, mutation.tests, "-x")
+        caught.update(failed)
+        if not failed:
+            survivors.append(mutation.name)
+        by = f"`{failed[0].removeprefix('tests/')}`" if failed else "**nothing**"
+        print(f"| {mutation.name} | `{mutation.file}` | {by} | {seconds:.0f} |", flush=True)
+    print(f"\n{len(chosen)} mutations, {len(survivors)} survived" + "".join(f"\n- {name}" for name in survivors))
+    if caught:
+        with repository_copy() as copy:
+            failed, _ = run_tests(copy, sorted(caught))
+        if failed:
+            print("these fail without any mutation: " + ", ".join(failed))
+            return 1
+        print(f"the {len(caught)} tests that caught them pass on the unchanged code")
+    return 1 if survivors else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
