@@ -1,6 +1,6 @@
 """Break the code on purpose, one line at a time, and name the test that notices.
 
-    python tools/mutate.py [WORD …] [--list]
+    python -m tools.mutate [WORD …] [--list]
 
 Each mutation of `tools/mutations.py` (with WORDs, those whose name or file contains one) is applied to a copy of the
 repository, and its test files run there until the first failure. The table says which test that was. A mutation that
@@ -22,10 +22,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-if __package__:
-    from tools.mutations import MUTATIONS, Mutation
-else:
-    from mutations import MUTATIONS, Mutation
+from tools.mutations import MUTATIONS, Mutation
 
 ROOT = Path(__file__).resolve().parent.parent
 _COPIED = ("configs", "docs", "frontend", "tests", "tools", "vio", "Makefile", "README.md", "pyproject.toml")

@@ -348,7 +348,7 @@ MUTATIONS = (
     ),
     Mutation(
         "filter: chi-square gate inverted",
-        "vio/filters/msckf.py",
+        "vio/filters/window_tracks.py",
         "passed: BoolArray = squares <= limit",
         "passed: BoolArray = squares >= limit",
         _WINDOW,
@@ -383,7 +383,7 @@ MUTATIONS = (
     ),
     Mutation(
         "filter: pixel noise runs away from the residuals",
-        "vio/filters/msckf.py",
+        "vio/filters/window_tracks.py",
         "ratio**_NOISE_GAIN",
         "ratio**-_NOISE_GAIN",
         _WINDOW,
@@ -418,14 +418,14 @@ MUTATIONS = (
     ),
     Mutation(
         "calibration: correction on the camera's side",
-        "vio/filters/extrinsics.py",
+        "vio/filters/online_calibration.py",
         "self.T_cam0_imu @ se3_exp(full[:6])",
         "se3_exp(full[:6]) @ self.T_cam0_imu",
         _CALIBRATE,
     ),
     Mutation(
         "calibration: sign of the clock's lever",
-        "vio/filters/extrinsics.py",
+        "vio/filters/online_calibration.py",
         "A @ twists[..., None]",
         "-A @ twists[..., None]",
         _CALIBRATE,
@@ -433,21 +433,21 @@ MUTATIONS = (
     # --- vio/filters: the paper's filter ---
     Mutation(
         "paper: right Jacobian for the left in the twist's step",
-        "vio/filters/motion.py",
+        "vio/filters/vislam_motion.py",
         "-tau_s * se3_left_jacobian(-tau_s * u)",
         "-tau_s * se3_left_jacobian(tau_s * u)",
         _PAPER,
     ),
     Mutation(
         "paper: sign of a correlation in the twist's noise",
-        "vio/filters/motion.py",
+        "vio/filters/vislam_motion.py",
         "[-Q * tau_s**2 / 2, Q * tau_s]",
         "[Q * tau_s**2 / 2, Q * tau_s]",
         _PAPER,
     ),
     Mutation(
         "paper: velocities' noise as if it were white",
-        "vio/filters/motion.py",
+        "vio/filters/vislam_motion.py",
         "(sigmas * part_s) ** 2",
         "sigmas**2 * part_s",
         _PAPER,
