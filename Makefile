@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint unit clean constraints
+.PHONY: demo test lint unit coverage mutations clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -21,6 +21,14 @@ lint: $(TESTED)
 
 unit: $(TESTED)
 	$(BIN)/python -m pytest
+
+# All tests again, with the lines of vio/ and frontend/ that they reach; LEARNED=1 counts the learned front ends in.
+coverage: $(TESTED)
+	$(BIN)/python -m pytest --cov --cov-report=term --cov-fail-under=90
+
+# Break the code on purpose, a line at a time: some test must fail each time (half an hour).
+mutations: $(TESTED)
+	$(BIN)/python -m tools.mutate
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
