@@ -17,6 +17,14 @@ FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py"
 KNOW_BOTH = {"vio.config", "vio.pipeline", "vio.sim.oracle"}
 # Modules of the estimator: numbers in, numbers out.
 ESTIMATOR = ("vio.filters", "vio.geometry", "vio.records", "vio.selectors", "vio.protocols", "vio.evaluation")
+# What a part must not know, lower parts first; the command line, which nothing may know, is held apart.
+_ABOVE_READERS = ("vio.config", "vio.pipeline", "vio.filters", "vio.mapping", "vio.colmap", "vio.run_folder")
+MUST_NOT_KNOW = {
+    "vio.robust": ("vio.records", "vio.calibration"),
+    "vio.calibration": ("vio.datasets", *_ABOVE_READERS),
+    "vio.datasets": _ABOVE_READERS,
+    "frontend": ("vio.pipeline", "vio.filters", "vio.run_folder"),
+}
 
 
 def _name(file: Path) -> str:
@@ -38,6 +46,16 @@ def _heads(file: Path, *, top_level_only: bool) -> set[str]:
     return {name.split(".")[0] for name in _imports(file, top_level_only=top_level_only)}
 
 
+def _within(name: str, part: str) -> bool:
+    return name == part or name.startswith(f"{part}.")
+
+
+def test_parts_that_must_not_know_others_exist() -> None:
+    names = [_name(file) for file in FILES]
+    parts = {*MUST_NOT_KNOW, *(other for others in MUST_NOT_KNOW.values() for other in others)}
+    assert {part for part in parts if not any(_within(name, part) for name in names)} == set()
+
+
 @pytest.mark.parametrize("file", FILES, ids=_name)
 def test_imports_go_one_way(file: Path) -> None:
     name = _name(file)
@@ -47,9 +65,9 @@ def test_imports_go_one_way(file: Path) -> None:
         assert not forbidden & {i.split(".")[0] for i in everything}
     if name.startswith("vio") and not name.startswith("vio.cli") and name not in KNOW_BOTH:
         assert not any(i.split(".")[0] == "frontend" for i in everything), "only the pipeline knows the front end"
-    if name.startswith("frontend"):
-        beyond = {i for i in everything if i.startswith(("vio.pipeline", "vio.cli", "vio.filters", "vio.run_folder"))}
-        assert not beyond, "the front end knows records and geometry only"
+    for part, others in MUST_NOT_KNOW.items():
+        if _within(name, part):
+            assert not {i for i in everything for other in others if _within(i, other)}, f"{part} lies below these"
     if not name.startswith(("vio.cli", "vio.__main__")):
         assert not any(i.startswith("vio.cli") for i in everything), "nothing knows the command line"
     assert "torch" not in _heads(file, top_level_only=True) or name == "frontend.learned"

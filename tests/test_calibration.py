@@ -7,32 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vio.calibration import (
-    CameraMotion,
-    ImuAlignment,
-    LeverArm,
-    NotObservable,
+from vio.calibration.egomotion import CameraMotion, camera_motion
+from vio.calibration.findings import NotObservable
+from vio.calibration.gyro import ImuAlignment, align_gyro, rates_of
+from vio.calibration.levers import LeverArm, lever_arm
+from vio.calibration.stereo import (
     RayMatches,
     StereoEstimate,
-    align_gyro,
-    camera_motion,
     combine_stereo,
     epipolar_angles,
     join_matches,
-    judge_exchange,
-    judge_imu,
-    judge_stereo,
-    lever_arm,
-    rates_of,
     refine_stereo,
     row_residuals,
 )
-from vio.datasets.tracks import FeatureTracks
+from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo
 from vio.errors import EstimationError
 from vio.evaluation import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import StereoCamera
-from vio.records import ImuSample
+from vio.records import ImuSample, feature_tracks
 from vio.sim.imu import ImuNoise, simulate_imu
 from vio.sim.motion import MotionSpline, evaluate, hand_held
 
@@ -281,13 +274,7 @@ def test_one_axis_of_turning_leaves_the_rotation_about_it_open() -> None:
 
 
 def test_no_tracks_no_motion_and_no_sensor_no_rates() -> None:
-    none = FeatureTracks(
-        np.zeros(6, dtype=np.int64),
-        np.zeros(0, dtype=np.int64),
-        np.zeros((0, 4)),
-        np.zeros(0, dtype=np.bool_),
-        np.zeros(0, dtype=np.bool_),
-    )
+    none = feature_tracks({}, 5)
     found = camera_motion(StereoCamera(400, 400, 320, 240, 0.1), none, np.arange(5) * 1_000_000_000)
     assert isinstance(found, NotObservable)
     assert "1 s apart" in found.because

@@ -20,15 +20,16 @@ from tests.dataset_makers import (
     make_drive,
     make_npz,
 )
+from vio.calibration.egomotion import stereo_twists
 from vio.datasets.common import read_npz
 from vio.datasets.ece276a import read_ece276a
-from vio.datasets.egomotion import stereo_twists
 from vio.datasets.features import FeatureDataset
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tracks import FeatureTracks, moving_frames, tracks_from_dense
+from vio.datasets.tracks import moving_frames, tracks_from_dense
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.records import FeatureTracks
 from vio.trajectory_io import read_trajectory
 
 Arrays = dict[str, np.ndarray]

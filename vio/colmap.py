@@ -18,7 +18,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from vio.calibration import RayMatches
+from vio.calibration.stereo import RayMatches
 from vio.errors import DataError, EstimationError, MissingDependencyError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera

@@ -18,13 +18,15 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from vio.calibration import CameraMotion, ImuAlignment, LeverArm, NotObservable, Rates, judge_imu, lever_arm
-from vio.datasets.egomotion import stereo_twists
-from vio.datasets.tracks import FeatureTracks
+from vio.calibration.egomotion import CameraMotion, stereo_twists
+from vio.calibration.findings import NotObservable
+from vio.calibration.gyro import ImuAlignment, Rates
+from vio.calibration.levers import LeverArm, lever_arm
+from vio.calibration.verdicts import judge_imu
 from vio.evaluation import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_exp, so3_exp
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, ImuSample, IntArray, Observations
+from vio.records import BoolArray, ImuSample, IntArray, Observations, feature_tracks
 
 log = logging.getLogger(__name__)
 
@@ -247,13 +249,7 @@ class _Camera:
         if len(self._kept) < 2:
             return None
         kept, links = self._kept, np.array(self._links)
-        tracks = FeatureTracks(
-            np.concatenate([[0], np.cumsum([len(o) for o in kept])]).astype(np.int64),
-            np.concatenate([o.ids for o in kept]),
-            np.concatenate([o.z for o in kept]),
-            np.concatenate([o.has_right for o in kept]),
-            np.concatenate([o.stale for o in kept]),
-        )
+        tracks = feature_tracks(dict(enumerate(kept)), len(kept))
         times_ns = np.array([o.time_ns for o in kept], dtype=np.int64)
         found = stereo_twists(self._camera, tracks, times_ns, np.array(self._guess))
         good = (links[found.frames] >= _LEAST_LINKS) & (np.diff(times_ns)[found.frames] * _NS < _LONGEST_INTERVAL_S)

@@ -7,7 +7,7 @@ adjuster or an exporter needs from a run's folder is prepared here, with numpy a
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,6 @@ from vio.datasets import open_dataset
 from vio.datasets.common import read_npz
 from vio.datasets.features import FeatureDataset
 from vio.datasets.observation_log import read_observation_log
-from vio.datasets.tracks import FeatureTracks
 from vio.errors import DataError, EstimationError, EvaluationError
 from vio.evaluation import align_poses, apply_alignment, evaluate, rotation_angle_deg
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_exp, se3_inverse, so3_hat, transform_points
@@ -26,10 +25,10 @@ from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
 from vio.records import (
     BoolArray,
     Estimate,
+    FeatureTracks,
     Image,
     IntArray,
     Landmarks,
-    Observations,
     Recording,
     StereoFrame,
     Trajectory,
@@ -580,21 +579,6 @@ def _against_reference(
     except EvaluationError:
         return None, None, None
     return ate, 1 / scale, of_run
-
-
-def joined_tracks(seen: Mapping[int, Observations], frames: int) -> FeatureTracks:
-    """The observations of some of `frames` frames, by frame number, as one table."""
-    counts = np.zeros(frames + 1, dtype=np.int64)
-    for k, o in seen.items():
-        counts[k + 1] = len(o)
-    parts = [seen[k] for k in sorted(seen)]
-    return FeatureTracks(
-        np.cumsum(counts),
-        np.concatenate([np.zeros(0, dtype=np.int64), *(o.ids for o in parts)]),
-        np.concatenate([np.zeros((0, 4)), *(o.z for o in parts)]),
-        np.concatenate([np.zeros(0, dtype=np.bool_), *(o.has_right for o in parts)]),
-        np.concatenate([np.zeros(0, dtype=np.bool_), *(o.stale for o in parts)]),
-    )
 
 
 def tracked_stretches(

@@ -6,6 +6,7 @@ everything else float64. Missing is `None` or a mask, never a special number.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -103,6 +104,42 @@ def observations(
     if len(np.unique(ids_)) != n:
         raise ValueError(f"frame {frame_index}: an id occurs twice among {n} observations")
     return Observations(int(frame_index), int(time_ns), ids_, z_, right, old)
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureTracks:
+    """The observations of all frames of a recording as one table, ordered by frame."""
+
+    offsets: IntArray  # (F + 1,) the rows of frame k are offsets[k]:offsets[k + 1]
+    ids: IntArray  # (R,)
+    z: FloatArray  # (R, 4) rectified pixels [ul vl ur vr]
+    has_right: BoolArray  # (R,) as in `Observations`
+    stale: BoolArray  # (R,) likewise
+
+    @property
+    def frames(self) -> IntArray:
+        """Frame number (R,) of each row."""
+        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
+
+    def at(self, frame: int, time_ns: int) -> Observations:
+        """The observations of one frame."""
+        rows = slice(self.offsets[frame], self.offsets[frame + 1])
+        return Observations(frame, time_ns, self.ids[rows], self.z[rows], self.has_right[rows], self.stale[rows])
+
+
+def feature_tracks(seen: Mapping[int, Observations], frames: int) -> FeatureTracks:
+    """Join the observations of some of `frames` frames, named by their numbers; the others show nothing."""
+    counts = np.zeros(frames + 1, dtype=np.int64)
+    for k, shown in seen.items():
+        counts[k + 1] = len(shown)
+    parts = [seen[k] for k in sorted(seen)]
+    return FeatureTracks(
+        np.cumsum(counts),
+        np.concatenate([np.zeros(0, dtype=np.int64), *(o.ids for o in parts)]),
+        np.concatenate([np.zeros((0, 4)), *(o.z for o in parts)]),
+        np.concatenate([np.zeros(0, dtype=np.bool_), *(o.has_right for o in parts)]),
+        np.concatenate([np.zeros(0, dtype=np.bool_), *(o.stale for o in parts)]),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,21 +10,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from vio.calibration import (
-        CameraMotion,
-        Finding,
-        ImuAlignment,
-        LeverArm,
-        NotObservable,
-        RayMatches,
-        RowResiduals,
-        StereoEstimate,
-    )
-    from vio.datasets.tracks import FeatureTracks
+    from vio.calibration.egomotion import CameraMotion
+    from vio.calibration.findings import Finding, NotObservable
+    from vio.calibration.gyro import ImuAlignment
+    from vio.calibration.levers import LeverArm
+    from vio.calibration.stereo import RayMatches, RowResiduals, StereoEstimate
     from vio.geometry.distortion import StereoRig
     from vio.geometry.lie import FloatArray
     from vio.protocols import Dataset
-    from vio.records import MotionSample, Recording
+    from vio.records import FeatureTracks, MotionSample, Recording
 
 MARKER = "calibration.json"
 _PAIRS = 30
@@ -160,7 +154,10 @@ def _raw_euroc(path: Path, refused: str) -> _Source | None:
 
 
 def _measure(source: _Source, pairs: int, frames: int, show: Callable[[int, int], None]) -> _Report:
-    from vio.calibration import NotObservable, RowResiduals, camera_motion, judge_exchange, judge_stereo, row_residuals
+    from vio.calibration.egomotion import camera_motion
+    from vio.calibration.findings import NotObservable
+    from vio.calibration.stereo import RowResiduals, row_residuals
+    from vio.calibration.verdicts import judge_exchange, judge_stereo
 
     notes = () if source.refused is None else (f"the reader refuses this calibration: {source.refused}",)
     tracks, samples = _tracks(source, frames) if not source.raw_pairs else (None, ())
@@ -194,7 +191,8 @@ def _measure(source: _Source, pairs: int, frames: int, show: Callable[[int, int]
 
 
 def _judged(source: _Source, stereo: StereoEstimate | NotObservable, matches: RayMatches) -> tuple[Finding, ...]:
-    from vio.calibration import NotObservable, judge_stereo
+    from vio.calibration.findings import NotObservable
+    from vio.calibration.verdicts import judge_stereo
 
     return () if isinstance(stereo, NotObservable) else judge_stereo(stereo, _given_baseline(source), matches)
 
@@ -207,7 +205,7 @@ def _stereo_in_motion(
     from dataclasses import replace
 
     from vio import colmap
-    from vio.calibration import combine_stereo
+    from vio.calibration.stereo import combine_stereo
     from vio.errors import EstimationError
     from vio.mapping import build_tracks, choose_keyframes, tracked_stretches
 
@@ -252,7 +250,7 @@ def _stereo_matches(
     import numpy as np
 
     from vio import colmap
-    from vio.calibration import join_matches
+    from vio.calibration.stereo import join_matches
     from vio.datasets.images import load_gray
     from vio.geometry.rectify import rectify_pixels
 
@@ -287,7 +285,7 @@ def _rays(rig: StereoRig, uv0: FloatArray, uv1: FloatArray, pair: int) -> tuple[
     """Rays of matched pixels of both cameras, and which of the matches have them."""
     import numpy as np
 
-    from vio.calibration import RayMatches
+    from vio.calibration.stereo import RayMatches
     from vio.geometry.distortion import unproject_pixel
 
     ray0, valid0 = unproject_pixel(rig.cam0, uv0)
@@ -300,7 +298,7 @@ def _track_matches(source: _Source, tracks: FeatureTracks, pairs: int) -> tuple[
     """The stereo rows of spread frames of a feature file."""
     import numpy as np
 
-    from vio.calibration import RayMatches
+    from vio.calibration.stereo import RayMatches
 
     assert source.dataset is not None
     camera = source.dataset.recording.camera
@@ -326,7 +324,8 @@ def _stereo_estimate(matches: RayMatches) -> tuple[StereoEstimate | NotObservabl
     import numpy as np
 
     from vio import colmap
-    from vio.calibration import NotObservable, epipolar_angles, refine_stereo, too_few
+    from vio.calibration.findings import NotObservable
+    from vio.calibration.stereo import epipolar_angles, refine_stereo, too_few
 
     if few := too_few(matches):
         return few, matches
@@ -367,8 +366,7 @@ def _tracks(
     from frontend import build_frontend
     from frontend.settings import FrontendSettings
     from vio.datasets.features import FeatureDataset
-    from vio.mapping import joined_tracks
-    from vio.records import Observations, StereoFrame
+    from vio.records import Observations, StereoFrame, feature_tracks
 
     dataset = source.dataset
     assert dataset is not None
@@ -385,7 +383,7 @@ def _tracks(
             show(len(seen), total)
         else:
             samples.append(event)
-    return joined_tracks(seen, len(recording.frame_times_ns)), tuple(samples)
+    return feature_tracks(seen, len(recording.frame_times_ns)), tuple(samples)
 
 
 def _measure_imu(
@@ -394,7 +392,10 @@ def _measure_imu(
     samples: tuple[MotionSample, ...],
     motion: CameraMotion | NotObservable,
 ) -> tuple[ImuAlignment | NotObservable, LeverArm | NotObservable, tuple[Finding, ...]]:
-    from vio.calibration import NotObservable, align_gyro, judge_imu, lever_arm, rates_of
+    from vio.calibration.findings import NotObservable
+    from vio.calibration.gyro import align_gyro, rates_of
+    from vio.calibration.levers import lever_arm
+    from vio.calibration.verdicts import judge_imu, judge_velocity_lever
 
     if not samples:
         why = "the recording holds no motion sensor"
@@ -409,37 +410,8 @@ def _measure_imu(
     given = recording.T_cam0_imu
     findings = () if given is None else judge_imu(imu, lever, given)
     if given is not None and not rates.inertial:
-        findings = (*findings, *_judge_velocity_lever(recording, tracks, samples))
+        findings = (*findings, *judge_velocity_lever(recording.camera, tracks, recording.frame_times_ns, rates, given))
     return imu, lever, findings
-
-
-def _judge_velocity_lever(
-    recording: Recording, tracks: FeatureTracks, samples: tuple[MotionSample, ...]
-) -> tuple[Finding, ...]:
-    """Say whether the translation of a recording with velocities is the camera's position in the IMU frame."""
-    import numpy as np
-
-    from vio.calibration import Finding, rates_of
-    from vio.datasets.egomotion import judge_levers
-
-    assert recording.T_cam0_imu is not None
-    R, t = recording.T_cam0_imu[:3, :3], recording.T_cam0_imu[:3, 3]
-    rates = rates_of(samples)
-    at, clock = recording.frame_times_ns, rates.times_ns
-    both = np.concatenate([rates.linear, rates.angular], axis=1)
-    velocities = np.stack([np.interp(at - at[0], clock - at[0], both[:, k]) for k in range(6)], axis=1)
-    verdict = judge_levers(recording.camera, tracks, at, velocities, R, (-R.T @ t, t))
-    if verdict.better != 1:
-        return ()
-    x, y, z = -R @ t
-    return (
-        Finding(
-            "IMU-camera translation inverted",
-            f"velocities and features place the camera at {verdict.place:+.2f} +- {verdict.place_sigma:.2f} between "
-            f"the position that the transform says (-1) and the one that its translation is in the IMU frame (+1); the "
-            f"translation must be -R t = ({x:.3f}, {y:.3f}, {z:.3f}) m",
-        ),
-    )
 
 
 # --- reporting ------------------------------------------------------------------------------------------------------
@@ -450,7 +422,7 @@ def _facts(report: _Report) -> dict[str, Any]:
 
     import numpy as np
 
-    from vio.calibration import NotObservable
+    from vio.calibration.findings import NotObservable
 
     def plain(record: Any) -> Any:
         if isinstance(record, NotObservable):
@@ -487,7 +459,9 @@ def _finite(values: Any) -> Any:
 def _table(report: _Report) -> list[tuple[str, str]]:
     import numpy as np
 
-    from vio.calibration import ImuAlignment, LeverArm, RowResiduals, StereoEstimate
+    from vio.calibration.gyro import ImuAlignment
+    from vio.calibration.levers import LeverArm
+    from vio.calibration.stereo import RowResiduals, StereoEstimate
     from vio.geometry.lie import so3_log
 
     rows: list[tuple[str, str]] = []
@@ -552,7 +526,9 @@ def _write_yaml(folder: Path, report: _Report) -> None:
     """Write the measured calibration, given values in place of what could not be observed, in both forms."""
     import numpy as np
 
-    from vio.calibration import ImuAlignment, LeverArm, StereoEstimate
+    from vio.calibration.gyro import ImuAlignment
+    from vio.calibration.levers import LeverArm
+    from vio.calibration.stereo import StereoEstimate
     from vio.datasets.euroc import camera_yaml
     from vio.datasets.rectified import RectifiedDataset
     from vio.geometry.lie import se3_from_parts, se3_inverse

@@ -5,7 +5,7 @@ Two generations of key names are read: `time_stamps features linear_velocity rot
 
 In the published files of the first kind `cam_T_imu` mixes two conventions: its rotation maps the IMU frame to the
 camera, but its translation is the camera's position in the IMU frame. The consistent transform has `t = -R t_file`.
-Nothing in the matrix itself betrays this, so the recording is asked: see `vio.datasets.egomotion.judge_levers`.
+Nothing in the matrix itself betrays this, so the recording is asked: see `vio.calibration.levers.judge_levers`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.calibration.levers import LeverVerdict, judge_levers
 from vio.datasets.common import checked_transform, clock_ns, read_npz, velocity_samples
-from vio.datasets.egomotion import LeverVerdict, judge_levers
 from vio.datasets.features import FeatureDataset
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
-from vio.datasets.tracks import FeatureTracks, moving_frames, settle_repeats, tracks_from_dense
+from vio.datasets.tracks import moving_frames, settle_repeats, tracks_from_dense
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
-from vio.records import IntArray, Recording
+from vio.records import FeatureTracks, IntArray, Recording
 
 OLD_KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
 NEW_KEYS = ("timestamps", "features", "v_t", "w_t", "K_l", "K_r", "extL_T_imu", "extR_T_imu")

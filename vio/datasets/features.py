@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.datasets.common import frame_range, merge_events
-from vio.datasets.tracks import FeatureTracks
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, Event, IntArray, MotionSample, Observations, Recording, StereoFrame
+from vio.records import BoolArray, Event, FeatureTracks, IntArray, MotionSample, Observations, Recording, StereoFrame
 
 
 @dataclass(frozen=True, slots=True)

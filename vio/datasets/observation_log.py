@@ -16,12 +16,12 @@ import numpy as np
 from vio.atomic import atomic_write_bytes
 from vio.datasets.common import checked_transform, read_npz
 from vio.datasets.features import FeatureDataset
-from vio.datasets.tracks import FeatureTracks
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import (
     BodyFrame,
+    FeatureTracks,
     ImuSample,
     IntArray,
     Landmarks,

@@ -20,7 +20,7 @@ import numpy as np
 from vio.datasets.settings import RepeatsMode
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, IntArray, Observations
+from vio.records import BoolArray, FeatureTracks, IntArray
 
 _MISSING = -1.0  # the files' code for "not seen"; it ends here
 _HALF_WINDOW = 5  # frames on each side over which a noisy velocity is averaged
@@ -28,27 +28,6 @@ _REST_MPS, _REST_RADPS = 0.05, 0.1  # slower than this counts as standing still
 _SIGNIFICANCE = 4.0  # standard errors by which an averaged velocity must differ from zero
 _JUMP_BETWEEN = 1.5  # steps: a jump below says that the track changed its point (1), above that it did not (2)
 _MIN_JUMPS = 20  # rows needed to judge
-
-
-@dataclass(frozen=True, slots=True)
-class FeatureTracks:
-    """The observations of all frames, one row each, ordered by frame and then as in the file."""
-
-    offsets: IntArray  # (F + 1,) the rows of frame k are offsets[k]:offsets[k + 1]
-    ids: IntArray  # (R,)
-    z: FloatArray  # (R, 4) rectified pixels [ul vl ur vr]
-    has_right: BoolArray  # (R,)
-    stale: BoolArray  # (R,) the pixels repeat those of the row's last frame although the vehicle moved
-
-    @property
-    def frames(self) -> IntArray:
-        """Frame number (R,) of each row."""
-        return np.repeat(np.arange(len(self.offsets) - 1), np.diff(self.offsets))
-
-    def at(self, frame: int, time_ns: int) -> Observations:
-        """The observations of one frame."""
-        rows = slice(self.offsets[frame], self.offsets[frame + 1])
-        return Observations(frame, time_ns, self.ids[rows], self.z[rows], self.has_right[rows], self.stale[rows])
 
 
 def tracks_from_dense(features: FloatArray, path: Path) -> FeatureTracks:

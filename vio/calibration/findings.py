@@ -1,0 +1,40 @@
+"""What a measurement ends in beside a number: why there is none, or what is wrong with the one that was given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+Fault: TypeAlias = Literal[
+    "cameras swapped",
+    "baseline translation inverted",
+    "left-right rotation wrong",
+    "baseline direction wrong",
+    "IMU-camera rotation wrong",
+    "IMU-camera rotation inverted",
+    "IMU-camera translation inverted",
+    "IMU-camera translation wrong",
+    "clocks apart",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class NotObservable:
+    """Stands in place of an estimate and says why there is none."""
+
+    what: str
+    because: str
+
+    def __str__(self) -> str:
+        return f"{self.what} not observable because {self.because}"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One fault of a given calibration, in words with figures."""
+
+    fault: Fault
+    detail: str
+
+    def __str__(self) -> str:
+        return f"{self.fault}: {self.detail}"

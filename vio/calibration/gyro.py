@@ -1,0 +1,201 @@
+"""How gyro and camera lie to each other, in angle and in time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from vio.calibration.egomotion import CameraMotion
+from vio.calibration.findings import NotObservable
+from vio.errors import EstimationError
+from vio.geometry.lie import FloatArray, nearest_rotation, so3_exp, so3_log
+from vio.records import BoolArray, ImuSample, IntArray, MotionSample
+from vio.robust import jackknife, robust_sigma
+
+_BLOCKS = 10  # of the jackknife
+_ROTATION_DEG = 1.0  # standard deviations beyond these are called weak …
+TIME_OFFSET_S = 0.005
+_LEAST_TURN_RADPS = 0.02  # spread of the rotation rate below which gyro and images tell each other nothing
+_LARGEST_OFFSET_S = 0.1
+_OFFSET_STEP_S = 0.004
+_VELOCITY_WEIGHT = 0.02  # rad/s per m/s: what one velocity's error is worth beside a rotation rate's
+_NS = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Motion samples as arrays."""
+
+    times_ns: IntArray  # (S,)
+    angular: FloatArray  # (S, 3) rad/s, imu frame
+    linear: FloatArray  # (S, 3) specific force in m/s^2, or velocity in m/s
+    inertial: bool  # the former
+
+
+def rates_of(samples: Sequence[MotionSample]) -> Rates:
+    """Motion samples of one kind as arrays.
+
+    Raises:
+        EstimationError: there is none.
+    """
+    if not samples:
+        raise EstimationError("the recording holds no motion sensor; only the cameras can be calibrated")
+    inertial = isinstance(samples[0], ImuSample)
+    pairs = [(s.gyro, s.accel) if isinstance(s, ImuSample) else (s.angular, s.linear) for s in samples]
+    return Rates(
+        np.array([s.time_ns for s in samples], dtype=np.int64),
+        np.array([p[0] for p in pairs]),
+        np.array([p[1] for p in pairs]),
+        inertial,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ImuAlignment:
+    """How gyro and camera lie to each other."""
+
+    R_cam0_imu: FloatArray  # (3, 3)
+    rotation_sigma_deg: FloatArray  # (3,) about the axes of cam0
+    time_offset_s: float  # IMU clock minus camera clock: a frame stamped t was exposed at t + offset of the IMU's clock
+    time_offset_sigma_s: float
+    gyro_bias: FloatArray  # (3,) rad/s
+    residual_radps: float  # robust spread of the rotation rates' difference, each axis
+    intervals: int
+    weak: str | None  # what the motion leaves open, in words
+
+
+def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservable:
+    """Find rotation, time offset and gyro bias that make the gyro's turns those of the camera.
+
+    Model, for each frame interval: `omega_cam dt = R_cam0_imu (integral of gyro over the shifted interval - b dt)`.
+    Velocities of a `velocity` recording take part as directions, since a car turns about one axis only.
+    """
+    if float(np.linalg.norm(motion.twists[:, 3:].std(axis=0))) < _LEAST_TURN_RADPS:
+        return NotObservable("IMU-camera rotation and time offset", "the camera does not turn")
+    problem = _GyroProblem(motion, rates)
+    offset = problem.coarse_offset()
+    keep = problem.covered
+    solution = problem.fit(problem.start(offset), keep)
+    sigma = problem.spread(solution, keep)
+    again = []
+    for block in np.array_split(np.flatnonzero(keep), _BLOCKS):
+        part = keep.copy()
+        part[block] = False
+        again.append(problem.fit(solution, part))
+    turns = np.array([so3_log(so3_exp(x[:3]) @ so3_exp(solution[:3]).T) for x in again])
+    errors = jackknife(np.concatenate([turns, np.array(again)[:, 3:]], axis=1))
+    errors = np.maximum(errors, problem.formal_sigma(solution, keep, sigma))
+    rotation_sigma = np.degrees(errors[:3])
+    weak = None
+    if rotation_sigma.max() > _ROTATION_DEG:
+        weak = "rotation about one axis (the motion turns too little about the others)"
+    if errors[3] > TIME_OFFSET_S:
+        weak = f"{weak} and time offset" if weak else "time offset (the rotation rate hardly changes)"
+    return ImuAlignment(
+        R_cam0_imu=so3_exp(solution[:3]),
+        rotation_sigma_deg=rotation_sigma,
+        time_offset_s=float(solution[3]),
+        time_offset_sigma_s=float(errors[3]),
+        gyro_bias=solution[4:],
+        residual_radps=sigma,
+        intervals=int(keep.sum()),
+        weak=weak,
+    )
+
+
+class _GyroProblem:
+    """Residuals of `align_gyro`; parameters are [rotation vector (3), offset (1), bias (3)]."""
+
+    def __init__(self, motion: CameraMotion, rates: Rates) -> None:
+        self._origin = int(motion.times_ns[0])
+        self._t = (rates.times_ns - self._origin) * _NS
+        steps = np.diff(self._t)[:, None] * (rates.angular[1:] + rates.angular[:-1]) / 2
+        self._turned = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        self._begin = (motion.times_ns[motion.frames] - self._origin) * _NS
+        self._end = (motion.times_ns[motion.frames + 1] - self._origin) * _NS
+        self._dt = self._end - self._begin
+        self._omega = motion.twists[:, 3:]
+        margin = _LARGEST_OFFSET_S
+        inside = (self._begin >= self._t[0]) & (self._end <= self._t[-1])
+        shiftable = (self._begin - margin >= self._t[0]) & (self._end + margin <= self._t[-1])
+        self.covered: BoolArray = shiftable if shiftable.sum() > 0.5 * inside.sum() else inside
+        self._velocities: tuple[FloatArray, FloatArray] | None = None
+        if not rates.inertial:
+            middle = (self._begin + self._end) / 2
+            v_imu = np.stack([np.interp(middle, self._t, rates.linear[:, k]) for k in range(3)], axis=1)
+            self._velocities = motion.twists[:, :3], v_imu
+
+    def gyro(self, offset: float) -> FloatArray:
+        """Mean rotation rate (K, 3) of each interval, imu frame."""
+        turned = [
+            np.interp(at + offset, self._t, self._turned[:, k]) for k in range(3) for at in (self._end, self._begin)
+        ]
+        return np.stack([turned[2 * k] - turned[2 * k + 1] for k in range(3)], axis=1) / self._dt[:, None]
+
+    def coarse_offset(self) -> float:
+        """The offset at which the two rotation rates' magnitudes go best together."""
+        seen = np.linalg.norm(self._omega, axis=1)[self.covered]
+        offsets = np.arange(-_LARGEST_OFFSET_S, _LARGEST_OFFSET_S + 1e-9, _OFFSET_STEP_S)
+        scores = []
+        for offset in offsets:
+            felt = np.linalg.norm(self.gyro(offset), axis=1)[self.covered]
+            scores.append(float(np.median(np.abs(felt - seen))))
+        return float(offsets[int(np.argmin(scores))])
+
+    def start(self, offset: float) -> FloatArray:
+        """Parameters from the closed form at one offset. Reference: Wahba's problem by SVD (Markley 1988)."""
+        gyro, omega = self.gyro(offset)[self.covered], self._omega[self.covered]
+        C = (omega - np.median(omega, axis=0)).T @ (gyro - np.median(gyro, axis=0))
+        if self._velocities is not None:
+            v_cam, v_imu = (v[self.covered] for v in self._velocities)
+            C = C + 1e-2 * (v_cam.T @ v_imu)
+        return np.concatenate([so3_log(nearest_rotation(C)), [offset], np.zeros(3)])
+
+    def residuals(self, x: FloatArray) -> FloatArray:
+        """Differences (K, 3 or 6) of the rates, and of the velocities where they are known."""
+        R = so3_exp(x[:3])
+        turning = self._omega - (self.gyro(float(x[3])) - x[4:]) @ R.T
+        if self._velocities is None:
+            return turning
+        v_cam, v_imu = self._velocities
+        return np.concatenate([turning, (v_cam - v_imu @ R.T) * _VELOCITY_WEIGHT], axis=1)
+
+    def fit(self, x: FloatArray, keep: BoolArray) -> FloatArray:
+        """Robust least squares from `x` on some of the intervals."""
+        start = x
+        for _ in range(2):
+            scale = self.spread(start, keep)
+            found = least_squares(
+                lambda y, s=scale: self.residuals(y)[keep].ravel() / s,
+                start,
+                loss="soft_l1",
+                x_scale=np.array([1e-2] * 3 + [1e-3] + [1e-3] * 3),
+                diff_step=1e-5,
+            )
+            start = found.x
+        out: FloatArray = start
+        return out
+
+    def spread(self, x: FloatArray, keep: BoolArray) -> float:
+        """Robust standard deviation of one residual."""
+        return max(robust_sigma(self.residuals(x)[keep]), 1e-6)
+
+    def formal_sigma(self, x: FloatArray, keep: BoolArray, sigma: float) -> FloatArray:
+        """Standard deviations (7,) if residuals were independent; large where a direction is open."""
+        J = np.empty((self.residuals(x)[keep].size, 7))
+        for k, h in enumerate([1e-4] * 3 + [1e-3] + [1e-4] * 3):
+            step = np.zeros(7)
+            step[k] = h
+            if k < 3:  # a turn on the camera's side, as the jackknife measures it
+                plus, minus = (
+                    np.concatenate([so3_log(so3_exp(s * step[:3]) @ so3_exp(x[:3])), x[3:]]) for s in (1.0, -1.0)
+                )
+            else:
+                plus, minus = x + step, x - step
+            J[:, k] = (self.residuals(plus) - self.residuals(minus))[keep].ravel() / (2 * h)
+        scale = np.maximum(np.linalg.norm(J, axis=0), 1e-12)
+        information = (J / scale).T @ (J / scale) + 1e-12 * np.eye(7)
+        return sigma * np.sqrt(np.diag(np.linalg.inv(information))) / scale

@@ -1,0 +1,234 @@
+"""Where the IMU lies: measured by its accelerometer, or chosen between two places by velocities."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.calibration.egomotion import CameraMotion, stereo_twists
+from vio.calibration.findings import NotObservable
+from vio.calibration.gyro import ImuAlignment, Rates
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp
+from vio.geometry.stereo import StereoCamera
+from vio.records import FeatureTracks, IntArray
+from vio.robust import jackknife, robust_sigma
+
+_BLOCKS = 10  # of the jackknife over windows
+_LEVER_M = 0.02  # a standard deviation beyond it withholds the value
+_WINDOW_S = 1.0
+_LEAST_WINDOWS = 12
+_NS = 1e-9
+
+_MIN_INTERVALS = 40  # frame intervals needed to judge two lever arms
+_JUDGED_BLOCKS = 12  # of the jackknife over them
+_LEAST_SIGMA = 0.1  # a jackknife over few blocks is not believed below this
+_LOG_ODDS = 10.0  # log-likelihood ratio that decides between two lever arms
+_HUBER = 2.0  # standard deviations
+_REWEIGHTINGS = 4
+_RIDGE = 1e-9  # keeps the fit solvable where a recording never accelerates or never turns
+
+
+@dataclass(frozen=True, slots=True)
+class LeverArm:
+    """Where the IMU lies in the left camera's frame."""
+
+    t_cam0_imu: FloatArray  # (3,) metres
+    sigma_m: FloatArray  # (3,)
+    windows: int
+
+
+def lever_arm(motion: CameraMotion, rates: Rates, alignment: ImuAlignment) -> LeverArm | NotObservable:
+    """Find the IMU's position in the left camera's frame from accelerometer and camera motion.
+
+    Over windows of a second, the doubly integrated specific force must move the IMU as the camera's motion and the
+    lever arm say. Start velocity and gravity are free in every window, the accelerometer bias is common.
+    """
+    what = "lever arm"
+    if not rates.inertial:
+        return NotObservable(what, "the recording holds velocities, no accelerometer")
+    if alignment.weak is not None:
+        return NotObservable(what, f"the motion leaves open the {alignment.weak}")
+    blocks = _windows(motion, rates, alignment)
+    if len(blocks) < _LEAST_WINDOWS:
+        return NotObservable(
+            what, f"only {len(blocks)} stretches of {_WINDOW_S:g} s are tracked throughout ({_LEAST_WINDOWS} needed)"
+        )
+    x = _solve_windows(blocks)
+    again = [
+        _solve_windows([b for k, b in enumerate(blocks) if k % _BLOCKS != left_out]) for left_out in range(_BLOCKS)
+    ]
+    sigma = jackknife(again)[:3]
+    if sigma.max() > _LEVER_M:
+        axis = "xyz"[int(np.argmax(sigma))]
+        return NotObservable(
+            what,
+            f"the motion turns too little: it leaves {sigma.max():.3f} m open along {axis} of cam0",
+        )
+    return LeverArm(x[:3], sigma, len(blocks))
+
+
+def _windows(motion: CameraMotion, rates: Rates, alignment: ImuAlignment) -> list[tuple[FloatArray, FloatArray]]:
+    """For each window, the design (3n, 6) and the right side (3n,) of `[t_cam0_imu; bias]`, nuisances projected out."""
+    origin = int(motion.times_ns[0])
+    t_imu = _seconds(rates.times_ns, origin) - alignment.time_offset_s
+    t_frame = _seconds(motion.times_ns, origin)
+    gyro = rates.angular - alignment.gyro_bias
+    steps: dict[int, FloatArray] = dict(zip(motion.frames.tolist(), motion.twists, strict=True))
+    out = []
+    first = 0
+    while first < len(t_frame) - 1:
+        last = first
+        while last in steps and t_frame[last] - t_frame[first] < _WINDOW_S:
+            last += 1
+        whole = t_frame[last] - t_frame[first] >= 0.8 * _WINDOW_S
+        inside = t_imu[0] <= t_frame[first] and t_imu[-1] >= t_frame[last]
+        if not (whole and inside):
+            first = max(last, first + 1)
+            continue
+        out.append(_window(steps, t_frame[first : last + 1], first, t_imu, gyro, rates.linear, alignment.R_cam0_imu))
+        first = last
+    return out
+
+
+def _seconds(times_ns: IntArray, origin_ns: int) -> FloatArray:
+    return np.asarray((times_ns - origin_ns) * _NS, dtype=np.float64)
+
+
+def _window(
+    steps: dict[int, FloatArray],
+    t: FloatArray,
+    first: int,
+    t_imu: FloatArray,
+    gyro: FloatArray,
+    force: FloatArray,
+    R_cam0_imu: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    n = len(t) - 1
+    T = np.eye(4)
+    T_start_cam = []
+    for k in range(n):
+        T = T @ se3_inverse(se3_exp(-(t[k + 1] - t[k]) * steps[first + k]))
+        T_start_cam.append(T)
+    poses = np.array(T_start_cam)
+    s = _integrals(t, t_imu, gyro, force, R_cam0_imu)
+    since = t[1:] - t[0]
+    rows = np.concatenate([poses[:, :3, :3] - np.eye(3), s[:, :, 1:]], axis=2).reshape(3 * n, 6)
+    right = (s[:, :, 0] - poses[:, :3, 3]).reshape(3 * n)
+    nuisance = np.concatenate(
+        [since[:, None, None] * np.eye(3), since[:, None, None] ** 2 / 2 * np.eye(3)], axis=2
+    ).reshape(3 * n, 6)
+    Q = np.linalg.qr(nuisance, mode="complete")[0][:, 6:]
+    return Q.T @ rows, Q.T @ right
+
+
+def _integrals(
+    t: FloatArray, t_imu: FloatArray, gyro: FloatArray, force: FloatArray, R_cam0_imu: FloatArray
+) -> FloatArray:
+    """Double integrals (n, 3, 4) at t[1:] of the force (column 0) and of the rotation (columns 1 to 3), in cam0(t0)."""
+    low, high = np.searchsorted(t_imu, [t[0], t[-1]])
+    knots = np.unique(np.concatenate([t, t_imu[low:high]]))
+    omega, f = (np.stack([np.interp(knots, t_imu, values[:, k]) for k in range(3)], axis=1) for values in (gyro, force))
+    dt = np.diff(knots)
+    turns = so3_exp(dt[:, None] * (omega[1:] + omega[:-1]) / 2)
+    R = [R_cam0_imu]
+    for turn in turns:
+        R.append(R[-1] @ turn)
+    rotation = np.array(R)
+    value = np.concatenate([(rotation @ f[..., None]), rotation], axis=2)  # (m, 3, 4)
+    mean = (value[1:] + value[:-1]) / 2
+    velocity = np.concatenate([np.zeros((1, 3, 4)), np.cumsum(dt[:, None, None] * mean, axis=0)])
+    third = dt[:, None, None] * velocity[:-1] + dt[:, None, None] ** 2 * (2 * value[:-1] + value[1:]) / 6
+    position = np.concatenate([np.zeros((1, 3, 4)), np.cumsum(third, axis=0)])
+    return position[np.searchsorted(knots, t[1:])]
+
+
+def _solve_windows(blocks: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
+    """Robust least squares over the windows, each weighted as a whole."""
+    weights: FloatArray = np.ones(len(blocks))
+    x: FloatArray = np.zeros(6)
+    for _ in range(6):
+        normal = sum((w * A.T @ A for w, (A, _) in zip(weights, blocks, strict=True)), 1e-9 * np.eye(6))
+        right = sum((w * A.T @ b for w, (A, b) in zip(weights, blocks, strict=True)), np.zeros(6))
+        x = np.linalg.solve(normal, right)
+        rms = np.array([np.sqrt(np.mean((A @ x - b) ** 2)) for A, b in blocks])
+        weights = 1 / (1 + (rms / max(float(np.median(rms)), 1e-9)) ** 2) ** 2
+    return x
+
+
+@dataclass(frozen=True, slots=True)
+class LeverVerdict:
+    """Which of two camera positions in the IMU frame agrees with velocities and features."""
+
+    better: int | None  # 0 or 1; None: the motion does not tell them apart
+    place: float  # where the data put the camera on the line between the two: -1 at the first, +1 at the second
+    place_sigma: float  # standard error of `place`; infinite where nothing could be measured
+    intervals: int  # frame intervals used
+
+
+def judge_levers(
+    camera: StereoCamera,
+    tracks: FeatureTracks,
+    times_ns: IntArray,
+    velocities: FloatArray,
+    R_cam0_imu: FloatArray,
+    levers: tuple[FloatArray, FloatArray],
+) -> LeverVerdict:
+    """Decide between two positions of cam0 in the IMU frame by the rigid-body law `v_cam = v_imu + omega x lever`.
+
+    The camera's velocity and rotation rate come from the stereo tracks, v_imu from the file (its noise averages out).
+    What else can make the two velocities differ is fitted beside the lever arm, for each axis: a constant, a part in
+    proportion to speed (scale, misalignment), to acceleration (clock offset), and to yaw rate times squared speed
+    (the side slip of tyres, which else passes for half a metre of lever arm). The standard error is a jackknife over
+    blocks of the recording, so that it covers errors that last.
+
+    Args:
+        camera: rectified pair.
+        tracks: features.
+        times_ns: (F,) frame times.
+        velocities: (F, 6) [v; omega] of the body, imu frame, m/s and rad/s.
+        R_cam0_imu: (3, 3).
+        levers: the two candidates, (3,) metres in the imu frame.
+    """
+    middle = (velocities[:-1] + velocities[1:]) / 2
+    turned = np.concatenate([middle[:, :3] @ R_cam0_imu.T, middle[:, 3:] @ R_cam0_imu.T], axis=1)
+    seen = stereo_twists(camera, tracks, times_ns, turned)
+    count = len(seen.frames)
+    if count < _MIN_INTERVALS:
+        return LeverVerdict(None, 0.0, float("inf"), count)
+    v_cam, omega = seen.twists[:, :3] @ R_cam0_imu, seen.twists[:, 3:] @ R_cam0_imu
+    centre, half = (levers[1] + levers[0]) / 2, (levers[1] - levers[0]) / 2
+    y = v_cam - middle[seen.frames, :3] - np.cross(omega, centre)
+    speed = np.linalg.norm(v_cam, axis=1)
+    yaw_rate = omega[:, np.argmax(omega.std(axis=0))]
+    nuisance = np.stack([np.ones(count), speed, np.gradient(speed), yaw_rate * speed**2], axis=1)
+    signal = np.cross(omega, half)
+    every = np.arange(count)
+    place = _fit_place(y, signal, nuisance)
+    left_out = [np.setdiff1d(every, block) for block in np.array_split(every, _JUDGED_BLOCKS)]
+    again = [_fit_place(y[keep], signal[keep], nuisance[keep]) for keep in left_out]
+    sigma = max(float(jackknife(again)), _LEAST_SIGMA)
+    better = int(place > 0) if 2 * abs(place) / sigma**2 > _LOG_ODDS else None
+    return LeverVerdict(better, place, sigma, count)
+
+
+def _fit_place(y: FloatArray, signal: FloatArray, nuisance: FloatArray) -> float:
+    """Fit `y = place * signal + nuisance c` (N, 3) robustly, c apart for each axis; the axes share `place`."""
+    top = bottom = 0.0
+    for axis in range(3):
+        X = np.concatenate([signal[:, axis : axis + 1], nuisance], axis=1)
+        scale = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
+        weight, sigma, x = np.ones(len(X)), 1.0, np.zeros(X.shape[1])
+        normal = np.eye(X.shape[1])
+        for _ in range(_REWEIGHTINGS):
+            weighted = X / scale * weight[:, None]
+            normal = weighted.T @ (X / scale) + _RIDGE * np.eye(X.shape[1])
+            x = np.linalg.solve(normal, weighted.T @ y[:, axis]) / scale
+            r = y[:, axis] - X @ x
+            sigma = max(robust_sigma(r), 1e-9)
+            weight = np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(r), 1e-12))
+        variance = float(np.linalg.inv(normal)[0, 0]) * (sigma / scale[0]) ** 2
+        top += x[0] / variance
+        bottom += 1 / variance
+    return top / bottom

@@ -1,0 +1,221 @@
+"""How the two cameras lie to each other, by rays of matched points; and how well the rows of rectified ones agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from vio.calibration.findings import NotObservable
+from vio.geometry.lie import FloatArray, nearest_rotation, so3_exp, so3_log
+from vio.records import BoolArray, IntArray
+from vio.robust import robust_sigma
+
+_BLOCKS = 10  # of a jackknife
+_WIDEST_DEG, _NARROWER_DEG = 1.0, 0.3  # epipolar angles of candidates, as the fit closes in
+_LEAST_MATCHES = 150
+_LEAST_PAIRS = 3
+_STEREO_ROTATION_DEG = 0.2  # standard deviations beyond these withhold a value …
+_STEREO_DIRECTION_DEG = 2.0
+_LEAST_STRETCHES = 3
+_LEAST_IN_CELL = 15  # matches that make a cell's median
+
+_Pose: TypeAlias = tuple[FloatArray, FloatArray]  # R_cam1_cam0 (3, 3), unit direction (3,) from cam0 to cam1 in cam0
+
+
+@dataclass(frozen=True, slots=True)
+class RayMatches:
+    """The same points seen by both cameras of a rig."""
+
+    pair: IntArray  # (N,) number of the stereo pair
+    ray0: FloatArray  # (N, 3) unit rays in cam0
+    ray1: FloatArray  # (N, 3) unit rays in cam1
+
+    def take(self, rows: BoolArray) -> RayMatches:
+        """Return the rows named by a mask (N,)."""
+        return RayMatches(self.pair[rows], self.ray0[rows], self.ray1[rows])
+
+
+def join_matches(parts: Sequence[RayMatches]) -> RayMatches:
+    """All matches of several pairs as one table."""
+    none = np.zeros((0, 3))
+    return RayMatches(
+        np.concatenate([np.zeros(0, dtype=np.int64), *(m.pair for m in parts)]),
+        np.concatenate([none, *(m.ray0 for m in parts)]),
+        np.concatenate([none, *(m.ray1 for m in parts)]),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class StereoEstimate:
+    """Left-right extrinsics without scale."""
+
+    R_cam1_cam0: FloatArray  # (3, 3)
+    direction: FloatArray  # (3,) unit vector from cam0 to cam1, cam0 frame
+    rotation_sigma_deg: float
+    direction_sigma_deg: float
+    matches: int  # inliers
+    pairs: int
+    residual_deg: float  # robust spread of the epipolar angle over single pairs
+    stretches: int | None = None  # stretches of video behind the values; None: single pairs alone
+
+
+def epipolar_angles(R_cam1_cam0: FloatArray, direction: FloatArray, matches: RayMatches) -> FloatArray:
+    """Signed angles (N,) in radians between the rays of cam1 and the epipolar planes of those of cam0."""
+    turned = matches.ray0 @ R_cam1_cam0.T
+    normal = np.cross(R_cam1_cam0 @ direction, turned)
+    length = np.linalg.norm(normal, axis=1)
+    return np.sum(normal * matches.ray1, axis=1) / np.maximum(length, 1e-9)
+
+
+def epipolar_spread(R_cam1_cam0: FloatArray, direction: FloatArray, matches: RayMatches) -> float:
+    """Median size of the epipolar angles, radians."""
+    return float(np.median(np.abs(epipolar_angles(R_cam1_cam0, direction, matches))))
+
+
+def refine_stereo(
+    matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray
+) -> StereoEstimate | NotObservable:
+    """Refine rotation and baseline direction on the epipolar angles, with standard deviations.
+
+    Args:
+        matches: candidate matches, outliers among them.
+        R_cam1_cam0: (3, 3) where to start.
+        direction: (3,) unit vector where to start, cam0 frame.
+    """
+    R, d = R_cam1_cam0, direction
+    inliers = matches
+    for gate in (np.radians(_WIDEST_DEG), np.radians(_NARROWER_DEG), None):
+        angles = np.abs(epipolar_angles(R, d, matches))
+        near = angles < np.radians(_WIDEST_DEG)
+        spread = robust_sigma(angles[near]) if near.any() else 1.0
+        limit = gate if gate is not None else max(4 * spread, 1e-5)
+        inliers = matches.take(angles < limit)
+        if few := too_few(inliers):
+            return few
+        R, d = _fit_stereo(inliers, R, d, max(spread, 1e-6))
+    spread = robust_sigma(epipolar_angles(R, d, inliers))
+    again = [_fit_stereo(inliers.take(~block), R, d, max(spread, 1e-6)) for block in _blocks(inliers.pair)]
+    rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in _deviations(R, d, again))
+    if rotation_sigma > np.radians(_STEREO_ROTATION_DEG) or direction_sigma > np.radians(_STEREO_DIRECTION_DEG):
+        return NotObservable(
+            "left-right extrinsics",
+            f"the matches leave {np.degrees(rotation_sigma):.2f} deg of rotation and {np.degrees(direction_sigma):.1f} "
+            "deg of direction open; all points may be far away or on one plane",
+        )
+    return StereoEstimate(
+        R_cam1_cam0=R,
+        direction=d,
+        rotation_sigma_deg=float(np.degrees(rotation_sigma)),
+        direction_sigma_deg=float(np.degrees(direction_sigma)),
+        matches=len(inliers.pair),
+        pairs=len(np.unique(inliers.pair)),
+        residual_deg=float(np.degrees(spread)),
+    )
+
+
+def too_few(matches: RayMatches) -> NotObservable | None:
+    """Say why left-right extrinsics cannot be had from so few matches; None: there are enough."""
+    pairs = len(np.unique(matches.pair))
+    if len(matches.pair) >= _LEAST_MATCHES and pairs >= _LEAST_PAIRS:
+        return None
+    return NotObservable(
+        "left-right extrinsics",
+        f"only {len(matches.pair)} consistent matches in {pairs} pairs were found ({_LEAST_MATCHES} in {_LEAST_PAIRS} "
+        "are needed); the images are too few, do not overlap, or have no texture",
+    )
+
+
+def _fit_stereo(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float) -> _Pose:
+    basis = _tangents(d)
+
+    def moved(x: FloatArray) -> _Pose:
+        out = d + basis @ x[3:]
+        return so3_exp(x[:3]) @ R, out / np.linalg.norm(out)
+
+    found = least_squares(
+        lambda x: epipolar_angles(*moved(x), matches) / spread, np.zeros(5), loss="soft_l1", x_scale=1e-2
+    )
+    return moved(found.x)
+
+
+def _tangents(d: FloatArray) -> FloatArray:
+    """Two unit vectors (3, 2) perpendicular to a direction and to each other."""
+    out: FloatArray = np.linalg.svd(d[None, :])[2][1:].T
+    return out
+
+
+def _blocks(labels: IntArray) -> list[BoolArray]:
+    """Masks (N,) of the rows of each of up to ten blocks of labels."""
+    names = np.unique(labels)
+    parts = np.array_split(names, min(_BLOCKS, len(names)))
+    return [np.isin(labels, part) for part in parts]
+
+
+def _deviations(R: FloatArray, d: FloatArray, others: Sequence[_Pose]) -> tuple[FloatArray, FloatArray]:
+    """Turns (n, 3) and swings (n, 3), radians, by which other rotations and directions differ from one."""
+    return np.array([so3_log(Rk @ R.T) for Rk, _ in others]), np.array([np.cross(d, dk) for _, dk in others])
+
+
+def _jackknife_norm(values: FloatArray) -> float:
+    """Standard error of a vector (its length) from its leave-one-block-out values (n, d)."""
+    return float(np.sqrt((len(values) - 1) * np.mean(np.sum((values - values.mean(axis=0)) ** 2, axis=1))))
+
+
+def combine_stereo(pairs: StereoEstimate, stretches: Sequence[_Pose]) -> StereoEstimate | None:
+    """The mean of rotation and direction over stretches of video, with their standard errors; None: too uncertain.
+
+    Args:
+        pairs: what single pairs say, for its counts.
+        stretches: at least three of `R_cam1_cam0` (3, 3) and direction (3,).
+    """
+    if len(stretches) < _LEAST_STRETCHES:
+        return None
+    R = nearest_rotation(np.sum([Rk for Rk, _ in stretches], axis=0))
+    d = np.sum([dk for _, dk in stretches], axis=0)
+    d = d / np.linalg.norm(d)
+    count = len(stretches)
+    rotation, direction = (
+        float(np.degrees(np.sqrt(np.sum(v**2) / (count * (count - 1))))) for v in _deviations(R, d, stretches)
+    )
+    if rotation > _STEREO_ROTATION_DEG or direction > _STEREO_DIRECTION_DEG:
+        return None
+    return replace(
+        pairs,
+        R_cam1_cam0=R,
+        direction=d,
+        rotation_sigma_deg=rotation,
+        direction_sigma_deg=direction,
+        stretches=count,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class RowResiduals:
+    """How well the rows of a rectified pair agree."""
+
+    median_px: float  # of vl - vr
+    spread_px: float  # robust standard deviation
+    grid_px: FloatArray  # (3, 3) medians over the image, rows from the top; NaN where too few matches lie
+    positive_disparity: float  # share of matches with ul > ur
+    matches: int
+
+
+def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | NotObservable:
+    """Describe the row differences of matches (N, 4) `[ul vl ur vr]` in rectified pixels of an image so large."""
+    if len(z) < _LEAST_MATCHES:
+        return NotObservable("row alignment", f"only {len(z)} matches were found")
+    off = z[:, 1] - z[:, 3]
+    median = float(np.median(off))
+    grid = np.full((3, 3), np.nan)
+    column = np.clip((3 * z[:, 0] / width).astype(int), 0, 2)
+    row = np.clip((3 * z[:, 1] / height).astype(int), 0, 2)
+    for i in range(3):
+        for j in range(3):
+            here = off[(row == i) & (column == j)]
+            if len(here) >= _LEAST_IN_CELL:
+                grid[i, j] = np.median(here)
+    return RowResiduals(median, robust_sigma(off - median), grid, float(np.mean(z[:, 0] > z[:, 2])), len(z))
