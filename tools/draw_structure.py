@@ -1,0 +1,189 @@
+"""The figure of docs/architecture.md: every room of the house, what it imports, and on which floor it stands.
+
+    python tools/draw_structure.py docs/images/structure.png [--root CHECKOUT]
+
+A room is a package or a single module directly in `vio/`, or `frontend/`. It stands one floor above the highest room
+that it imports. Arrows point at what is imported; those that a longer way implies are left out, and so are those to the
+foundation (records, protocols, geometry, errors, setting), on which nearly everything stands. Imports inside functions
+count. An import that closes a circle is red.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyBboxPatch
+
+FOUNDATION = ("vio.records", "vio.protocols", "vio.geometry", "vio.errors", "vio.setting", "vio.threads", "vio.atomic")
+_COLOURS = {"vio.cli": "#e8d5b5", "frontend": "#f0c9c9", "vio.filters": "#cfe3cf", "vio.sim": "#dcd3ea"}
+_PLAIN, _GROUND, _CLOSING = "#d6e2f0", "#e9e9e9", "#c23b5a"
+_WIDTH, _HEIGHT = 1.0, 0.62
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """A package or a module, and what it imports of the others."""
+
+    name: str
+    lines: int
+    files: int
+    imports: frozenset[str]
+
+
+def read_rooms(root: Path) -> dict[str, Room]:
+    """Return all rooms of a checkout by name."""
+    files: dict[str, list[Path]] = {}
+    for path in sorted([*(root / "vio").rglob("*.py"), *(root / "frontend").rglob("*.py")]):
+        name = _room_of(".".join(path.relative_to(root).with_suffix("").parts))
+        if name not in ("vio.__init__", "vio.__main__", "vio._version"):
+            files.setdefault(name, []).append(path)
+    rooms = {}
+    for name, paths in files.items():
+        texts = [path.read_text(encoding="utf-8") for path in paths]
+        imported = {_room_of(module) for text in texts for module in _imports(text)} & set(files)
+        rooms[name] = Room(name, sum(len(t.splitlines()) for t in texts), len(paths), frozenset(imported - {name}))
+    return rooms
+
+
+def _room_of(module: str) -> str:
+    """`vio.filters.window` lies in the room `vio.filters`, `frontend.klt` in `frontend`."""
+    parts = module.split(".")
+    return "frontend" if parts[0] == "frontend" else ".".join(parts[:2])
+
+
+def _imports(text: str) -> Iterator[str]:
+    """Modules that a text imports anywhere, but for those that only a type checker reads."""
+    skipped: set[int] = set()
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+            skipped.update(id(child) for statement in node.body for child in ast.walk(statement))
+        elif id(node) not in skipped and isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif id(node) not in skipped and isinstance(node, ast.ImportFrom) and node.module:
+            # `from vio import calibration` names a room, `from vio.records import Image` something in one.
+            yield from (f"vio.{alias.name}" for alias in node.names) if node.module == "vio" else [node.module]
+
+
+def floors(rooms: Mapping[str, Room]) -> tuple[dict[str, int], list[tuple[str, str]]]:
+    """Return the floor of each room, 0 at the ground, and the imports (from, to) that close a circle."""
+    floor: dict[str, int] = {}
+    closing: list[tuple[str, str]] = []
+
+    def visit(name: str, above: tuple[str, ...]) -> int:
+        if name not in floor:
+            below = []
+            for other in sorted(rooms[name].imports):
+                if other in (*above, name):
+                    closing.append((name, other))
+                else:
+                    below.append(visit(other, (*above, name)))
+            floor[name] = 1 + max(below, default=-1)
+        return floor[name]
+
+    for name in sorted(rooms):
+        visit(name, ())
+    return floor, closing
+
+
+def drawn_arrows(rooms: Mapping[str, Room]) -> list[tuple[str, str]]:
+    """Imports between rooms without circles that no longer way implies."""
+
+    @cache
+    def reached(name: str) -> frozenset[str]:
+        return rooms[name].imports.union(*(reached(n) for n in rooms[name].imports))
+
+    return [
+        (name, other)
+        for name, room in rooms.items()
+        for other in sorted(room.imports)
+        if not any(other in reached(via) for via in room.imports - {other})
+    ]
+
+
+def draw(rooms: Mapping[str, Room], path: Path) -> None:
+    """Write the figure as PNG."""
+    upper = {n: replace(r, imports=r.imports - set(FOUNDATION)) for n, r in rooms.items() if n not in FOUNDATION}
+    level, closing = floors(upper)
+    straight = {n: replace(r, imports=r.imports - {b for a, b in closing if a == n}) for n, r in upper.items()}
+    place = _places(straight, level, [n for n in FOUNDATION if n in rooms])
+    across = max(x for x, _ in place.values()) + 1.3
+    up = max(y for _, y in place.values()) + 1.0
+    figure = Figure(figsize=(1.45 * across, 0.95 * up), dpi=100)
+    axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
+    axes.set_xlim(-0.15, across - 0.15)
+    axes.set_ylim(-0.15, up - 0.15)
+    axes.axis("off")
+    for name, other in [*drawn_arrows(straight), *closing]:
+        colour = _CLOSING if (name, other) in closing else "#8a93a0"
+        (x0, y0), (x1, y1) = place[name], place[other]
+        axes.annotate(
+            "",
+            xy=(x1 + _WIDTH / 2, y1 + _HEIGHT),
+            xytext=(x0 + _WIDTH / 2, y0),
+            # A long way goes around the rooms between.
+            arrowprops={
+                "connectionstyle": f"arc3,rad={0.12 if y0 - y1 > 1.5 else 0}",
+                "arrowstyle": "-|>",
+                "color": colour,
+                "lw": 0.9,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            },
+            zorder=1,
+        )
+    for name, (x, y) in place.items():
+        colour = _GROUND if name in FOUNDATION else _COLOURS.get(name, _PLAIN)
+        box = FancyBboxPatch(
+            (x, y), _WIDTH, _HEIGHT, boxstyle="round,pad=0,rounding_size=0.06", fc=colour, ec="#55606e"
+        )
+        axes.add_patch(box)
+        room = rooms[name]
+        label = name.removeprefix("vio.") + ("/" if room.files > 1 else "")
+        axes.text(x + _WIDTH / 2, y + 0.39, label, ha="center", va="center", fontsize=9, weight="bold")
+        files = f", {room.files} files" if room.files > 1 else ""
+        axes.text(x + _WIDTH / 2, y + 0.17, f"{room.lines} lines{files}", ha="center", va="center", fontsize=6.5)
+    figure.savefig(path)
+
+
+def _places(rooms: Mapping[str, Room], level: Mapping[str, int], ground: list[str]) -> dict[str, tuple[float, float]]:
+    """Lower left corners: the foundation as one row, above it a row a floor, rooms near those they have to do with."""
+    rows = [[n for n in sorted(rooms) if level[n] == k] for k in range(max(level.values()) + 1)]
+    across = 1.25 * max(len(row) for row in [ground, *rows])
+    arrows = drawn_arrows(rooms)
+    tied = {n: [b for a, b in arrows if a == n] + [a for a, b in arrows if b == n] for n in rooms}
+
+    def spread(row: list[str]) -> dict[str, float]:
+        return {name: across / len(row) * (i + 0.5) - _WIDTH / 2 for i, name in enumerate(row)}
+
+    x = {name: at for row in rows for name, at in spread(row).items()}
+    for _ in range(8):
+        for row in [*rows[::-1], *rows]:
+            row.sort(key=lambda n: float(np.mean([x[m] for m in tied[n]] or [x[n]])))
+            x.update(spread(row))
+    upper = {name: (x[name], 1.1 * (k + 1)) for k, row in enumerate(rows) for name in row}
+    return {**{name: (at, 0.0) for name, at in spread(ground).items()}, **upper}
+
+
+def main() -> int:
+    """Draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("out", type=Path, help="PNG to write")
+    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent, help="the checkout")
+    args = parser.parse_args()
+    rooms = read_rooms(args.root)
+    draw(rooms, args.out)
+    sys.stdout.write(f"{len(rooms)} rooms, {sum(r.lines for r in rooms.values())} lines: {args.out}\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
