@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 
 import numpy as np
 
@@ -36,6 +35,8 @@ from vio.selectors import build_selector
 
 log = logging.getLogger(__name__)
 
+STAGES = ("read", "frontend", "watch", "select", "filter")  # of a frame's wall time
+
 _BACKENDS: dict[BackendName, type[Vislam] | type[Msckf]] = {"vislam": Vislam, "msckf": Msckf}
 
 
@@ -47,6 +48,7 @@ class FrameLog:
     time_ns: int
     read_ms: float
     frontend_ms: float
+    watch_ms: float
     select_ms: float
     filter_ms: float
     detected: int
@@ -60,6 +62,11 @@ class FrameLog:
     innovation_median_px: float | None
     nis_per_dof: float | None
     stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
+
+    @property
+    def total_ms(self) -> float:
+        """Wall time of the whole frame."""
+        return sum(getattr(self, f"{stage}_ms") for stage in STAGES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,12 +132,7 @@ def run(
         VioError: the configuration, the data or the estimation is at fault; the message says which.
     """
     recording = dataset.recording
-    if start < 0 or (stop is not None and stop <= start):
-        raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
-    if start >= len(recording.frame_times_ns):
-        raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
-    if config.lag_frames and (config.backend != "msckf" or config.lag_frames >= config.msckf.clones):
-        raise ConfigError(f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones")
+    _check(recording, config, start, stop)
     motion = resolve_motion(recording, config)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
@@ -141,71 +143,76 @@ def run(
     backend = backend or _build_backend(recording, config, motion, T_cam0_body)
     viewer = viewer or NullViewer()
     dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
-
     watch = _Watch(recording, motion, T_cam0_body)
-
-    estimates: list[Estimate] = []
-    frames: list[FrameLog] = []
-    kept: list[Observations] = []
-    samples: list[MotionSample] = []
-    began = clock = time.perf_counter()
+    diary = _Diary(backend, config.lag_frames, keep_observations=keep_observations)
+    laps = _Laps()
     try:
         for event in dataset.events(start, stop, images=_needs_images(dataset, config)):
             if not isinstance(event, StereoFrame):
                 watch.sample(event)
+                diary.sample(event)
                 if motion is not None:
                     backend.propagate(event)
                 if dead_reckoning is not None:
                     dead_reckoning.propagate(event)
-                if keep_observations:
-                    samples.append(event)
                 continue
-            marks = [clock, time.perf_counter()]
+            laps.end("read")
             expected = backend.predict(event.time_ns)
-            marks.append(time.perf_counter())
-            output = frontend.process(event, None if expected is None or not config.frontend.prior else expected.tracks)
-            marks.append(time.perf_counter())
-            seen = output.observations
-            if backend.stereo_only:
-                seen = seen.take(seen.has_right)
-            selection = selector.select(seen, None if expected is None else expected.motion)
+            laps.end("predict")
+            output = frontend.process(event, expected.tracks if expected and config.frontend.prior else None)
+            laps.end("frontend")
             watch.observations(output.observations)
-            marks.append(time.perf_counter())
+            laps.end("watch")
+            seen = (
+                output.observations.take(output.observations.has_right) if backend.stereo_only else output.observations
+            )
+            selection = selector.select(seen, expected.motion if expected else None)
+            laps.end("select")
             report = backend.update(seen.take(selection.chosen))
             estimate = backend.estimate()
-            marks.append(time.perf_counter())
-            watch.update(event.index, report, estimate)
-            _revise(estimates, frames, backend, config.lag_frames)
+            laps.end("update")
 
-            estimates.append(estimate)
-            frames.append(_frame_log(event, marks, output, selection, report))
+            watch.update(event.index, report, estimate)
+            diary.frame(estimate, _frame_log(event, laps, output, selection, report), output.observations)
             if dead_reckoning is not None:
                 dead_reckoning.frame(event)
-            if keep_observations:
-                kept.append(output.observations)
             viewer.frame(output, estimate, report)
-            clock = time.perf_counter()
+            laps.begin()
     finally:
         watch.close()
         viewer.close()
-    if not frames:
+    if not diary.frames:
         raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
-    _revise(estimates, frames, backend, config.lag_frames, all_of_them=True)
+    diary.finish()
     return RunResult(
         recording=recording,
         config=config,
         motion=motion,
         body=body,
         T_cam0_body=T_cam0_body,
-        estimates=tuple(estimates),
-        dead_reckoning=_trajectory(dead_reckoning.poses, frames, body) if dead_reckoning is not None else None,
+        estimates=tuple(diary.estimates),
+        dead_reckoning=_trajectory(dead_reckoning.poses, diary.frames, body) if dead_reckoning is not None else None,
         landmarks=backend.landmarks(),
-        frames=tuple(frames),
-        observations=tuple(kept) if keep_observations else None,
-        motion_samples=tuple(samples) if keep_observations else None,
+        frames=tuple(diary.frames),
+        observations=tuple(diary.observations) if keep_observations else None,
+        motion_samples=tuple(diary.samples) if keep_observations else None,
         warnings=tuple(watch.lines),
-        wall_s=time.perf_counter() - began,
+        wall_s=laps.since_start(),
     )
+
+
+def _check(recording: Recording, config: Config, start: int, stop: int | None) -> None:
+    """Refuse what no run can be made of.
+
+    Raises:
+        ConfigError: the range of frames is empty, or the settings contradict one another.
+    """
+    if start < 0 or (stop is not None and stop <= start):
+        raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
+    if start >= len(recording.frame_times_ns):
+        raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
+    if config.lag_frames and (config.backend != "msckf" or config.lag_frames >= config.msckf.clones):
+        raise ConfigError(f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones")
 
 
 def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
@@ -233,16 +240,61 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     return config.motion
 
 
-def _revise(
-    estimates: list[Estimate], frames: list[FrameLog], backend: Backend, lag: int, *, all_of_them: bool = False
-) -> None:
-    """Give the estimate of `lag` frames ago, or all since then, the pose that the back end has now."""
-    if lag == 0:
-        return
-    for k in range(max(len(estimates) - lag, 0), len(estimates) if all_of_them else len(estimates) - lag + 1):
-        T = backend.pose_of(frames[k].index)
-        if T is not None:
-            estimates[k] = replace(estimates[k], T_world_imu=T)
+class _Laps:
+    """Wall time of the stages of one frame, the end of one being the beginning of the next."""
+
+    def __init__(self) -> None:
+        self._start = time.perf_counter()
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a frame."""
+        self.ms: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def end(self, stage: str) -> None:
+        """Note how long a stage has taken."""
+        now = time.perf_counter()
+        self.ms[stage] = 1e3 * (now - self._last)
+        self._last = now
+
+    def since_start(self) -> float:
+        """Seconds since the run began."""
+        return time.perf_counter() - self._start
+
+
+class _Diary:
+    """What a run keeps: an estimate and a row of the log per frame and, on request, what went in."""
+
+    def __init__(self, backend: Backend, lag_frames: int, *, keep_observations: bool) -> None:
+        self._backend, self._lag, self._keep = backend, lag_frames, keep_observations
+        self.estimates: list[Estimate] = []
+        self.frames: list[FrameLog] = []
+        self.observations: list[Observations] = []
+        self.samples: list[MotionSample] = []
+
+    def sample(self, sample: MotionSample) -> None:
+        if self._keep:
+            self.samples.append(sample)
+
+    def frame(self, estimate: Estimate, row: FrameLog, seen: Observations) -> None:
+        if self._lag:
+            self._revise(len(self.estimates) - self._lag, len(self.estimates) - self._lag + 1)
+        self.estimates.append(estimate)
+        self.frames.append(row)
+        if self._keep:
+            self.observations.append(seen)
+
+    def finish(self) -> None:
+        if self._lag:
+            self._revise(len(self.estimates) - self._lag, len(self.estimates))
+
+    def _revise(self, first: int, end: int) -> None:
+        """Give estimates the poses that the back end has for them now."""
+        for k in range(max(first, 0), end):
+            T = self._backend.pose_of(self.frames[k].index)
+            if T is not None:
+                self.estimates[k] = replace(self.estimates[k], T_world_imu=T)
 
 
 class _Watch:
@@ -343,16 +395,16 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
 
 
 def _frame_log(
-    frame: StereoFrame, marks: list[float], output: FrontendOutput, selection: Selection, report: UpdateReport
+    frame: StereoFrame, laps: _Laps, output: FrontendOutput, selection: Selection, report: UpdateReport
 ) -> FrameLog:
-    read, predict, front, select, update = (1e3 * (b - a) for a, b in pairwise(marks))
     return FrameLog(
         index=frame.index,
         time_ns=frame.time_ns,
-        read_ms=read,
-        frontend_ms=front,
-        select_ms=select,
-        filter_ms=predict + update,
+        read_ms=laps.ms["read"],
+        frontend_ms=laps.ms["frontend"],
+        watch_ms=laps.ms["watch"],
+        select_ms=laps.ms["select"],
+        filter_ms=laps.ms["predict"] + laps.ms["update"],
         detected=output.detected,
         tracked=output.tracked,
         matched=output.matched,

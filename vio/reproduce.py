@@ -166,7 +166,7 @@ def _row(variant: Variant, result: RunResult, score: Evaluation | None) -> Row:
         used_per_frame=float(np.mean([f.used for f in frames])),
         landmarks=len(result.landmarks.ids),
         innovation_median_px=float(np.median(innovations)) if innovations else None,
-        ms_per_frame=float(np.mean([f.read_ms + f.frontend_ms + f.select_ms + f.filter_ms for f in frames])),
+        ms_per_frame=float(np.mean([f.total_ms for f in frames])),
         evaluation=score,
     )
 

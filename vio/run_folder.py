@@ -21,7 +21,7 @@ from vio.config import to_yaml
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
-from vio.pipeline import FrameLog, RunResult
+from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.records import Landmarks, Trajectory
 from vio.trajectory_io import read_trajectory, write_kitti, write_tum
 
@@ -95,7 +95,7 @@ def metrics_of(
 ) -> dict[str, Any]:
     """Collect what `--json` prints and metrics.json holds; null where there is no reference."""
     frames = result.frames
-    work_ms = np.array([f.read_ms + f.frontend_ms + f.select_ms + f.filter_ms for f in frames])
+    work_ms = np.array([f.total_ms for f in frames])
     scores = None if evaluation is None else evaluation.as_dict()
     return {
         "out": str(folder),
@@ -114,10 +114,7 @@ def metrics_of(
         "ms_per_frame": float(work_ms.mean()),
         "ms_per_frame_median": float(np.median(work_ms)),
         "ms_per_frame_95": float(np.percentile(work_ms, 95)),
-        "stages_ms": {
-            name: float(np.mean([getattr(f, f"{name}_ms") for f in frames]))
-            for name in ("read", "frontend", "select", "filter")
-        },
+        "stages_ms": {name: float(np.mean([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES},
         "landmarks": len(result.landmarks.ids),
         "ate_m": None if scores is None else scores["ate_m"],
         "rpe": None if scores is None else scores["rpe"],
