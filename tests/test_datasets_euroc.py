@@ -30,14 +30,15 @@ from tests.euroc_maker import (
 )
 from tools.check_rectification import match_sift
 from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.euroc import camera_yaml, pair_stamps, read_camera_yaml, read_euroc
+from vio.datasets.euroc import pair_stamps, read_euroc
+from vio.datasets.euroc_files import camera_yaml, read_camera_yaml
 from vio.datasets.images import load_gray
-from vio.datasets.rectified import ImuDensities, RectifiedDataset
+from vio.datasets.rectified import RectifiedDataset
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import rectify, rectifying_rotations
-from vio.records import ImuSample, Recording, StereoFrame
+from vio.records import ImuDensities, ImuSample, Recording, StereoFrame
 
 
 def _read(path: Path, **settings: object) -> RectifiedDataset:
@@ -449,7 +450,7 @@ def test_unreadable_images_are_skipped_up_to_a_limit(tmp_path: Path, caplog: pyt
 def test_images_of_another_size_than_the_calibration_are_refused(tmp_path: Path) -> None:
     make_euroc(tmp_path)
     cv2.imwrite(str(tmp_path / "mav0" / "cam1" / "data" / f"{_T1}.png"), np.zeros((20, 30), np.uint8))
-    with pytest.raises(DataError, match=rf"{_T1}.png is 30 x 20 pixels but .*cam1/sensor.yaml is for 64 x 48; give"):
+    with pytest.raises(DataError, match=rf"{_T1}.png is 30 x 20 pixels but .*cam1/sensor.yaml says 64 x 48; give"):
         _frames(_read(tmp_path))
 
 

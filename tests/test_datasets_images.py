@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from tests.dataset_makers import make_images
+from vio.datasets.image_pairs import ImageSize, pair_images
 from vio.datasets.images import (
     UnreadableImageError,
     list_images,
     load_gray,
-    pair_images,
     prefetch,
-    refuse_other_size,
+    write_png,
 )
 from vio.errors import DataError
 
@@ -110,8 +110,16 @@ def test_missing_image_is_unreadable(tmp_path: Path) -> None:
 
 
 def test_sizes_are_compared_by_name() -> None:
-    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png is 30 x 24"):
-        refuse_other_size(PIXELS, Path("b.png"), 30, 24, Path("a.png"))
+    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png says 30 x 24"):
+        ImageSize(30, 24, Path("a.png")).check(PIXELS, Path("b.png"))
+    ImageSize(32, 24, Path("a.png")).check(PIXELS, Path("b.png"))
+
+
+def test_a_written_png_reads_back(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", PIXELS)
+    pixels, bits = load_gray(tmp_path / "a.png")
+    np.testing.assert_array_equal(pixels, PIXELS)
+    assert bits == 8
 
 
 def test_images_are_listed_in_order_without_strangers(tmp_path: Path) -> None:

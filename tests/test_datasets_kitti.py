@@ -216,12 +216,12 @@ def test_all_images_unreadable_is_an_error_at_once(tmp_path: Path) -> None:
         read_kitti(folder, DEFAULT)
 
 
-@pytest.mark.parametrize(("camera", "other"), [("image_1", r"image_0.000002\.png"), ("both", r"image_0.000000\.png")])
-def test_images_of_different_size_are_named(camera: str, other: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("camera", ["image_1", "both"])
+def test_images_of_different_size_are_named(camera: str, tmp_path: Path) -> None:
     folder = make_kitti(tmp_path / "seq")
     for name in ("image_0", "image_1") if camera == "both" else (camera,):
         assert cv2.imwrite(str(folder / name / "000002.png"), np.zeros((24, 30), dtype=np.uint8))
-    with pytest.raises(DataError, match=rf"000002\.png is 30 x 24 pixels but .*{other} is 32 x 24"):
+    with pytest.raises(DataError, match=r"000002\.png is 30 x 24 pixels but .*image_0.000000\.png says 32 x 24"):
         frames_of(folder)
 
 
@@ -273,8 +273,9 @@ BAD = [
     (_write("calib.txt", calib_text(0.0, 0.0)), CalibrationError, r"P0 and P1 give a stereo baseline of 0 m"),
     (_write("calib.txt", calib_text(0.54, 0.0)), CalibrationError, r"stereo baseline of -0\.54 m.*exchanged"),
     (_write("calib.txt", GOOD.replace("6.0e+02", "x", 1)), CalibrationError, r"line 1: P0 holds no number"),
-    (_write("calib.txt", GOOD.replace(" 1 0", " 1", 1)), CalibrationError, r"line 1: P0 holds 11 values; 12"),
-    (_write("calib.txt", GOOD.replace("P0: 7", "P0: -7")), CalibrationError, r"P0 is no matrix K \[I \| t\]"),
+    (_write("calib.txt", GOOD.replace(" 1 0", " 1", 1)), CalibrationError, r"line 1: P0 holds 11 values where 12"),
+    (_write("calib.txt", GOOD.replace(" 1 0", " 2 0", 1)), CalibrationError, r"line 1: P0 is no matrix of intrinsics"),
+    (_write("calib.txt", GOOD.replace("P0: 7", "P0: -7")), CalibrationError, r"P0 and P1 differ in focal length"),
     (_write("calib.txt", GOOD.replace("6.0e+02", "5.0e+02", 1)), CalibrationError, r"P0 and P1 differ in focal length"),
     (_write("calib.txt", GOOD.replace("1.8e+02 0 0 0 1 0\nTr", "1.8e+02 99 0 0 1 0\nTr")), CalibrationError, "off the"),
     (_remove("times.txt"), DataError, r"times\.txt is missing"),

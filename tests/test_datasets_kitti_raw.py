@@ -154,7 +154,7 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
     "short D": (_entry("D_00", "-0.3 0.2 0 0"), CalibrationError, "D_00 holds 4 values where 5 finite ones belong"),
     "NaN in T": (_entry("T_01", "-0.5 nan 0"), CalibrationError, "T_01 holds 3 values where 3 finite ones belong"),
     "text": (_entry("T_01", "-0.5 a 0"), CalibrationError, "T_01 holds no number"),
-    "no matrix": (_entry("K_00", "1 2 3 4 5 6 7 8 9"), CalibrationError, "camera 00: no intrinsic matrix"),
+    "no matrix": (_entry("K_00", "1 2 3 4 5 6 7 8 9"), CalibrationError, "camera 00 is no matrix of intrinsics"),
     "negative focal": (
         _entry("K_00", "-40 0 31 0 40 24 0 0 1"),
         CalibrationError,

@@ -85,7 +85,7 @@ def _edit(key: str, index: object, value: float) -> Callable[[Arrays], Arrays]:
         (_set("theta_vk_i", np.zeros((3, 4))), DataError, r"theta_vk_i has shape 3 x 4"),
         (_edit("w_vk_vk_i", (0, 2), np.nan), DataError, r"w_vk_vk_i is not finite in 1 of 6 frames, first in frame 2"),
         (_edit("t", (0, 2), 0.0), DataError, r"t\[2\]: the clock runs backwards"),
-        (_set("b", 0.0), CalibrationError, r"the stereo baseline b is 0 m"),
+        (_set("b", 0.0), CalibrationError, r"\.mat: stereo baseline must be positive, got 0 m"),
         (_set("fu", [1.0, 2.0]), DataError, r"fu has shape 1 x 2; expected 1 finite"),
         (_set("C_c_v", np.diag([1.0, 1, 2])), CalibrationError, r"C_c_v: not a rotation"),
         (_set("C_c_v", np.eye(2)), DataError, r"C_c_v has shape 2 x 2"),

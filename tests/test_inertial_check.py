@@ -10,14 +10,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vio.datasets.common import imu_samples
+from vio.datasets.euroc_files import read_imu_csv
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.inertial_check import InertialCheck, InertialFinding, judge_clocks
 from vio.records import ImuSample, Observations, observations
-from vio.sim.imu import ImuNoise, imu_samples, read_imu_csv, simulate_imu
-from vio.sim.motion import MotionSpline, car_loop, evaluate, fit_spline, hand_held, read_tum, turned
+from vio.sim.imu import ImuNoise, simulate_imu
+from vio.sim.motion import MotionSpline, car_loop, evaluate, fit_spline, hand_held, turned
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_rectified_rig, small_rig
+from vio.trajectory_io import read_trajectory
 
 _FRAME_NS = 50_000_000
 
@@ -87,13 +90,15 @@ def _recording(name: str, seed: int = 0, mount: str = "euroc") -> Watched:
     reach = 15.0 if name == "car" else 3.0
     frames = _observe(camera, evaluate(motion, times).T_world_imu, T_cam0_imu, times.tolist(), reach, seed)
     gravity = 9.81 * evaluate(motion, imu.times_ns).T_world_imu[:, 2, :3]
-    return Watched(camera, T_cam0_imu, imu_samples(imu), list(gravity), frames)
+    return Watched(camera, T_cam0_imu, list(imu_samples(imu)), list(gravity), frames)
 
 
 @cache
 def _real(folder: Path, seconds: float) -> Watched:
     """The real IMU record of a flight, and points seen along its ground truth."""
-    truth_ns, poses = read_tum(folder / "groundtruth_tum.txt")
+    truth = read_trajectory(folder / "groundtruth_tum.txt", fmt="tum")
+    truth_ns, poses = truth.times_ns, truth.T_world_body
+    assert truth_ns is not None
     used = truth_ns < truth_ns[0] + round((seconds + 1) * 1e9)
     motion, _ = fit_spline(truth_ns[used], poses[used], knot_s=0.1)
     start, end = motion.start_ns, motion.start_ns + round(seconds * 1e9)

@@ -188,8 +188,8 @@ BAD = {
     "missing column": (f"1 {TUM_ROW}\n2 0 0 0 0 0 1\n", None, "line 2: 7 columns instead of 8; tum form has"),
     "unknown form": ("1 2 3\n", None, "line 1: 3 columns fit no known format.*tum.*kitti.*euroc"),
     "comments count": (f"# one\n\n1 {TUM_ROW}\n# four\n1.5 0 0 0 0 0 1\n", None, "line 5: 7 columns"),
-    "time repeats": (f"1 {TUM_ROW}\n1.0 {TUM_ROW}\n", None, "line 2: the time repeats.*sort"),
-    "time backwards": (f"2 {TUM_ROW}\n1 {TUM_ROW}\n", None, "line 2: the time runs backwards.*sort"),
+    "time repeats": (f"1 {TUM_ROW}\n1.0 {TUM_ROW}\n", None, "line 2: the clock repeats.*reorder"),
+    "time backwards": (f"2 {TUM_ROW}\n1 {TUM_ROW}\n", None, "line 2: the clock runs backwards.*reorder"),
     "time not a number": (f"one {TUM_ROW}\n", None, "line 1: the time 'one' is not a number"),
     "time nan": (f"nan {TUM_ROW}\n", None, "line 1: the time 'nan' is not a number"),
     "time huge": (f"1e999999999 {TUM_ROW}\n", None, "line 1: the time .* cannot be in seconds"),
@@ -232,9 +232,9 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, name: str) -> None:
 
 
 def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"cannot read trajectory .*missing\.txt: No such file"):
+    with pytest.raises(DataError, match=r"cannot read .*missing\.txt: No such file"):
         read_trajectory(tmp_path / "missing.txt")
-    with pytest.raises(DataError, match=r"cannot read trajectory .*directory"):
+    with pytest.raises(DataError, match=r"cannot read .*directory"):
         read_trajectory(tmp_path)
     (tmp_path / "b").write_bytes(b"\x89PNG\xff\xfe\x00")
     with pytest.raises(DataError, match="is not a text file"):

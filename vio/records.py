@@ -34,6 +34,27 @@ class ImuSample:
 
 
 @dataclass(frozen=True, slots=True)
+class ImuRecord:
+    """Raw readings of an inertial measurement unit, with the true biases where they are known."""
+
+    times_ns: IntArray  # (N,) strictly increasing
+    gyro: FloatArray  # (N, 3) rad/s, imu frame
+    accel: FloatArray  # (N, 3) m/s^2, imu frame, specific force
+    gyro_bias: FloatArray | None = None  # (N, 3) rad/s; None for a real record
+    accel_bias: FloatArray | None = None  # (N, 3) m/s^2; None for a real record
+
+
+@dataclass(frozen=True, slots=True)
+class ImuDensities:
+    """Noise of an inertial measurement unit as its calibration states it (continuous time)."""
+
+    gyro: float  # white noise, rad/s/sqrt(Hz)
+    gyro_walk: float  # bias random walk, rad/s^2/sqrt(Hz)
+    accel: float  # white noise, m/s^2/sqrt(Hz)
+    accel_walk: float  # bias random walk, m/s^3/sqrt(Hz)
+
+
+@dataclass(frozen=True, slots=True)
 class VelocitySample:
     """The paper's control input `u = [v; omega]`: body velocity and angular rate."""
 

@@ -20,10 +20,10 @@ from vio.atomic import atomic_folder
 from vio.config import to_yaml
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
-from vio.geometry.lie import FloatArray, se3_inverse, transform_points
+from vio.geometry.lie import FloatArray, transform_points
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.records import Landmarks, Trajectory
-from vio.trajectory_io import read_trajectory, write_kitti, write_tum
+from vio.trajectory_io import in_first_cam0, read_trajectory, write_kitti, write_tum
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ def write_run_folder(
     with atomic_folder(folder, replace=True, marker=MARKER) as inside:
         (inside / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
         write_tum(inside / "trajectory.tum", result.trajectory)
-        write_kitti(inside / "trajectory.kitti", kitti_form(result))
+        write_kitti(inside / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
         if result.dead_reckoning is not None:
             write_tum(inside / "dead_reckoning.tum", result.dead_reckoning)
         (inside / "landmarks.ply").write_bytes(landmarks_ply(result.landmarks))
@@ -157,12 +157,6 @@ def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
         raise DataError(f"{path}: no run folder (it has no {MARKER}); give a trajectory file or a folder of `vio run`")
     metrics = json.loads((path / MARKER).read_text(encoding="utf-8"))
     return read_trajectory(path / "trajectory.tum"), np.array(metrics["T_cam0_imu"], dtype=np.float64)
-
-
-def kitti_form(result: RunResult) -> Trajectory:
-    """Return the trajectory as KITTI writes it: cam0 poses relative to the first one."""
-    cam0 = result.trajectory.in_cam0(result.T_cam0_body)
-    return replace(cam0, T_world_body=se3_inverse(cam0.T_world_body[0]) @ cam0.T_world_body)
 
 
 def landmarks_ply(landmarks: Landmarks) -> bytes:

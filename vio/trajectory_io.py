@@ -8,8 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
 from pathlib import Path
@@ -25,8 +24,10 @@ from vio.geometry.lie import (
     quat_xyzw_from_rotation,
     rotation_from_quat_xyzw,
     se3_from_parts,
+    se3_inverse,
 )
 from vio.records import BodyFrame, IntArray, Trajectory
+from vio.text_files import INT64_MAX, check_increasing, exact_text, seconds_text, text_lines
 
 logger = logging.getLogger(__name__)
 
@@ -34,9 +35,7 @@ TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
 
 ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one that is still read as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
-_NS_PER_S = 10**9
-_INT64_MAX = 2**63 - 1
-_MAX_S = Decimal(_INT64_MAX).scaleb(-9)
+_MAX_S = Decimal(INT64_MAX).scaleb(-9)
 _COLUMNS: dict[TrajectoryFormat, str] = {
     "tum": "8 columns 'timestamp tx ty tz qx qy qz qw'",
     "kitti": "12 columns, the first three rows of a 4x4 pose",
@@ -55,8 +54,11 @@ class _Table:
     line_numbers: list[int]  # from 1, one per row
     commas: bool  # what separates the fields of the first row; else white space
 
+    def where(self, row: int) -> str:
+        return f"{self.path}, line {self.line_numbers[row]}"
+
     def fail(self, row: int, what: str) -> NoReturn:
-        raise DataError(f"{self.path}, line {self.line_numbers[row]}: {what}")
+        raise DataError(f"{self.where(row)}: {what}")
 
 
 def read_trajectory(
@@ -106,7 +108,9 @@ def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     lines.append("# timestamp tx ty tz qx qy qz qw")
     q_xyzw = quat_xyzw_from_rotation(trajectory.T_world_body[:, :3, :3])
     values = np.concatenate([trajectory.positions, q_xyzw], axis=1)
-    lines += [f"{_seconds(t)} {_numbers(row)}" for t, row in zip(trajectory.times_ns.tolist(), values, strict=True)]
+    lines += [
+        f"{seconds_text(t)} {exact_text(row)}" for t, row in zip(trajectory.times_ns.tolist(), values, strict=True)
+    ]
     atomic_write_text(path, "\n".join(lines) + "\n")
 
 
@@ -128,17 +132,17 @@ def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
             _format_frames(frames),
         )
     rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12)
-    atomic_write_text(path, "".join(f"{_numbers(row)}\n" for row in rows))
+    atomic_write_text(path, "".join(f"{exact_text(row)}\n" for row in rows))
+
+
+def in_first_cam0(trajectory: Trajectory, T_cam0_imu: FloatArray) -> Trajectory:
+    """Return a trajectory as KITTI writes it: cam0 poses relative to the first one."""
+    cam0 = trajectory.in_cam0(T_cam0_imu)
+    return replace(cam0, T_world_body=se3_inverse(cam0.T_world_body[0]) @ cam0.T_world_body)
 
 
 def _read_table(path: Path) -> _Table:
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise DataError(f"cannot read trajectory {path}: {error.strerror}; give a readable file") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: is not a text file; give a TUM, KITTI or EuRoC trajectory file") from error
-    lines = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    lines = [(number, line.strip()) for number, line in text_lines(path) if line.strip()]
     data = [(number, line) for number, line in lines if not line.startswith("#")]
     commas = bool(data) and "," in data[0][1]
     return _Table(
@@ -187,17 +191,13 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
 def _times_ns(table: _Table, kind: TrajectoryFormat) -> IntArray:
     """The first column as strictly increasing integer nanoseconds (N,)."""
     times = [_time_ns(table, row, kind) for row in range(len(table.rows))]
-    for row in range(1, len(times)):
-        if times[row] <= times[row - 1]:
-            what = "repeats" if times[row] == times[row - 1] else "runs backwards from"
-            table.fail(row, f"the time {what} that of the pose before; sort by time and remove doubles")
-    return np.array(times, dtype=np.int64)
+    return check_increasing(times, table.where)
 
 
 def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
     text = table.rows[row][0]
     if kind == "euroc":
-        if not re.fullmatch(r"[+-]?\d{1,19}", text) or abs(int(text)) > _INT64_MAX:
+        if not re.fullmatch(r"[+-]?\d{1,19}", text) or abs(int(text)) > INT64_MAX:
             table.fail(row, f"the time {text!r} is not in whole nanoseconds; EuRoC form has {_COLUMNS[kind]}")
         return int(text)
     try:
@@ -272,13 +272,3 @@ def _parse_frames(table: _Table, text: str) -> IntArray:
             "remove the comment or mend it"
         )
     return np.concatenate([np.arange(span.start, span.stop, dtype=np.int64) for span in spans])
-
-
-def _seconds(time_ns: int) -> str:
-    whole, rest = divmod(abs(time_ns), _NS_PER_S)
-    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
-
-
-def _numbers(values: Sequence[float] | FloatArray) -> str:
-    """Shortest text that reads back to the same bits."""
-    return " ".join(repr(float(v)) for v in values)

@@ -112,7 +112,7 @@ def execute(args: argparse.Namespace) -> int:
 def _open(text: str) -> _Source:
     """Open a recording with its calibration taken literally, even one that cannot be rectified with it."""
     from vio.datasets import DatasetSettings, open_dataset
-    from vio.datasets.kitti import KittiDataset
+    from vio.datasets.image_pairs import ImageDataset
     from vio.datasets.rectified import RectifiedDataset
     from vio.errors import CalibrationError
     from vio.geometry.distortion import rig_from_rectified
@@ -132,14 +132,14 @@ def _open(text: str) -> _Source:
     known = recording.camera.width is not None
     T = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
     rig = rig_from_rectified(recording.camera, T) if known else None
-    pairs = dataset.pairs if isinstance(dataset, KittiDataset) else ()
+    pairs = dataset.pairs if isinstance(dataset, ImageDataset) else ()
     return _Source(recording.path, rig, pairs, dataset, None)
 
 
 def _raw_euroc(path: Path, refused: str) -> _Source | None:
     """An EuRoC folder whose cameras cannot be rectified: its rig and images as they stand; None: it is none."""
-    from vio.datasets.euroc import read_camera_yaml
-    from vio.datasets.images import pair_images
+    from vio.datasets.euroc_files import read_camera_yaml
+    from vio.datasets.image_pairs import pair_images
     from vio.geometry.distortion import StereoRig
 
     mav = path / "mav0" if (path / "mav0").is_dir() else path
@@ -529,7 +529,7 @@ def _write_yaml(folder: Path, report: _Report) -> None:
     from vio.calibration.gyro import ImuAlignment
     from vio.calibration.levers import LeverArm
     from vio.calibration.stereo import StereoEstimate
-    from vio.datasets.euroc import camera_yaml
+    from vio.datasets.euroc_files import camera_yaml
     from vio.datasets.rectified import RectifiedDataset
     from vio.geometry.lie import se3_from_parts, se3_inverse
 

@@ -91,7 +91,7 @@ def execute(args: argparse.Namespace) -> int:
             if form == "kitti":
                 export_kitti(recording, args.out, replace=True, progress=progress)
             else:
-                noise = scenario.conditions.imu_noise
+                noise = scenario.conditions.imu_noise.densities
                 export_euroc(recording, args.out, replace=True, noise=noise, progress=progress)
 
     with one_blas_thread():

@@ -1,4 +1,4 @@
-"""What the readers share: integer clocks, events in time order, checked transforms and text tables."""
+"""What the readers share: integer clocks, events in time order, checked calibrations and archives."""
 
 from __future__ import annotations
 
@@ -13,11 +13,22 @@ import numpy.typing as npt
 
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts
-from vio.records import Event, ImuSample, IntArray, MotionSample, Recording, StereoFrame, VelocitySample
+from vio.records import (
+    BoolArray,
+    Event,
+    ImuRecord,
+    ImuSample,
+    IntArray,
+    MotionSample,
+    Recording,
+    StereoFrame,
+    VelocitySample,
+)
+from vio.text_files import NS_PER_S, check_increasing
 
-NS_PER_S = 10**9
 _ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I that is still read as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
+_EXACT_ENTRY = 1e-8  # to which the zeros and the one of a matrix of intrinsics must be so
 
 
 def seconds_to_ns(seconds: npt.ArrayLike) -> IntArray:
@@ -42,15 +53,7 @@ def clock_ns(seconds: npt.ArrayLike, where: Callable[[int], str]) -> IntArray:
     if bad.any():
         k = int(np.argmax(bad))
         raise DataError(f"{where(k)}: the time {s[k]:g} is not a time in seconds; write a finite number there")
-    times_ns = seconds_to_ns(s)
-    steps = np.diff(times_ns)
-    if (steps <= 0).any():
-        k = int(np.argmax(steps <= 0)) + 1
-        what = "repeats" if steps[k - 1] == 0 else "runs backwards"
-        raise DataError(
-            f"{where(k)}: the clock {what} ({s[k]:.9f} s after {s[k - 1]:.9f} s); remove or reorder that entry"
-        )
-    return times_ns
+    return check_increasing(seconds_to_ns(s), where)
 
 
 def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
@@ -84,6 +87,71 @@ def velocity_samples(times_ns: IntArray, linear: FloatArray, angular: FloatArray
     return tuple(
         VelocitySample(int(t), v, w)
         for t, v, w in zip(times_ns.tolist(), np.ascontiguousarray(linear), np.ascontiguousarray(angular), strict=True)
+    )
+
+
+def numbers_in(text: str, count: int, where: str) -> FloatArray:
+    """The numbers (count,) in one entry of a calibration file.
+
+    Args:
+        text: the entry.
+        count: how many numbers belong there.
+        where: names the file and the entry, for the message.
+
+    Raises:
+        CalibrationError: there are more, fewer, or others than finite numbers.
+    """
+    try:
+        values = np.array([float(value) for value in text.split()])
+    except ValueError as error:
+        raise CalibrationError(f"{where} holds no number ({error}); copy the calibration again") from error
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise CalibrationError(f"{where} holds {len(values)} values where {count} finite ones belong; copy it again")
+    return values
+
+
+def check_intrinsics(K: FloatArray, where: str) -> None:
+    """Raise CalibrationError unless a matrix (3, 3) has the form of intrinsics."""
+    if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=_EXACT_ENTRY):
+        raise CalibrationError(
+            f"{where} is no matrix of intrinsics [fu 0 cu; 0 fv cv; 0 0 1] but {K.tolist()}; check the order"
+        )
+
+
+def finite_rows(values: FloatArray, what: str) -> FloatArray:
+    """Return values (F, k) of frames, all finite.
+
+    Raises:
+        DataError: a frame's are not; the message begins with `what`, which names file and variable.
+    """
+    bad: BoolArray = np.asarray(~np.isfinite(values).all(axis=1))
+    if bad.any():
+        raise DataError(
+            f"{what} is not finite in {int(bad.sum())} of {len(bad)} frames, first in frame {int(np.argmax(bad))}; "
+            "remove or repair them"
+        )
+    return values
+
+
+def shape_text(array: np.ndarray) -> str:
+    """The shape of an array for a message: '4 x 3', or 'one value'."""
+    return " x ".join(map(str, array.shape)) or "one value"
+
+
+@contextlib.contextmanager
+def naming(where: Path | str) -> Iterator[None]:
+    """Put the place of a calibration before the message of a CalibrationError raised within."""
+    try:
+        yield
+    except CalibrationError as error:
+        raise CalibrationError(f"{where}: {error}") from error
+
+
+def imu_samples(record: ImuRecord) -> tuple[ImuSample, ...]:
+    """Turn a record into events."""
+    return tuple(
+        ImuSample(t, gyro, accel)
+        for t, gyro, accel in zip(record.times_ns.tolist(), record.gyro, record.accel, strict=True)
     )
 
 
@@ -127,41 +195,6 @@ def merge_events(
     if waiting is not None:
         yield waiting
         yield from samples
-
-
-def read_numbers(path: Path, columns: int, *, separator: str | None = None, skip: int = 0) -> FloatArray:
-    """Read a text table of numbers (N, columns), skipping the first `skip` lines and blank ones at the end.
-
-    Raises:
-        DataError: the file cannot be read, or a line holds something else; the message names the line.
-    """
-    rows: list[list[float]] = []
-    for number, line in text_lines(path)[skip:]:
-        fields = line.split(separator)
-        if len(fields) != columns:
-            raise DataError(f"{path}, line {number}: {len(fields)} values where {columns} belong")
-        try:
-            rows.append([float(value) for value in fields])
-        except ValueError as error:
-            raise DataError(f"{path}, line {number}: not a number ({error}); write plain decimals") from error
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)
-
-
-def text_lines(path: Path) -> list[tuple[int, str]]:
-    """The lines of a text file with their numbers from 1, blank lines at its end dropped.
-
-    Raises:
-        DataError: the file is missing or is no text.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise DataError(f"{path}: not a text file ({error.reason}); give the original file") from error
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
-    while lines and not lines[-1].strip():
-        lines.pop()
-    return list(enumerate(lines, start=1))
 
 
 def read_npz(path: Path) -> Mapping[str, np.ndarray]:

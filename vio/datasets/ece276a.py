@@ -17,7 +17,16 @@ from pathlib import Path
 import numpy as np
 
 from vio.calibration.levers import LeverVerdict, judge_levers
-from vio.datasets.common import checked_transform, clock_ns, read_npz, velocity_samples
+from vio.datasets.common import (
+    check_intrinsics,
+    checked_transform,
+    clock_ns,
+    finite_rows,
+    naming,
+    read_npz,
+    shape_text,
+    velocity_samples,
+)
 from vio.datasets.features import FeatureDataset
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
 from vio.datasets.tracks import moving_frames, settle_repeats, tracks_from_dense
@@ -94,43 +103,33 @@ def _array(
     """One array as float64, of a fitting shape."""
     value = arrays[key]
     if not fits(value.shape) or value.dtype.kind not in "fiu":
-        shape = " x ".join(map(str, value.shape)) or "one value"
-        raise DataError(f"{path}: {key} has shape {shape} and type {value.dtype}; expected {wanted} real numbers")
+        raise DataError(
+            f"{path}: {key} has shape {shape_text(value)} and type {value.dtype}; expected {wanted} real numbers"
+        )
     return value.astype(np.float64)
 
 
 def _velocities(arrays: Mapping[str, np.ndarray], key: str, path: Path, count: int) -> FloatArray:
     values = _array(arrays, key, path, lambda s: s == (3, count), f"3 x {count}")
-    bad = ~np.isfinite(values).all(axis=0)
-    if bad.any():
-        raise DataError(
-            f"{path}: {key} is not finite in {int(bad.sum())} of {count} frames, first in frame {int(np.argmax(bad))}; "
-            "remove or repair them"
-        )
-    return np.ascontiguousarray(values.T)
+    return np.ascontiguousarray(finite_rows(values.T, f"{path}: {key}"))
 
 
 def _intrinsics(arrays: Mapping[str, np.ndarray], key: str, path: Path) -> FloatArray:
     K = _array(arrays, key, path, lambda s: s == (3, 3), "3 x 3")
-    if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]):
-        raise CalibrationError(f"{path}: {key} is {K.tolist()}; expected [[fu, 0, cu], [0, fv, cv], [0, 0, 1]]")
+    check_intrinsics(K, f"{path}: {key}")
     return K
 
 
-def _camera(K: FloatArray, baseline_m: float) -> StereoCamera:
-    return StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), baseline_m)
+def _camera(K: FloatArray, baseline_m: float, path: Path) -> StereoCamera:
+    with naming(path):
+        return StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), baseline_m)
 
 
 def _old_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibration:
     K = _intrinsics(arrays, "K", path)
     b = float(_array(arrays, "b", path, lambda s: int(np.prod(s)) == 1, "one value").reshape(()))
-    if not b > 0:
-        raise CalibrationError(
-            f"{path}: the stereo baseline b is {b:g} m; it must be positive, so check the calibration"
-        )
-    camera = _camera(K, b)
     T = checked_transform(_array(arrays, "cam_T_imu", path, lambda s: s == (4, 4), "4 x 4"), f"{path}, cam_T_imu")
-    return _Calibration(camera, T, ambiguous=True)
+    return _Calibration(_camera(K, b, path), T, ambiguous=True)
 
 
 def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibration:
@@ -147,7 +146,7 @@ def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
         x, y, z = T_cam1_cam0[:3, 3]
         aligned = np.abs(T_cam1_cam0[:3, :3] - np.eye(3)).max() < _ALIGNED
         if aligned and x < 0 and np.hypot(y, z) < _RECTIFIED * -x:
-            return _Calibration(_camera(K, float(-x)), left, ambiguous=False)
+            return _Calibration(_camera(K, float(-x), path), left, ambiguous=False)
     raise CalibrationError(
         f"{path}: extL_T_imu and extR_T_imu place the cameras {np.round(T_cam1_cam0[:3, 3], 4).tolist()} m apart; the "
         "right camera of a rectified pair lies on the left one's positive x axis, turned alike"

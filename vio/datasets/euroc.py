@@ -11,43 +11,37 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 
 from __future__ import annotations
 
-import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
-from vio.datasets.common import checked_transform, text_lines
+from vio.datasets.common import imu_samples
+from vio.datasets.euroc_files import (
+    STATE_CSV,
+    TUM_FILE,
+    camera_yaml,
+    image_list_csv,
+    median_rate_hz,
+    read_camera_yaml,
+    read_imu_csv,
+    read_imu_yaml,
+    stamped_rows,
+)
 from vio.datasets.images import list_images
-from vio.datasets.rectified import ImuDensities, RectifiedDataset, make_rectifier, write_frames
+from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
-from vio.errors import CalibrationError, DataError
-from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
-from vio.records import ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
+from vio.errors import DataError
+from vio.geometry.distortion import CameraModel, StereoRig, rig_from_rectified
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
+from vio.text_files import write_text
 from vio.trajectory_io import read_trajectory
 
-DISTORTION_MODELS: dict[str, DistortionModel] = {
-    "radial-tangential": "radtan",
-    "radtan": "radtan",
-    "plumb_bob": "radtan",
-    "equidistant": "equidistant",
-    "none": "pinhole",
-}
-_STATE = Path("state_groundtruth_estimate0", "data.csv")
-_TUM = "groundtruth_tum.txt"
-_NOISE = (
-    "gyroscope_noise_density",
-    "gyroscope_random_walk",
-    "accelerometer_noise_density",
-    "accelerometer_random_walk",
-)
 _PAIRED_NS = 3_000_000  # stamps further apart belong to different exposures
 _JITTER_NS = 1_000_000  # by which the offset between paired stamps may vary around its median
-_INT64_MAX = 2**63 - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +110,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         pairs=tuple((left.files[a], right.files[b]) for a, b in zip(of_left.tolist(), of_right.tolist(), strict=True)),
         motion=imu.samples,
         rectifier=rectifier,
-        calibrated_in=(mav / "cam0" / "sensor.yaml", mav / "cam1" / "sensor.yaml"),
+        sizes=rig_sizes(rig, (mav / "cam0" / "sensor.yaml", mav / "cam1" / "sensor.yaml")),
         settings=settings,
         imu_noise=imu.noise,
     )
@@ -138,36 +132,9 @@ def _mav(path: Path) -> Path:
 def _read_camera(folder: Path) -> _Camera:
     model, T_body_cam = read_camera_yaml(folder / "sensor.yaml")
     path = folder / "data.csv"
-    times_ns, rows, lines = _stamped_rows(path, 2, "timestamp [ns],filename")
+    times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
     files, renamed = _find_images(folder / "data", [row[0] for row in rows], path, lines)
     return _Camera(model, T_body_cam, times_ns, files, renamed)
-
-
-def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
-    """Read a camera's `sensor.yaml`: its model, and `T_BS` (4, 4) from the camera to the body.
-
-    Raises:
-        CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
-    """
-    sheet = _read_yaml(path)
-    if (kind := sheet.get("camera_model", "pinhole")) != "pinhole":
-        raise CalibrationError(f"{path}: camera_model {kind!r} is not supported; only 'pinhole' is (with distortion)")
-    name = sheet.get("distortion_model", "none")
-    if not isinstance(name, str) or name not in DISTORTION_MODELS:
-        raise CalibrationError(
-            f"{path}: distortion_model {name!r} is unknown; the known ones are {', '.join(DISTORTION_MODELS)}"
-        )
-    model = DISTORTION_MODELS[name]
-    coefficients = () if model == "pinhole" else _numbers(sheet, "distortion_coefficients", path)
-    if model == "radtan" and not any(coefficients):
-        model, coefficients = "pinhole", ()
-    fu, fv, cu, cv = _numbers(sheet, "intrinsics", path, 4)
-    width, height = _numbers(sheet, "resolution", path, 2)
-    try:
-        camera = CameraModel(fu, fv, cu, cv, int(width), int(height), model, coefficients)
-    except CalibrationError as error:
-        raise CalibrationError(f"{path}: {error}") from error
-    return camera, _T_BS(sheet, path)
 
 
 def _find_images(folder: Path, names: Sequence[str], path: Path, lines: Sequence[int]) -> tuple[tuple[Path, ...], int]:
@@ -243,137 +210,23 @@ def _read_imu(folder: Path) -> _Imu:
     notes: tuple[str, ...] = ()
     T_body_imu, noise = np.eye(4), None
     if (path := folder / "sensor.yaml").is_file():
-        sheet = _read_yaml(path)
-        T_body_imu = _T_BS(sheet, path)
-        noise = _read_noise(sheet, path)
+        T_body_imu, noise = read_imu_yaml(path)
     else:
         notes = (f"{path} is missing; the IMU is taken for the body frame, its noise is unknown",)
-    return _Imu(T_body_imu, noise, read_imu(folder / "data.csv"), notes)
-
-
-def _read_noise(sheet: Mapping[str, object], path: Path) -> ImuDensities | None:
-    """The noise figures; None where none is stated."""
-    if not any(key in sheet for key in _NOISE):
-        return None
-    values = [_numbers(sheet, key, path, 1)[0] for key in _NOISE]
-    for key, value in zip(_NOISE, values, strict=True):
-        if not value > 0:
-            raise CalibrationError(f"{path}: {key} is {value:g}; a noise density must be positive")
-    return ImuDensities(gyro=values[0], gyro_walk=values[1], accel=values[2], accel_walk=values[3])
-
-
-def read_imu(path: Path) -> tuple[ImuSample, ...]:
-    """Read `timestamp [ns], gyro x y z [rad/s], accel x y z [m/s^2]`.
-
-    Raises:
-        DataError: a line has not seven finite numbers, or the clock does not increase; the message names the line.
-    """
-    times_ns, rows, lines = _stamped_rows(path, 7, "timestamp [ns], gyro x y z, accel x y z")
-    try:
-        values = np.array(rows, dtype=np.float64)
-    except ValueError:
-        values = np.array([[_number(text) for text in row] for row in rows])
-    bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        k = int(np.argmax(bad))
-        raise DataError(
-            f"{path}, line {lines[k]}: a reading is not a finite number ({','.join(rows[k])}; {int(bad.sum())} lines "
-            "in all); remove such lines"
-        )
-    return tuple(ImuSample(t, row[:3], row[3:]) for t, row in zip(times_ns.tolist(), values, strict=True))
+    return _Imu(T_body_imu, noise, imu_samples(read_imu_csv(folder / "data.csv")), notes)
 
 
 def _read_reference(mav: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory | None:
     """Ground truth of the IMU. EuRoC's describes the body; a TUM file may say that it describes the (raw) cam0."""
-    if (path := mav / _STATE).is_file():
+    if (path := mav / STATE_CSV).is_file():
         truth = read_trajectory(path, fmt="euroc", body="imu")
-    elif (path := mav.absolute().parent / _TUM).is_file():
+    elif (path := mav.absolute().parent / TUM_FILE).is_file():
         truth = read_trajectory(path, fmt="tum")
     else:
         return None
     if truth.body == "cam0":
         return truth.in_imu(se3_inverse(T_imu_cam0))
     return replace(truth, T_world_body=truth.T_world_body @ T_body_imu)
-
-
-# --- files ----------------------------------------------------------------------------------------------------------
-
-
-def _stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[list[str]], list[int]]:
-    """Times (N,) of a csv, its other fields, and the lines they stood in; lines that begin with '#' are let be.
-
-    Raises:
-        DataError: the file is missing or empty, a line has other fields, or the clock does not increase.
-    """
-    times: list[int] = []
-    rows: list[list[str]] = []
-    lines: list[int] = []
-    for number, line in text_lines(path):
-        if line.startswith("#"):
-            continue
-        fields = [field.strip() for field in line.split(",")]
-        if len(fields) != columns:
-            raise DataError(f"{path}, line {number}: {len(fields)} values where {columns} belong ({form})")
-        if not re.fullmatch(r"\d{1,19}", fields[0]) or int(fields[0]) > _INT64_MAX:
-            raise DataError(f"{path}, line {number}: {fields[0]!r} is no time in whole nanoseconds ({form})")
-        time_ns = int(fields[0])
-        if times and time_ns <= times[-1]:
-            what = "repeats" if time_ns == times[-1] else "runs backwards"
-            raise DataError(
-                f"{path}, line {number}: the clock {what} ({time_ns} ns after {times[-1]} ns); remove or reorder that "
-                "line"
-            )
-        times.append(time_ns)
-        rows.append(fields[1:])
-        lines.append(number)
-    if not times:
-        raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove its folder")
-    return np.array(times, dtype=np.int64), rows, lines
-
-
-def _read_yaml(path: Path) -> Mapping[str, object]:
-    if not path.is_file():
-        raise CalibrationError(f"{path} is missing; it holds the sensor's calibration")
-    # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
-    lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
-    try:
-        sheet = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
-    except yaml.YAMLError as error:
-        raise CalibrationError(f"{path}: not a YAML file ({' '.join(str(error).split())}); copy it again") from error
-    if not isinstance(sheet, dict):
-        raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
-    return sheet
-
-
-def _number(value: object) -> float:
-    """A number as YAML or csv has it (PyYAML takes 1e-3 for text); NaN where it is none."""
-    try:
-        return float(value) if isinstance(value, (int, float, str)) else float("nan")
-    except ValueError:
-        return float("nan")
-
-
-def _numbers(sheet: Mapping[str, object], key: str, path: Path, count: int | None = None) -> tuple[float, ...]:
-    """A list of finite numbers, or a lone one."""
-    if key not in sheet:
-        raise CalibrationError(f"{path}: has no entry '{key}'; copy the calibration again")
-    value = sheet[key]
-    numbers = tuple(_number(v) for v in (value if isinstance(value, list) else [value]))
-    if (count is not None and len(numbers) != count) or not np.all(np.isfinite(numbers)):
-        wanted = "finite numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
-        raise CalibrationError(f"{path}: '{key}' is {value!r} where {wanted} belong")
-    return numbers
-
-
-def _T_BS(sheet: Mapping[str, object], path: Path) -> FloatArray:
-    """The transform from the sensor to the body, as an OpenCV matrix or as a list of rows."""
-    entry = sheet.get("T_BS")
-    values = entry.get("data") if isinstance(entry, dict) else entry
-    if isinstance(values, list) and all(isinstance(row, list) for row in values):
-        values = [value for row in values for value in row]
-    if not isinstance(values, list) or len(values) != 16:
-        raise CalibrationError(f"{path}: T_BS must hold 16 numbers, the 4x4 transform from the sensor to the body")
-    return checked_transform(np.array([_number(v) for v in values]).reshape(4, 4), f"{path}, T_BS")
 
 
 # --- writing --------------------------------------------------------------------------------------------------------
@@ -394,13 +247,9 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Callab
         DataError: too many images are unreadable, or a file cannot be copied.
     """
     source, mav = _mav(dataset.recording.path), out / "mav0"
-    T_imu_rect0 = se3_inverse(dataset.rectifier.T_rect0_imu)
-    T_body_rect0 = _read_imu_pose(source / "imu0" / "sensor.yaml") @ T_imu_rect0
-    camera = dataset.recording.camera
-    assert camera.width is not None
-    assert camera.height is not None
-    T_rect0_rect1 = se3_from_parts(np.eye(3), [camera.baseline_m, 0, 0])
-    model = CameraModel(camera.fu, camera.fv, camera.cu, camera.cv, camera.width, camera.height)
+    rig = rig_from_rectified(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
+    sheet = source / "imu0" / "sensor.yaml"
+    T_body_imu = read_imu_yaml(sheet)[0] if sheet.is_file() else np.eye(4)
     folders = [mav / name for name in ("cam0", "cam1")]
     for folder in folders:
         (folder / "data").mkdir(parents=True)
@@ -409,38 +258,14 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Callab
         return folders[0] / "data" / f"{frame.time_ns}.png", folders[1] / "data" / f"{frame.time_ns}.png"
 
     times_ns = write_frames(dataset, name, progress)
-    rate_hz = 1e9 / float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
-    rows = "".join(f"{t},{t}.png\n" for t in times_ns.tolist())
-    for folder, T_body_cam in zip(folders, (T_body_rect0, T_body_rect0 @ T_rect0_rect1), strict=True):
-        text = camera_yaml(model, T_body_cam, comment=f"rectified {folder.name}", rate_hz=rate_hz)
-        (folder / "sensor.yaml").write_text(text, encoding="utf-8", newline="\n")
-        (folder / "data.csv").write_text(f"#timestamp [ns],filename\n{rows}", encoding="utf-8", newline="\n")
-    for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), _STATE):
+    for folder, model, T_imu_cam in zip(folders, (rig.cam0, rig.cam1), (rig.T_imu_cam0, rig.T_imu_cam1), strict=True):
+        comment, rate_hz = f"rectified {folder.name}", median_rate_hz(times_ns)
+        write_text(folder / "sensor.yaml", camera_yaml(model, T_body_imu @ T_imu_cam, comment=comment, rate_hz=rate_hz))
+        write_text(folder / "data.csv", image_list_csv(times_ns))
+    for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV):
         _copy(source / part, mav / part)
-    _copy(source.absolute().parent / _TUM, out / _TUM)
+    _copy(source.absolute().parent / TUM_FILE, out / TUM_FILE)
     return len(times_ns)
-
-
-def camera_yaml(camera: CameraModel, T_body_cam: FloatArray, *, comment: str, rate_hz: float) -> str:
-    """The text of a camera's `sensor.yaml`, with all digits; `T_body_cam` (4, 4) becomes its `T_BS`."""
-    name = "equidistant" if camera.model == "equidistant" else "radial-tangential"
-    rows = ",\n         ".join(", ".join(repr(float(x)) for x in row) for row in T_body_cam)
-    return (
-        f"%YAML:1.0\nsensor_type: camera\ncomment: {comment}\n\n"
-        f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n\n"
-        f"rate_hz: {rate_hz:.6g}\nresolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
-        f"intrinsics: [{_listed((camera.fu, camera.fv, camera.cu, camera.cv))}] #fu, fv, cu, cv\n"
-        f"distortion_model: {name}\n"
-        f"distortion_coefficients: [{_listed(camera.coefficients or (0.0,) * 4)}]\n"
-    )
-
-
-def _listed(values: Sequence[float]) -> str:
-    return ", ".join(repr(float(value)) for value in values)
-
-
-def _read_imu_pose(path: Path) -> FloatArray:
-    return _T_BS(_read_yaml(path), path) if path.is_file() else np.eye(4)
 
 
 def _copy(source: Path, target: Path) -> None:

@@ -10,34 +10,20 @@ KITTI's poses and `T_cam0_imu.txt` describe camera 0. Where the colour pair is u
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import (
-    checked_transform,
-    clock_ns,
-    frame_range,
-    merge_events,
-    read_numbers,
-    text_lines,
-    velocity_samples,
-)
-from vio.datasets.images import (
-    BadFrame,
-    UnreadableImageError,
-    load_gray,
-    pair_images,
-    readable_frames,
-    refuse_other_size,
-)
+from vio.datasets.common import check_intrinsics, checked_transform, clock_ns, naming, numbers_in, velocity_samples
+from vio.datasets.image_pairs import ImageDataset, ImageSize, first_readable, pair_images
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
-from vio.records import Event, IntArray, Observations, Recording, StereoFrame, Trajectory, VelocitySample
+from vio.records import IntArray, Recording, Trajectory, VelocitySample
+from vio.text_files import exact_text, read_numbers, seconds_text, text_lines, write_text
 from vio.trajectory_io import read_trajectory
 
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
@@ -53,51 +39,7 @@ class _Calibration:
     off_axis_m: float  # distance of the right camera from the left one's x axis
 
 
-@dataclass(frozen=True, slots=True)
-class KittiDataset:
-    """Implements `vio.protocols.Dataset` over a folder of rectified image pairs."""
-
-    recording: Recording
-    pairs: tuple[tuple[Path, Path], ...]  # left and right image of each frame
-    motion: tuple[VelocitySample, ...]  # in time order
-    measured: Path  # the image whose size is the camera's
-    settings: DatasetSettings
-
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
-        """Yield events of the frames `start <= index < stop` in time order.
-
-        A frame with an unreadable image is left out with a warning, up to `max_bad_frames` of them.
-
-        Raises:
-            DataError: the range holds no frame, images differ in size, or too many are unreadable.
-        """
-        chosen = frame_range(self.recording, start, stop)
-        frames = readable_frames(self._load, chosen, self.settings) if images else (self._frame(k) for k in chosen)
-        return merge_events(self.recording, chosen, self.motion, frames)
-
-    def observations(self, index: int) -> Observations | None:
-        """Return None: the recording holds images only."""
-        return None
-
-    def _frame(self, index: int) -> StereoFrame:
-        return StereoFrame(index, int(self.recording.frame_times_ns[index]), None, None)
-
-    def _load(self, index: int) -> StereoFrame | BadFrame:
-        camera = self.recording.camera
-        assert camera.width is not None
-        assert camera.height is not None
-        left_path, right_path = self.pairs[index]
-        try:
-            left, right = load_gray(left_path)[0], load_gray(right_path)[0]
-        except UnreadableImageError as error:
-            return BadFrame(index, str(error))
-        if left.shape != right.shape:
-            refuse_other_size(right, right_path, left.shape[1], left.shape[0], left_path)
-        refuse_other_size(left, left_path, camera.width, camera.height, self.measured)
-        return replace(self._frame(index), left=left, right=right)
-
-
-def read_kitti(path: Path, settings: DatasetSettings) -> KittiDataset:
+def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     """Read a KITTI odometry folder.
 
     Raises:
@@ -108,7 +50,8 @@ def read_kitti(path: Path, settings: DatasetSettings) -> KittiDataset:
     calibration = read_calibration(path / "calib.txt", cameras)
     pairs = pair_images(*(path / f"image_{k}" for k in cameras))
     times_ns = _read_times(path / "times.txt", path / f"image_{cameras[0]}", len(pairs))
-    measured, width, height, notes = _probe(pairs, settings.max_bad_frames)
+    measured, image, bits = first_readable(pairs, settings.max_bad_frames)
+    size = ImageSize(image.shape[1], image.shape[0], measured)
     motion = _read_velocity(path / "velocity.csv", times_ns)
     T_cam0_imu = read_extrinsics(path / "T_cam0_imu.txt")
     if motion and T_cam0_imu is None:
@@ -116,24 +59,24 @@ def read_kitti(path: Path, settings: DatasetSettings) -> KittiDataset:
             f"{path}: velocity.csv stands without T_cam0_imu.txt, the transform from the IMU to camera 0; add it, or "
             "take velocity.csv away to use the images alone"
         )
+    notes = [] if bits == 8 else [f"images have {bits} bits ({measured.name}); scaled to 8 bits by 1/257"]
     if calibration.off_axis_m > _NOTED_M:
-        notes = (
-            *notes,
+        notes.append(
             f"the camera of image_{cameras[1]} lies {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of "
-            f"image_{cameras[0]}; the pair is taken as rectified all the same",
+            f"image_{cameras[0]}; the pair is taken as rectified all the same"
         )
     recording = Recording(
         kind="kitti",
         path=path,
-        camera=replace(calibration.camera, width=width, height=height),
+        camera=replace(calibration.camera, width=size.width, height=size.height),
         T_cam0_imu=None if T_cam0_imu is None else calibration.T_left_cam0 @ T_cam0_imu,
         frame_times_ns=times_ns,
         has_images=True,
         motion=frozenset({"velocity"}) if motion else frozenset(),
         reference=_read_reference(path, times_ns, calibration.T_left_cam0),
-        notes=notes,
+        notes=tuple(notes),
     )
-    return KittiDataset(recording, pairs, motion, measured, settings)
+    return ImageDataset(recording, pairs, motion, (size, size), settings)
 
 
 def is_kitti_folder(path: Path) -> bool:
@@ -176,7 +119,8 @@ def read_calibration(path: Path, cameras: tuple[int, int]) -> _Calibration:
         raise CalibrationError(
             f"{path}: {names} put the right camera {off_axis:g} m off the left one's x axis; rectify"
         )
-    camera = StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), float(x))
+    with naming(path):
+        camera = StereoCamera(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), float(x))
     return _Calibration(camera, se3_from_parts(np.eye(3), offsets[0]), off_axis)
 
 
@@ -186,18 +130,9 @@ def _projection(path: Path, name: str) -> FloatArray:
     if len(found) != 1:
         raise CalibrationError(f"{path}: {len(found)} lines begin with '{name}:'; exactly one must")
     number, values = found[0]
-    try:
-        P = np.array([float(value) for value in values.split()])
-    except ValueError as error:
-        raise CalibrationError(f"{path}, line {number}: {name} holds no number ({error})") from error
-    if P.shape != (12,) or not np.isfinite(P).all():
-        raise CalibrationError(f"{path}, line {number}: {name} holds {len(P)} values; 12 finite ones belong there")
-    P = P.reshape(3, 4)
-    K = P[:, :3]
-    if not (np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1]) and K[0, 0] > 0 and K[1, 1] > 0):
-        raise CalibrationError(
-            f"{path}, line {number}: {name} is no matrix K [I | t] with positive focal lengths; check the order"
-        )
+    where = f"{path}, line {number}: {name}"
+    P = numbers_in(values, 12, where).reshape(3, 4)
+    check_intrinsics(P[:, :3], where)
     return P
 
 
@@ -210,20 +145,6 @@ def _read_times(path: Path, folder: Path, count: int) -> IntArray:
             f"{path} holds {len(seconds)} times and {folder} {count} images; there must be one time an image"
         )
     return clock_ns(seconds, lambda k: f"{path}, line {k + 1}")
-
-
-def _probe(pairs: tuple[tuple[Path, Path], ...], max_bad_frames: int) -> tuple[Path, int, int, tuple[str, ...]]:
-    """The first readable left image, its width, height and a note on its depth."""
-    for index, (left, _) in enumerate(pairs):
-        try:
-            image, bits = load_gray(left)
-        except UnreadableImageError:
-            if index >= max_bad_frames or index + 1 == len(pairs):
-                raise
-            continue
-        note = () if bits == 8 else (f"images have {bits} bits ({left.name}); scaled to 8 bits by 1/257",)
-        return left, image.shape[1], image.shape[0], note
-    raise DataError("no image pair")  # pair_images gives at least one
 
 
 def _read_velocity(path: Path, frame_times_ns: IntArray) -> tuple[VelocitySample, ...]:
@@ -272,3 +193,27 @@ def _read_reference(path: Path, times_ns: IntArray, T_left_cam0: FloatArray) -> 
         raise DataError(f"{file} holds {len(poses)} poses for {len(times_ns)} images; give one line for each image")
     moved = T_left_cam0 @ poses @ se3_inverse(T_left_cam0) if np.any(T_left_cam0 != np.eye(4)) else poses
     return Trajectory(moved, times_ns[: len(poses)], "cam0", np.arange(len(poses)))
+
+
+# --- writing --------------------------------------------------------------------------------------------------------
+
+
+def write_calibration(folder: Path, camera: StereoCamera, T_cam0_imu: FloatArray | None) -> None:
+    """Write `calib.txt` and, where the IMU's pose (4, 4) is known, `T_cam0_imu.txt`, with all digits."""
+    P0 = np.column_stack([camera.K, np.zeros(3)])
+    P1 = P0.copy()
+    P1[0, 3] = -camera.fu * camera.baseline_m
+    write_text(folder / "calib.txt", "".join(f"P{k}: {exact_text(P)}\n" for k, P in enumerate((P0, P1))))
+    if T_cam0_imu is not None:
+        write_text(folder / "T_cam0_imu.txt", "".join(f"{exact_text(row)}\n" for row in T_cam0_imu[:3]))
+
+
+def write_times(folder: Path, times_ns: IntArray) -> None:
+    """Write `times.txt`: seconds since the first of the times (N,), exact to the nanosecond."""
+    write_text(folder / "times.txt", "".join(f"{seconds_text(t)}\n" for t in (times_ns - times_ns[0]).tolist()))
+
+
+def write_velocity(folder: Path, samples: Sequence[VelocitySample], start_ns: int) -> None:
+    """Write `velocity.csv` with all digits, in seconds since `start_ns`."""
+    rows = (f"{seconds_text(s.time_ns - start_ns)},{exact_text([*s.linear, *s.angular], ',')}" for s in samples)
+    write_text(folder / "velocity.csv", "\n".join([VELOCITY_HEADER, *rows]) + "\n")

@@ -19,14 +19,16 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import NS_PER_S, checked_transform, text_lines
-from vio.datasets.images import UnreadableImageError, load_gray, pair_images
-from vio.datasets.rectified import RectifiedDataset, Rectifier, make_rectifier, write_frames
+from vio.datasets.common import check_intrinsics, checked_transform, naming, numbers_in
+from vio.datasets.image_pairs import ImagePairs, first_readable, pair_images
+from vio.datasets.kitti import write_calibration, write_times
+from vio.datasets.rectified import RectifiedDataset, Rectifier, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
-from vio.geometry.distortion import CameraModel, StereoRig
+from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import IntArray, Recording, StereoFrame
+from vio.text_files import NS_PER_S, check_increasing, text_lines
 
 CAMERAS = "calib_cam_to_cam.txt"
 VELO = "calib_velo_to_cam.txt"
@@ -89,7 +91,8 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         reference=None,
         notes=(*time_notes, *imu_notes),
     )
-    return RectifiedDataset(recording, pairs, (), rectifier, (calibration_path, calibration_path), settings)
+    sizes = rig_sizes(rectifier.rig, (calibration_path, calibration_path))
+    return RectifiedDataset(recording, pairs, (), sizes, settings, rectifier)
 
 
 def _find(path: Path, name: str) -> Path | None:
@@ -102,7 +105,7 @@ def _find(path: Path, name: str) -> Path | None:
 def _rectifier(
     calibration: KittiRawCalibration,
     T_cam0_imu: FloatArray | None,
-    pairs: tuple[tuple[Path, Path], ...],
+    pairs: ImagePairs,
     settings: DatasetSettings,
     where: Path,
 ) -> Rectifier:
@@ -110,7 +113,7 @@ def _rectifier(
     c = calibration
     T_imu_cam0 = np.eye(4) if T_cam0_imu is None else se3_inverse(T_cam0_imu)
     raw, rectified = (c.cam0.width, c.cam0.height), (c.rect0.width, c.rect0.height)
-    size = _image_size(pairs, settings.max_bad_frames)
+    size = first_readable(pairs, settings.max_bad_frames)[1].shape[::-1]
     if size == rectified and raw != rectified:
         T_imu_rect0 = T_imu_cam0 @ se3_from_parts(c.R_rect_cam0.T, np.zeros(3))
         rig = StereoRig(c.rect0, c.rect1, T_imu_rect0, T_imu_rect0 @ se3_inverse(c.T_rect1_rect0))
@@ -122,19 +125,6 @@ def _rectifier(
             f"(raw) or {rectified[0]} x {rectified[1]} (rectified); give the calibration of these images"
         )
     return make_rectifier(rig, settings.interpolation, where)
-
-
-def _image_size(pairs: tuple[tuple[Path, Path], ...], max_bad_frames: int) -> tuple[int, int]:
-    """Width and height of the first readable left image."""
-    for index, (left, _) in enumerate(pairs):
-        try:
-            image, _ = load_gray(left)
-        except UnreadableImageError:
-            if index >= max_bad_frames or index + 1 == len(pairs):
-                raise
-            continue
-        return image.shape[1], image.shape[0]
-    raise DataError("no image pair")  # pair_images gives at least one
 
 
 # --- calibration ----------------------------------------------------------------------------------------------------
@@ -173,21 +163,11 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
 
 
 def _camera(K: FloatArray, width: float, height: float, coefficients: tuple[float, ...], where: str) -> CameraModel:
-    if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=1e-9):
-        raise CalibrationError(f"{where}: no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1]; check the order")
-    try:
-        return CameraModel(
-            float(K[0, 0]),
-            float(K[1, 1]),
-            float(K[0, 2]),
-            float(K[1, 2]),
-            int(width),
-            int(height),
-            "radtan" if coefficients else "pinhole",
-            coefficients,
-        )
-    except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from error
+    check_intrinsics(K, where)
+    kind: DistortionModel = "radtan" if coefficients else "pinhole"
+    with naming(where):
+        fu, fv, cu, cv = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+        return CameraModel(fu, fv, cu, cv, int(width), int(height), kind, coefficients)
 
 
 def _rigid(entries: Mapping[str, str], k: str, path: Path) -> FloatArray:
@@ -238,19 +218,13 @@ def _read_entries(path: Path) -> dict[str, str]:
 def _entry(entries: Mapping[str, str], name: str, count: int, path: Path) -> FloatArray:
     if name not in entries:
         raise CalibrationError(f"{path}: has no entry {name}; copy the calibration again")
-    try:
-        values = np.array([float(value) for value in entries[name].split()])
-    except ValueError as error:
-        raise CalibrationError(f"{path}: {name} holds no number ({error}); copy the calibration again") from error
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise CalibrationError(f"{path}: {name} holds {len(values)} values where {count} finite ones belong")
-    return values
+    return numbers_in(entries[name], count, f"{path}: {name}")
 
 
 # --- clock ----------------------------------------------------------------------------------------------------------
 
 
-def _frame_numbers(pairs: tuple[tuple[Path, Path], ...]) -> IntArray:
+def _frame_numbers(pairs: ImagePairs) -> IntArray:
     """The numbers (F,) that the images are named by."""
     bad = next((left for left, _ in pairs if not left.stem.isdecimal()), None)
     if bad is not None:
@@ -281,11 +255,7 @@ def _read_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...
             "line an image, or one for each frame of the drive"
         )
     times = [_parse_time(lines[row][1], path, lines[row][0]) for row in rows]
-    for k in range(1, len(times)):
-        if times[k] <= times[k - 1]:
-            what = "repeats" if times[k] == times[k - 1] else "runs backwards"
-            raise DataError(f"{path}, line {lines[rows[k]][0]}: the clock {what}; remove or reorder that entry")
-    return np.array(times, dtype=np.int64), ()
+    return check_increasing(times, lambda k: f"{path}, line {lines[rows[k]][0]}"), ()
 
 
 def _parse_time(text: str, path: Path, number: int) -> int:
@@ -327,22 +297,6 @@ def write_rectified_kitti(dataset: RectifiedDataset, out: Path, progress: Callab
         return folders[0] / f"{count:06d}.png", folders[1] / f"{count:06d}.png"
 
     times_ns = write_frames(dataset, name, progress)
-    camera, T_cam0_imu = dataset.recording.camera, dataset.recording.T_cam0_imu
-    P0 = np.column_stack([camera.K, np.zeros(3)])
-    P1 = P0.copy()
-    P1[0, 3] = -camera.fu * camera.baseline_m
-    _write(out / "calib.txt", [f"P{k}: {_numbers(P)}" for k, P in enumerate((P0, P1))])
-    elapsed = (times_ns - times_ns[0]).tolist()
-    _write(out / "times.txt", [f"{t // NS_PER_S}.{t % NS_PER_S:09d}" for t in elapsed])
-    if T_cam0_imu is not None:
-        _write(out / "T_cam0_imu.txt", [_numbers(row) for row in T_cam0_imu])
+    write_calibration(out, dataset.recording.camera, dataset.recording.T_cam0_imu)
+    write_times(out, times_ns)
     return len(times_ns)
-
-
-def _numbers(values: FloatArray) -> str:
-    """All digits, so that reading gives back the same bits."""
-    return " ".join(repr(float(value)) for value in np.ravel(values))
-
-
-def _write(path: Path, lines: list[str]) -> None:
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")

@@ -2,33 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import frame_range, merge_events
-from vio.datasets.images import BadFrame, UnreadableImageError, load_gray, readable_frames
-from vio.datasets.settings import DatasetSettings, Interpolation
-from vio.errors import CalibrationError, DataError
+from vio.datasets.common import naming
+from vio.datasets.image_pairs import ImageDataset, ImageSize
+from vio.datasets.images import write_png
+from vio.datasets.settings import Interpolation
+from vio.errors import DataError
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.rectify import MapArray, rectified_pair, rectify
 from vio.geometry.stereo import StereoCamera
-from vio.records import Event, Image, IntArray, MotionSample, Observations, Recording, StereoFrame
-
-_PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
-
-
-@dataclass(frozen=True, slots=True)
-class ImuDensities:
-    """Noise of an inertial measurement unit as its calibration states it (continuous time)."""
-
-    gyro: float  # white noise, rad/s/sqrt(Hz)
-    gyro_walk: float  # bias random walk, rad/s^2/sqrt(Hz)
-    accel: float  # white noise, m/s^2/sqrt(Hz)
-    accel_walk: float  # bias random walk, m/s^3/sqrt(Hz)
+from vio.records import Image, ImuDensities, IntArray, StereoFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +50,15 @@ def make_rectifier(rig: StereoRig, interpolation: Interpolation, where: Path) ->
     """
     if (pair := rectified_pair(rig)) is not None:
         return Rectifier(rig, pair, se3_inverse(rig.T_imu_cam0), None, interpolation)
-    try:
+    with naming(where):
         done = rectify(rig)
-    except CalibrationError as error:
-        raise CalibrationError(f"{where}: {error}") from error
     return Rectifier(rig, done.camera, done.T_rect0_imu, (done.map0, done.map1), interpolation)
+
+
+def rig_sizes(rig: StereoRig, calibrated_in: tuple[Path, Path]) -> tuple[ImageSize, ImageSize]:
+    """The sizes of left and right files that a rig is calibrated for, and which file says so."""
+    left, right = calibrated_in
+    return ImageSize(rig.cam0.width, rig.cam0.height, left), ImageSize(rig.cam1.width, rig.cam1.height, right)
 
 
 def _remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpolation) -> Image:
@@ -78,56 +71,15 @@ def _remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpo
 
 
 @dataclass(frozen=True, slots=True)
-class RectifiedDataset:
-    """Implements `vio.protocols.Dataset` over image files of real cameras; its frames are rectified."""
+class RectifiedDataset(ImageDataset):
+    """Implements `vio.protocols.Dataset` over image files of real cameras, rectified as they are read."""
 
-    recording: Recording
-    pairs: tuple[tuple[Path, Path], ...]  # left and right image of each frame, raw
-    motion: tuple[MotionSample, ...]  # in time order
     rectifier: Rectifier
-    calibrated_in: tuple[Path, Path]  # files that state the raw size of the left and the right image
-    settings: DatasetSettings
     imu_noise: ImuDensities | None = None
 
-    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
-        """Yield events of the frames `start <= index < stop` in time order.
-
-        A frame with an unreadable image is left out with a warning, up to `max_bad_frames` of them.
-
-        Raises:
-            DataError: the range holds no frame, an image has not the calibrated size, or too many are unreadable.
-        """
-        chosen = frame_range(self.recording, start, stop)
-        frames = (
-            readable_frames(self._load, chosen, self.settings)
-            if images
-            else (self._frame(k, None, None) for k in chosen)
-        )
-        return merge_events(self.recording, chosen, self.motion, frames)
-
-    def observations(self, index: int) -> Observations | None:
-        """Return None: the recording holds images only."""
-        return None
-
-    def _frame(self, index: int, left: Image | None, right: Image | None) -> StereoFrame:
-        return StereoFrame(index, int(self.recording.frame_times_ns[index]), left, right)
-
-    def _load(self, index: int) -> StereoFrame | BadFrame:
-        """Read and rectify one frame; runs in the prefetch thread."""
-        try:
-            left, right = (load_gray(path)[0] for path in self.pairs[index])
-        except UnreadableImageError as error:
-            return BadFrame(index, str(error))
-        rig = self.rectifier.rig
-        for image, path, camera, calibration in zip(
-            (left, right), self.pairs[index], (rig.cam0, rig.cam1), self.calibrated_in, strict=True
-        ):
-            if image.shape != (camera.height, camera.width):
-                raise DataError(
-                    f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {calibration} is for {camera.width} x "
-                    f"{camera.height}; give the calibration of these images"
-                )
-        return self._frame(index, *self.rectifier(left, right))
+    def prepared(self, left: Image, right: Image) -> tuple[Image, Image]:
+        """Rectify one raw pair, each image (H, W) as large as its camera's."""
+        return self.rectifier(left, right)
 
 
 def refuse_rectified(dataset: RectifiedDataset) -> None:
@@ -153,24 +105,13 @@ def write_frames(
         DataError: too many images are unreadable, or one has the wrong size.
     """
     times: list[int] = []
-    for frame in _only_frames(dataset.events()):
+    for frame in (event for event in dataset.events() if isinstance(event, StereoFrame)):
         assert frame.left is not None
         assert frame.right is not None
         for path, image in zip(name(frame, len(times)), (frame.left, frame.right), strict=True):
-            path.write_bytes(_png(image))
+            write_png(path, image)
         times.append(frame.time_ns)
         progress()
     if not times:
         raise DataError(f"{dataset.recording.path}: no frame could be read; see the warnings above")
     return np.array(times, dtype=np.int64)
-
-
-def _only_frames(events: Iterable[Event]) -> Iterator[StereoFrame]:
-    return (event for event in events if isinstance(event, StereoFrame))
-
-
-def _png(image: Image) -> bytes:
-    import cv2
-
-    _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
-    return bytes(data.tobytes())

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import checked_transform, clock_ns, velocity_samples
+from vio.datasets.common import checked_transform, clock_ns, finite_rows, naming, shape_text, velocity_samples
 from vio.datasets.features import FeatureDataset, SensorVariances
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, settle_repeats, tracks_from_dense
-from vio.errors import CalibrationError, DataError
+from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, IntArray, Landmarks, Recording, Trajectory
+from vio.records import IntArray, Landmarks, Recording, Trajectory
 
 KEYS = ("y_k_j", "t", "v_vk_vk_i", "w_vk_vk_i", "fu", "fv", "cu", "cv", "b", "C_c_v", "rho_v_c_v")
 
@@ -34,11 +34,11 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
     arrays = _read_mat(path)
     features = arrays["y_k_j"]
     if features.ndim != 3 or features.shape[0] != 4 or features.shape[1] < 2:
-        raise DataError(f"{path}: y_k_j has shape {_shape(features)}; expected 4 x T x M with at least two frames")
+        raise DataError(f"{path}: y_k_j has shape {shape_text(features)}; expected 4 x T x M with at least two frames")
     count = features.shape[1]
     times_ns = clock_ns(_rows(arrays, "t", path, 1, count)[:, 0], lambda k: f"{path}, t[{k}]")
-    linear = _finite(_rows(arrays, "v_vk_vk_i", path, 3, count), "v_vk_vk_i", path)
-    angular = _finite(_rows(arrays, "w_vk_vk_i", path, 3, count), "w_vk_vk_i", path)
+    linear = _finite(arrays, "v_vk_vk_i", path, count)
+    angular = _finite(arrays, "w_vk_vk_i", path, count)
     tracks, stale_frames, notes = settle_repeats(
         tracks_from_dense(np.swapaxes(features, 1, 2), path), moving_frames(linear, angular), settings.repeated_tracks
     )
@@ -85,48 +85,36 @@ def _read_mat(path: Path) -> Mapping[str, FloatArray]:
     return {name: value.astype(np.float64) for name, value in arrays.items() if value.dtype.kind in "fiu"}
 
 
-def _shape(array: FloatArray) -> str:
-    return " x ".join(map(str, array.shape)) or "one value"
-
-
 def _rows(arrays: Mapping[str, FloatArray], key: str, path: Path, rows: int, count: int) -> FloatArray:
     """The first `count` columns of a (rows, >= count) array, as (count, rows)."""
     value = arrays[key]
     if value.ndim != 2 or value.shape[0] != rows or value.shape[1] < count:
-        raise DataError(f"{path}: {key} has shape {_shape(value)}; expected {rows} x T with T at least {count}")
+        raise DataError(f"{path}: {key} has shape {shape_text(value)}; expected {rows} x T with T at least {count}")
     return np.ascontiguousarray(value[:, :count].T)
 
 
-def _finite(values: FloatArray, key: str, path: Path) -> FloatArray:
-    bad: BoolArray = np.asarray(~np.isfinite(values).all(axis=1))
-    if bad.any():
-        raise DataError(
-            f"{path}: {key} is not finite in {int(bad.sum())} of {len(bad)} frames, first in frame "
-            f"{int(np.argmax(bad))}; remove or repair them"
-        )
-    return values
+def _finite(arrays: Mapping[str, FloatArray], key: str, path: Path, count: int) -> FloatArray:
+    """The first `count` columns of a finite (3, >= count) array, as (count, 3)."""
+    return finite_rows(_rows(arrays, key, path, 3, count), f"{path}: {key}")
 
 
 def _vector(arrays: Mapping[str, FloatArray], key: str, path: Path, size: int) -> FloatArray:
     value = arrays[key].reshape(-1)
     if len(value) != size or not np.isfinite(value).all():
-        raise DataError(f"{path}: {key} has shape {_shape(arrays[key])}; expected {size} finite value(s)")
+        raise DataError(f"{path}: {key} has shape {shape_text(arrays[key])}; expected {size} finite value(s)")
     return value
 
 
 def _camera(arrays: Mapping[str, FloatArray], path: Path) -> StereoCamera:
     fu, fv, cu, cv, b = (float(_vector(arrays, key, path, 1)[0]) for key in ("fu", "fv", "cu", "cv", "b"))
-    if not b > 0:
-        raise CalibrationError(
-            f"{path}: the stereo baseline b is {b:g} m; it must be positive, so check the calibration"
-        )
-    return StereoCamera(fu, fv, cu, cv, b)
+    with naming(path):
+        return StereoCamera(fu, fv, cu, cv, b)
 
 
 def _extrinsics(arrays: Mapping[str, FloatArray], path: Path) -> FloatArray:
     C, rho = arrays["C_c_v"], _vector(arrays, "rho_v_c_v", path, 3)
     if C.shape != (3, 3):
-        raise DataError(f"{path}: C_c_v has shape {_shape(C)}; expected 3 x 3")
+        raise DataError(f"{path}: C_c_v has shape {shape_text(C)}; expected 3 x 3")
     return checked_transform(np.concatenate([C, (-C @ rho)[:, None]], axis=1), f"{path}, C_c_v")
 
 
@@ -134,15 +122,15 @@ def _reference(arrays: Mapping[str, FloatArray], path: Path, times_ns: IntArray)
     if not {"r_i_vk_i", "theta_vk_i"} <= set(arrays):
         return None
     count = len(times_ns)
-    r = _finite(_rows(arrays, "r_i_vk_i", path, 3, count), "r_i_vk_i", path)
-    theta = _finite(_rows(arrays, "theta_vk_i", path, 3, count), "theta_vk_i", path)
+    r = _finite(arrays, "r_i_vk_i", path, count)
+    theta = _finite(arrays, "theta_vk_i", path, count)
     return Trajectory(se3_from_parts(so3_exp(theta), r), times_ns, "imu", np.arange(count))
 
 
 def _landmarks(arrays: Mapping[str, FloatArray], path: Path, count: int) -> Landmarks | None:
     if "rho_i_pj_i" not in arrays:
         return None
-    p = _finite(_rows(arrays, "rho_i_pj_i", path, 3, count), "rho_i_pj_i", path)
+    p = _finite(arrays, "rho_i_pj_i", path, count)
     return Landmarks(np.arange(count), p, np.zeros((count, 3, 3)))
 
 

@@ -9,35 +9,36 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from vio.atomic import atomic_folder
+from vio.datasets.euroc_files import (
+    STATE_CSV,
+    camera_yaml,
+    image_list_csv,
+    imu_csv,
+    imu_yaml,
+    median_rate_hz,
+    state_csv,
+)
+from vio.datasets.images import write_png
+from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, rectified_camera
-from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_inverse
-from vio.records import Image
+from vio.geometry.distortion import rectified_camera
+from vio.geometry.lie import se3_inverse
+from vio.records import ImuDensities
 from vio.sim.errors import SimulationError
-from vio.sim.imu import ImuNoise, ImuRecord, sample_times
+from vio.sim.imu import ADIS16448, sample_times
 from vio.sim.motion import evaluate
 from vio.sim.sequence import SimulatedRecording
+from vio.text_files import exact_text, write_text
+from vio.trajectory_io import in_first_cam0
 
 Progress = Callable[[int, int], None]  # frames written, frames in all
 
 MARKER = "simulation.json"
+_TRUTH_HZ = 200.0
 _PENDING = 8  # images waiting to be written
-_PNG_LEVEL = 1
-
-_IMU_HEADER = (
-    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
-    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
-)
-_STATE_HEADER = (
-    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
-    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], "
-    "b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], b_w_RS_S_z [rad s^-1], "
-    "b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
-)
 
 
 def export_euroc(
@@ -45,19 +46,19 @@ def export_euroc(
     out: Path,
     *,
     replace: bool = False,
-    noise: ImuNoise | None = None,
+    noise: ImuDensities = ADIS16448,
     progress: Progress | None = None,
 ) -> None:
     """Render all frames into `out/mav0` as EuRoC's ASL format.
 
-    Ground truth is written at 200 Hz in the IMU's clock; its bias columns are zero where a real IMU goes with the
+    Ground truth is written at 200 Hz, in the IMU's clock; its bias columns are zero where a real IMU goes with the
     images.
 
     Args:
         recording: what to write; any rig.
         out: folder to make.
         replace: whether an older export at `out` may be replaced.
-        noise: the figures written into the IMU's sensor.yaml; None: the defaults of `ImuNoise`.
+        noise: the figures written into the IMU's sensor.yaml.
         progress: told after each frame.
 
     Raises:
@@ -69,20 +70,20 @@ def export_euroc(
     if record is None:
         raise SimulationError("an EuRoC folder needs an IMU; simulate with imu=ImuNoise() or with a recorded one")
     rig, stamps = simulation.rig, simulation.stamps_ns
-    rate_hz = 1e9 / float(np.median(np.diff(stamps))) if len(stamps) > 1 else 20.0
+    made = "recorded" if record.gyro_bias is None else "simulated"
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
         mav = folder / "mav0"
-        cameras = (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1))
-        for name, camera, T_imu_cam in cameras:
+        for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
             (mav / name / "data").mkdir(parents=True)
-            _write(mav / name / "sensor.yaml", _camera_yaml(name, camera, T_imu_cam, rate_hz))
-            rows = [f"{t},{t}.png" for t in stamps]
-            _write(mav / name / "data.csv", "\n".join(["#timestamp [ns],filename", *rows]) + "\n")
-        for name, text in (("imu0", _imu_csv(record)), ("state_groundtruth_estimate0", _state_csv(recording))):
+            sheet = camera_yaml(camera, T_imu_cam, comment=f"simulated {name}", rate_hz=median_rate_hz(stamps))
+            write_text(mav / name / "sensor.yaml", sheet)
+            write_text(mav / name / "data.csv", image_list_csv(stamps))
+        for name, text in (("imu0", imu_csv(record)), (STATE_CSV.parent.name, _truth_csv(recording))):
             (mav / name).mkdir()
-            _write(mav / name / "data.csv", text)
-        _write(mav / "imu0" / "sensor.yaml", _imu_yaml(record, ImuNoise() if noise is None else noise))
-        _write(folder / MARKER, _description(recording))
+            write_text(mav / name / "data.csv", text)
+        sheet = imu_yaml(np.eye(4), noise, comment=f"{made} imu0", rate_hz=median_rate_hz(record.times_ns))
+        write_text(mav / "imu0" / "sensor.yaml", sheet)
+        write_text(folder / MARKER, _description(recording))
         files = [tuple(mav / name / "data" / f"{t}.png" for name in ("cam0", "cam1")) for t in stamps]
         _write_images(recording, files, progress)
 
@@ -106,27 +107,17 @@ def export_kitti(
         raise SimulationError("a KITTI folder needs a rectified rig; export this one as an EuRoC folder") from error
     stamps = simulation.stamps_ns
     T_cam0_imu = se3_inverse(simulation.rig.T_imu_cam0)
-    poses = recording.reference.in_cam0(T_cam0_imu).T_world_body
-    poses = se3_inverse(poses[0]) @ poses
-    P0 = np.hstack([camera.K, np.zeros((3, 1))])
-    P1 = P0.copy()
-    P1[0, 3] = -camera.fu * camera.baseline_m
+    poses = in_first_cam0(recording.reference, T_cam0_imu).T_world_body
+    within = [sample for sample in simulation.velocity if stamps[0] <= sample.time_ns <= stamps[-1]]
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
         for name in ("image_0", "image_1"):
             (folder / name).mkdir()
-        _write(folder / "calib.txt", "".join(f"{name}: {_numbers(P)}\n" for name, P in (("P0", P0), ("P1", P1))))
-        _write(folder / "times.txt", "".join(f"{_seconds(t - stamps[0])}\n" for t in stamps))
-        _write(folder / "poses.txt", "".join(f"{_numbers(T[:3])}\n" for T in poses))
-        _write(folder / "T_cam0_imu.txt", "".join(f"{_numbers(row)}\n" for row in T_cam0_imu[:3]))
-        rows = [
-            f"{_seconds(s.time_ns - stamps[0])},{_numbers(s.linear, ',')},{_numbers(s.angular, ',')}"
-            for s in simulation.velocity
-            if stamps[0] <= s.time_ns <= stamps[-1]
-        ]
-        if rows:
-            header = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
-            _write(folder / "velocity.csv", "\n".join([header, *rows]) + "\n")
-        _write(folder / MARKER, _description(recording))
+        write_calibration(folder, camera, T_cam0_imu)
+        write_times(folder, stamps)
+        write_text(folder / "poses.txt", "".join(f"{exact_text(T[:3])}\n" for T in poses))
+        if within:
+            write_velocity(folder, within, int(stamps[0]))
+        write_text(folder / MARKER, _description(recording))
         files = [tuple(folder / name / f"{i:06d}.png" for name in ("image_0", "image_1")) for i in range(len(stamps))]
         _write_images(recording, files, progress)
 
@@ -137,7 +128,7 @@ def _write_images(recording: SimulatedRecording, files: list[tuple[Path, ...]], 
     with ThreadPoolExecutor(max_workers=1) as writer:
         for index, pair in enumerate(files):
             for path, image in zip(pair, recording.images(index), strict=True):
-                waiting.append(writer.submit(_write_png, path, image))
+                waiting.append(writer.submit(write_png, path, image))
             while len(waiting) > _PENDING:
                 waiting.popleft().result()
             if progress is not None:
@@ -146,74 +137,17 @@ def _write_images(recording: SimulatedRecording, files: list[tuple[Path, ...]], 
             waiting.popleft().result()
 
 
-def _write_png(path: Path, image: Image) -> None:
-    _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
-    path.write_bytes(data.tobytes())
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8", newline="\n")
-
-
-def _numbers(values: FloatArray, separator: str = " ") -> str:
-    """All digits, so that reading gives back the same bits."""
-    return separator.join(repr(float(x)) for x in np.ravel(values))
-
-
-def _seconds(time_ns: int) -> str:
-    """Exact decimal seconds of non-negative nanoseconds."""
-    return f"{int(time_ns) // 1_000_000_000}.{int(time_ns) % 1_000_000_000:09d}"
-
-
-def _matrix_yaml(T: FloatArray) -> str:
-    rows = [", ".join(repr(float(x)) for x in row) for row in T]
-    return "T_BS:\n  cols: 4\n  rows: 4\n  data: [" + ",\n         ".join(rows) + "]\n"
-
-
-def _camera_yaml(name: str, camera: CameraModel, T_imu_cam: FloatArray, rate_hz: float) -> str:
-    model = "equidistant" if camera.model == "equidistant" else "radial-tangential"
-    coefficients = camera.coefficients if camera.coefficients else (0.0, 0.0, 0.0, 0.0)
-    numbers = ", ".join(repr(float(x)) for x in (camera.fu, camera.fv, camera.cu, camera.cv))
-    return (
-        f"%YAML:1.0\nsensor_type: camera\ncomment: simulated {name}\n\n{_matrix_yaml(T_imu_cam)}\n"
-        f"rate_hz: {rate_hz:.6g}\nresolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
-        f"intrinsics: [{numbers}] #fu, fv, cu, cv\ndistortion_model: {model}\n"
-        f"distortion_coefficients: [{', '.join(repr(float(x)) for x in coefficients)}]\n"
-    )
-
-
-def _imu_yaml(record: ImuRecord, noise: ImuNoise) -> str:
-    rate_hz = 1e9 / float(np.median(np.diff(record.times_ns))) if len(record.times_ns) > 1 else 0.0
-    return (
-        f"%YAML:1.0\nsensor_type: imu\ncomment: {'simulated' if record.gyro_bias is not None else 'recorded'} imu0\n\n"
-        f"{_matrix_yaml(np.eye(4))}\nrate_hz: {rate_hz:.6g}\n"
-        f"gyroscope_noise_density: {noise.gyro_density!r}  # [ rad / s / sqrt(Hz) ]\n"
-        f"gyroscope_random_walk: {noise.gyro_walk!r}  # [ rad / s^2 / sqrt(Hz) ]\n"
-        f"accelerometer_noise_density: {noise.accel_density!r}  # [ m / s^2 / sqrt(Hz) ]\n"
-        f"accelerometer_random_walk: {noise.accel_walk!r}  # [ m / s^3 / sqrt(Hz) ]\n"
-    )
-
-
-def _imu_csv(record: ImuRecord) -> str:
-    rows = zip(record.times_ns, record.gyro, record.accel, strict=True)
-    return "\n".join([_IMU_HEADER, *(f"{t},{_numbers(w, ',')},{_numbers(a, ',')}" for t, w, a in rows)]) + "\n"
-
-
-def _state_csv(recording: SimulatedRecording) -> str:
+def _truth_csv(recording: SimulatedRecording) -> str:
     simulation = recording.simulation
-    times = sample_times(simulation.motion, 200.0)
+    times = sample_times(simulation.motion, _TRUTH_HZ)
     state = evaluate(simulation.motion, times)
-    quaternions = quat_xyzw_from_rotation(state.T_world_imu[:, :3, :3])[:, [3, 0, 1, 2]]
     biases = np.zeros((len(times), 6))
     record = simulation.imu
     if record is not None and record.gyro_bias is not None and record.accel_bias is not None:
         known = np.hstack([record.gyro_bias, record.accel_bias])
         elapsed, at = (record.times_ns - times[0]).astype(np.float64), (times - times[0]).astype(np.float64)
         biases = np.stack([np.interp(at, elapsed, known[:, i]) for i in range(6)], axis=1)
-    table = np.hstack([state.T_world_imu[:, :3, 3], quaternions, state.velocity_world, biases])
-    return (
-        "\n".join([_STATE_HEADER, *(f"{t},{_numbers(row, ',')}" for t, row in zip(times, table, strict=True))]) + "\n"
-    )
+    return state_csv(times, state.T_world_imu, state.velocity_world, biases)
 
 
 def _description(recording: SimulatedRecording) -> str:

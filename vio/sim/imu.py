@@ -6,15 +6,14 @@ Kalibr IMU noise model: white noise of density s has deviation s sqrt(rate) per 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from vio.errors import DataError
+from vio.datasets.common import velocity_samples
 from vio.geometry.lie import FloatArray
-from vio.records import ImuSample, IntArray, VelocitySample
+from vio.records import ImuDensities, ImuRecord, IntArray, VelocitySample
 from vio.setting import setting
 from vio.sim.motion import MotionSpline, evaluate
 
@@ -23,21 +22,21 @@ GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_MPS2])
 _NS = 1e-9
 
 
+ADIS16448 = ImuDensities(gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2.0e-3, accel_walk=3.0e-3)  # EuRoC's figures
+
+
 @dataclass(frozen=True, slots=True)
 class ImuNoise:
-    """Errors of an inertial measurement unit; the defaults are EuRoC's figures for its ADIS16448."""
+    """Errors of an inertial measurement unit; the defaults are those of EuRoC's."""
 
-    gyro_density: float = setting(1.6968e-4, "gyroscope white noise", unit="rad/s/sqrt(Hz)")
-    gyro_walk: float = setting(1.9393e-5, "gyroscope bias random walk", unit="rad/s^2/sqrt(Hz)")
-    accel_density: float = setting(2.0e-3, "accelerometer white noise", unit="m/s^2/sqrt(Hz)")
-    accel_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)")
+    densities: ImuDensities = ADIS16448  # white noise and bias walks
     gyro_bias_sigma: float = setting(5e-3, "deviation of the gyroscope bias at the start", unit="rad/s")
     accel_bias_sigma: float = setting(5e-2, "deviation of the accelerometer bias at the start", unit="m/s^2")
     gyro_limit: float = setting(17.45, "gyroscope saturation, each axis", unit="rad/s")
     accel_limit: float = setting(176.5, "accelerometer saturation, each axis", unit="m/s^2")
 
 
-NO_IMU_NOISE = ImuNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_IMU_NOISE = ImuNoise(ImuDensities(0.0, 0.0, 0.0, 0.0), gyro_bias_sigma=0.0, accel_bias_sigma=0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,17 +45,6 @@ class VelocityNoise:
 
     linear_sigma: float = setting(0.5, "deviation of the body velocity, each axis", unit="m/s")
     angular_sigma: float = setting(0.05, "deviation of the angular rate, each axis", unit="rad/s")
-
-
-@dataclass(frozen=True, slots=True)
-class ImuRecord:
-    """Readings of an inertial measurement unit, with the true biases where they are known."""
-
-    times_ns: IntArray  # (N,) strictly increasing
-    gyro: FloatArray  # (N, 3) rad/s, imu frame
-    accel: FloatArray  # (N, 3) m/s^2, imu frame, specific force
-    gyro_bias: FloatArray | None = field(default=None)  # (N, 3) rad/s; None for a real record
-    accel_bias: FloatArray | None = field(default=None)  # (N, 3) m/s^2; None for a real record
 
 
 def sample_times(spline: MotionSpline, rate_hz: float, start_ns: int | None = None) -> IntArray:
@@ -79,13 +67,13 @@ def simulate_imu(
     state = evaluate(spline, times)
     n = len(times)
     gyro_rng, accel_rng = np.random.default_rng([seed, 21]), np.random.default_rng([seed, 22])
-    gyro_bias = _walk(gyro_rng, n, rate_hz, noise.gyro_walk, noise.gyro_bias_sigma)
-    accel_bias = _walk(accel_rng, n, rate_hz, noise.accel_walk, noise.accel_bias_sigma)
+    gyro_bias = _walk(gyro_rng, n, rate_hz, noise.densities.gyro_walk, noise.gyro_bias_sigma)
+    accel_bias = _walk(accel_rng, n, rate_hz, noise.densities.accel_walk, noise.accel_bias_sigma)
     gyro = state.angular_velocity + gyro_bias
-    gyro = gyro + noise.gyro_density * np.sqrt(rate_hz) * gyro_rng.standard_normal((n, 3))
+    gyro = gyro + noise.densities.gyro * np.sqrt(rate_hz) * gyro_rng.standard_normal((n, 3))
     R = state.T_world_imu[:, :3, :3]
     accel = np.einsum("nji,nj->ni", R, state.acceleration_world - GRAVITY_WORLD) + accel_bias
-    accel = accel + noise.accel_density * np.sqrt(rate_hz) * accel_rng.standard_normal((n, 3))
+    accel = accel + noise.densities.accel * np.sqrt(rate_hz) * accel_rng.standard_normal((n, 3))
     return ImuRecord(
         times,
         np.clip(gyro, -noise.gyro_limit, noise.gyro_limit),
@@ -110,7 +98,7 @@ def simulate_velocity(
     noise: VelocityNoise | None = None,
     seed: int = 0,
     times_ns: npt.ArrayLike | None = None,
-) -> list[VelocitySample]:
+) -> tuple[VelocitySample, ...]:
     """Read the paper's control input `u = [v; omega]` off a motion, in the imu frame, with the paper's noise.
 
     `times_ns` (N,) overrides the rate.
@@ -122,41 +110,4 @@ def simulate_velocity(
     linear = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.velocity_world)
     linear = linear + noise.linear_sigma * rng.standard_normal(linear.shape)
     angular = state.angular_velocity + noise.angular_sigma * rng.standard_normal(linear.shape)
-    return [VelocitySample(int(t), v, w) for t, v, w in zip(times, linear, angular, strict=True)]
-
-
-def imu_samples(record: ImuRecord) -> list[ImuSample]:
-    """The readings as events."""
-    return [ImuSample(int(t), g, a) for t, g, a in zip(record.times_ns, record.gyro, record.accel, strict=True)]
-
-
-def read_imu_csv(path: Path) -> ImuRecord:
-    """Read a real record in EuRoC's form: `timestamp [ns], gyro x y z, accel x y z`.
-
-    Raises:
-        DataError: the file is missing, a row is not seven finite numbers, or times do not increase.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read the IMU record {path}: {error}") from error
-    times, values = [], []
-    for number, line in enumerate(lines, start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        words = line.split(",")
-        try:
-            times.append(int(words[0]))
-            row = [float(word) for word in words[1:]]
-        except ValueError:
-            row = []
-        if len(row) != 6 or not np.all(np.isfinite(row)):
-            raise DataError(f"{path}, line {number}: expected a time in ns and six finite numbers, got {line[:60]!r}")
-        values.append(row)
-    if not times:
-        raise DataError(f"{path} holds no IMU samples")
-    t, data = np.array(times, dtype=np.int64), np.array(values)
-    if np.any(np.diff(t) <= 0):
-        i = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
-        raise DataError(f"{path}: times do not increase at sample {i} ({t[i - 1]} ns, then {t[i]} ns)")
-    return ImuRecord(t, data[:, :3], data[:, 3:])
+    return velocity_samples(times, linear, angular)

@@ -19,9 +19,11 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from vio.errors import DataError
-from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, so3_exp, so3_log
+from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
 from vio.records import BoolArray, IntArray
 from vio.sim.errors import SimulationError
+from vio.text_files import check_increasing
+from vio.trajectory_io import read_trajectory
 
 logger = logging.getLogger(__name__)
 
@@ -194,12 +196,7 @@ def _check_record(times_ns: npt.ArrayLike, T_world_imu: npt.ArrayLike, degree: i
         raise DataError(f"a trajectory needs at least two poses, got {len(t)}")
     if not np.all(np.isfinite(T)):
         raise DataError(f"pose {int(np.argwhere(~np.isfinite(T))[0, 0])} of the trajectory is not finite; remove it")
-    if np.any(np.diff(t) <= 0):
-        i = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
-        raise DataError(
-            f"trajectory times do not increase at pose {i} ({t[i - 1]} ns, then {t[i]} ns); sort the record"
-        )
-    return t, T
+    return check_increasing(t, lambda k: f"pose {k} of the trajectory"), T
 
 
 def _design(first: IntArray, u: FloatArray, segments: int, degree: int) -> scipy.sparse.csr_matrix:
@@ -445,58 +442,20 @@ def _eased(t: FloatArray, ramp_s: float = 2.0) -> FloatArray:
 # --- recorded motion ------------------------------------------------------------------------------------------------
 
 
-def read_tum(path: Path) -> tuple[IntArray, FloatArray]:
-    """Read a trajectory `t tx ty tz qx qy qz qw` (s, m): times (N,) in ns and poses (N, 4, 4).
-
-    Raises:
-        DataError: the file is missing, a line is not eight finite numbers, or times do not increase.
-    """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read the trajectory {path}: {error}") from error
-    times, values = [], []
-    for number, line in enumerate(lines, start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
-        if len(row) != 8 or not np.all(np.isfinite(row)) or np.linalg.norm(row[4:]) < 1e-6:
-            raise DataError(f"{path}, line {number}: expected `t tx ty tz qx qy qz qw`, got {line[:60]!r}")
-        times.append(_nanoseconds(words[0]))
-        values.append(row[1:])
-    if len(times) < 2:
-        raise DataError(f"{path} holds {len(times)} poses; a trajectory needs at least two")
-    t = np.array(times, dtype=np.int64)
-    if np.any(np.diff(t) <= 0):
-        i = int(np.flatnonzero(np.diff(t) <= 0)[0]) + 1
-        raise DataError(f"{path}: times do not increase at pose {i} ({t[i - 1]} ns, then {t[i]} ns); sort the record")
-    data = np.array(values)
-    return t, se3_from_parts(rotation_from_quat_xyzw(data[:, 3:]), data[:, :3])
-
-
-def _nanoseconds(seconds: str) -> int:
-    """Exact nanoseconds of a decimal number of seconds; a float would lose digits at Unix times."""
-    whole, _, fraction = seconds.partition(".")
-    if whole.isdigit() and fraction.isdigit():
-        return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, "0"))
-    return round(float(seconds) * 1e9)
-
-
 def recorded_motion(path: Path, *, knot_s: float = 0.1, degree: int = 5) -> tuple[MotionSpline, FitReport]:
     """Smooth a recorded ground truth (TUM file of the IMU's poses) so that it is twice differentiable.
 
     Raises:
-        DataError: the file cannot be used; see `read_tum`.
+        DataError: the file cannot be used, or describes the camera; the message names it.
     """
-    times, T = read_tum(path)
+    truth = read_trajectory(path, fmt="tum")
+    if truth.body != "imu" or truth.times_ns is None or len(truth) < 2:
+        raise DataError(f"{path}: describes {len(truth)} poses of {truth.body}; give two or more of the IMU")
+    times = truth.times_ns
     gap_s = float(np.diff(times).max()) * _NS
     if gap_s > 5 * knot_s:
         logger.warning("%s has a gap of %.2f s; the motion is made up there", path, gap_s)
-    spline, report = fit_spline(times, T, knot_s=knot_s, degree=degree, robust=True)
+    spline, report = fit_spline(times, truth.T_world_body, knot_s=knot_s, degree=degree, robust=True)
     logger.info(
         "%s: spline within %.1f mm and %.2f mrad rms, %d of %d poses left out",
         path,

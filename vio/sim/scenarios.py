@@ -21,10 +21,10 @@ from threadpoolctl import threadpool_limits
 from vio.errors import DataError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
-from vio.records import Image, IntArray
+from vio.records import Image, ImuRecord, IntArray
 from vio.sim.effects import CLEAN, SensorEffects
 from vio.sim.errors import SimulationError
-from vio.sim.imu import ImuNoise, ImuRecord, VelocityNoise
+from vio.sim.imu import ImuNoise, VelocityNoise
 from vio.sim.motion import MotionSpline, car_loop, evaluate, hand_held, look_rotation, spline_from_waypoints, turned
 from vio.sim.rigs import (
     R_FLU_EUROC_IMU,

@@ -10,13 +10,15 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from vio.datasets.common import frame_range, imu_samples, merge_events
+from vio.datasets.euroc_files import read_imu_csv, stamped_rows
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import StereoRig, rectified_camera
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.records import (
     Event,
     Image,
-    ImuSample,
+    ImuRecord,
     IntArray,
     MotionSample,
     MotionSource,
@@ -28,10 +30,11 @@ from vio.records import (
 )
 from vio.sim.effects import SensorEffects, develop, exposed, smeared
 from vio.sim.errors import SimulationError
-from vio.sim.imu import ImuNoise, ImuRecord, VelocityNoise, imu_samples, read_imu_csv, simulate_imu, simulate_velocity
+from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
 from vio.sim.motion import FitReport, MotionSpline, evaluate, recorded_motion
 from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
 from vio.sim.world import World, check_clear, room
+from vio.text_files import check_increasing
 
 logger = logging.getLogger(__name__)
 
@@ -116,10 +119,10 @@ def simulate(
     _check_cameras(world, rig, motion, times)
     taken, stamps = _faulty(times, faults, seed)
     record = simulate_imu(motion, rate_hz=imu_rate_hz, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
-    samples: list[VelocitySample] = []
+    samples: tuple[VelocitySample, ...] = ()
     if velocity is not None:
         samples = simulate_velocity(motion, rate_hz=velocity_rate_hz or rate_hz, noise=velocity, seed=seed)
-    return Simulation(world, rig, motion, taken, stamps, record, tuple(samples), effects, seed)
+    return Simulation(world, rig, motion, taken, stamps, record, samples, effects, seed)
 
 
 def _frame_times(
@@ -130,9 +133,7 @@ def _frame_times(
         count = int((motion.end_ns - motion.start_ns) * 1e-9 * rate_hz) + 1
         times = motion.start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     else:
-        times = np.asarray(given, dtype=np.int64)
-        if np.any(np.diff(times) <= 0):
-            raise DataError("the frame times do not increase; sort them")
+        times = check_increasing(given, lambda k: f"frame time {k}")
     half_shutter = int(effects.blur_exposure_ms * 0.5e6) + 1 if effects.blur_exposure_ms > 0 else 0
     offset = _offset_ns(faults)
     inside = (times - half_shutter >= motion.start_ns) & (times + half_shutter <= motion.end_ns)
@@ -253,25 +254,23 @@ class SimulatedRecording:
         return len(self.simulation.stamps_ns)
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
-        """Yield motion samples and frames in time order; see `vio.protocols.Dataset`."""
-        stamps = self.simulation.stamps_ns
-        stop = len(stamps) if stop is None else min(stop, len(stamps))
-        if not 0 <= start < stop:
-            return
-        samples = self._motion_samples(int(stamps[start]), int(stamps[stop - 1]))
-        at = 0
-        for index in range(start, stop):
-            while at < len(samples) and samples[at].time_ns <= stamps[index]:
-                yield samples[at]
-                at += 1
-            yield self.frame(index) if images else StereoFrame(index, int(stamps[index]), None, None)
+        """Yield motion samples and frames in time order; see `vio.protocols.Dataset`.
 
-    def _motion_samples(self, first_ns: int, last_ns: int) -> list[MotionSample]:
-        every: list[MotionSample] = list(self.simulation.velocity)
-        if self.simulation.imu is not None:
-            inertial: list[ImuSample] = imu_samples(self.simulation.imu)
-            every += inertial
-        return sorted((s for s in every if first_ns <= s.time_ns <= last_ns), key=lambda sample: sample.time_ns)
+        Raises:
+            DataError: the range holds no frame.
+            SimulationError: the rig is not rectified.
+        """
+        recording = self.recording
+        chosen = frame_range(recording, start, stop)
+        times_ns = recording.frame_times_ns
+        frames = (self.frame(k) if images else StereoFrame(k, int(times_ns[k]), None, None) for k in chosen)
+        return merge_events(recording, chosen, self._motion_samples(), frames)
+
+    def _motion_samples(self) -> list[MotionSample]:
+        """All samples in time order."""
+        simulation = self.simulation
+        inertial = () if simulation.imu is None else imu_samples(simulation.imu)
+        return sorted((*simulation.velocity, *inertial), key=lambda sample: sample.time_ns)
 
     def observations(self, index: int) -> Observations | None:
         """Return None: a simulated recording holds images."""
@@ -378,25 +377,11 @@ def read_flight(
     if image_times is None:
         times = np.arange(motion.start_ns, motion.end_ns, 50_000_000)
     else:
-        times = _read_times(image_times)
+        times, _, _ = stamped_rows(image_times, 1, "nanoseconds, one integer a line")
     times = times[(times >= motion.start_ns) & (times <= motion.end_ns)]
     if len(times) == 0:
         raise DataError(f"no image time falls into the ground truth {groundtruth}; use the same clock for both")
     return RecordedFlight(motion, fit, times, None if imu_csv is None else read_imu_csv(imu_csv))
-
-
-def _read_times(path: Path) -> IntArray:
-    try:
-        words = path.read_text(encoding="utf-8").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read the image times {path}: {error}") from error
-    bad = next((word for word in words if not word.isdigit()), None)
-    if bad is not None:
-        raise DataError(f"{path}: expected one integer of nanoseconds a line, got {bad[:30]!r}")
-    times = np.array([int(word) for word in words], dtype=np.int64)
-    if np.any(np.diff(times) <= 0):
-        raise DataError(f"{path}: image times do not increase; sort them")
-    return times
 
 
 def room_around(

@@ -1,0 +1,251 @@
+"""The files of an EuRoC (ASL) folder, both ways: `sensor.yaml` of cameras and IMU, and the `data.csv` of each sensor.
+
+Times are integer nanoseconds; numbers are written with all their digits. `T_BS` maps sensor coordinates to the body.
+Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from vio.datasets.common import checked_transform, naming
+from vio.errors import CalibrationError, DataError
+from vio.geometry.distortion import CameraModel, DistortionModel
+from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
+from vio.records import ImuDensities, ImuRecord, IntArray
+from vio.text_files import INT64_MAX, NS_PER_S, check_increasing, exact_text, text_lines
+
+DISTORTION_MODELS: dict[str, DistortionModel] = {
+    "radial-tangential": "radtan",
+    "radtan": "radtan",
+    "plumb_bob": "radtan",
+    "equidistant": "equidistant",
+    "none": "pinhole",
+}
+STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, within mav0
+TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
+_NOISE = {  # entries of the IMU's sensor.yaml, and their units
+    "gyroscope_noise_density": "rad / s / sqrt(Hz)",
+    "gyroscope_random_walk": "rad / s^2 / sqrt(Hz)",
+    "accelerometer_noise_density": "m / s^2 / sqrt(Hz)",
+    "accelerometer_random_walk": "m / s^3 / sqrt(Hz)",
+}
+_IMAGES_HEADER = "#timestamp [ns],filename"
+_IMU_HEADER = (
+    "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
+    "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
+)
+_STATE_HEADER = (
+    "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], "
+    "v_RS_R_x [m s^-1], v_RS_R_y [m s^-1], v_RS_R_z [m s^-1], "
+    "b_w_RS_S_x [rad s^-1], b_w_RS_S_y [rad s^-1], b_w_RS_S_z [rad s^-1], "
+    "b_a_RS_S_x [m s^-2], b_a_RS_S_y [m s^-2], b_a_RS_S_z [m s^-2]"
+)
+
+# --- sensor.yaml ----------------------------------------------------------------------------------------------------
+
+
+def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
+    """Read a camera's `sensor.yaml`: its model, and `T_BS` (4, 4) from the camera to the body.
+
+    Raises:
+        CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
+    """
+    sheet = _read_yaml(path)
+    if (kind := sheet.get("camera_model", "pinhole")) != "pinhole":
+        raise CalibrationError(f"{path}: camera_model {kind!r} is not supported; only 'pinhole' is (with distortion)")
+    name = sheet.get("distortion_model", "none")
+    if not isinstance(name, str) or name not in DISTORTION_MODELS:
+        raise CalibrationError(
+            f"{path}: distortion_model {name!r} is unknown; the known ones are {', '.join(DISTORTION_MODELS)}"
+        )
+    model = DISTORTION_MODELS[name]
+    coefficients = () if model == "pinhole" else _numbers(sheet, "distortion_coefficients", path)
+    if model == "radtan" and not any(coefficients):
+        model, coefficients = "pinhole", ()
+    fu, fv, cu, cv = _numbers(sheet, "intrinsics", path, 4)
+    width, height = _numbers(sheet, "resolution", path, 2)
+    with naming(path):
+        camera = CameraModel(fu, fv, cu, cv, int(width), int(height), model, coefficients)
+    return camera, _T_BS(sheet, path)
+
+
+def camera_yaml(camera: CameraModel, T_body_cam: FloatArray, *, comment: str, rate_hz: float) -> str:
+    """The text of a camera's `sensor.yaml`, with all digits; `T_body_cam` (4, 4) becomes its `T_BS`."""
+    name = "equidistant" if camera.model == "equidistant" else "radial-tangential"
+    return (
+        f"%YAML:1.0\nsensor_type: camera\ncomment: {comment}\n\n"
+        f"{_T_BS_yaml(T_body_cam)}\n"
+        f"rate_hz: {rate_hz:.6g}\nresolution: [{camera.width}, {camera.height}]\ncamera_model: pinhole\n"
+        f"intrinsics: [{exact_text((camera.fu, camera.fv, camera.cu, camera.cv), ', ')}] #fu, fv, cu, cv\n"
+        f"distortion_model: {name}\n"
+        f"distortion_coefficients: [{exact_text(camera.coefficients or (0.0,) * 4, ', ')}]\n"
+    )
+
+
+def read_imu_yaml(path: Path) -> tuple[FloatArray, ImuDensities | None]:
+    """Read the IMU's `sensor.yaml`: its `T_BS` (4, 4) to the body, and its noise where that is stated.
+
+    Raises:
+        CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
+    """
+    sheet = _read_yaml(path)
+    return _T_BS(sheet, path), _noise(sheet, path)
+
+
+def _noise(sheet: Mapping[str, object], path: Path) -> ImuDensities | None:
+    """The noise figures; None where none is stated."""
+    if not any(key in sheet for key in _NOISE):
+        return None
+    values = [_numbers(sheet, key, path, 1)[0] for key in _NOISE]
+    for key, value in zip(_NOISE, values, strict=True):
+        if not value > 0:
+            raise CalibrationError(f"{path}: {key} is {value:g}; a noise density must be positive")
+    return ImuDensities(*values)
+
+
+def imu_yaml(T_body_imu: FloatArray, noise: ImuDensities, *, comment: str, rate_hz: float) -> str:
+    """The text of the IMU's `sensor.yaml`, with all digits; `T_body_imu` (4, 4) becomes its `T_BS`."""
+    values = (noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk)
+    stated = (f"{key}: {value!r}  # [ {unit} ]\n" for (key, unit), value in zip(_NOISE.items(), values, strict=True))
+    return (
+        f"%YAML:1.0\nsensor_type: imu\ncomment: {comment}\n\n"
+        f"{_T_BS_yaml(T_body_imu)}\nrate_hz: {rate_hz:.6g}\n{''.join(stated)}"
+    )
+
+
+def median_rate_hz(times_ns: IntArray) -> float:
+    """How often a sensor reported by its times (N,); a single time tells no rate, and gives 0."""
+    return NS_PER_S / float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
+
+
+def _read_yaml(path: Path) -> Mapping[str, object]:
+    if not path.is_file():
+        raise CalibrationError(f"{path} is missing; it holds the sensor's calibration")
+    # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
+    lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
+    try:
+        sheet = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
+    except yaml.YAMLError as error:
+        raise CalibrationError(f"{path}: not a YAML file ({' '.join(str(error).split())}); copy it again") from error
+    if not isinstance(sheet, dict):
+        raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
+    return sheet
+
+
+def _number(value: object) -> float:
+    """A number as YAML or csv has it (PyYAML takes 1e-3 for text); NaN where it is none."""
+    try:
+        return float(value) if isinstance(value, (int, float, str)) else float("nan")
+    except ValueError:
+        return float("nan")
+
+
+def _numbers(sheet: Mapping[str, object], key: str, path: Path, count: int | None = None) -> tuple[float, ...]:
+    """A list of finite numbers, or a lone one."""
+    if key not in sheet:
+        raise CalibrationError(f"{path}: has no entry '{key}'; copy the calibration again")
+    value = sheet[key]
+    numbers = tuple(_number(v) for v in (value if isinstance(value, list) else [value]))
+    if (count is not None and len(numbers) != count) or not np.all(np.isfinite(numbers)):
+        wanted = "finite numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
+        raise CalibrationError(f"{path}: '{key}' is {value!r} where {wanted} belong")
+    return numbers
+
+
+def _T_BS(sheet: Mapping[str, object], path: Path) -> FloatArray:
+    """The transform from the sensor to the body, as an OpenCV matrix or as a list of rows."""
+    entry = sheet.get("T_BS")
+    values = entry.get("data") if isinstance(entry, dict) else entry
+    if isinstance(values, list) and all(isinstance(row, list) for row in values):
+        values = [value for row in values for value in row]
+    if not isinstance(values, list) or len(values) != 16:
+        raise CalibrationError(f"{path}: T_BS must hold 16 numbers, the 4x4 transform from the sensor to the body")
+    return checked_transform(np.array([_number(v) for v in values]).reshape(4, 4), f"{path}, T_BS")
+
+
+def _T_BS_yaml(T_body_sensor: FloatArray) -> str:
+    rows = ",\n         ".join(exact_text(row, ", ") for row in T_body_sensor)
+    return f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n"
+
+
+# --- data.csv -------------------------------------------------------------------------------------------------------
+
+
+def image_list_csv(times_ns: IntArray) -> str:
+    """The text of a camera's `data.csv` for images named by their times (N,), nanoseconds."""
+    return "\n".join([_IMAGES_HEADER, *(f"{t},{t}.png" for t in times_ns.tolist())]) + "\n"
+
+
+def read_imu_csv(path: Path) -> ImuRecord:
+    """Read `timestamp [ns], gyro x y z [rad/s], accel x y z [m/s^2]`.
+
+    Raises:
+        DataError: a line has not seven finite numbers, or the clock does not increase; the message names the line.
+    """
+    times_ns, rows, lines = stamped_rows(path, 7, "timestamp [ns], gyro x y z, accel x y z")
+    try:
+        values = np.array(rows, dtype=np.float64)
+    except ValueError:
+        values = np.array([[_number(text) for text in row] for row in rows])
+    bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise DataError(
+            f"{path}, line {lines[k]}: a reading is not a finite number ({','.join(rows[k])}; {int(bad.sum())} lines "
+            "in all); remove such lines"
+        )
+    return ImuRecord(times_ns, values[:, :3], values[:, 3:])
+
+
+def imu_csv(record: ImuRecord) -> str:
+    """The text of the IMU's `data.csv`, with all digits."""
+    return _stamped_csv(_IMU_HEADER, record.times_ns, np.hstack([record.gyro, record.accel]))
+
+
+def state_csv(times_ns: IntArray, T_world_body: FloatArray, velocity_world: FloatArray, biases: FloatArray) -> str:
+    """The text of the ground truth, with all digits.
+
+    Args:
+        times_ns: (N,).
+        T_world_body: (N, 4, 4).
+        velocity_world: (N, 3) m/s.
+        biases: (N, 6) of gyroscope (rad/s) and accelerometer (m/s^2).
+    """
+    q_wxyz = np.roll(quat_xyzw_from_rotation(T_world_body[:, :3, :3]), 1, axis=1)
+    return _stamped_csv(_STATE_HEADER, times_ns, np.hstack([T_world_body[:, :3, 3], q_wxyz, velocity_world, biases]))
+
+
+def _stamped_csv(header: str, times_ns: IntArray, values: FloatArray) -> str:
+    rows = (f"{t},{exact_text(row, ',')}" for t, row in zip(times_ns.tolist(), values, strict=True))
+    return "\n".join([header, *rows]) + "\n"
+
+
+def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[list[str]], list[int]]:
+    """Times (N,) of a csv, its other fields, and the lines they stood in; lines that begin with '#' are let be.
+
+    Raises:
+        DataError: the file is missing or empty, a line has other fields, or the clock does not increase.
+    """
+    times: list[int] = []
+    rows: list[list[str]] = []
+    lines: list[int] = []
+    for number, line in text_lines(path):
+        if line.startswith("#"):
+            continue
+        fields = [field.strip() for field in line.split(",")]
+        if len(fields) != columns:
+            raise DataError(f"{path}, line {number}: {len(fields)} values where {columns} belong ({form})")
+        if not re.fullmatch(r"\d{1,19}", fields[0]) or int(fields[0]) > INT64_MAX:
+            raise DataError(f"{path}, line {number}: {fields[0]!r} is no time in whole nanoseconds ({form})")
+        times.append(int(fields[0]))
+        rows.append(fields[1:])
+        lines.append(number)
+    if not times:
+        raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove its folder")
+    return check_increasing(times, lambda k: f"{path}, line {lines[k]}"), rows, lines
