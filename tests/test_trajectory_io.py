@@ -237,7 +237,7 @@ def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"cannot read .*directory"):
         read_trajectory(tmp_path)
     (tmp_path / "b").write_bytes(b"\x89PNG\xff\xfe\x00")
-    with pytest.raises(DataError, match="is not a text file"):
+    with pytest.raises(DataError, match="b: not a text file"):
         read_trajectory(tmp_path / "b")
 
 
