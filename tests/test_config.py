@@ -106,8 +106,7 @@ def test_shipped_files_are_valid_and_hold_deviations_only() -> None:
 
 
 def _numbers() -> list[SettingInfo]:
-    numbers = (s for s in describe(Config()) if isinstance(s.default, (int, float)) and not isinstance(s.default, bool))
-    return [s for s in numbers if not s.key.startswith("frontend.")]
+    return [s for s in describe(Config()) if isinstance(s.default, (int, float)) and not isinstance(s.default, bool)]
 
 
 @pytest.mark.parametrize("info", _numbers(), ids=lambda info: info.key)
