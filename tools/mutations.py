@@ -23,6 +23,9 @@ _RECTIFY = ("tests/test_rectify.py", "tests/test_rectify_cli.py", "tests/test_da
 _WINDOW = (
     "tests/test_multiview.py",
     "tests/test_navigation.py",
+    "tests/test_motion_noise.py",
+    "tests/test_window.py",
+    "tests/test_window_tracks.py",
     "tests/test_msckf.py",
     "tests/test_online_calibration.py",
     "tests/test_consistency.py",

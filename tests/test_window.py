@@ -1,0 +1,145 @@
+"""The window's covariance and means: invariants that hold whatever the motion and the landmarks are."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+
+from vio.filters.navigation import DIM, Measurement, NavState, TwistMotion
+from vio.filters.settings import MsckfSettings
+from vio.filters.window import Window, posterior
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
+
+STEP_NS = 50_000_000
+LANDMARKS = np.array([[4.0, 1.0, 0.5], [6.0, -2.0, 1.0]])
+
+
+def _window(clones: int = 4) -> Window:
+    """A turning body with clones, two landmarks, and correlations between all of them."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(DIM, DIM)) * 0.05
+    nav = NavState(
+        se3_exp([1.0, -2, 0.5, 0.3, -0.2, 0.8]), np.array([8.0, 0.2, -0.1]), np.full(3, 0.4), *np.zeros((2, 3))
+    )
+    window = Window(TwistMotion(MsckfSettings()), nav, root @ root.T)
+    for k in range(clones):
+        window.add_clone(k, k * STEP_NS)
+        if k == clones - 2:
+            A = rng.normal(size=(6, len(window.P))) * 0.3
+            window.add_landmarks(np.array([3, 8]), LANDMARKS, A, np.array([np.eye(3) * 1e-3] * 2))
+        if k < clones - 1:
+            window.propagate(window.motion.advance(window.nav, k * STEP_NS, (k + 1) * STEP_NS))
+    return window
+
+
+def _symmetric_and_positive(P: FloatArray) -> bool:
+    return bool(np.abs(P - P.T).max() < 1e-12 and np.linalg.eigvalsh(P).min() > -1e-9)
+
+
+def test_every_change_keeps_the_covariance_symmetric_and_positive() -> None:
+    window, rng = _window(), np.random.default_rng(1)
+    assert _symmetric_and_positive(window.P)
+    H = rng.normal(size=(20, len(window.P)))
+    window.commit(H.T @ H, H.T @ rng.normal(size=20))
+    assert _symmetric_and_positive(window.P)
+    window.widen(np.eye(DIM) * 1e-4)
+    assert _symmetric_and_positive(window.P)
+    window.keep_landmarks(np.array([False, True]))
+    window.drop_oldest_clone()
+    assert _symmetric_and_positive(window.P)
+    assert len(window.P) == DIM + 18 + 3 == len(window.offset)
+
+
+def test_a_landmark_whose_error_is_its_anchors_moves_with_it() -> None:
+    """Both errors are of one kind: the newest camera sees the landmark where it did, also after a large move."""
+    window = _window()
+    before = transform_points(se3_inverse(window.clones[-1].T_world_imu), LANDMARKS)
+    error = np.zeros(len(window.P))
+    move = np.array([0.7, -0.4, 0.2, 0.5, -0.3, 0.9])
+    error[window.clone_rows(3)] = move
+    error[window.first_landmark :] = np.tile(move[:3], 2)
+    window.relinearise(error)
+    np.testing.assert_allclose(window.clones[3].T_world_imu, se3_exp(move) @ _window().clones[3].T_world_imu)
+    after = transform_points(se3_inverse(window.clones[-1].T_world_imu), window.landmarks)
+    np.testing.assert_allclose(after, before, atol=1e-12)
+
+
+def test_widening_the_last_step_is_the_same_as_having_known_it_less() -> None:
+    early, late = _window(), _window()
+    extra = np.diag(np.linspace(1e-4, 2e-3, DIM))
+    step = early.motion.advance(early.nav, 3 * STEP_NS, 4 * STEP_NS)
+    early.propagate(replace(step, Q=step.Q + extra))
+    early.add_clone(4, 4 * STEP_NS)
+    late.propagate(step)
+    late.add_clone(4, 4 * STEP_NS)
+    late.widen(extra)
+    np.testing.assert_allclose(late.P, early.P, atol=1e-13)
+
+
+def test_covariance_of_the_last_move_counts_what_both_poses_share() -> None:
+    window = _window()
+    J = np.zeros((6, len(window.P)))
+    J[:, window.clone_rows(3)], J[:, window.clone_rows(2)] = np.eye(6), -np.eye(6)
+    np.testing.assert_allclose(window.last_move_covariance(window.P), J @ window.P @ J.T, atol=1e-12)
+    move = window.last_move()
+    assert move is not None
+    np.testing.assert_allclose(window.clones[2].T_world_imu @ move, window.clones[3].T_world_imu, atol=1e-12)
+    assert _window(clones=2).last_move() is not None
+    window.clones = window.clones[-1:]
+    assert window.last_move() is None
+
+
+def test_new_landmarks_are_correlated_with_what_made_them() -> None:
+    window = _window()
+    D = len(window.P)
+    A, noise = np.random.default_rng(2).normal(size=(3, D)), np.diag([1e-3, 2e-3, 3e-3])
+    J = np.concatenate([np.eye(D), A])
+    expected = J @ window.P @ J.T
+    expected[D:, D:] += noise
+    window.offset = np.linspace(-1, 1, D)
+    window.add_landmarks(np.array([9]), np.array([[1.0, 2.0, 3.0]]), A, noise[None])
+    np.testing.assert_allclose(window.P, expected, atol=1e-12)
+    np.testing.assert_allclose(window.offset, J @ np.linspace(-1, 1, D), atol=1e-12)
+    assert window.landmark_ids.tolist() == [3, 8, 9]
+
+
+def test_what_is_forgotten_leaves_the_rest_as_it_was() -> None:
+    window, whole = _window(), _window()
+    window.drop_oldest_clone()
+    window.keep_landmarks(np.array([False, True]))
+    kept = np.r_[0:DIM, DIM + 6 : DIM + 24, DIM + 27 : DIM + 30]
+    np.testing.assert_array_equal(window.P, whole.P[np.ix_(kept, kept)])
+    assert [c.frame_index for c in window.clones] == [1, 2, 3]
+    np.testing.assert_array_equal(window.landmarks, LANDMARKS[1:])
+    window.keep_landmarks(np.array([True]))
+    assert window.landmark_ids.tolist() == [8]
+
+
+def test_a_measurement_is_a_kalman_update_of_all_that_is_correlated() -> None:
+    window, rng = _window(), np.random.default_rng(3)
+    told = Measurement(rng.normal(size=(4, DIM)), rng.normal(size=4), np.diag([0.1, 0.2, 0.3, 0.4]))
+    H = np.zeros((4, len(window.P)))
+    H[:, :DIM] = told.H
+    K = window.P @ H.T @ np.linalg.inv(H @ window.P @ H.T + told.R)
+    expected, shift = (np.eye(len(window.P)) - K @ H) @ window.P, K @ told.residual
+    moved = copy.deepcopy(window)
+    moved.measure(told)
+    np.testing.assert_allclose(moved.P, expected, atol=1e-9)
+    np.testing.assert_allclose(moved.offset, 0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        moved.clones[0].T_world_imu, se3_exp(shift[DIM : DIM + 6]) @ window.clones[0].T_world_imu
+    )
+    window.commit_measurement(told)
+    np.testing.assert_allclose(window.offset, -shift, atol=1e-9)
+    np.testing.assert_array_equal(window.clones[0].T_world_imu, _window().clones[0].T_world_imu)
+
+
+def test_posterior_of_a_prior_with_a_negative_eigenvalue_by_rounding_is_still_one() -> None:
+    """Cholesky's factors do not exist then; what is known for sure stays known."""
+    known = np.diag([1.0, 4.0, 0.0])
+    known[2, 2] = -1e-20
+    P, shift = posterior(known, np.diag([1.0, 0.0, 1e6]), np.array([1.0, 1.0, 1e6]))
+    np.testing.assert_allclose(P, np.diag([0.5, 4.0, 0.0]), atol=1e-12)
+    np.testing.assert_allclose(shift, [0.5, 4.0, 0.0], atol=1e-12)
