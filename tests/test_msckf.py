@@ -501,6 +501,35 @@ class Flight:
         return np.array(errors), np.array(covariances), filt
 
 
+@pytest.mark.parametrize("motion", [None, "imu"])
+def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion: str | None) -> None:
+    """What is told then is the last covariance carried by each step's transition, and each step's noise on top."""
+    flight, settings = Flight(frames=6), MsckfSettings()
+    _, _, filt = flight.run(settings, motion)
+    window, noise = filt._window, np.random.default_rng(1)
+    assert window is not None
+    P = filt._output.copy()
+    samples = flight.imu(noise, settings, np.zeros(6)) if motion == "imu" else []
+    other = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
+    for sample in samples:
+        other.take(sample)
+        if sample.time_ns > 5 * STEP_NS:
+            filt.propagate(sample)
+    nothing = flight.observe(0, 0.0, noise, 0)
+    for k in (6, 7):
+        step = other.advance(window.nav, (k - 1) * STEP_NS, k * STEP_NS, filt._noise.factors)
+        P = step.Phi @ P @ step.Phi.T + step.Q
+        filt.update(replace(nothing, frame_index=k, time_ns=k * STEP_NS))
+    estimate = filt.estimate()
+
+    def on_the_body(xi: FloatArray) -> FloatArray:
+        """The error exp(xi) T_hat as T_hat exp(error)."""
+        return se3_log(se3_inverse(estimate.T_world_imu) @ se3_exp(xi) @ estimate.T_world_imu)
+
+    J = numeric_jacobian(on_the_body, np.zeros(6))
+    np.testing.assert_allclose(estimate.covariance, J @ P[:6, :6] @ J.T, rtol=1e-4, atol=1e-5 * np.abs(P[:6, :6]).max())
+
+
 @pytest.mark.parametrize("motion", [None, "velocity", "imu"])
 def test_flight_that_starts_in_motion_is_followed(motion: str | None) -> None:
     errors, _, _ = Flight().run(MsckfSettings(), motion)
