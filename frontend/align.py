@@ -17,13 +17,14 @@ import numpy.typing as npt
 
 from frontend.patches import FloatImage, Patches, inside
 from vio.geometry.lie import FloatArray
-from vio.records import IntArray
+from vio.records import BoolArray, IntArray
 
 _PARAMETERS = 8  # shift u, v; gain; offset; linear part by rows
 _ROW_PARAMETERS = 6  # the same without the second row of the linear part
 _ROW_SIGMA_PX = 0.3  # how far from its row a feature may lie in the other image of a rectified pair
 _GRAY_SIGMA = 4.0  # difference of the two cameras' views of one patch, after gain and offset
 _ROW_WEIGHT = (_GRAY_SIGMA / _ROW_SIGMA_PX) ** 2
+_MAX_MOVE_PX = 2.5
 _DONE_PX = 0.05  # the last step is taken; what then remains is a small fraction of it
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
@@ -205,6 +206,16 @@ def shift_warps(centres: FloatArray) -> FloatArray:
     warp[:, 0, 0] = warp[:, 1, 1] = 1.0
     warp[:, :, 2] = centres
     return warp
+
+
+def on_peak(place: FloatArray, start: FloatArray) -> BoolArray:
+    """Mask (N,) of fitted pixels (N, 2) near where the fit began (N, 2): one that moved further has left its peak."""
+    return np.asarray(np.abs(place - start).max(axis=1) <= _MAX_MOVE_PX)
+
+
+def template_points(warp: FloatArray, offset: FloatArray) -> FloatArray:
+    """Image points (N, 2) of template points, given as offsets (N, 2) from the centre, under warps (N, 2, 3)."""
+    return np.asarray(warp[:, :, 2] + (warp[:, :, :2] @ offset[:, :, None])[:, :, 0])
 
 
 def scale_change(warp: FloatArray) -> FloatArray:

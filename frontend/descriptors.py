@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from frontend.align import align, cut_patches, rounded, shift_warps, templates
+from frontend.align import align, cut_patches, on_peak, rounded, shift_warps, template_points, templates
+from frontend.columns import joined, take
 from frontend.detect import spread_evenly
-from frontend.frames import FrameGate, Stopwatch, SwapAlarm, usable_prior
+from frontend.frames import FrameGate, Stopwatch, SwapAlarm, handed_out
 from frontend.outliers import Vote, predicted_motion, static_tracks
 from frontend.patches import FloatImage, inside
+from frontend.prediction import moved_pixels, told_pixels, usable_prior
 from frontend.settings import FrontendSettings, MatchSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, project, triangulate
-from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior, observations
+from vio.geometry.stereo import StereoCamera, left_rays, triangulate
+from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
 
 Descriptors: TypeAlias = npt.NDArray[np.float32] | npt.NDArray[np.uint8]
 
-_REFINE_RADIUS = 6
+_REFINE_RADIUS = 6  # half side of the patches, pixels
 _REFINE_ITERATIONS = 6
-_REFINE_MAX_PX = 2.5
 _REFINE_MIN_CORRELATION = 0.8
-_FAR_M = 1e6
-_SWAP_FEW = 0.2
-_SWAP_MIN_POINTS = 20
-_BORDER_PX = 8.0
+_FAR_M = 1e6  # depth that stands in for an unknown one
+_MIN_DEPTH_M = 0.05
+_SWAP_FEW = 0.2  # share of matches below which left and right may be swapped
+_BORDER_PX = 8.0  # key points nearer to the image's border are left out: their patch would not fit
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +38,9 @@ class Keypoints:
 
     pixels: FloatArray  # (N, 2)
     descriptors: Descriptors  # (N, D) unit vectors, or (N, D / 8) bytes of D bits
-    size_px: FloatArray  # (N,) diameter of what was described, pixels
-    angle_deg: FloatArray  # (N,) its orientation; 0 where the extractor has none
 
     def __len__(self) -> int:
         return len(self.pixels)
-
-    def take(self, index: BoolArray | IntArray) -> Keypoints:
-        """Return the rows named by a mask or by indices."""
-        return Keypoints(*(getattr(self, column.name)[index] for column in fields(self)))
 
 
 class Extractor(Protocol):
@@ -107,15 +102,14 @@ class OpenCvExtractor:
         """Return the key points of one image, strongest first; see `Extractor`."""
         found, descriptors = self.engine.detectAndCompute(image, None)
         described = np.zeros((0, 32), dtype=np.uint8) if descriptors is None else np.asarray(descriptors)
-        values = np.array([(*k.pt, k.size, k.angle, k.response) for k in found], dtype=np.float64).reshape(-1, 5)
-        order = np.lexsort((values[:, 1], values[:, 0], -values[:, 4]))
-        values, described = values[order], described[order]
-        pixels, size, angle = values[:, :2].copy(), values[:, 2].copy(), values[:, 3].copy()
+        values = np.array([(*k.pt, k.response) for k in found], dtype=np.float64).reshape(-1, 3)
+        order = np.lexsort((values[:, 1], values[:, 0], -values[:, 2]))
+        pixels, described = values[order, :2], described[order]
         if self.name == "orb":
-            return Keypoints(pixels, described.astype(np.uint8), size, angle)
+            return Keypoints(pixels, described.astype(np.uint8))
         # Root-SIFT. Reference: Arandjelovic & Zisserman, Three things everyone should know, CVPR (2012).
         unit = described.astype(np.float32)
-        return Keypoints(pixels, np.sqrt(unit / np.maximum(unit.sum(axis=1, keepdims=True), 1e-6)), size, angle)
+        return Keypoints(pixels, np.sqrt(unit / np.maximum(unit.sum(axis=1, keepdims=True), 1e-6)))
 
 
 def orb_extractor(settings: MatchSettings) -> OpenCvExtractor:
@@ -126,6 +120,15 @@ def orb_extractor(settings: MatchSettings) -> OpenCvExtractor:
 def sift_extractor(settings: MatchSettings) -> OpenCvExtractor:
     """SIFT. Reference: Lowe, Distinctive image features from scale-invariant keypoints, IJCV (2004)."""
     return OpenCvExtractor(cv2.SIFT.create(nfeatures=settings.max_keypoints, contrastThreshold=0.02), "sift")
+
+
+@dataclass(frozen=True, slots=True)
+class _Pair:
+    """The key points of the left image, and where the right image shows them."""
+
+    looks: Keypoints  # (N,)
+    right: FloatArray  # (N, 2) pixels, arbitrary where has_right is False
+    has_right: BoolArray  # (N,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,18 +144,15 @@ class _Tracks:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def take(self, index: BoolArray | IntArray) -> _Tracks:
-        return _Tracks(
-            self.ids[index], self.left[index], self.right[index], self.has_right[index], self.looks.take(index)
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class _Memory:
+    """What the front end keeps of the frame before."""
+
     time_ns: int
-    image: FloatImage  # left
+    left: FloatImage
     tracks: _Tracks
-    twist_per_s: FloatArray  # (6,)
+    twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` of the last consensus, over its time
 
 
 class DescriptorFrontend:
@@ -170,47 +170,37 @@ class DescriptorFrontend:
         self._extract = extract
         self._match = match
         self._gate = FrameGate(camera, name)
-        self._swap = SwapAlarm()
+        self._swap = SwapAlarm(_SWAP_FEW)
         self._memory: _Memory | None = None
         self._next_id = 0
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
-        """Extract, match and reject in one rectified stereo pair; frames come in time order.
-
-        Args:
-            frame: the pair, 8-bit gray, of the size that the camera states.
-            prior: predicted pixels by id and predicted rotation since the previous frame, where the filter has them.
-
-        Raises:
-            DataError: the frame has no images, images of a wrong size or type, or a time not after the last one's; or
-                left and right look swapped.
-        """
+        """Extract, match and reject in one rectified stereo pair; see `vio.protocols.Frontend`."""
         watch = Stopwatch()
-        left_image, right_image = self._gate.admit(frame)
-        views = left_image.astype(np.float32), right_image.astype(np.float32)
+        images = self._gate.admit(frame)
+        views = images[0].astype(np.float32), images[1].astype(np.float32)
         watch.lap("prepare")
-        left, right = (
-            found.take(inside(left_image, found.pixels, _BORDER_PX))
-            for found in (self._extract(left_image), self._extract(right_image))
-        )
+        found = [self._extract(image) for image in images]
+        left, right = (take(points, inside(images[0], points.pixels, _BORDER_PX)) for points in found)
         watch.lap("extract")
-        place, has_right = self._stereo(left, right, views)
+        pair = self._stereo(left, right, views)
         watch.lap("stereo")
-        tracks, twist, used = self._tracked(frame, left, place, has_right, views[0], usable_prior(prior))
+        tracks, twist, used = self._tracked(frame, pair, views[0], usable_prior(prior))
         watch.lap("track")
         carried = len(tracks)
-        tracks = self._completed(tracks, left, place, has_right, used, left_image)
+        tracks = self._completed(tracks, pair, used, images[0])
         self._memory = _Memory(frame.time_ns, views[0], tracks, twist)
-        self._check_swap(frame, left, right, int(has_right.sum()))
-        watch.lap("check")
-        z = np.concatenate([tracks.left, tracks.right], axis=1)
-        return FrontendOutput(
-            observations(frame.index, frame.time_ns, tracks.ids, z, tracks.has_right),
-            tracked=carried,
-            matched=int(tracks.has_right.sum()),
-            detected=len(tracks) - carried,
-            stages_ms=watch.stages_ms,
+        width = images[0].shape[1]
+        self._swap.check(
+            frame,
+            len(left),
+            int(pair.has_right.sum()),
+            lambda: len(self._match(right, left, self._allowed(right, left, width))),
         )
+        watch.lap("check")
+        return handed_out(frame, tracks, carried, watch)
+
+    # --- left and right ---------------------------------------------------------------------------------------------
 
     def _allowed(self, left: Keypoints, right: Keypoints, width: int) -> BoolArray:
         """Pairs (N, M) near one row with a disparity in range."""
@@ -222,10 +212,8 @@ class DescriptorFrontend:
             & (disparity <= limits.max_disparity * width)
         )
 
-    def _stereo(
-        self, left: Keypoints, right: Keypoints, views: tuple[FloatImage, FloatImage]
-    ) -> tuple[FloatArray, BoolArray]:
-        """Right pixels (N, 2) of the left key points, and the mask (N,) of those matched."""
+    def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[FloatImage, FloatImage]) -> _Pair:
+        """Match the key points of the left image into the right one."""
         place, has_right = np.zeros((len(left), 2)), np.zeros(len(left), dtype=np.bool_)
         pairs = self._match(left, right, self._allowed(left, right, views[0].shape[1]))
         rows = pairs[:, 0]
@@ -233,7 +221,7 @@ class DescriptorFrontend:
         place[rows], alike = self._refined(views[0], left.pixels[rows], views[1], target, target[:, 1])
         disparity = left.pixels[rows, 0] - place[rows, 0]
         has_right[rows] = alike & (disparity >= self._disparity.min_disparity_px)
-        return place, has_right
+        return _Pair(left, place, has_right)
 
     def _refined(
         self,
@@ -247,114 +235,85 @@ class DescriptorFrontend:
         if self._settings.refine == "none" or len(points) == 0:
             return start, np.ones(len(start), dtype=np.bool_)
         centres = rounded(points)
-        store = templates(cut_patches(source, centres, _REFINE_RADIUS))
         beside = points - centres
-        warp, score = align(
-            store, np.arange(len(points)), target, shift_warps(start - beside), _REFINE_ITERATIONS, rows
-        )
-        place = warp[:, :, 2] + (warp[:, :, :2] @ beside[:, :, None])[:, :, 0]
-        good = (score >= _REFINE_MIN_CORRELATION) & (np.abs(place - start).max(axis=1) <= _REFINE_MAX_PX)
+        store, slots = templates(cut_patches(source, centres, _REFINE_RADIUS)), np.arange(len(points))
+        warp, score = align(store, slots, target, shift_warps(start - beside), _REFINE_ITERATIONS, rows)
+        place = template_points(warp, beside)
+        good = (score >= _REFINE_MIN_CORRELATION) & on_peak(place, start)
         return np.where(good[:, None], place, start), good
 
+    # --- before and now ---------------------------------------------------------------------------------------------
+
     def _tracked(
-        self,
-        frame: StereoFrame,
-        left: Keypoints,
-        place: FloatArray,
-        has_right: BoolArray,
-        view: FloatImage,
-        prior: TrackPrior | None,
+        self, frame: StereoFrame, pair: _Pair, view: FloatImage, prior: TrackPrior | None
     ) -> tuple[_Tracks, FloatArray, BoolArray]:
         """Tracks of the frame before found among the key points; the motion per second; the mask of points used."""
-        memory, used = self._memory, np.zeros(len(left), dtype=np.bool_)
+        memory, used = self._memory, np.zeros(len(pair.looks), dtype=np.bool_)
         if memory is None or len(memory.tracks) == 0:
             nothing = np.zeros(0, dtype=np.int64)
-            empty = _Tracks(nothing, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), left.take(nothing))
+            empty = _Tracks(
+                nothing, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), take(pair.looks, nothing)
+            )
             return empty, np.zeros(6) if memory is None else memory.twist_per_s, used
-        settings, old = self._settings, memory.tracks
+        old, left = memory.tracks, pair.looks.pixels
         seconds = (frame.time_ns - memory.time_ns) * 1e-9
         expected = se3_exp(memory.twist_per_s * seconds)
-        R_prior = None if prior is None else prior.R_cam_prev
-        told = expected if R_prior is None else se3_from_parts(R_prior, expected[:3, 3])
-        p, deep = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
+        p_prev, deep = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
         deep &= old.has_right
-        guess = self._moved(old.left, np.where(deep[:, None], p, left_rays(self._camera, old.left) * _FAR_M), told)
-        if prior is not None and len(prior.ids):
-            _, a, b = np.intersect1d(old.ids, prior.ids, assume_unique=True, return_indices=True)
-            guess[a] = prior.z[b, :2]
-        reach = settings.search_radius * view.shape[1]
-        # The last motion may be wrong, so that the old pixel is a second centre of the search.
-        allowed = np.zeros((len(old), len(left)), dtype=np.bool_)
-        for centre in (guess, old.left):
-            allowed |= np.abs(centre[:, None] - left.pixels).max(axis=2) <= reach
-        pairs = self._match(old.looks, left, allowed)
+        far = left_rays(self._camera, old.left) * _FAR_M
+        guess = self._guess(old, np.where(deep[:, None], p_prev, far), expected, prior)
+        pairs = self._match(old.looks, pair.looks, self._near(old, guess, left, view.shape[1]))
         rows, found = pairs[:, 0], pairs[:, 1]
-        pixels, alike = self._refined(memory.image, old.left[rows], view, left.pixels[found])
+        pixels, alike = self._refined(memory.left, old.left[rows], view, left[found])
         rows, found, pixels = rows[alike], found[alike], pixels[alike]
-        T_prior = None
+        R_prior = T_prior = None
         if prior is not None:
-            _, a, b = np.intersect1d(old.ids, prior.ids, assume_unique=True, return_indices=True)
-            T_prior = predicted_motion(self._camera, p[a[deep[a]]], prior.z[b[deep[a]], :2], expected)
+            named, told = told_pixels(old.ids[deep], prior)
+            R_prior = prior.R_cam_prev
+            T_prior = predicted_motion(self._camera, p_prev[deep][named], told, expected)
         rng = np.random.default_rng((self._consensus.seed, frame.index))
-        vote = Vote(self._camera, self._consensus, settings.consensus_px, rng)
-        voters = deep[rows]
-        keep, motion = static_tracks(vote, old.left[rows], p[rows], voters, pixels, expected, R_prior, T_prior)
-        agrees, twist = has_right[found].copy(), memory.twist_per_s
+        vote = Vote(self._camera, self._consensus, self._settings.consensus_px, rng)
+        voters, p_rows = deep[rows], p_prev[rows]
+        keep, motion = static_tracks(vote, old.left[rows], p_rows, voters, pixels, expected, R_prior, T_prior)
         # The right pixel belongs to the key point; it moves along with the refinement.
-        right = place[found] + np.stack([pixels[:, 0] - left.pixels[found, 0], np.zeros(len(found))], axis=1)
+        right = pair.right[found] + np.stack([pixels[:, 0] - left[found, 0], np.zeros(len(found))], axis=1)
+        agrees, twist = pair.has_right[found], memory.twist_per_s
         if motion is not None:
             keep[~voters] = False
             twist = se3_log(motion.T_curr_prev) / seconds
-            depth = np.maximum(transform_points(motion.T_curr_prev, p[rows])[:, 2], 0.05)
-            expected_disparity = self._camera.fu * self._camera.baseline_m / depth
-            change = np.abs(pixels[:, 0] - right[:, 0] - expected_disparity)
-            agrees &= ~voters | (change <= settings.consensus_px)
+            depth = np.maximum(transform_points(motion.T_curr_prev, p_rows)[:, 2], _MIN_DEPTH_M)
+            change = np.abs(pixels[:, 0] - right[:, 0] - self._camera.fu * self._camera.baseline_m / depth)
+            agrees = agrees & (~voters | (change <= self._settings.consensus_px))
         rows, found = rows[keep], found[keep]
         used[found] = True
-        tracks = _Tracks(old.ids[rows], pixels[keep], right[keep], agrees[keep], left.take(found))
-        return tracks, twist, used
+        return _Tracks(old.ids[rows], pixels[keep], right[keep], agrees[keep], take(pair.looks, found)), twist, used
 
-    def _moved(self, left: FloatArray, point: FloatArray, T_curr_prev: FloatArray) -> FloatArray:
-        moved = transform_points(T_curr_prev, point)
-        ahead = moved[:, 2] > 0.1
-        pixels = project(self._camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
-        return np.where(ahead[:, None], pixels, left)
+    def _guess(self, old: _Tracks, p_prev: FloatArray, expected: FloatArray, prior: TrackPrior | None) -> FloatArray:
+        """Guess the left pixels (N, 2) of tracks at points (N, 3) in the coming frame."""
+        if prior is not None and prior.R_cam_prev is not None:
+            expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
+        guess = moved_pixels(self._camera, expected, p_prev, old.left)
+        if prior is not None:
+            rows, told = told_pixels(old.ids, prior)
+            guess[rows] = told
+        return guess
 
-    def _completed(
-        self,
-        tracks: _Tracks,
-        left: Keypoints,
-        place: FloatArray,
-        has_right: BoolArray,
-        used: BoolArray,
-        image: Image,
-    ) -> _Tracks:
+    def _near(self, old: _Tracks, guess: FloatArray, points: FloatArray, width: int) -> BoolArray:
+        """Pairs (N, M) of tracks and left key points (M, 2) near where the track is guessed (N, 2), or where it was."""
+        reach = self._settings.search_radius * width
+        near = np.zeros((len(old), len(points)), dtype=np.bool_)
+        # The last motion may be wrong, so that the old pixel is a second centre of the search.
+        for centre in (guess, old.left):
+            near |= np.abs(centre[:, None] - points).max(axis=2) <= reach
+        return near
+
+    def _completed(self, tracks: _Tracks, pair: _Pair, used: BoolArray, image: Image) -> _Tracks:
         """Add new features from key points with a right match, evenly over the image."""
         height, width = image.shape
-        free = np.flatnonzero(~used & has_right)
-        chosen = free[spread_evenly(left.pixels[free], tracks.left, (width, height), self._grid)]
+        left = pair.looks.pixels
+        free = np.flatnonzero(~used & pair.has_right)
+        chosen = free[spread_evenly(left[free], tracks.left, (width, height), self._grid)]
         ids = np.arange(len(chosen), dtype=np.int64) + self._next_id
         self._next_id += len(chosen)
-        return _Tracks(
-            np.concatenate([tracks.ids, ids]),
-            np.concatenate([tracks.left, left.pixels[chosen]]),
-            np.concatenate([tracks.right, place[chosen]]),
-            np.concatenate([tracks.has_right, has_right[chosen]]),
-            _joined(tracks.looks, left.take(chosen)),
-        )
-
-    def _check_swap(self, frame: StereoFrame, left: Keypoints, right: Keypoints, matched: int) -> None:
-        """Raise when several frames in a row match only with negative disparities."""
-        n = len(left)
-        if n < _SWAP_MIN_POINTS or matched >= _SWAP_FEW * n:
-            self._swap.clear()
-            return
-        assert frame.left is not None
-        mirrored = self._match(right, left, self._allowed(right, left, frame.left.shape[1]))
-        self._swap.check(frame, n, matched, len(mirrored))
-
-
-def _joined(a: Keypoints, b: Keypoints) -> Keypoints:
-    return replace(
-        a, **{column.name: np.concatenate([getattr(a, column.name), getattr(b, column.name)]) for column in fields(a)}
-    )
+        new = _Tracks(ids, left[chosen], pair.right[chosen], pair.has_right[chosen], take(pair.looks, chosen))
+        return joined(tracks, new)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from frontend.settings import GridSettings, KltSettings
+from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
@@ -114,38 +116,64 @@ def detect_corners(
         Corners in pixels of the full image, in the order in which they should be taken.
     """
     height, width = half.shape
-    border = settings.anchor_radius_px // 2 + 2
-    if wanted <= 0 or min(height, width) <= 4 * border:
+    if wanted <= 0 or min(height, width) <= 4 * _border(settings):
         return np.zeros((0, 2))
     # A gradient per pixel of the full image is half of one per pixel of the half image.
     response = corner_response(half) / np.float32(4.0)
     if allowed is not None:
         response = np.where(allowed, response, np.float32(0.0))
-    distance = max(1, min_distance_px(2 * width, 2 * height, grid) // 2)
-    candidates = local_maxima(response, occupied / 2, distance, border, settings.min_gradient**2)
-    missing = grid.target_features - len(occupied)
-    if len(candidates) < missing:
-        floor = settings.min_gradient_over_noise * noise_gradient(half) / 2.0
-        if floor < settings.min_gradient:
-            weaker = local_maxima(response, occupied / 2, distance, border, floor**2)
-            candidates = weaker[np.argsort(-response[weaker[:, 1], weaker[:, 0]], kind="stable")[:missing]]
+    corners = _candidates(half, response, occupied, grid, settings)
     shape = grid_shape(2 * width, 2 * height, grid)
-    cells = shape[0] * shape[1]
-    cell = cell_index(2 * candidates.astype(np.float64), 2 * width, 2 * height, shape)
-    strength = response[candidates[:, 1], candidates[:, 0]]
-    strongest = np.zeros(cells, dtype=np.float32)
+    cell = cell_index(2 * corners.astype(np.float64), 2 * width, 2 * height, shape)
+    strength = response[corners[:, 1], corners[:, 0]]
+    strongest = np.zeros(shape[0] * shape[1], dtype=np.float32)
     np.maximum.at(strongest, cell, strength)
-    kept = strength >= settings.min_relative_gradient**2 * strongest[cell]
-    candidates, cell, strength = candidates[kept], cell[kept], strength[kept]
-    held = np.bincount(cell_index(occupied, 2 * width, 2 * height, shape), minlength=cells)
-    order = np.lexsort((candidates[:, 0], candidates[:, 1], -strength, cell))
-    first = np.searchsorted(cell[order], np.arange(cells))
-    level = np.arange(len(order)) - first[cell[order]] + held[cell[order]]  # features that the cell then holds already
-    # Cells are filled evenly, emptiest first; among equals the strongest corner wins.
-    queue = np.lexsort((-strength[order], level))
-    queue = queue[level[queue] < 2 * grid.cell_features][:wanted]
-    chosen = candidates[order[queue]]
+    kept = np.flatnonzero(strength >= settings.min_relative_gradient**2 * strongest[cell])
+    # Of equally strong corners those of the first cell come first, so that equal images give equal corners.
+    kept = kept[np.lexsort((corners[kept, 0], corners[kept, 1], cell[kept], -strength[kept]))]
+    level = _filling(cell[kept], cell_index(occupied, 2 * width, 2 * height, shape), len(strongest))
+    order = np.argsort(level, kind="stable")
+    chosen = corners[kept[order[level[order] < 2 * grid.cell_features][:wanted]]]
     return 2.0 * (chosen + _peak_offset(response, chosen))
+
+
+def _border(settings: KltSettings) -> int:
+    """Pixels of the half image at its border that can hold no corner: its anchor would not fit into the full one."""
+    return settings.anchor_radius_px // 2 + 2
+
+
+def _candidates(
+    half: Image, response: Response, occupied: FloatArray, grid: GridSettings, settings: KltSettings
+) -> IntArray:
+    """Pixels (K, 2) of the half image that are corners; in the dark, weaker ones, the strongest first."""
+    height, width = half.shape
+    distance = max(1, min_distance_px(2 * width, 2 * height, grid) // 2)
+    found = local_maxima(response, occupied / 2, distance, _border(settings), settings.min_gradient**2)
+    missing = grid.target_features - len(occupied)
+    if len(found) >= missing:
+        return found
+    floor = settings.min_gradient_over_noise * noise_gradient(half) / 2.0
+    if floor >= settings.min_gradient:
+        return found
+    weaker = local_maxima(response, occupied / 2, distance, _border(settings), floor**2)
+    return weaker[np.argsort(-response[weaker[:, 1], weaker[:, 0]], kind="stable")[:missing]]
+
+
+def _filling(cell: IntArray, occupied: IntArray, cells: int) -> IntArray:
+    """How many features (N,) the cell of each point holds before it, if points are taken in their order.
+
+    Taking the points by this number fills all cells evenly, the emptiest first.
+
+    Args:
+        cell: number of the cell (N,) of each point.
+        occupied: number of the cell (M,) of each feature that is there already.
+        cells: how many cells there are.
+    """
+    order = np.argsort(cell, kind="stable")
+    first = np.searchsorted(cell[order], np.arange(cells))
+    filled = np.empty(len(cell), dtype=np.int64)
+    filled[order] = np.arange(len(order)) - first[cell[order]] + np.bincount(occupied, minlength=cells)[cell[order]]
+    return filled
 
 
 def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int], grid: GridSettings) -> IntArray:
@@ -166,14 +194,36 @@ def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int
     near[:, len(occupied) :] &= np.tril(np.ones((len(points), len(points)), dtype=np.bool_), -1)
     candidates = np.flatnonzero(~near.any(axis=1))
     shape = grid_shape(width, height, grid)
-    cells = shape[0] * shape[1]
-    cell = cell_index(points[candidates], width, height, shape)
-    held = np.bincount(cell_index(occupied, width, height, shape), minlength=cells)
-    order = np.argsort(cell, kind="stable")
-    first = np.searchsorted(cell[order], np.arange(cells))
-    level = np.empty(len(candidates), dtype=np.int64)
-    level[order] = np.arange(len(order)) - first[cell[order]] + held[cell[order]]
+    cell, held = (cell_index(uv, width, height, shape) for uv in (points[candidates], occupied))
+    level = _filling(cell, held, shape[0] * shape[1])
     return candidates[np.argsort(level, kind="stable")[:wanted]]
+
+
+def load_mask(path: Path) -> Image:
+    """Read the image (H, W) whose black pixels must not hold corners.
+
+    Raises:
+        ConfigError: the file does not decode.
+    """
+    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    if mask is None:
+        raise ConfigError(f"frontend.klt.mask: {path} cannot be read as an image; give a PNG of the recording's size")
+    return np.asarray(mask, dtype=np.uint8)
+
+
+def half_mask(mask: Image, shape: tuple[int, ...], half_shape: tuple[int, ...]) -> BoolArray:
+    """The mask (H, W) at half resolution: True where all pixels around are allowed.
+
+    Raises:
+        ConfigError: the mask is not of the images' shape.
+    """
+    if mask.shape != shape:
+        raise ConfigError(
+            f"frontend.klt.mask is {mask.shape[1]}x{mask.shape[0]}, but the images are {shape[1]}x{shape[0]}; "
+            "give a mask of the recording's size"
+        )
+    solid = np.asarray(cv2.erode(mask, np.ones((3, 3), np.uint8)))
+    return np.asarray(solid[::2, ::2][: half_shape[0], : half_shape[1]] > 0)
 
 
 def _peak_offset(response: Response, pixels: IntArray) -> FloatArray:

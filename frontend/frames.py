@@ -1,20 +1,21 @@
-"""What every front end that looks at images needs: checks of a frame, a stopwatch, an alarm for swapped cameras."""
+"""What every front end that looks at images needs: checks of a frame, a stopwatch, an alarm for swaps, the output."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import Protocol
 
-import cv2
 import numpy as np
 
-from vio.errors import ConfigError, DataError
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, Image, StereoFrame, TrackPrior
+from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, observations
 
 _SWAP_FRAMES = 3  # frames without matches before the mirrored search is believed
-_ROTATION_SLACK = 1e-3  # how far a predicted rotation may be from one
+_SWAP_MIN_POINTS = 20  # with fewer features nothing is suspicious
 _SWAP_MANY = 0.4  # share of matches in the mirrored images that proves the swap
 
 
@@ -80,36 +81,23 @@ class FrameGate:
         return frame.left, frame.right
 
 
-def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
-    """The part of a prior that says something: rows of finite left pixels, one an id, and a rotation that is one."""
-    if prior is None:
-        return None
-    ids, first = np.unique(prior.ids, return_index=True)
-    finite = np.isfinite(prior.z[first, :2]).all(axis=1)
-    R = prior.R_cam_prev
-    if R is not None and not (np.isfinite(R).all() and np.abs(R @ R.T - np.eye(3)).max() < _ROTATION_SLACK):
-        R = None
-    if R is None and not finite.any():
-        return None
-    return TrackPrior(ids[finite], prior.z[first[finite]], R)
-
-
 @dataclass(slots=True)
 class SwapAlarm:
     """Raises when left and right are exchanged: few matches, many in the mirrored images, repeatedly."""
 
+    few: float  # share of features with a match, below which the mirrored images are looked at
     _suspicious: int = 0
 
-    def clear(self) -> None:
-        """Forget what was suspicious: a frame matched well."""
-        self._suspicious = 0
-
-    def check(self, frame: StereoFrame, features: int, matched: int, mirrored: int) -> None:
-        """Take in the matches of one suspicious frame, as it is and mirrored.
+    def check(self, frame: StereoFrame, features: int, matched: int, count_mirrored: Callable[[], int]) -> None:
+        """Take in how many features of a frame matched; `count_mirrored` tells how many do in the mirrored images.
 
         Raises:
             DataError: left and right look swapped.
         """
+        if features < _SWAP_MIN_POINTS or matched >= self.few * features:
+            self._suspicious = 0
+            return
+        mirrored = count_mirrored()
         self._suspicious = self._suspicious + 1 if mirrored >= max(_SWAP_MANY * features, 2 * matched) else 0
         if self._suspicious >= _SWAP_FRAMES:
             raise DataError(
@@ -119,28 +107,33 @@ class SwapAlarm:
             )
 
 
-def load_mask(path: Path) -> Image:
-    """Read the image (H, W) whose black pixels must not hold corners.
+class Seen(Protocol):
+    """Features as any front end keeps them."""
 
-    Raises:
-        ConfigError: the file does not decode.
-    """
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
-    if mask is None:
-        raise ConfigError(f"frontend.klt.mask: {path} cannot be read as an image; give a PNG of the recording's size")
-    return np.asarray(mask, dtype=np.uint8)
+    @property
+    def ids(self) -> IntArray:
+        """Names (N,)."""
+
+    @property
+    def left(self) -> FloatArray:
+        """Pixels (N, 2)."""
+
+    @property
+    def right(self) -> FloatArray:
+        """Pixels (N, 2), arbitrary where `has_right` is False."""
+
+    @property
+    def has_right(self) -> BoolArray:
+        """Mask (N,)."""
 
 
-def half_mask(mask: Image, shape: tuple[int, ...], half_shape: tuple[int, ...]) -> BoolArray:
-    """The mask (H, W) at half resolution: True where all pixels around are allowed.
-
-    Raises:
-        ConfigError: the mask is not of the images' shape.
-    """
-    if mask.shape != shape:
-        raise ConfigError(
-            f"frontend.klt.mask is {mask.shape[1]}x{mask.shape[0]}, but the images are {shape[1]}x{shape[0]}; "
-            "give a mask of the recording's size"
-        )
-    solid = np.asarray(cv2.erode(mask, np.ones((3, 3), np.uint8)))
-    return np.asarray(solid[::2, ::2][: half_shape[0], : half_shape[1]] > 0)
+def handed_out(frame: StereoFrame, seen: Seen, carried: int, watch: Stopwatch) -> FrontendOutput:
+    """What a front end says of a frame: features, of which `carried` were handed out with the frame before."""
+    z = np.concatenate([seen.left, seen.right], axis=1)
+    return FrontendOutput(
+        observations(frame.index, frame.time_ns, seen.ids, z, seen.has_right),
+        tracked=carried,
+        matched=int(seen.has_right.sum()),
+        detected=len(seen.ids) - carried,
+        stages_ms=watch.stages_ms,
+    )

@@ -220,19 +220,14 @@ def _half(device: torch.device) -> Any:
     return torch.autocast("cuda", dtype=torch.float16, enabled=device.type == "cuda")
 
 
-def _keypoints(pixels: Tensor, descriptors: Tensor, size: Tensor, angle: Tensor, strength: Tensor) -> Keypoints:
+def _keypoints(pixels: Tensor, descriptors: Tensor, strength: Tensor) -> Keypoints:
     """Move key points (N, ...) to NumPy, strongest first, descriptors as unit vectors; those not finite are dropped."""
-    columns = [np.asarray(t.detach().float().cpu().numpy()) for t in (pixels, descriptors, size, angle, strength)]
-    uv, described, sizes, angles, weight = columns
+    columns = (np.asarray(t.detach().float().cpu().numpy()) for t in (pixels, descriptors, strength))
+    uv, described, weight = columns
     order = np.argsort(-weight, kind="stable")
     order = order[np.isfinite(described[order]).all(axis=1) & np.isfinite(uv[order]).all(axis=1)]
     norm = np.maximum(np.linalg.norm(described[order], axis=1, keepdims=True), 1e-9)
-    return Keypoints(
-        uv[order].astype(np.float64),
-        (described[order] / norm).astype(np.float32),
-        sizes[order].astype(np.float64),
-        angles[order].astype(np.float64),
-    )
+    return Keypoints(uv[order].astype(np.float64), (described[order] / norm).astype(np.float32))
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,8 +258,7 @@ class _Whole:
         else:
             uv, described = found.keypoints, found.descriptors
             score = found.keypoint_scores if hasattr(found, "keypoint_scores") else found.detection_scores
-        zero = torch.zeros(len(uv))
-        return _keypoints(uv, described, zero, zero, score.reshape(-1))
+        return _keypoints(uv, described, score.reshape(-1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,15 +278,12 @@ class _Patches:
             pixels = _as_tensor(image, self.device)
             frames, response = self.detector(pixels)
             if frames.shape[1] == 0:
-                nothing = torch.zeros(0)
-                return _keypoints(torch.zeros(0, 2), torch.zeros(0, 1), nothing, nothing, nothing)
+                return _keypoints(torch.zeros(0, 2), torch.zeros(0, 1), torch.zeros(0))
             patches = kf.extract_patches_from_pyramid(pixels, frames, self.patch_px)[0]
             with _half(self.device):
                 described = self.descriptor(patches)
             centre = kf.get_laf_center(frames)[0]
-            size = 2 * kf.get_laf_scale(frames).reshape(-1)
-            angle = kf.get_laf_orientation(frames).reshape(-1)
-        return _keypoints(centre, described, size, angle, response.reshape(-1))
+        return _keypoints(centre, described, response.reshape(-1))
 
 
 @dataclass(frozen=True, slots=True)

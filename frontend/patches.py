@@ -1,7 +1,8 @@
-"""Small image patches around many points at once, without a loop over the points."""
+"""Images as tracking needs them, and small patches of them around many points at once."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
@@ -12,6 +13,14 @@ from vio.records import BoolArray, Image, IntArray
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]  # (H, W) gray levels
 Patches: TypeAlias = npt.NDArray[np.float32]  # (N, h, w) gray levels
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """One image in the forms that tracking needs."""
+
+    full: FloatImage  # (H, W) gray levels
+    half: Image  # (H/2, W/2); what lies at (u, v) in the full image lies at (u/2, v/2) there
 
 
 def inside(image: Image | FloatImage, points: npt.NDArray[np.float64], margin: float) -> BoolArray:

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from frontend.detect import cell_index, grid_shape, min_distance_px
-from frontend.klt import KltFrontend, circle_gaps
+from frontend.flow import circle_gaps
+from frontend.klt import KltFrontend
 from frontend.outliers import fit_motion
 from frontend.settings import FrontendSettings, GridSettings, KltSettings
 from frontend.stereo_match import half_image

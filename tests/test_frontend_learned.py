@@ -268,8 +268,7 @@ def test_corners_lie_at_corners(torch: Any, detector: str) -> None:
 
 def points_of(descriptors: FloatArray) -> Keypoints:
     unit = (descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)).astype(np.float32)
-    n = len(unit)
-    return Keypoints(np.zeros((n, 2)), unit, np.zeros(n), np.zeros(n))
+    return Keypoints(np.zeros((len(unit), 2)), unit)
 
 
 def test_mutual_nearest_equals_a_loop() -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from frontend import FrontendSettings, build_frontend
-from frontend.frames import usable_prior
 from frontend.outliers import pixel_errors, predicted_motion, rigid_consensus
+from frontend.prediction import usable_prior
 from frontend.settings import ConsensusSettings, GridSettings, MatchSettings
 from tests.test_frontend_outliers import CAMERA, T_TRUE, pixels, scene, vote
 from tools.frontend_accuracy import accuracy_scenario

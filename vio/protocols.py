@@ -49,7 +49,16 @@ class Frontend(Protocol):
     """Images in, tracked stereo observations out."""
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
-        """Track, match and detect in one frame; frames come in time order."""
+        """Track, match and detect in one frame; frames come in time order.
+
+        Args:
+            frame: a rectified pair, 8-bit gray, of the size that the camera states, for front ends that look at images.
+            prior: predicted pixels by id and predicted rotation since the last frame, where the filter has them.
+
+        Raises:
+            DataError: the frame lacks what the front end needs, its images have a wrong size or type, its time is not
+                after the last one's, or left and right look swapped.
+        """
 
 
 class Selector(Protocol):

@@ -1,0 +1,27 @@
+"""Records of equally long columns, such as the features of a frame: rows of one, two of them on end."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from vio.records import BoolArray, IntArray
+
+Record = TypeVar("Record")
+
+
+def take(record: Record, index: BoolArray | IntArray) -> Record:
+    """The rows of a record that a mask (N,) or indices (K,) name."""
+    return type(record)(*(take(c, index) if is_dataclass(c) else c[index] for c in _columns(record)))
+
+
+def joined(first: Record, second: Record) -> Record:
+    """The rows of one record, then those of another."""
+    pairs = zip(_columns(first), _columns(second), strict=True)
+    return type(first)(*(joined(a, b) if is_dataclass(a) else np.concatenate([a, b]) for a, b in pairs))
+
+
+def _columns(record: Any) -> list[Any]:
+    return [getattr(record, column.name) for column in fields(record)]

@@ -1,0 +1,93 @@
+"""The features that the front end `klt` keeps alive, and the patches that it finds them again by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from frontend.align import Templates, cut_patches, empty_templates, shift_warps, templates
+from frontend.columns import joined
+from frontend.patches import FloatImage
+from vio.geometry.lie import FloatArray
+from vio.records import BoolArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """The features alive after a frame; older features come first."""
+
+    ids: IntArray  # (N,) given when a feature is first shown; arbitrary before
+    left: FloatArray  # (N, 2) pixels
+    right: FloatArray  # (N, 2) pixels, arbitrary where has_right is False
+    has_right: BoolArray  # (N,)
+    blind: IntArray  # (N,) frames in a row without a right match
+    age: IntArray  # (N,) frames since birth
+    shown: BoolArray  # (N,) handed out as observations
+    point: FloatArray  # (N, 3) cam0 frame, metres; arbitrary where placed is False
+    placed: BoolArray  # (N,)
+    slot: IntArray  # (N,) row of the anchor in the bank
+    warp: FloatArray  # (N, 2, 3) from offsets in the anchor to pixels of the left image
+    skew: FloatArray  # (N, 2, 2) what is added to the warp's linear part for the right image
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def newborn(left: FloatArray, slot: IntArray) -> Tracks:
+    """Features that begin at left pixels (N, 2), with anchors in slots (N,)."""
+    n = len(left)
+    return Tracks(
+        ids=np.zeros(n, dtype=np.int64),
+        left=left,
+        right=np.zeros((n, 2)),
+        has_right=np.zeros(n, dtype=np.bool_),
+        blind=np.zeros(n, dtype=np.int64),
+        age=np.zeros(n, dtype=np.int64),
+        shown=np.zeros(n, dtype=np.bool_),
+        point=np.zeros((n, 3)),
+        placed=np.zeros(n, dtype=np.bool_),
+        slot=slot,
+        warp=shift_warps(left),
+        skew=np.zeros((n, 2, 2)),
+    )
+
+
+def no_tracks() -> Tracks:
+    """No features."""
+    return newborn(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+
+
+class AnchorBank:
+    """Templates of the living features, in slots that are used again: anchors stay where they are while tracks move."""
+
+    def __init__(self, count: int, radius_px: int) -> None:
+        self.store = empty_templates(count, radius_px)
+        self._radius_px = radius_px
+        self._taken = np.zeros(count, dtype=np.bool_)
+
+    def put(self, image: FloatImage, centres: FloatArray) -> IntArray:
+        """Cut new anchors around pixels (N, 2) of an image; return their slots (N,)."""
+        free = np.flatnonzero(~self._taken)[: len(centres)]
+        if len(free) < len(centres):
+            self._grow(len(self._taken) + len(centres))
+            free = np.flatnonzero(~self._taken)[: len(centres)]
+        self._taken[free] = True
+        self.renew(free, image, centres)
+        return free
+
+    def renew(self, slots: IntArray, image: FloatImage, centres: FloatArray) -> None:
+        """Replace the anchors in slots (N,) by what lies around pixels (N, 2) of an image."""
+        new = templates(cut_patches(image, centres, self._radius_px))
+        for column in fields(Templates):
+            getattr(self.store, column.name)[slots] = getattr(new, column.name)
+
+    def keep_only(self, slots: IntArray) -> None:
+        """Free all slots but these."""
+        self._taken[:] = False
+        self._taken[slots] = True
+
+    def _grow(self, count: int) -> None:
+        """Add `count` empty slots."""
+        self.store = joined(self.store, empty_templates(count, self._radius_px))
+        self._taken = np.concatenate([self._taken, np.zeros(count, dtype=np.bool_)])
