@@ -10,8 +10,8 @@ from frontend.settings import KltSettings
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image
 
-_LK_EPSILON_PX = 0.02
-_LK_MIN_EIGENVALUE = 1e-4
+_LK_EPSILON_PX = 0.02  # of the half-resolution image
+_LK_MIN_EIGENVALUE = 1e-4  # as OpenCV's own default
 _RETRY_SHARE = 0.25  # share of failures at which tracking is tried again with all pyramid levels
 _LOST_SHARE = 0.5  # the same for the last attempt, from the old pixels
 _SPARSE = 4  # every so many pixels of the half image tell its brightness
@@ -109,22 +109,60 @@ def _both_ways(
 def _flow(
     source: Image, target: Image, points: FloatArray, guess: FloatArray, levels: int, settings: KltSettings
 ) -> tuple[FloatArray, BoolArray]:
-    """Track points (N, 2) between half-resolution images by Lucas-Kanade, all in pixels of the full image.
+    """Track points (N, 2) between half-resolution images, all in pixels of the full image.
 
     Returns:
         The new pixels (N, 2), and a mask (N,) of those found; the others stay where they were.
     """
+    half, seen = lucas_kanade(
+        source,
+        target,
+        points / 2,
+        guess / 2,
+        window_px=settings.window_px,
+        levels=levels,
+        iterations=settings.iterations,
+        epsilon_px=_LK_EPSILON_PX,
+    )
+    return np.where(seen[:, None], 2 * half, points), seen
+
+
+def lucas_kanade(
+    source: Image,
+    target: Image,
+    points: FloatArray,
+    guess: FloatArray,
+    *,
+    window_px: int,
+    levels: int,
+    iterations: int,
+    epsilon_px: float,
+) -> tuple[FloatArray, BoolArray]:
+    """Track points by OpenCV's pyramidal Lucas-Kanade.
+
+    Args:
+        source: image (H, W) that the points lie in.
+        target: image (H, W) to find them in.
+        points: pixels (N, 2).
+        guess: pixels (N, 2) to start from.
+        window_px: side of the window.
+        levels: pyramid levels beside the images themselves.
+        iterations: largest number of steps a level.
+        epsilon_px: step below which a point has settled.
+
+    Returns:
+        Pixels (N, 2), arbitrary where not found, and a mask (N,) of those found.
+    """
     found, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
         target,
-        (points / 2).astype(np.float32).reshape(-1, 1, 2),
-        (guess / 2).astype(np.float32).reshape(-1, 1, 2),
-        winSize=(settings.window_px, settings.window_px),
+        points.astype(np.float32).reshape(-1, 1, 2),
+        guess.astype(np.float32).reshape(-1, 1, 2),
+        winSize=(window_px, window_px),
         maxLevel=levels,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, settings.iterations, _LK_EPSILON_PX),
+        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, iterations, epsilon_px),
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
         minEigThreshold=_LK_MIN_EIGENVALUE,
     )
-    pixels = 2 * np.asarray(found, dtype=np.float64).reshape(-1, 2)
-    seen = (np.asarray(status).reshape(-1) == 1) & np.isfinite(pixels).all(axis=1)
-    return np.where(seen[:, None], pixels, points), seen
+    pixels = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    return pixels, (np.asarray(status).reshape(-1) == 1) & np.isfinite(pixels).all(axis=1)

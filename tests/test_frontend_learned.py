@@ -8,15 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
 from frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
 from frontend.detect import detect_corners
+from frontend.flow import lucas_kanade
 from frontend.settings import FrontendSettings, GridSettings, KltSettings, LearnedSettings, MatchSettings
 from frontend.stereo_match import half_image
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
+from tools.bench_frontend import kornia_options
 from vio.datasets.images import load_gray
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.geometry.lie import FloatArray
@@ -205,34 +206,13 @@ def test_every_network_runs_with_weights_from_a_file(torch: Any, name: str, tmp_
         assert ((seen.z[:, :2] >= 0) & (seen.z[:, :2] <= [239, 159])).all()
 
 
-WEIGHTED = {
-    "aliked": {"detector": "aliked", "detector_weights": "aliked/aliked-t16.pth"},
-    "aliked-n16": {
-        "detector": "aliked",
-        "aliked_model": "aliked-n16",
-        "detector_weights": "aliked/aliked-n16.pth",
-    },
-    "keynet-mkd": {
-        "detector": "keynet",
-        "detector_weights": "keynet/keynet_pytorch.pth",
-        "descriptor": "mkd",
-        "descriptor_weights": "mkd/mkd-cart-64.pth",
-        "affine_weights": "affnet/AffNet.pth",
-        "orientation_weights": "affnet/OriNet.pth",
-    },
-}
-
-
-@pytest.mark.parametrize("name", WEIGHTED)
+@pytest.mark.parametrize("name", ["kornia-aliked-t16", "kornia-aliked-n16", "kornia-keynet-affnet-mkd"])
 def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> None:
     """On the rendered wall, whose truth is known."""
     if not (data_dir / "weights").is_dir():
         pytest.skip("no weights in VIO_DATA")
-    options = {
-        key: data_dir / "weights" / value if key.endswith("_weights") else value
-        for key, value in WEIGHTED[name].items()
-    }
-    frontend = build(LearnedSettings(**options), replace(MATCH, max_keypoints=120))  # type: ignore[arg-type]
+    options: Any = kornia_options(name, data_dir / "weights")
+    frontend = build(LearnedSettings(**options), replace(MATCH, max_keypoints=120))
     poses = flight(2)
     a, b = (frontend.process(small_frame(k, pose)).observations for k, pose in enumerate(poses))
     _, i, j = np.intersect1d(a.ids, b.ids, return_indices=True)
@@ -299,34 +279,20 @@ def test_bits_are_compared_by_how_many_differ() -> None:
 # --- Lucas-Kanade in torch ------------------------------------------------------------------------------------------
 
 
-def opencv_flow(source: Image, target: Image, points: FloatArray, guess: FloatArray) -> tuple[FloatArray, Any]:
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        source,
-        target,
-        points.astype(np.float32).reshape(-1, 1, 2),
-        guess.astype(np.float32).reshape(-1, 1, 2),
-        winSize=(15, 15),
-        maxLevel=3,
-        criteria=(cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 0.01),
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        minEigThreshold=1e-4,
-    )
-    return np.asarray(found, dtype=np.float64).reshape(-1, 2), np.asarray(status).reshape(-1) == 1
-
-
 def compare(images: list[Image]) -> None:
     """Time, left to right and right to left in one call, against OpenCV call by call: [left, next left, right]."""
     from frontend.torch_klt import TorchFlow
 
     points = detect_corners(half_image(images[0]), np.zeros((0, 2)), 200, GridSettings(), KltSettings())
     legs = [(0, 1), (0, 2), (2, 0)]
-    engine = TorchFlow()
+    search: Any = {"window_px": 15, "levels": 3, "iterations": 30, "epsilon_px": 0.01}
+    engine = TorchFlow(**search)
     n = len(points)
     source, target = (np.repeat([leg[i] for leg in legs], n) for i in (0, 1))
     found, seen = engine.track(engine.pyramid(images), source, target, np.tile(points, (3, 1)), np.tile(points, (3, 1)))
     for k, (a, b) in enumerate(legs):
-        expected, status = opencv_flow(images[a], images[b], points, points)
-        back, _ = opencv_flow(images[b], images[a], expected, points)
+        expected, status = lucas_kanade(images[a], images[b], points, points, **search)
+        back, _ = lucas_kanade(images[b], images[a], expected, points, **search)
         # Where OpenCV itself does not return, it found nothing that a number could agree with.
         settled = status & (np.linalg.norm(back - points, axis=1) < 0.5)
         rows = slice(k * n, (k + 1) * n)

@@ -442,6 +442,14 @@ KORNIA = {
         "orientation_weights": "affnet/OriNet.pth",
     },
 }  # variants of the front end `kornia`, with weights from the folder `weights` of VIO_DATA
+
+
+def kornia_options(name: str, weights: Path) -> dict[str, str | Path]:
+    """Settings of `frontend.learned` of a variant of kornia, with files in the folder of weights; none of others."""
+    options = KORNIA.get(name, {})
+    return {key: weights / value if key.endswith("_weights") else value for key, value in options.items()}
+
+
 NAMES = ("klt", "orb", "sift", "oracle", *KORNIA)
 
 
@@ -451,10 +459,7 @@ def builders(names: list[str], overrides: list[str]) -> dict[str, Builder]:
     def builder(name: str) -> Builder:
         if name == "oracle":
             return _oracle
-        learned = [
-            f"learned.{key}={data_folder() / 'weights' / value if key.endswith('_weights') else value}"
-            for key, value in KORNIA.get(name, {}).items()
-        ]
+        learned = [f"learned.{key}={value}" for key, value in kornia_options(name, data_folder() / "weights").items()]
         settings = load_config(None, [f"frontend.{override}" for override in [*learned, *overrides]]).frontend
         kind = "kornia" if name in KORNIA else name
         return lambda clip: build_frontend(kind, clip.camera, settings, _ClipDataset(clip))

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 
 from frontend.align import align, cut_patches, shift_warps, templates
+from frontend.flow import lucas_kanade
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rectified import Rectifier, make_rectifier
 from vio.datasets.settings import Interpolation
@@ -38,8 +39,7 @@ from vio.sim.world import World, room
 
 _RATIO = 0.75  # of the best to the second best descriptor distance
 _RANSAC_PX = 1.0
-_WINDOW = (21, 21)
-_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-3)
+_WINDOW_PX = 21
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,18 +86,13 @@ def match_sift(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
 
 def refined(left: Image, right: Image, pl: FloatArray, pr: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Right pixels (N, 2) moved in both directions until their patch fits the left one, and a mask of those kept."""
-    there, found, _ = cv2.calcOpticalFlowPyrLK(
-        left,
-        right,
-        pl.astype(np.float32).reshape(-1, 1, 2),
-        pr.astype(np.float32).reshape(-1, 1, 2),
-        winSize=_WINDOW,
-        maxLevel=0,
-        criteria=_CRITERIA,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )
-    uv = there.reshape(-1, 2).astype(np.float64)
-    return uv, (found.reshape(-1) == 1) & (np.linalg.norm(uv - pr, axis=1) < 2.0)
+    uv, found = _flow(left, right, pl, pr, levels=0)
+    return uv, found & (np.linalg.norm(uv - pr, axis=1) < 2.0)
+
+
+def _flow(a: Image, b: Image, points: FloatArray, guess: FloatArray, *, levels: int) -> tuple[FloatArray, BoolArray]:
+    """Pixels (N, 2) in image b of points (N, 2) in image a, to a thousandth of a pixel, and a mask of those found."""
+    return lucas_kanade(a, b, points, guess, window_px=_WINDOW_PX, levels=levels, iterations=40, epsilon_px=1e-3)
 
 
 def row_residuals(source: str, interpolation: Interpolation) -> list[RowResidual]:
@@ -224,22 +219,8 @@ def _pictures(scene: _Scene, time_ns: int, noise: float) -> dict[str, tuple[Imag
 
 def _track(first: Image, second: Image, start: FloatArray, guess: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Lucas-Kanade forth and back: pixels (N, 2) and a mask of those that returned."""
-
-    def step(a: Image, b: Image, p: FloatArray, q: FloatArray) -> tuple[FloatArray, BoolArray]:
-        there, found, _ = cv2.calcOpticalFlowPyrLK(
-            a,
-            b,
-            p.astype(np.float32).reshape(-1, 1, 2),
-            q.astype(np.float32).reshape(-1, 1, 2),
-            winSize=_WINDOW,
-            maxLevel=2,
-            criteria=_CRITERIA,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )
-        return there.reshape(-1, 2).astype(np.float64), found.reshape(-1) == 1
-
-    there, found = step(first, second, start, guess)
-    back, found_back = step(second, first, there, start)
+    there, found = _flow(first, second, start, guess, levels=2)
+    back, found_back = _flow(second, first, there, start, levels=2)
     return there, found & found_back & (np.linalg.norm(back - start, axis=1) < _BACK_PX)
 
 
