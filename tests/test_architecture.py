@@ -70,7 +70,7 @@ def test_imports_go_one_way(file: Path) -> None:
             assert not {i for i in everything for other in others if _within(i, other)}, f"{part} lies below these"
     if not name.startswith(("vio.cli", "vio.__main__")):
         assert not any(i.startswith("vio.cli") for i in everything), "nothing knows the command line"
-    assert "torch" not in _heads(file, top_level_only=True) or name == "frontend.learned"
+    assert "torch" not in _heads(file, top_level_only=True)
 
 
 def test_pycolmap_stays_in_one_file() -> None:

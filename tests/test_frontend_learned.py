@@ -56,13 +56,13 @@ def small_frame(index: int, pose: FloatArray) -> StereoFrame:
 
 
 def test_importing_the_packages_does_not_import_torch() -> None:
-    modules = "vio, frontend, frontend.klt, frontend.descriptors, frontend.learned, frontend.torch_klt"
+    modules = "vio, frontend, frontend.klt, frontend.descriptors, frontend.learned, frontend.learned.torch_flow"
     code = f"import sys, {modules}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    from frontend.torch_klt import TorchFlow
+    from frontend.learned.torch_flow import TorchFlow
 
     for module in ("torch", "kornia", "kornia.feature"):
         monkeypatch.setitem(sys.modules, module, None)
@@ -132,7 +132,7 @@ def test_weights_of_another_network_are_refused(torch: Any, tmp_path: Path) -> N
 
 
 def test_cuda_that_is_absent_is_refused(torch: Any) -> None:
-    from frontend.torch_klt import TorchFlow
+    from frontend.learned.torch_flow import TorchFlow
 
     if torch.cuda.is_available():
         pytest.skip("this machine has CUDA")
@@ -227,7 +227,8 @@ def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> 
 @pytest.mark.parametrize("detector", ["gftt", "harris"])
 def test_corners_lie_at_corners(torch: Any, detector: str) -> None:
     """White squares: the four kinds of corner err inwards alike, so that a shift of half a pixel would show."""
-    from frontend.learned import _extractor, pick_device
+    from frontend.learned.extractors import build_extractor
+    from frontend.learned.weights import pick_device
 
     image = np.full((192, 256), 40, dtype=np.uint8)
     true = []
@@ -235,7 +236,7 @@ def test_corners_lie_at_corners(torch: Any, detector: str) -> None:
         for u in range(20, 230, 40):
             image[v : v + 17, u : u + 17] = 200
             true += [(u + a, v + b) for a in (-0.5, 16.5) for b in (-0.5, 16.5)]
-    found = _extractor(LearnedSettings(detector=detector), MATCH, pick_device("cpu"))(image)  # type: ignore[arg-type]
+    found = build_extractor(LearnedSettings(detector=detector), MATCH, pick_device("cpu"))(image)  # type: ignore[arg-type]
     gap = found.pixels[:, None] - np.array(true)
     nearest = np.abs(gap).max(axis=2).argmin(axis=0)
     offset = gap[nearest, np.arange(len(true))]
@@ -281,7 +282,7 @@ def test_bits_are_compared_by_how_many_differ() -> None:
 
 def compare(images: list[Image]) -> None:
     """Time, left to right and right to left in one call, against OpenCV call by call: [left, next left, right]."""
-    from frontend.torch_klt import TorchFlow
+    from frontend.learned.torch_flow import TorchFlow
 
     points = detect_corners(half_image(images[0]), np.zeros((0, 2)), 200, GridSettings(), KltSettings())
     legs = [(0, 1), (0, 2), (2, 0)]
@@ -319,7 +320,7 @@ def test_torch_flow_has_opencvs_numbers_on_a_real_drive(torch: Any, data_dir: Pa
 
 
 def test_torch_flow_of_nothing_and_of_flat_images(torch: Any) -> None:
-    from frontend.torch_klt import TorchFlow
+    from frontend.learned.torch_flow import TorchFlow
 
     engine = TorchFlow(levels=1)
     flat = np.full((60, 80), 90, dtype=np.uint8)

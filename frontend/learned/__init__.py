@@ -1,0 +1,46 @@
+"""What needs torch (extra `learned`): the front end `kornia`, and Lucas-Kanade of many tracks at once.
+
+Nothing is ever downloaded: every network is built without weights and filled from a file, read with
+`weights_only=True`. Detectors gftt and harris with descriptor sift need no weights. torch and kornia are imported only
+when a part that needs them is built.
+"""
+
+from __future__ import annotations
+
+from frontend.descriptors import DescriptorFrontend, Matcher, MutualNearest
+from frontend.learned.extractors import build_extractor
+from frontend.learned.lightglue import build_lightglue
+from frontend.learned.weights import pick_device
+from frontend.settings import FrontendSettings
+from vio.errors import MissingDependencyError
+from vio.geometry.stereo import StereoCamera
+
+
+def build_learned(camera: StereoCamera, settings: FrontendSettings) -> DescriptorFrontend:
+    """Build the front end that the settings describe.
+
+    Raises:
+        MissingDependencyError: torch or kornia is not installed.
+        ConfigError: weights are needed but not named, CUDA is asked for but absent, or parts do not fit together.
+        DataError: a file of weights cannot be read, or is of another network.
+    """
+    _require_torch()
+    match, learned = settings.match, settings.learned
+    device = pick_device(learned.device)
+    extract = build_extractor(learned, match, device)
+    matcher: Matcher = MutualNearest(match.ratio)
+    if learned.matcher == "lightglue":
+        matcher = build_lightglue(learned, camera, device)
+    return DescriptorFrontend(camera, settings, "kornia", extract, matcher)
+
+
+def _require_torch() -> None:
+    try:
+        import kornia.feature
+        import torch  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"the kornia front end needs torch and kornia ({error}); "
+            "install them with: pip install 'stereo-vio[learned]'"
+        ) from error
+    assert kornia.feature is not None

@@ -1,0 +1,224 @@
+"""Key points and descriptors by kornia's networks and operators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
+
+import numpy as np
+
+from frontend.descriptors import Extractor, Keypoints
+from frontend.learned.weights import SECTION, Module, filled, half_precision, load_weights
+from frontend.settings import LearnedSettings, MatchSettings
+from vio.errors import DataError
+from vio.records import Image
+
+if TYPE_CHECKING:
+    import torch
+
+Tensor: TypeAlias = "torch.Tensor"
+
+_PATCH_RADIUS_PX = 12.0  # of what sift, mkd, ... describe around a corner
+_PATCH_PX = {"sift": 41}
+_NMS_PX = 5
+
+
+def build_extractor(learned: LearnedSettings, match: MatchSettings, device: torch.device) -> Extractor:
+    """Build what finds and describes key points.
+
+    Raises:
+        ConfigError: weights are needed but not named.
+        DataError: a file of weights cannot be read, or is of another network.
+    """
+    import kornia.feature as kf
+
+    name, count = learned.detector, match.max_keypoints
+    if name == "aliked":
+        aliked = kf.ALIKED(learned.aliked_model, max_num_keypoints=count, detection_threshold=0.0)
+        return _Whole(filled(aliked, learned.detector_weights, "detector_weights").to(device), name, count, device)
+    if name == "disk":
+        return _Whole(filled(kf.DISK(), learned.detector_weights, "detector_weights").to(device), name, count, device)
+    if name == "xfeat":
+        xfeat = kf.XFeat(top_k=count)
+        filled(xfeat.net, learned.detector_weights, "detector_weights")
+        return _Whole(xfeat.eval().to(device), name, count, device)
+    describe = _descriptor(learned).to(device)
+    patch_px = _PATCH_PX.get(learned.descriptor, 32)
+    if name == "keynet":
+        keynet = kf.KeyNetDetector(
+            pretrained=False, num_features=count, aff_module=_affine(learned), ori_module=_orienter(learned)
+        )
+        filled(keynet.model, learned.detector_weights, "detector_weights")
+        return _Patches(keynet.eval().to(device), describe, patch_px, device)
+    corners = _Corners(name, count, _affine(learned), _orienter(learned), device)
+    return _Patches(corners, describe, patch_px, device)
+
+
+def _affine(learned: LearnedSettings) -> Module | None:
+    import kornia.feature as kf
+
+    if learned.affine_weights is None:
+        return None
+    return filled(kf.LAFAffNetShapeEstimator(pretrained=False), learned.affine_weights, "affine_weights")
+
+
+def _orienter(learned: LearnedSettings) -> Module | None:
+    import kornia.feature as kf
+
+    if learned.orientation_weights is None:
+        return None
+    angle = filled(kf.OriNet(pretrained=False), learned.orientation_weights, "orientation_weights")
+    return kf.LAFOrienter(32, angle_detector=angle).eval()
+
+
+def _descriptor(learned: LearnedSettings) -> Module:
+    import kornia.feature as kf
+
+    name, path = learned.descriptor, learned.descriptor_weights
+    if name == "sift":
+        return kf.SIFTDescriptor(_PATCH_PX["sift"]).eval()
+    if name == "mkd":
+        return _mkd(path)
+    networks: dict[str, Any] = {"hardnet": kf.HardNet, "hynet": kf.HyNet, "sosnet": kf.SOSNet}
+    return filled(networks[name](pretrained=False), path, "descriptor_weights")
+
+
+def _mkd(path: Path | None) -> Module:
+    """Multiple kernel descriptor; its weights are the whitening, which also tells which kernels it is for.
+
+    Reference: Mukundan et al., Understanding and improving kernel local descriptors, IJCV (2019).
+    """
+    import kornia.feature as kf
+    from kornia.feature.mkd import Whitening
+
+    models = load_weights(path, "descriptor_weights")
+    whitening = models.get("liberty")
+    if not isinstance(whitening, dict) or "pca" not in whitening:
+        raise DataError(f"{path} ({SECTION}.descriptor_weights) holds no whitening of MKD; give one of its .pth files")
+    size = len(whitening["pca"]["mean"])
+    for kernel in ("cart", "polar", "concat"):
+        module = kf.MKDDescriptor(patch_size=32, kernel_type=kernel, whitening=cast(Any, None))
+        if module.odims == size:
+            module.whitening_layer = Whitening("pcawt", whitening, in_dims=size, output_dims=min(128, size))
+            module.whitening = "pcawt"
+            return module.eval()
+    raise DataError(
+        f"{path} ({SECTION}.descriptor_weights) whitens {size} numbers, as no kernel of MKD has; give another file"
+    )
+
+
+def _as_tensor(image: Image, device: torch.device) -> Tensor:
+    """Image (1, 1, H, W) in 0..1."""
+    import torch
+
+    return torch.from_numpy(image.astype(np.float32) / 255.0)[None, None].to(device)
+
+
+def _keypoints(pixels: Tensor, descriptors: Tensor, strength: Tensor) -> Keypoints:
+    """Move key points (N, ...) to NumPy, strongest first, descriptors as unit vectors; those not finite are dropped."""
+    columns = (np.asarray(t.detach().float().cpu().numpy()) for t in (pixels, descriptors, strength))
+    uv, described, weight = columns
+    order = np.argsort(-weight, kind="stable")
+    order = order[np.isfinite(described[order]).all(axis=1) & np.isfinite(uv[order]).all(axis=1)]
+    norm = np.maximum(np.linalg.norm(described[order], axis=1, keepdims=True), 1e-9)
+    return Keypoints(uv[order].astype(np.float64), (described[order] / norm).astype(np.float32))
+
+
+@dataclass(frozen=True, slots=True)
+class _Whole:
+    """A network that detects and describes: ALIKED, DISK, XFeat.
+
+    Reference: Zhao et al., ALIKED (2023); Tyszkiewicz et al., DISK (2020); Potje et al., XFeat (2024).
+    """
+
+    network: Any
+    name: str
+    count: int
+    device: torch.device
+
+    def __call__(self, image: Image) -> Keypoints:
+        import torch
+
+        with torch.inference_mode(), half_precision(self.device):
+            pixels = _as_tensor(image, self.device)
+            colour = pixels.repeat(1, 3, 1, 1)
+            if self.name == "disk":
+                found = self.network(colour, n=self.count, pad_if_not_divisible=True)[0]
+                uv, described, score = found.keypoints, found.descriptors, found.detection_scores
+            elif self.name == "xfeat":
+                found = self.network.detectAndCompute(colour)[0]
+                uv, described, score = found["keypoints"], found["descriptors"], found["scores"]
+            else:
+                found = self.network(colour)[0]
+                uv, described, score = found.keypoints, found.descriptors, found.keypoint_scores
+        return _keypoints(uv, described, score.reshape(-1))
+
+
+@dataclass(frozen=True, slots=True)
+class _Patches:
+    """A detector of local affine frames, and a descriptor of the patches in them."""
+
+    detector: Any  # image (1, 1, H, W) to frames (1, N, 2, 3) and responses (1, N)
+    descriptor: Any  # patches (N, 1, P, P) to descriptors (N, D)
+    patch_px: int
+    device: torch.device
+
+    def __call__(self, image: Image) -> Keypoints:
+        import kornia.feature as kf
+        import torch
+
+        with torch.inference_mode():
+            pixels = _as_tensor(image, self.device)
+            frames, response = self.detector(pixels)
+            if frames.shape[1] == 0:
+                return _keypoints(torch.zeros(0, 2), torch.zeros(0, 1), torch.zeros(0))
+            patches = kf.extract_patches_from_pyramid(pixels, frames, self.patch_px)[0]
+            with half_precision(self.device):
+                described = self.descriptor(patches)
+            centre = kf.get_laf_center(frames)[0]
+        return _keypoints(centre, described, response.reshape(-1))
+
+
+@dataclass(frozen=True, slots=True)
+class _Corners:
+    """Corners by kornia's structure-tensor responses, as frames of one size.
+
+    Reference: Shi & Tomasi (1994) for gftt, Harris & Stephens (1988) for harris.
+    """
+
+    name: str
+    count: int
+    affine: Any  # module on (frames, image) or None
+    orient: Any  # the same
+    device: torch.device
+
+    def __call__(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        import kornia.feature as kf
+        import torch
+
+        response = (
+            kf.gftt_response(pixels) if self.name == "gftt" else kf.harris_response(pixels, torch.tensor(0.04))
+        )[0, 0]
+        peak = torch.nn.functional.max_pool2d(response[None, None], _NMS_PX, 1, _NMS_PX // 2)[0, 0]
+        border = torch.zeros_like(response, dtype=torch.bool)
+        border[2:-2, 2:-2] = True
+        rows, columns = torch.nonzero((response == peak) & (response > 1e-8) & border, as_tuple=True)
+        strength = response[rows, columns]
+        order = torch.argsort(-strength, stable=True)[: self.count]
+        rows, columns, strength = rows[order], columns[order], strength[order]
+        middle = response[rows, columns]
+
+        def offset(before: Tensor, after: Tensor) -> Tensor:
+            bend = before - 2 * middle + after
+            return torch.clamp((before - after) / 2 / torch.where(bend < 0, bend, -1.0), -0.5, 0.5)
+
+        du = offset(response[rows, columns - 1], response[rows, columns + 1])
+        dv = offset(response[rows - 1, columns], response[rows + 1, columns])
+        centre = torch.stack([columns + du, rows + dv], dim=1)[None]
+        radius = torch.full((1, len(order), 1, 1), _PATCH_RADIUS_PX, device=self.device)
+        frames = kf.laf_from_center_scale_ori(centre, radius)
+        for module in (self.affine, self.orient):
+            if module is not None and len(order):
+                frames = module.to(self.device)(frames, pixels)
+        return frames, strength[None]
