@@ -21,7 +21,8 @@ ESTIMATOR = ("vio.filters", "vio.geometry", "vio.records", "vio.selectors", "vio
 _ABOVE_READERS = ("vio.config", "vio.pipeline", "vio.filters", "vio.mapping", "vio.colmap", "vio.run_folder")
 MUST_NOT_KNOW = {
     "vio.robust": ("vio.records", "vio.calibration"),
-    "vio.calibration": ("vio.datasets", *_ABOVE_READERS),
+    "vio.calibration": ("vio.watch", "vio.datasets", *_ABOVE_READERS),
+    "vio.watch": ("vio.datasets", *_ABOVE_READERS),
     "vio.datasets": _ABOVE_READERS,
     "frontend": ("vio.pipeline", "vio.filters", "vio.run_folder"),
 }

@@ -15,12 +15,14 @@ from vio.datasets.euroc_files import read_imu_csv
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.inertial_check import InertialCheck, InertialFinding, judge_clocks
 from vio.records import ImuSample, Observations, observations
 from vio.sim.imu import ImuNoise, simulate_imu
 from vio.sim.motion import MotionSpline, car_loop, evaluate, fit_spline, hand_held, turned
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_rectified_rig, small_rig
 from vio.trajectory_io import read_trajectory
+from vio.watch.clocks import judge_clocks
+from vio.watch.finding import InertialFinding
+from vio.watch.inertial import InertialCheck
 
 _FRAME_NS = 50_000_000
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -14,13 +13,11 @@ from vio.errors import ConfigError, DataError
 from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
 from vio.geometry.lie import FloatArray
-from vio.health import RunHealth
 from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
 from vio.records import (
     BodyFrame,
     Estimate,
     FrontendOutput,
-    ImuSample,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -32,6 +29,7 @@ from vio.records import (
     UpdateReport,
 )
 from vio.selectors import build_selector
+from vio.watch.run import RunWatch
 
 log = logging.getLogger(__name__)
 
@@ -143,7 +141,7 @@ def run(
     backend = backend or _build_backend(recording, config, motion, T_cam0_body)
     viewer = viewer or NullViewer()
     dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
-    watch = _Watch(recording, motion, T_cam0_body)
+    watch = RunWatch(recording.camera, T_cam0_body, imu=motion == "imu")
     diary = _Diary(backend, config.lag_frames, keep_observations=keep_observations)
     laps = _Laps()
     try:
@@ -295,39 +293,6 @@ class _Diary:
             T = self._backend.pose_of(self.frames[k].index)
             if T is not None:
                 self.estimates[k] = replace(self.estimates[k], T_world_imu=T)
-
-
-class _Watch:
-    """Looks on: whether the estimate stays sane and, with raw IMU, whether its readings agree with the images."""
-
-    def __init__(self, recording: Recording, motion: MotionSource | None, T_cam0_body: FloatArray) -> None:
-        self._health = RunHealth()
-        self._inertial = None
-        if motion == "imu":
-            from vio.inertial_check import InertialCheck
-
-            self._inertial = InertialCheck(recording.camera, T_cam0_body)
-        self.lines: list[str] = []
-
-    def sample(self, sample: MotionSample) -> None:
-        if self._inertial is not None and isinstance(sample, ImuSample):
-            self._inertial.imu(sample)
-
-    def observations(self, seen: Observations) -> None:
-        if self._inertial is not None:
-            self._say(finding.message for finding in self._inertial.frame(seen))
-
-    def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
-        self._say(self._health.frame(index, report, estimate))
-
-    def close(self) -> None:
-        if self._inertial is not None:
-            self._say(finding.message for finding in self._inertial.finish())
-
-    def _say(self, lines: Iterable[str]) -> None:
-        for line in lines:
-            log.warning("%s", line)
-            self.lines.append(line)
 
 
 class _DeadReckoning:

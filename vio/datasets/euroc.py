@@ -39,6 +39,7 @@ from vio.geometry.lie import FloatArray, se3_inverse
 from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
 from vio.text_files import write_text
 from vio.trajectory_io import read_trajectory
+from vio.watch.clocks import judge_clocks
 
 _PAIRED_NS = 3_000_000  # stamps further apart belong to different exposures
 _JITTER_NS = 1_000_000  # by which the offset between paired stamps may vary around its median
@@ -86,8 +87,6 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
     if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
-        from vio.inertial_check import judge_clocks  # it imports readers
-
         (finding,) = judge_clocks(times_ns, np.array([x.time_ns for x in imu.samples], dtype=np.int64))
         raise DataError(
             f"{mav / 'imu0' / 'data.csv'}: no IMU sample falls into the time of the images; {finding.message}; or take "

@@ -1,0 +1,66 @@
+"""What may be wrong with an IMU, its clock or its extrinsics, and how it is said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+InertialFault: TypeAlias = Literal[
+    "clocks without overlap",
+    "clocks overlap in part",
+    "clocks apart",
+    "accelerometer units",
+    "gravity removed",
+    "gyro units",
+    "gyro sign",
+    "gyro axes",
+    "gyro disagrees",
+    "extrinsics inverted",
+    "extrinsics rotation",
+    "extrinsics translation",
+    "accelerometer sign",
+    "accelerometer axes",
+    "upside down",
+    "saturation",
+    "IMU gap",
+]
+
+# A second finding of a group would say the same thing in other words.
+_GROUPS: dict[InertialFault, str] = {
+    "clocks without overlap": "overlap",
+    "clocks overlap in part": "overlap",
+    "clocks apart": "overlap",
+    "accelerometer units": "size",
+    "gravity removed": "size",
+    "gyro sign": "rotation",
+    "gyro axes": "rotation",
+    "gyro disagrees": "rotation",
+    "extrinsics inverted": "rotation",
+    "extrinsics rotation": "rotation",
+    "accelerometer sign": "force",
+    "accelerometer axes": "force",
+    "upside down": "force",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class InertialFinding:
+    """One thing that is wrong with the IMU, its clock or its extrinsics."""
+
+    fault: InertialFault
+    seen: str  # what the data show, with figures
+    explanation: str  # what would explain it, and what to do
+    certain: bool = True  # False: a hint; correct data can look like this
+
+    @property
+    def message(self) -> str:
+        """One line for the log."""
+        return f"{self.fault}: {self.seen}; {self.explanation}"
+
+    @property
+    def group(self) -> str:
+        """What it is about; of each group, one finding is enough."""
+        return _GROUPS.get(self.fault, self.fault)
+
+    def __str__(self) -> str:
+        return self.message

@@ -1,0 +1,61 @@
+"""All that looks on at a run, in one: is the estimate sane and, with raw IMU, can its readings be right?"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.records import Estimate, ImuSample, MotionSample, Observations, UpdateReport
+from vio.watch.health import RunHealth
+
+if TYPE_CHECKING:
+    from vio.watch.inertial import InertialCheck
+
+log = logging.getLogger(__name__)
+
+
+class RunWatch:
+    """Is shown everything that happens in a run, in time order; logs what it finds, and keeps it in `lines`."""
+
+    def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, *, imu: bool) -> None:
+        """Prepare.
+
+        Args:
+            camera: rectified pair.
+            T_cam0_body: (4, 4) as the run uses it.
+            imu: whether raw IMU samples carry the run.
+        """
+        self._health = RunHealth()
+        self._inertial: InertialCheck | None = None
+        if imu:
+            from vio.watch.inertial import InertialCheck  # it loads scipy
+
+            self._inertial = InertialCheck(camera, T_cam0_body)
+        self.lines: list[str] = []
+
+    def sample(self, sample: MotionSample) -> None:
+        """See one motion sample."""
+        if self._inertial is not None and isinstance(sample, ImuSample):
+            self._inertial.imu(sample)
+
+    def observations(self, seen: Observations) -> None:
+        """See what the front end gave, before any selection."""
+        if self._inertial is not None:
+            self._say(finding.message for finding in self._inertial.frame(seen))
+
+    def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
+        """See what the back end made of a frame."""
+        self._say(self._health.frame(index, report, estimate))
+
+    def close(self) -> None:
+        """See the end of the run, also of one that failed."""
+        if self._inertial is not None:
+            self._say(finding.message for finding in self._inertial.finish())
+
+    def _say(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            log.warning("%s", line)
+            self.lines.append(line)
