@@ -12,30 +12,23 @@ import pycolmap
 import pytest
 
 from tests.dataset_makers import make_kitti
-from vio import colmap
 from vio.cli import main
+from vio.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px, write_model
+from vio.colmap.trajectory import read_colmap_trajectory
 from vio.config import Config
 from vio.datasets import open_dataset
 from vio.errors import DataError, EstimationError
 from vio.evaluation import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import project
-from vio.mapping import (
-    Comparison,
-    SavedRun,
-    align_to_points,
-    build_tracks,
-    choose_keyframes,
-    compare_keyframes,
-    landmarks_of,
-    position_covariances,
-    read_saved_run,
-    reprojection,
-    triangulate_tracks,
-)
+from vio.mapping.comparison import Comparison, compare_keyframes
+from vio.mapping.keyframes import TrackedPath, choose_keyframes
+from vio.mapping.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
+from vio.mapping.poses import align_to_points, position_covariances
 from vio.pipeline import run as process
 from vio.records import Estimate
 from vio.run_folder import write_run_folder
+from vio.saved_run import read_saved_run
 from vio.sim.effects import CLEAN
 from vio.sim.export import export_kitti
 from vio.sim.imu import ImuNoise
@@ -78,8 +71,8 @@ def folder(whole_run: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def saved(whole_run: Path) -> SavedRun:
-    return read_saved_run(whole_run)
+def saved(whole_run: Path) -> TrackedPath:
+    return read_saved_run(whole_run).tracked
 
 
 def _json(capsys: pytest.CaptureFixture[str], *arguments: str) -> dict[str, object]:
@@ -100,7 +93,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
 # --- keyframes, points, poses ---------------------------------------------------------------------------------------
 
 
-def test_keyframes_span_the_run_and_obey_their_limit(saved: SavedRun) -> None:
+def test_keyframes_span_the_run_and_obey_their_limit(saved: TrackedPath) -> None:
     every = choose_keyframes(saved)
     few = choose_keyframes(saved, most=8)
     assert 2 < len(few) <= 8 < len(every)
@@ -109,7 +102,7 @@ def test_keyframes_span_the_run_and_obey_their_limit(saved: SavedRun) -> None:
         assert (np.diff(chosen) > 0).all()
 
 
-def test_points_of_exact_pixels_are_exact(saved: SavedRun) -> None:
+def test_points_of_exact_pixels_are_exact(saved: TrackedPath) -> None:
     keyframes = choose_keyframes(saved, most=8)
     T = saved.trajectory.T_world_body[keyframes]
     tracks = build_tracks(saved, keyframes, T)
@@ -124,7 +117,7 @@ def test_points_of_exact_pixels_are_exact(saved: SavedRun) -> None:
     assert np.abs(residual).max() < 1e-5
 
 
-def test_a_pose_comes_back_from_points(saved: SavedRun) -> None:
+def test_a_pose_comes_back_from_points(saved: TrackedPath) -> None:
     rng = np.random.default_rng(0)
     p_world = rng.uniform([-3, -2, 3], [3, 2, 9], (60, 3))
     T_world_cam0 = se3_exp([0.2, -0.1, 0.3, 0.05, -0.1, 0.02])
@@ -138,7 +131,7 @@ def test_a_pose_comes_back_from_points(saved: SavedRun) -> None:
     assert align_to_points(saved.camera, start, p_world[:4], z[:4], has_right[:4]) is None
 
 
-def test_covariances_of_positions_and_points_match_sampling(saved: SavedRun) -> None:
+def test_covariances_of_positions_and_points_match_sampling(saved: TrackedPath) -> None:
     rng = np.random.default_rng(1)
     T_cam0_imu = se3_exp([0.3, -0.2, 0.1, 0.4, 0.2, -0.3])
     T_world_imu = se3_exp([1.0, 2.0, 3.0, 0.3, -0.4, 0.5])
@@ -159,15 +152,13 @@ def test_covariances_of_positions_and_points_match_sampling(saved: SavedRun) -> 
 # --- models ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_model_projects_as_our_camera_does_but_for_half_a_pixel(saved: SavedRun, tmp_path: Path) -> None:
+def test_a_model_projects_as_our_camera_does_but_for_half_a_pixel(saved: TrackedPath, tmp_path: Path) -> None:
     keyframes = choose_keyframes(saved, most=8)
     T = saved.trajectory.T_world_body[keyframes]
     tracks = build_tracks(saved, keyframes, T)
-    names = colmap.ModelImages(
-        tuple(f"left/{k:06d}.png" for k in keyframes), tuple(f"right/{k:06d}.png" for k in keyframes)
-    )
+    names = keyframe_images(keyframes)
     colours = np.arange(3 * len(tracks.ids), dtype=np.int64).astype(np.uint8).reshape(-1, 3)
-    colmap.write_model(colmap.build_model(saved.camera, T, tracks, names, colours), tmp_path)
+    write_model(build_model(saved.camera, T, tracks, names, colours), tmp_path)
     model = pycolmap.Reconstruction(tmp_path)
     assert (model.num_cameras(), model.num_rigs(), model.num_frames()) == (2, 1, len(keyframes))
     assert model.num_points3D() == len(tracks.ids)
@@ -191,30 +182,30 @@ def test_a_model_projects_as_our_camera_does_but_for_half_a_pixel(saved: SavedRu
     residual, _ = reprojection(saved.camera, T, tracks)
     left, right = np.linalg.norm(residual[:, :2], axis=1), np.linalg.norm(residual[:, 2:], axis=1)
     total = np.bincount(tracks.point, left + right) / np.bincount(tracks.point, 1.0 + tracks.has_right)
-    assert colmap.mean_reprojection_error_px(model) == pytest.approx(total.mean(), rel=1e-9)
+    assert mean_reprojection_error_px(model) == pytest.approx(total.mean(), rel=1e-9)
 
 
 @pytest.mark.parametrize("stamped", [False, True])
-def test_a_model_is_read_as_a_trajectory(saved: SavedRun, tmp_path: Path, stamped: bool) -> None:
+def test_a_model_is_read_as_a_trajectory(saved: TrackedPath, tmp_path: Path, stamped: bool) -> None:
     keyframes = choose_keyframes(saved, most=6)
     T = saved.trajectory.T_world_body[keyframes]
     tracks = build_tracks(saved, keyframes, T)
     numbers = 1403715273262142976 + 10**8 * keyframes if stamped else keyframes
-    names = colmap.ModelImages(tuple(f"cam0/{k}.png" for k in numbers), tuple(f"cam1/{k}.png" for k in numbers))
+    names = ModelImages(tuple(f"cam0/{k}.png" for k in numbers), tuple(f"cam1/{k}.png" for k in numbers))
     place = tmp_path / "sparse" / "0"
     place.mkdir(parents=True)
-    colmap.write_model(colmap.build_model(saved.camera, T, tracks, names), place)
-    found = colmap.read_colmap_trajectory(tmp_path)
+    write_model(build_model(saved.camera, T, tracks, names), place)
+    found = read_colmap_trajectory(tmp_path)
     assert found.body == "cam0"
     np.testing.assert_allclose(found.T_world_body, T, atol=1e-12)
     assert (found.times_ns is not None) == stamped
     assert ((found.times_ns if stamped else found.frame_indices) == numbers).all()
     with pytest.raises(DataError, match="no COLMAP model"):
-        colmap.read_colmap_trajectory(place.parent.parent / "nothing")
+        read_colmap_trajectory(place.parent.parent / "nothing")
     (place / "points3D.bin").write_bytes(b"broken")
     (place / "images.bin").write_bytes(b"broken")
     with pytest.raises(DataError, match="cannot read the model"):
-        colmap.read_colmap_trajectory(tmp_path)
+        read_colmap_trajectory(tmp_path)
 
 
 # --- refinement -----------------------------------------------------------------------------------------------------
@@ -400,7 +391,7 @@ def test_calibrate_measures_rectified_images_and_finds_swapped_ones(
 # --- comparison -----------------------------------------------------------------------------------------------------
 
 
-def test_a_comparison_finds_scale_and_the_place_of_a_jump(saved: SavedRun) -> None:
+def test_a_comparison_finds_scale_and_the_place_of_a_jump(saved: TrackedPath) -> None:
     rows = choose_keyframes(saved, most=30)
     rng = np.random.default_rng(2)
     T = saved.trajectory.T_world_body[rows].copy()
@@ -418,7 +409,7 @@ def test_a_comparison_finds_scale_and_the_place_of_a_jump(saved: SavedRun) -> No
     assert found.segments[0].difference_m == pytest.approx(0.05, rel=0.2)
 
 
-def test_pure_rotation_has_no_scale(saved: SavedRun) -> None:
+def test_pure_rotation_has_no_scale(saved: TrackedPath) -> None:
     rows = np.arange(10)
     still = np.repeat(np.eye(4)[None], len(saved.frames), axis=0)
     still[:, :3, :3] = so3_exp(np.linspace(0, 1, len(saved.frames))[:, None] * [0.0, 1.0, 0.0])
@@ -431,9 +422,8 @@ def test_pure_rotation_has_no_scale(saved: SavedRun) -> None:
     assert "does not move" in found.why_no_scale
 
 
-def test_a_run_without_right_matches_says_why(saved: SavedRun) -> None:
-    tracks = replace(saved.dataset.tracks, has_right=np.zeros_like(saved.dataset.tracks.has_right))
-    blind = replace(saved, dataset=replace(saved.dataset, tracks=tracks))
+def test_a_run_without_right_matches_says_why(saved: TrackedPath) -> None:
+    blind = replace(saved, tracks=replace(saved.tracks, has_right=np.zeros_like(saved.tracks.has_right)))
     with pytest.raises(EstimationError, match="not observable because no feature has a right match"):
         choose_keyframes(blind)
 

@@ -283,6 +283,14 @@ def test_extrinsics_are_told_from_gyro_and_accelerometer(mount: str) -> None:
     assert "lies 29 deg" in turned_by[0].seen
 
 
+def test_a_mirrored_frame_that_no_exchange_of_axes_explains_is_told() -> None:
+    it = _recording("room")
+    across = np.array([0.5, 0.3, 0.8]) / np.linalg.norm([0.5, 0.3, 0.8])
+    found = _watch(it, samples=_gyro(it, lambda w: w - 2 * across * (across @ w)))
+    assert _faults(found) == ["gyro axes"]
+    assert "a mirrored frame fits" in found[0].seen
+
+
 def test_small_errors_of_extrinsics_are_left_to_calibration() -> None:
     it = _recording("room")
     assert _watch(it, T_cam0_imu=it.T_cam0_imu @ se3_exp([0.01, 0.02, 0, 0.03, 0.03, -0.03])) == []

@@ -78,9 +78,10 @@ def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
     from vio.run_folder import MARKER, read_run
 
     if path.is_dir() and not (path / MARKER).is_file():
-        from vio import colmap
+        from vio.colmap import quiet
+        from vio.colmap.trajectory import model_folder, read_colmap_trajectory
 
-        colmap.quiet()
-        if colmap.model_folder(path) is not None:
-            return colmap.read_colmap_trajectory(path), None
+        quiet()
+        if model_folder(path) is not None:
+            return read_colmap_trajectory(path), None
     return read_run(path)

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from vio.mapping import PointTracks, SavedRun
-    from vio.records import IntArray
+from typing import Any
 
 MARKER = "export.json"
 
@@ -36,109 +32,44 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import json
+    from dataclasses import asdict
 
-    from vio import colmap
     from vio.atomic import atomic_folder
+    from vio.cli.output import answer
     from vio.cli.running import rendering
+    from vio.colmap import quiet
     from vio.errors import ConfigError
-    from vio.mapping import build_tracks, choose_keyframes, read_saved_run, with_poses
+    from vio.offline.export import export_colmap
+    from vio.saved_run import read_saved_run, with_poses
     from vio.threads import one_blas_thread
 
     if args.keyframes is not None and args.keyframes < 2:
         raise ConfigError("--keyframes must be at least 2")
-    colmap.quiet()
+    quiet()
     run = read_saved_run(args.run)
     if args.refined:
         run = with_poses(run, args.run / "refined")
     out = args.out or args.run / "colmap"
-    with one_blas_thread(), rendering(f"export {args.run.name}") as show:
-        keyframes = choose_keyframes(run, most=args.keyframes)
-        T_world_cam0 = run.trajectory.T_world_body[keyframes]
-        tracks = build_tracks(run, keyframes, T_world_cam0)
-        frames = run.frames[keyframes].tolist()
-        names = colmap.ModelImages(
-            tuple(f"left/{k:06d}.png" for k in frames), tuple(f"right/{k:06d}.png" for k in frames)
+    with (
+        one_blas_thread(),
+        rendering(f"export {args.run.name}") as show,
+        atomic_folder(out, replace=True, marker=MARKER) as folder,
+    ):
+        done = export_colmap(
+            run, folder, most=args.keyframes, images=not args.no_images, source=args.source, progress=show
         )
-        with atomic_folder(out, replace=True, marker=MARKER) as folder:
-            colours = None
-            if not args.no_images:
-                colours = _write_images(run, args.source, keyframes, tracks, names, folder / "images", show)
-            model = colmap.build_model(run.camera, T_world_cam0, tracks, names, colours)
-            (folder / "sparse" / "0").mkdir(parents=True)
-            colmap.write_model(model, folder / "sparse" / "0")
-            below = colmap.ModelImages(
-                tuple(f"images/{name}" for name in names.left), tuple(f"images/{name}" for name in names.right)
-            )
-            (folder / "transforms.json").write_text(
-                colmap.nerfstudio_transforms(run.camera, T_world_cam0, below), encoding="utf-8"
-            )
-            (folder / "points.ply").write_bytes(_ply(tracks, colours))
-            facts = {
-                "out": str(out),
-                "of": str(args.run),
-                "source": run.source,
-                "poses": "refined" if args.refined else "filter",
-                "keyframes": len(keyframes),
-                "images": 0 if args.no_images else 2 * len(keyframes),
-                "points": len(tracks.ids),
-                "mean_reprojection_error_px": colmap.mean_reprojection_error_px(model),
-            }
-            (folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    if args.json:
-        print(json.dumps(facts))
-        return 0
+        facts = {
+            "out": str(out),
+            "of": str(args.run),
+            "source": run.source,
+            "poses": "refined" if args.refined else "filter",
+            **asdict(done),
+        }
+        (folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
     rows = (
         ("folder", str(out)),
-        ("keyframes", f"{len(keyframes)} stereo pairs, {facts['images']} images written"),
-        ("points", f"{facts['points']}"),
-        ("residual", f"{facts['mean_reprojection_error_px']:.3f} px mean reprojection error, as COLMAP computes it"),
+        ("keyframes", f"{done.keyframes} stereo pairs, {done.images} images written"),
+        ("points", f"{done.points}"),
+        ("residual", f"{done.mean_reprojection_error_px:.3f} px mean reprojection error, as COLMAP computes it"),
     )
-    for name, value in rows:
-        print(f"{name:<10} {value}")
-    return 0
-
-
-def _write_images(
-    run: SavedRun,
-    source: str | None,
-    keyframes: IntArray,
-    tracks: PointTracks,
-    names: Any,
-    folder: Path,
-    show: Any,
-) -> Any:
-    """Write the rectified images of the keyframes; return the colours (M, 3) of the points, seen by the left camera."""
-    import numpy as np
-
-    from vio.mapping import sample_gray, stereo_frames, write_png
-
-    for side in ("left", "right"):
-        (folder / side).mkdir(parents=True)
-    total, count = np.zeros(len(tracks.ids)), np.zeros(len(tracks.ids))
-    for k, frame in enumerate(stereo_frames(run, source, keyframes)):
-        assert frame.left is not None
-        assert frame.right is not None
-        write_png(folder / names.left[k], frame.left)
-        write_png(folder / names.right[k], frame.right)
-        rows = tracks.keyframe == k
-        np.add.at(total, tracks.point[rows], sample_gray(frame.left, tracks.z[rows, :2]))
-        np.add.at(count, tracks.point[rows], 1)
-        show(k + 1, len(keyframes))
-    gray = np.rint(total / np.maximum(count, 1)).astype(np.uint8)
-    return np.repeat(gray[:, None], 3, axis=1)
-
-
-def _ply(tracks: PointTracks, colours: Any) -> bytes:
-    """The points as a binary PLY: x y z in metres, red green blue."""
-    import numpy as np
-
-    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    points = np.zeros(len(tracks.ids), dtype=fields)
-    points["x"], points["y"], points["z"] = tracks.p_world.T
-    if colours is not None:
-        points["red"], points["green"], points["blue"] = colours.T
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n" + "".join(
-        f"property {kinds[kind]} {name}\n" for name, kind in fields
-    )
-    return f"{header}end_header\n".encode("ascii") + points.tobytes()
+    return answer(facts, rows, as_json=args.json)

@@ -1,0 +1,32 @@
+"""Spreads and standard errors against what they stand for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vio.robust import jackknife, robust_sigma
+
+
+def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
+    values = np.random.default_rng(0).standard_normal((40, 3)) * [1.0, 2.0, 5.0]
+    again = [np.delete(values, k, axis=0).mean(axis=0) for k in range(40)]
+    np.testing.assert_allclose(jackknife(again), values.std(axis=0, ddof=1) / np.sqrt(40), rtol=1e-12)
+    assert float(jackknife([a[0] for a in again])) == pytest.approx(float(jackknife(again)[0]), rel=1e-12)
+
+
+def test_errors_that_last_count_when_blocks_are_longer_than_they() -> None:
+    rng = np.random.default_rng(1)
+    lasting = np.repeat(rng.standard_normal(200), 10)  # 200 independent values, each seen ten times
+    single = [np.delete(lasting, k).mean() for k in range(0, 2000, 10)]
+    blocks = [np.setdiff1d(np.arange(2000), block) for block in np.array_split(np.arange(2000), 20)]
+    by_blocks = float(jackknife([lasting[kept].mean() for kept in blocks]))
+    assert by_blocks == pytest.approx(1 / np.sqrt(200), rel=0.5)
+    assert float(jackknife(single)) < 0.5 * by_blocks
+
+
+def test_a_robust_spread_is_that_of_the_good_values() -> None:
+    values = 3 * np.random.default_rng(2).standard_normal(20_000)
+    assert robust_sigma(values) == pytest.approx(3.0, rel=0.03)
+    values[:3000] = 1e6
+    assert robust_sigma(values) == pytest.approx(3.0, rel=0.3)

@@ -1,0 +1,17 @@
+"""What commands print: one JSON object for machines, or a table for people."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+
+def answer(facts: Mapping[str, Any], rows: Iterable[tuple[str, str]], *, as_json: bool, name_width: int = 10) -> int:
+    """Print all facts as JSON, or rows of names and values as a table; return the exit status."""
+    if as_json:
+        print(json.dumps(facts))
+    else:
+        for name, value in rows:
+            print(f"{name:<{name_width}} {value}")
+    return 0

@@ -1,0 +1,155 @@
+"""Two trajectories over the same keyframes: how far apart, at which scale, and where they disagree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.errors import EvaluationError
+from vio.evaluation import align_poses, apply_alignment, evaluate, rotation_angle_deg
+from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse
+from vio.mapping.keyframes import TrackedPath
+from vio.records import BoolArray, IntArray, Trajectory
+from vio.robust import robust_sigma
+
+_SCALE_SIGMA = 0.02  # a scale less certain than this is not stated
+_LEAST_MOTIONS = 8  # keyframes needed to say which motions stand out
+_OUTLYING = 6.0  # robust standard deviations
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """A trajectory that others are measured by."""
+
+    trajectory: Trajectory  # of the left camera or the IMU
+    T_cam0_imu: FloatArray  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A stretch between keyframes over which two trajectories move differently."""
+
+    first_frame: int
+    last_frame: int
+    difference_m: float  # largest difference of the motions between neighbouring keyframes
+    difference_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A second opinion on a run's keyframes."""
+
+    total: int  # keyframes compared
+    frames: IntArray  # (R,) frame numbers
+    aligned: FloatArray  # (R, 4, 4) the other poses in the run's world, after SE(3) alignment
+    difference_m: FloatArray  # (R,)
+    difference_deg: FloatArray  # (R,)
+    ate_m: float  # after SE(3) alignment
+    ate_deg: float
+    scale: float | None  # length of the other trajectory over the run's; None: see why_no_scale
+    scale_sigma: float | None  # standard error
+    why_no_scale: str | None
+    segments: tuple[Segment, ...]
+    reference_ate_m: float | None  # of the other poses, against ground truth
+    reference_scale: float | None  # length of the other trajectory over that of ground truth
+    run_reference_ate_m: float | None  # of the run at the same keyframes
+
+
+def compare_keyframes(
+    run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray, truth: GroundTruth | None = None
+) -> Comparison:
+    """Compare poses of the left camera from elsewhere with those of a run.
+
+    Args:
+        run: the run.
+        rows: (R,) rows of its trajectory.
+        T_other_cam0: (R, 4, 4) poses from elsewhere at these rows, in any world.
+        truth: what both are compared with besides.
+
+    Reference: Umeyama (1991) for the alignment, as in `vio.evaluation`.
+    """
+    own = run.trajectory.T_world_body[rows]
+    aligned = apply_alignment(align_poses(T_other_cam0, own, "se3"), T_other_cam0)
+    difference_m = np.linalg.norm(aligned[:, :3, 3] - own[:, :3, 3], axis=1)
+    # Rotations are compared apart: a straight path leaves the roll of an alignment by positions open.
+    turn = nearest_rotation(np.einsum("nij,nkj->ik", own[:, :3, :3], T_other_cam0[:, :3, :3]))
+    difference_deg = rotation_angle_deg(np.swapaxes(own[:, :3, :3], 1, 2) @ turn @ T_other_cam0[:, :3, :3])
+    scale, sigma, why = _scale_ratio(T_other_cam0, own, float(np.sqrt(np.mean(difference_m**2))))
+    against = (None, None, None) if truth is None else _against(truth, run, rows, T_other_cam0)
+    return Comparison(
+        total=len(rows),
+        frames=run.frames[rows],
+        aligned=aligned,
+        difference_m=difference_m,
+        difference_deg=difference_deg,
+        ate_m=float(np.sqrt(np.mean(difference_m**2))),
+        ate_deg=float(np.sqrt(np.mean(difference_deg**2))),
+        scale=scale,
+        scale_sigma=sigma,
+        why_no_scale=why,
+        segments=_disagreements(run.frames[rows], own, T_other_cam0),
+        reference_ate_m=against[0],
+        reference_scale=against[1],
+        run_reference_ate_m=against[2],
+    )
+
+
+def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[float | None, float | None, str | None]:
+    """Length of the other trajectory over one's own with its standard error, or why there is none."""
+    p = T_own[:, :3, 3]
+    extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
+    if len(p) < 3:
+        return None, None, f"only {len(p)} keyframes are connected"
+    try:
+        alignment = align_poses(T_other, T_own, "sim3")
+    except EvaluationError:
+        return None, None, "the camera does not move (pure rotation or standstill)"
+    rest = apply_alignment(alignment, T_other)[:, :3, 3] - p
+    sigma = float(np.sqrt(np.mean(np.sum(rest**2, axis=1)))) / (extent * np.sqrt(len(p)))
+    if sigma > _SCALE_SIGMA:
+        return None, None, f"the camera moves over {extent:.3g} m only, against differences of {ate_m:.2g} m"
+    return 1 / alignment.scale, sigma, None
+
+
+def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray) -> tuple[Segment, ...]:
+    """Stretches where motions between neighbouring keyframes differ far more than they usually do."""
+    if len(frames) < _LEAST_MOTIONS:
+        return ()
+    motion_own = se3_inverse(T_own[:-1]) @ T_own[1:]
+    motion_other = se3_inverse(T_other[:-1]) @ T_other[1:]
+    off_m = np.linalg.norm(motion_own[:, :3, 3] - motion_other[:, :3, 3], axis=1)
+    off_deg = rotation_angle_deg(np.swapaxes(motion_own[:, :3, :3], 1, 2) @ motion_other[:, :3, :3])
+    bad = _stands_out(off_m) | _stands_out(off_deg)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8)))
+    return tuple(
+        Segment(int(frames[a]), int(frames[b]), float(off_m[a:b].max()), float(off_deg[a:b].max()))
+        for a, b in edges.reshape(-1, 2).tolist()
+    )
+
+
+def _stands_out(values: FloatArray) -> BoolArray:
+    middle = float(np.median(values))
+    return values > middle + _OUTLYING * max(robust_sigma(values - middle), 0.1 * middle, 1e-9)
+
+
+def _against(
+    truth: GroundTruth, run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray
+) -> tuple[float | None, float | None, float | None]:
+    """ATE of the other poses, their scale, and ATE of the run's; None where they cannot be compared."""
+    own = replace(
+        run.trajectory,
+        T_world_body=run.trajectory.T_world_body[rows],
+        times_ns=None if run.trajectory.times_ns is None else run.trajectory.times_ns[rows],
+        frame_indices=run.frames[rows],
+    )
+    other = replace(own, T_world_body=T_other_cam0)
+    try:
+        ate, of_run = (
+            float(evaluate(t, truth.trajectory, T_cam0_imu=truth.T_cam0_imu).as_dict()["ate_m"]) for t in (other, own)
+        )
+        scaled = evaluate(other, truth.trajectory, align="sim3", T_cam0_imu=truth.T_cam0_imu)
+        scale = float(scaled.as_dict()["scale"])
+    except EvaluationError:
+        return None, None, None
+    return ate, 1 / scale, of_run

@@ -1,0 +1,264 @@
+"""A recording's calibration measured from the recording itself, and compared with the one that it comes with."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.calibration.egomotion import CameraMotion, camera_motion
+from vio.calibration.findings import Finding, NotObservable
+from vio.calibration.gyro import ImuAlignment, align_gyro, rates_of
+from vio.calibration.levers import LeverArm, lever_arm
+from vio.calibration.stereo import (
+    RayMatches,
+    RowResiduals,
+    StereoEstimate,
+    combine_stereo,
+    epipolar_angles,
+    join_matches,
+    refine_stereo,
+    row_residuals,
+    too_few,
+)
+from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo, judge_velocity_lever
+from vio.colmap.adjustment import adjust_rig_in_motion
+from vio.colmap.pairs import adjust_rig, relative_pose, sift_matches
+from vio.datasets.images import load_gray
+from vio.errors import EstimationError
+from vio.geometry.distortion import StereoRig, unproject_pixel
+from vio.geometry.lie import FloatArray
+from vio.geometry.rectify import rectify_pixels
+from vio.geometry.stereo import left_rays
+from vio.mapping.keyframes import choose_keyframes, tracked_stretches
+from vio.mapping.points import build_tracks
+from vio.offline.source import CalibrationSource, track
+from vio.protocols import Dataset, Frontend
+from vio.records import BoolArray, FeatureTracks, MotionSample, Recording
+
+log = logging.getLogger(__name__)
+
+_STRETCH, _STRETCHES, _STRETCH_KEYFRAMES = 36, 6, 20  # frames, pieces, keyframes of each, for the rig in motion
+_STRETCH_GATE_PX = 8.0  # wide: a wrong rig puts every point off
+_FRAMES_PER_PAIR = 5  # a frame of a feature file holds fewer matches than a pair of images
+_CROOKED_PX = 2.0  # rows further apart than this are matched wrongly or not at all
+_HOPELESS = ("cameras swapped", "baseline translation inverted")  # features mean nothing then
+
+_ROWS, _IMU, _LEVER = "row alignment", "IMU-camera rotation and time offset", "lever arm"
+
+
+@dataclass(frozen=True, slots=True)
+class ImuReport:
+    """What the motion sensor's place and clock turned out to be."""
+
+    alignment: ImuAlignment | NotObservable
+    lever: LeverArm | NotObservable
+    findings: tuple[Finding, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationReport:
+    """All results."""
+
+    source: CalibrationSource
+    stereo: StereoEstimate | NotObservable
+    rows: RowResiduals | NotObservable
+    imu: ImuReport
+    stereo_findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """All faults that were found."""
+        return (*self.stereo_findings, *self.imu.findings)
+
+
+@dataclass(frozen=True, slots=True)
+class _Matches:
+    """Matches of left and right images, and what they say as they stand."""
+
+    rays: RayMatches  # of the raw cameras
+    exchanged: RayMatches | None  # each image taken for the other camera's; None: the cameras are equal
+    z: FloatArray  # (N, 4) rectified pixels [ul vl ur vr]; empty where images cannot be rectified
+
+
+def measure(
+    source: CalibrationSource,
+    build_frontend: Callable[[Dataset], Frontend],
+    *,
+    pairs: int,
+    frames: int,
+    progress: Callable[[int, int], None],
+) -> CalibrationReport:
+    """Measure what a recording shows of its calibration, left and right first: all else stands on it.
+
+    Args:
+        source: the recording.
+        build_frontend: makes the front end that tracks its images.
+        pairs: stereo pairs to match.
+        frames: frames to track for the motion sensor.
+        progress: called with (done, total) of the part at work.
+
+    Raises:
+        VioError: the recording cannot be read.
+    """
+    notes = () if source.refused is None else (f"the reader refuses this calibration: {source.refused}",)
+    if source.raw_pairs:
+        matches, tracked = _match_images(source, pairs, progress), None
+    else:
+        assert source.dataset is not None
+        tracked = track(source.dataset, build_frontend, frames)
+        matches = _match_tracks(source.dataset.recording, tracked[0], pairs)
+    given = source.T_cam0_cam1
+    stereo, agreeing = _measure_stereo(matches.rays)
+    findings = () if matches.exchanged is None else judge_exchange(matches.rays, matches.exchanged, given)
+    if not findings and isinstance(stereo, StereoEstimate):
+        findings = judge_stereo(stereo, given, agreeing)
+    if source.dataset is None:
+        rows = NotObservable(_ROWS, "the images cannot be rectified")
+        why = "the left-right calibration must be mended first: it decides where features are and how far away"
+        return CalibrationReport(source, stereo, rows, _no_imu(why), findings, notes)
+    described = row_residuals(matches.z, *source.image_size(matches.z))
+    if _hopeless(described, findings):
+        why = f"{findings[0].fault if findings else 'image rows do not match'}: mend that first, then measure again"
+        return CalibrationReport(source, stereo, described, _no_imu(why), findings, notes)
+    recording = source.dataset.recording
+    tracks, samples = tracked or track(source.dataset, build_frontend, frames, progress)
+    motion = camera_motion(recording.camera, tracks, recording.frame_times_ns)
+    if isinstance(motion, CameraMotion) and isinstance(stereo, StereoEstimate):
+        stereo = _stereo_in_motion(source, stereo, tracks, motion)
+        findings = judge_stereo(stereo, given, agreeing)
+    imu = _measure_imu(recording, tracks, samples, motion)
+    return CalibrationReport(source, stereo, described, imu, findings, notes)
+
+
+def _hopeless(rows: RowResiduals | NotObservable, findings: tuple[Finding, ...]) -> bool:
+    """Whether features in both images cannot be trusted to be of one point."""
+    crooked = isinstance(rows, RowResiduals) and abs(rows.median_px) + rows.spread_px > _CROOKED_PX
+    return crooked or any(f.fault in _HOPELESS for f in findings)
+
+
+# --- left and right -------------------------------------------------------------------------------------------------
+
+
+def _match_images(source: CalibrationSource, pairs: int, progress: Callable[[int, int], None]) -> _Matches:
+    """SIFT matches of spread pairs of images."""
+    assert source.rig is not None
+    rig, rotations = source.rig, source.rectifying()
+    rays: list[RayMatches] = []
+    exchanged: list[RayMatches] = []
+    z: list[FloatArray] = [np.zeros((0, 4))]
+    chosen = np.unique(np.linspace(0, len(source.raw_pairs) - 1, pairs).astype(int))
+    for done, k in enumerate(chosen.tolist()):
+        left, right = (load_gray(path)[0] for path in source.raw_pairs[k])
+        uv0, uv1 = sift_matches(left, right)
+        matches, valid = _rays(rig, uv0, uv1, k)
+        rays.append(matches)
+        exchanged.append(_rays(rig, uv1, uv0, k)[0])
+        if source.dataset is not None:
+            if rotations is not None:
+                camera = source.dataset.recording.camera
+                uv0, _ = rectify_pixels(rig.cam0, rotations[0], camera, uv0)
+                uv1, _ = rectify_pixels(rig.cam1, rotations[1], camera, uv1)
+            z.append(np.concatenate([uv0, uv1], axis=1)[valid])
+        progress(done + 1, len(chosen))
+    return _Matches(
+        rays=join_matches(rays),
+        exchanged=join_matches(exchanged) if rig.cam0 != rig.cam1 else None,
+        z=np.concatenate(z),
+    )
+
+
+def _rays(rig: StereoRig, uv0: FloatArray, uv1: FloatArray, pair: int) -> tuple[RayMatches, BoolArray]:
+    """Rays of matched pixels (N, 2) of both cameras, and a mask (N,) of the matches that have them."""
+    ray0, valid0 = unproject_pixel(rig.cam0, uv0)
+    ray1, valid1 = unproject_pixel(rig.cam1, uv1)
+    valid = valid0 & valid1 & (ray0[:, 2] > 0.1) & (ray1[:, 2] > 0.1)
+    return RayMatches(np.full(int(valid.sum()), pair), ray0[valid], ray1[valid]), valid
+
+
+def _match_tracks(recording: Recording, tracks: FeatureTracks, pairs: int) -> _Matches:
+    """The stereo rows of spread frames of a feature file."""
+    frames, fresh = tracks.frames, tracks.has_right & ~tracks.stale
+    filled = np.unique(frames[fresh])
+    spread = np.unique(np.linspace(0, len(filled) - 1, _FRAMES_PER_PAIR * pairs).astype(int))
+    rows = fresh & np.isin(frames, filled[spread] if len(filled) else filled)
+    z = tracks.z[rows]
+    rays = (left_rays(recording.camera, uv) for uv in (z[:, :2], z[:, 2:]))  # both cameras have the same intrinsics
+    ray0, ray1 = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    return _Matches(RayMatches(frames[rows], ray0, ray1), None, z)
+
+
+def _measure_stereo(matches: RayMatches) -> tuple[StereoEstimate | NotObservable, RayMatches]:
+    """RANSAC, refinement on epipolar angles, bundle adjustment of the rig; with the matches that agree."""
+    if few := too_few(matches):
+        return few, matches
+    start = relative_pose(matches)
+    if start is None:
+        return NotObservable("left-right extrinsics", "no rigid pose of cam1 explains the matches"), matches
+    refined = refine_stereo(matches, *start)
+    if isinstance(refined, NotObservable):
+        return refined, matches
+    angles = np.abs(epipolar_angles(refined.R_cam1_cam0, refined.direction, matches))
+    inliers = matches.take(angles < max(4 * np.radians(refined.residual_deg), 1e-5))
+    R, direction = adjust_rig(inliers, refined.R_cam1_cam0, refined.direction)
+    return replace(refined, R_cam1_cam0=R, direction=direction), inliers
+
+
+def _stereo_in_motion(
+    source: CalibrationSource, stereo: StereoEstimate, tracks: FeatureTracks, motion: CameraMotion
+) -> StereoEstimate:
+    """The left-right extrinsics by bundle adjustment over stretches of video; as they were where that fails."""
+    assert source.dataset is not None
+    width, height = source.image_size(tracks.z)
+    camera = replace(source.dataset.recording.camera, width=int(width) + 1, height=int(height) + 1)
+    rotations = source.rectifying()
+    found = []
+    for piece in tracked_stretches(source.path, camera, tracks, motion, longest=_STRETCH, most=_STRETCHES):
+        try:
+            keyframes = choose_keyframes(piece, most=_STRETCH_KEYFRAMES)
+            T_world_cam0 = piece.trajectory.T_world_body[keyframes]
+            points = build_tracks(piece, keyframes, T_world_cam0, gate_px=_STRETCH_GATE_PX)
+            R, direction = adjust_rig_in_motion(camera, T_world_cam0, points)
+        except EstimationError as error:
+            log.warning("a stretch of video was left out: %s", error)
+            continue
+        if rotations is not None:
+            R_rect_cam0, R_rect_cam1 = rotations
+            R, direction = R_rect_cam1.T @ R @ R_rect_cam0, R_rect_cam0.T @ direction
+        found.append((R, direction))
+    return combine_stereo(stereo, found) or stereo
+
+
+# --- motion sensor --------------------------------------------------------------------------------------------------
+
+
+def _no_imu(why: str) -> ImuReport:
+    return ImuReport(NotObservable(_IMU, why), NotObservable(_LEVER, why))
+
+
+def _measure_imu(
+    recording: Recording,
+    tracks: FeatureTracks,
+    samples: tuple[MotionSample, ...],
+    motion: CameraMotion | NotObservable,
+) -> ImuReport:
+    if not samples:
+        return _no_imu("the recording holds no motion sensor")
+    if isinstance(motion, NotObservable):
+        return ImuReport(motion, NotObservable(_LEVER, motion.because))
+    rates = rates_of(samples)
+    alignment = align_gyro(motion, rates)
+    if isinstance(alignment, NotObservable):
+        return ImuReport(alignment, NotObservable(_LEVER, alignment.because))
+    lever = lever_arm(motion, rates, alignment)
+    given = recording.T_cam0_imu
+    if given is None:
+        return ImuReport(alignment, lever)
+    findings = judge_imu(alignment, lever, given)
+    if not rates.inertial:
+        times_ns = recording.frame_times_ns
+        findings = (*findings, *judge_velocity_lever(recording.camera, tracks, times_ns, rates, given))
+    return ImuReport(alignment, lever, findings)

@@ -1,0 +1,123 @@
+"""A second opinion on a saved run: COLMAP's reconstruction from the images alone, compared with it."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vio.colmap.model import keyframe_images
+from vio.colmap.reconstruction import Mapper, Reconstructed, match_images, reconstruct
+from vio.mapping.comparison import Comparison, compare_keyframes
+from vio.mapping.keyframes import choose_keyframes
+from vio.offline.images import write_images
+from vio.records import Trajectory
+from vio.saved_run import SavedRun
+
+_COLOURS: dict[Mapper, str] = {"incremental": "#d9822b", "global": "#3a9d5d"}
+
+
+@dataclass(frozen=True, slots=True)
+class Opinion:
+    """What one of COLMAP's mappers makes of a run's keyframes."""
+
+    mapper: Mapper
+    total: int  # keyframes given
+    found: tuple[Reconstructed, Comparison] | None  # None: it could not connect them
+
+    @property
+    def verdict(self) -> str:
+        """In a few words."""
+        if self.found is None:
+            return (
+                "not observable because COLMAP could not connect the keyframes; too few images, no overlap between "
+                "them, or too little texture"
+            )
+        model, comparison = self.found
+        missing = self.total - len(model.keyframes)
+        left_out = f"; {missing} of {self.total} keyframes could not be connected" if missing else ""
+        if comparison.scale is None:
+            return f"poses compared, scale not observable because {comparison.why_no_scale}{left_out}"
+        where = f"disagrees in {len(comparison.segments)} segments" if comparison.segments else "agrees all along"
+        return f"{where}{left_out}"
+
+
+def check_run(
+    run: SavedRun,
+    folder: Path,
+    mappers: Sequence[Mapper],
+    *,
+    most: int,
+    source: str | None,
+    threads: int,
+    progress: Callable[[int, int], None],
+) -> tuple[Opinion, ...]:
+    """Reconstruct keyframes of a run from their images by some mappers, the stereo rig known, and compare.
+
+    Leaves a folder of each mapper's name with its model, and the picture `check.png`.
+
+    Args:
+        run: the run.
+        folder: where; it is there and empty.
+        mappers: COLMAP's.
+        most: keyframes.
+        source: the recording, where it is not at the place that the run names.
+        threads: for all steps; one makes the result repeatable.
+        progress: called with (done, total).
+
+    Raises:
+        VioError: the run has too few views, or its images are not to be had.
+    """
+    path, steps = run.tracked, 2 + len(mappers)
+    keyframes = choose_keyframes(path, most=most)
+    names = keyframe_images(path.frames[keyframes])
+    images, database = folder / "images", folder / "database.db"
+    write_images(run, source, keyframes, names, images)
+    progress(1, steps)
+    match_images(database, images, names, path.camera, threads=threads)
+    progress(2, steps)
+    opinions: list[Opinion] = []
+    for mapper in mappers:
+        model = reconstruct(database, images, names, mapper, folder / mapper, threads=threads)
+        found = None
+        if model is not None:
+            rows = keyframes[model.keyframes]
+            found = model, compare_keyframes(path, rows, model.T_world_cam0, run.truth)
+        opinions.append(Opinion(mapper, len(keyframes), found))
+        progress(2 + len(opinions), steps)
+    _draw(folder / "check.png", path.trajectory, opinions)
+    shutil.rmtree(images)
+    database.unlink()
+    return tuple(opinions)
+
+
+def _draw(path: Path, trajectory: Trajectory, opinions: Sequence[Opinion]) -> None:
+    """Both trajectories seen from above, and their distance along the way."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5), dpi=110, layout="constrained")
+    above, along = figure.subplots(1, 2)
+    p = trajectory.positions
+    axes = np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2][:2]
+    above.plot(*((p - p[0]) @ axes.T).T, color="#1f5fbf", label="run")
+    for opinion in opinions:
+        if opinion.found is None:
+            continue
+        comparison, colour = opinion.found[1], _COLOURS[opinion.mapper]
+        q = (comparison.aligned[:, :3, 3] - p[0]) @ axes.T
+        above.plot(*q.T, ".", color=colour, label=f"COLMAP, {opinion.mapper}")
+        along.plot(comparison.frames, 1e3 * comparison.difference_m, ".-", color=colour, label=opinion.mapper)
+        for segment in comparison.segments:
+            along.axvspan(segment.first_frame, segment.last_frame, color=colour, alpha=0.2)
+    above.set_aspect("equal", "datalim")
+    above.set_xlabel("m, plane of largest extent")
+    along.set_xlabel("frame")
+    along.set_ylabel("distance to the run, mm")
+    for panel in (above, along):
+        if panel.get_legend_handles_labels()[0]:
+            panel.legend()
+        panel.grid(alpha=0.3)
+    figure.savefig(path)

@@ -1,0 +1,110 @@
+"""A run in the form of other programs: a metric COLMAP model, and nerfstudio's transforms beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vio.colmap.model import (
+    ColourArray,
+    ModelImages,
+    build_model,
+    keyframe_images,
+    mean_reprojection_error_px,
+    write_model,
+)
+from vio.colmap.nerfstudio import coloured_ply, nerfstudio_transforms
+from vio.geometry.lie import FloatArray
+from vio.mapping.keyframes import choose_keyframes
+from vio.mapping.points import PointTracks, build_tracks
+from vio.offline.images import write_images
+from vio.records import Image, IntArray
+from vio.saved_run import SavedRun
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """What was written."""
+
+    keyframes: int
+    images: int
+    points: int
+    mean_reprojection_error_px: float  # as COLMAP computes it
+
+
+def export_colmap(
+    run: SavedRun,
+    folder: Path,
+    *,
+    most: int | None,
+    images: bool,
+    source: str | None,
+    progress: Callable[[int, int], None],
+) -> Exported:
+    """Write `sparse/0`, `images`, `transforms.json` and `points.ply` into a folder that is there and empty.
+
+    Args:
+        run: the run.
+        folder: where.
+        most: keyframes; None: as many as are needed.
+        images: whether to write the rectified images, which give the points their colours.
+        source: the recording, where it is not at the place that the run names.
+        progress: called with (done, total) after each keyframe's images.
+
+    Raises:
+        VioError: the run has too few views or no consistent track, or its images are not to be had.
+    """
+    keyframes = choose_keyframes(run.tracked, most=most)
+    T_world_cam0 = run.tracked.trajectory.T_world_body[keyframes]
+    tracks = build_tracks(run.tracked, keyframes, T_world_cam0)
+    names = keyframe_images(run.tracked.frames[keyframes])
+    colours = None
+    if images:
+        colours = _write_images(run, source, keyframes, tracks, names, folder / "images", progress)
+    camera = run.tracked.camera
+    model = build_model(camera, T_world_cam0, tracks, names, colours)
+    (folder / "sparse" / "0").mkdir(parents=True)
+    write_model(model, folder / "sparse" / "0")
+    transforms = nerfstudio_transforms(camera, T_world_cam0, names.below("images"))
+    (folder / "transforms.json").write_text(transforms, encoding="utf-8")
+    (folder / "points.ply").write_bytes(coloured_ply(tracks, colours))
+    return Exported(
+        keyframes=len(keyframes),
+        images=2 * len(keyframes) if images else 0,
+        points=len(tracks.ids),
+        mean_reprojection_error_px=mean_reprojection_error_px(model),
+    )
+
+
+def _write_images(
+    run: SavedRun,
+    source: str | None,
+    keyframes: IntArray,
+    tracks: PointTracks,
+    names: ModelImages,
+    folder: Path,
+    progress: Callable[[int, int], None],
+) -> ColourArray:
+    """Write the images of the keyframes; return the colours (M, 3) of the points, as the left camera sees them."""
+    total, count = np.zeros(len(tracks.ids)), np.zeros(len(tracks.ids))
+
+    def look(keyframe: int, left: Image) -> None:
+        rows = tracks.keyframe == keyframe
+        np.add.at(total, tracks.point[rows], _sample_gray(left, tracks.z[rows, :2]))
+        np.add.at(count, tracks.point[rows], 1)
+        progress(keyframe + 1, len(keyframes))
+
+    write_images(run, source, keyframes, names, folder, look)
+    gray = np.rint(total / np.maximum(count, 1)).astype(np.uint8)
+    return np.repeat(gray[:, None], 3, axis=1)
+
+
+def _sample_gray(image: Image, uv: FloatArray) -> FloatArray:
+    """Gray values (N,) of the pixels nearest to (N, 2)."""
+    u = np.clip(np.rint(uv[:, 0]).astype(int), 0, image.shape[1] - 1)
+    v = np.clip(np.rint(uv[:, 1]).astype(int), 0, image.shape[0] - 1)
+    out: FloatArray = image[v, u].astype(np.float64)
+    return out

@@ -1,0 +1,125 @@
+"""Bundle adjustment over a saved run's keyframes, and the run's other frames after it."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from vio.colmap.adjustment import Adjustment, PositionPriors, adjust
+from vio.config import Config, merge
+from vio.errors import ConfigError, EvaluationError
+from vio.evaluation import evaluate
+from vio.mapping.keyframes import choose_keyframes
+from vio.mapping.points import build_tracks, landmarks_of
+from vio.mapping.poses import fill_between, position_covariances, position_difference_m
+from vio.pipeline import run as process
+from vio.records import IntArray, Landmarks, Trajectory
+from vio.saved_run import SavedRun
+
+log = logging.getLogger(__name__)
+
+STEPS = 4  # that `progress` counts
+
+
+@dataclass(frozen=True, slots=True)
+class Refinement:
+    """A run after bundle adjustment."""
+
+    trajectory: Trajectory  # of the left camera, every frame of the run
+    landmarks: Landmarks
+    adjustment: Adjustment
+    keyframes: IntArray  # (K,) rows of the trajectory
+    aligned: int  # frames between keyframes that were aligned to the refined points
+    with_priors: bool
+    moved_rms_m: float  # from the run, after SE(3) alignment
+    ate_before_m: float | None  # against the reference in the recording; None without one
+    ate_m: float | None  # likewise, after refinement
+
+
+def refine_run(
+    run: SavedRun, *, most: int | None, priors: bool, threads: int, progress: Callable[[int], None]
+) -> Refinement:
+    """Bundle-adjust the keyframes of a run under its stereo rig, and align the other frames to the refined points.
+
+    Args:
+        run: the run.
+        most: keyframes; None: as many as are needed.
+        priors: hold the camera positions to the filter's by its covariance, where the filter still repeats the run.
+        threads: of the solver; one makes the result repeatable.
+        progress: called with the number of steps done.
+
+    Raises:
+        VioError: the run has too few views or no consistent track, or the solver failed.
+    """
+    path = run.tracked
+    keyframes = choose_keyframes(path, most=most)
+    T_world_cam0 = path.trajectory.T_world_body[keyframes]
+    tracks = build_tracks(path, keyframes, T_world_cam0)
+    held = _priors(run, keyframes) if priors else None
+    progress(1)
+    rounds = iter((2, 3))
+    done = adjust(
+        path.camera, T_world_cam0, tracks, priors=held, threads=threads, progress=lambda: progress(next(rounds))
+    )
+    poses, aligned = fill_between(path, keyframes, done.T_world_cam0, done.tracks)
+    progress(STEPS)
+    refined = replace(path.trajectory, T_world_body=poses)
+    before, after = _scores(run, refined)
+    return Refinement(
+        trajectory=refined,
+        landmarks=landmarks_of(path.camera, done.T_world_cam0, done.tracks, done.sigma_px),
+        adjustment=done,
+        keyframes=keyframes,
+        aligned=aligned,
+        with_priors=held is not None,
+        moved_rms_m=position_difference_m(path.trajectory, refined),
+        ate_before_m=before,
+        ate_m=after,
+    )
+
+
+def _scores(run: SavedRun, refined: Trajectory) -> tuple[float | None, float | None]:
+    """ATE before and after, against the reference in the recording; None without one."""
+    truth = run.truth
+    if truth is None:
+        return None, None
+    try:
+        before, after = (
+            float(evaluate(t, truth.trajectory, T_cam0_imu=truth.T_cam0_imu).as_dict()["ate_m"])
+            for t in (run.tracked.trajectory, refined)
+        )
+    except EvaluationError as error:
+        log.warning("the reference was not used: %s", error)
+        return None, None
+    return before, after
+
+
+def _priors(run: SavedRun, keyframes: IntArray) -> PositionPriors | None:
+    """Replay the filter on its saved observations for the covariance of each pose; None where it has changed since."""
+    where, frames = run.tracked.where, run.tracked.frames
+    again = process(
+        run.dataset, _estimator_settings(where / "config.yaml"), start=int(frames[0]), stop=int(frames[-1]) + 1
+    )
+    poses = again.trajectory.in_cam0(again.T_cam0_body).T_world_body
+    if len(poses) != len(frames) or np.abs(poses - run.tracked.trajectory.T_world_body).max() > 1e-6:
+        log.warning(
+            "the filter does not repeat %s any more (other version or settings); refining without priors", where
+        )
+        return None
+    chosen = [again.estimates[int(k)] for k in keyframes]
+    return PositionPriors(poses[keyframes, :3, 3], position_covariances(chosen, run.T_cam0_imu))
+
+
+def _estimator_settings(path: Path) -> Config:
+    """The settings that a run was made with, but those of its front end, whose work is done."""
+    try:
+        values = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"cannot read {path} ({error}); repeat the run") from error
+    kept = {key: value for key, value in values.items() if key not in ("frontend", "dataset")}
+    return merge(Config(), kept, where=str(path))

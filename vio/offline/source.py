@@ -1,0 +1,122 @@
+"""A recording with its calibration as given, before anything is believed of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.euroc_files import read_camera_yaml
+from vio.datasets.features import FeatureDataset
+from vio.datasets.image_pairs import ImageDataset, pair_images
+from vio.datasets.rectified import RectifiedDataset
+from vio.errors import CalibrationError
+from vio.geometry.distortion import StereoRig, rig_from_rectified
+from vio.geometry.lie import FloatArray
+from vio.geometry.rectify import rectifying_rotations
+from vio.protocols import Dataset, Frontend
+from vio.records import FeatureTracks, MotionSample, Observations, StereoFrame, feature_tracks
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationSource:
+    """What there is to measure a calibration from."""
+
+    path: Path
+    rig: StereoRig | None  # as calibrated; None: features without an image size
+    raw_pairs: tuple[tuple[Path, Path], ...]  # image files, unrectified where the cameras are; empty: features only
+    dataset: Dataset | None  # None: the calibration is such that images cannot be rectified
+    refused: str | None  # why not
+
+    @property
+    def T_cam0_cam1(self) -> FloatArray:
+        """The given pose (4, 4) of cam1 in cam0."""
+        if self.rig is not None:
+            return self.rig.T_cam0_cam1
+        assert self.dataset is not None
+        out = np.eye(4)
+        out[0, 3] = self.dataset.recording.camera.baseline_m
+        return out
+
+    def rectifying(self) -> tuple[FloatArray, FloatArray] | None:
+        """Rotations (3, 3) of the raw cameras into the rectified ones; None: they are rectified, or cannot be."""
+        if not isinstance(self.dataset, RectifiedDataset) or self.dataset.rectifier.maps is None:
+            return None
+        return rectifying_rotations(self.dataset.rectifier.rig)[:2]
+
+    def image_size(self, z: FloatArray) -> tuple[float, float]:
+        """Width and height in pixels; where unknown, those that rectified pixels (N, 4) fill."""
+        camera = None if self.dataset is None else self.dataset.recording.camera
+        if camera is not None and camera.width is not None and camera.height is not None:
+            return float(camera.width), float(camera.height)
+        return (float(z[:, 0].max()) + 1, float(z[:, 1].max()) + 1) if len(z) else (1.0, 1.0)
+
+
+def open_source(text: str) -> CalibrationSource:
+    """Open a recording with its calibration taken literally, even one that cannot be rectified with it.
+
+    Raises:
+        DataError: no known recording, or it cannot be read.
+        CalibrationError: the calibration cannot be right, and the recording is none of EuRoC's.
+    """
+    try:
+        dataset = open_dataset(text, DatasetSettings(extrinsics="literal"))
+    except CalibrationError as error:
+        found = _raw_euroc(Path(text.removeprefix("euroc:")), str(error))
+        if found is None:
+            raise
+        return found
+    recording = dataset.recording
+    if isinstance(dataset, RectifiedDataset):
+        return CalibrationSource(recording.path, dataset.rectifier.rig, dataset.pairs, dataset, None)
+    known = recording.camera.width is not None
+    T = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    rig = rig_from_rectified(recording.camera, T) if known else None
+    pairs = dataset.pairs if isinstance(dataset, ImageDataset) else ()
+    return CalibrationSource(recording.path, rig, pairs, dataset, None)
+
+
+def _raw_euroc(path: Path, refused: str) -> CalibrationSource | None:
+    """An EuRoC folder whose cameras cannot be rectified: its rig and images as they stand; None: it is none."""
+    mav = path / "mav0" if (path / "mav0").is_dir() else path
+    if not all((mav / name / "sensor.yaml").is_file() and (mav / name / "data").is_dir() for name in ("cam0", "cam1")):
+        return None
+    (cam0, T0), (cam1, T1) = (read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1"))
+    pairs = pair_images(mav / "cam0" / "data", mav / "cam1" / "data")
+    return CalibrationSource(path, StereoRig(cam0, cam1, T0, T1), pairs, None, refused)
+
+
+def track(
+    dataset: Dataset,
+    build_frontend: Callable[[Dataset], Frontend],
+    frames: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> tuple[FeatureTracks, tuple[MotionSample, ...]]:
+    """Return stereo tracks of the first frames, from the file or by a front end, and the motion samples.
+
+    Args:
+        dataset: the recording.
+        build_frontend: makes the front end where the recording holds images.
+        frames: at most so many are tracked.
+        progress: called with (done, total) after each of them.
+
+    Raises:
+        DataError: the images cannot be read.
+    """
+    if isinstance(dataset, FeatureDataset):
+        return dataset.tracks, dataset.motion
+    count = len(dataset.recording.frame_times_ns)
+    total = min(frames, count)
+    front = build_frontend(dataset)
+    seen: dict[int, Observations] = {}
+    samples: list[MotionSample] = []
+    for event in dataset.events(0, total):
+        if isinstance(event, StereoFrame):
+            seen[event.index] = front.process(event).observations
+            progress(len(seen), total)
+        else:
+            samples.append(event)
+    return feature_tracks(seen, count), tuple(samples)

@@ -1,0 +1,126 @@
+"""A run's folder read back, with the observations that led to it and the images behind them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vio.datasets import open_dataset
+from vio.datasets.common import read_npz
+from vio.datasets.features import FeatureDataset
+from vio.datasets.observation_log import read_observation_log
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray
+from vio.mapping.comparison import GroundTruth
+from vio.mapping.keyframes import TrackedPath
+from vio.records import IntArray, StereoFrame
+from vio.run_folder import MARKER
+from vio.trajectory_io import read_trajectory
+
+OBSERVATIONS = "observations.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class SavedRun:
+    """What a run's folder holds, with the observations that led to it."""
+
+    tracked: TrackedPath  # the left camera's trajectory with its observations; `tracked.where` is the folder
+    source: str  # the recording as `kind:path`, the one that the images came from
+    dataset: FeatureDataset  # observations of every frame, as a recording
+    T_cam0_imu: FloatArray  # (4, 4)
+    metrics: dict[str, Any]
+
+    @property
+    def truth(self) -> GroundTruth | None:
+        """The ground truth that lies in the recording; None: there is none."""
+        reference = self.dataset.recording.reference
+        return None if reference is None else GroundTruth(reference, self.T_cam0_imu)
+
+
+def read_saved_run(folder: Path) -> SavedRun:
+    """Read the folder of `vio run --save-observations`.
+
+    Raises:
+        DataError: no such folder, or the observations were not saved.
+    """
+    marker = folder / MARKER
+    if not marker.is_file():
+        raise DataError(f"{folder}: no run folder (it has no {MARKER}); give a folder that `vio run` wrote")
+    log = folder / OBSERVATIONS
+    if not log.is_file():
+        raise DataError(f"{folder} has no {OBSERVATIONS}; repeat its run with --save-observations")
+    metrics = json.loads(marker.read_text(encoding="utf-8"))
+    dataset = read_observation_log(log)
+    T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
+    trajectory = read_trajectory(folder / "trajectory.tum")
+    frames = trajectory.frame_indices
+    if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
+        raise DataError(f"{folder}: trajectory.tum and {OBSERVATIONS} are not of one whole run; repeat the run")
+    tracked = TrackedPath(folder, dataset.recording.camera, trajectory.in_cam0(T_cam0_imu), dataset.tracks)
+    return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics)
+
+
+def _original_source(log: Path) -> str:
+    """The recording that holds the images, through any number of replayed logs."""
+    source = str(read_npz(log)["source"])
+    kind, _, path = source.partition(":")
+    seen = {log.resolve()}
+    while kind == "log" and Path(path).is_file() and Path(path).resolve() not in seen:
+        seen.add(Path(path).resolve())
+        source = str(read_npz(Path(path))["source"])
+        kind, _, path = source.partition(":")
+    return source
+
+
+def with_poses(run: SavedRun, folder: Path) -> SavedRun:
+    """The run with the poses of another folder, such as that of `vio refine`.
+
+    Raises:
+        DataError: that folder does not exist or describes other frames.
+    """
+    if not (folder / "trajectory.tum").is_file():
+        raise DataError(f"{folder} holds no trajectory; make it with `vio refine {run.tracked.where}`")
+    trajectory = read_trajectory(folder / "trajectory.tum").in_cam0(run.T_cam0_imu)
+    if trajectory.frame_indices is None or not np.array_equal(trajectory.frame_indices, run.tracked.frames):
+        raise DataError(f"{folder} describes other frames than {run.tracked.where}; refine again")
+    return replace(run, tracked=replace(run.tracked, trajectory=trajectory))
+
+
+def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator[StereoFrame]:
+    """Yield the rectified image pairs of rows (K,) of the trajectory, in order.
+
+    Args:
+        run: the run.
+        source: the recording, where it is not at the place that the run names.
+        rows: increasing.
+
+    Raises:
+        DataError: the recording is gone, holds no images, has another camera, or a frame cannot be read.
+    """
+    try:
+        dataset = open_dataset(source or run.source)
+    except DataError as error:
+        raise DataError(
+            f"the images of {run.tracked.where} are not to be had: {error}; name the recording with --source"
+        ) from error
+    recording = dataset.recording
+    if not recording.has_images:
+        raise DataError(f"{source or run.source} holds no images; name the recording with --source or use --no-images")
+    ours, theirs = run.tracked.camera, recording.camera
+    if not np.allclose(
+        [ours.fu, ours.fv, ours.cu, ours.cv, ours.baseline_m],
+        [theirs.fu, theirs.fv, theirs.cu, theirs.cv, theirs.baseline_m],
+        rtol=1e-9,
+    ):
+        raise DataError(f"{recording.path} has another calibration than the run {run.tracked.where}; repeat the run")
+    for row in rows.tolist():
+        index = int(run.tracked.frames[row])
+        found = [e for e in dataset.events(index, index + 1) if isinstance(e, StereoFrame)]
+        if not found or found[0].left is None or found[0].right is None:
+            raise DataError(f"{recording.path}: frame {index} cannot be read; see the warnings above")
+        yield found[0]
