@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from tools.draw_structure import floors, read_rooms
+
 ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
 
@@ -83,6 +85,26 @@ def test_imports_go_one_way(file: Path) -> None:
     if not name.startswith(("vio.cli", "vio.__main__")):
         assert not any(i.startswith("vio.cli") for i in everything), "nothing knows the command line"
     assert "torch" not in _heads(file, top_level_only=True)
+
+
+def test_rooms_import_each_other_in_no_circle() -> None:
+    rooms = read_rooms(ROOT)
+    assert {"vio.filters", "vio.datasets", "frontend", "vio.pipeline"} <= set(rooms)
+    assert floors(rooms)[1] == []
+
+
+def test_a_circle_of_rooms_would_be_seen(tmp_path: Path) -> None:
+    (tmp_path / "frontend").mkdir()
+    for name, text in (
+        ("a", "def f():\n    from vio.b import g\n"),
+        ("b", "from vio import c\n"),
+        ("c", "import vio.a"),
+    ):
+        (tmp_path / "vio").mkdir(exist_ok=True)
+        (tmp_path / "vio" / f"{name}.py").write_text(text)
+    floor, closing = floors(read_rooms(tmp_path))
+    assert closing == [("vio.c", "vio.a")]
+    assert floor == {"vio.a": 2, "vio.b": 1, "vio.c": 0}
 
 
 def test_pycolmap_stays_in_its_package() -> None:
