@@ -12,11 +12,11 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammaincinv
 
 from vio.errors import EvaluationError
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_inverse, so3_exp, so3_hat, so3_log
 from vio.records import BodyFrame, IntArray, Trajectory
+from vio.statistics import chi_square_quantile
 
 AlignMode: TypeAlias = Literal["se3", "sim3", "none"]
 AssociationMode: TypeAlias = Literal["time", "frame"]
@@ -429,9 +429,8 @@ def nees_bounds(d: int, runs: int, confidence: float = 0.95) -> tuple[float, flo
     if d < 1 or runs < 1 or not 0 < confidence < 1:
         raise EvaluationError(f"NEES bounds need d, runs >= 1 and 0 < confidence < 1, got {d}, {runs}, {confidence:g}")
     tail = (1 - confidence) / 2
-    # The quantile of chi-square with k degrees of freedom is twice that of the gamma distribution of shape k / 2.
-    low, high = (2 * float(gammaincinv(d * runs / 2, p)) / runs for p in (tail, 1 - tail))
-    return low, high
+    low, high = chi_square_quantile([tail, 1 - tail], d * runs) / runs
+    return float(low), float(high)
 
 
 def _plain(record: Any) -> Any:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import ClassVar
 
 import numpy as np
-from scipy.stats import chi2
 
 from vio.errors import ConfigError, EstimationError
 from vio.filters.settings import VislamSettings
@@ -28,6 +27,7 @@ from vio.records import (
     UpdateReport,
     VelocitySample,
 )
+from vio.statistics import chi_square_quantile
 
 _MIN_DEPTH_M = 0.3
 _MIN_FEATURES = 3  # fewer points leave a pose undetermined, and a single wrong one would steer it
@@ -153,7 +153,7 @@ class Vislam:
         self._frame_time_ns: int | None = None  # of the last frame
         self._map = _Map()
         probability = settings.gate_probability
-        self._gate = np.inf if probability is None else float(chi2.ppf(probability, 4))
+        self._gate = np.inf if probability is None else float(chi_square_quantile(probability, 4))
 
     def propagate(self, sample: MotionSample) -> None:
         """Take a velocity sample.

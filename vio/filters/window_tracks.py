@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
 
 from vio.filters.multiview import (
     CAUCHY,
@@ -27,6 +26,7 @@ from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray
+from vio.statistics import chi_square_quantile
 
 MIN_TRACKS_FOR_NOISE = 15  # fewer tracks say nothing of how noisy pixels, or the motion model, are
 _MIN_TRACKS_TO_STAND = 15
@@ -168,4 +168,4 @@ class WindowTracks:
 @lru_cache(maxsize=8)
 def _chi2_table(probability: float) -> FloatArray:
     """Quantiles of chi-square for 0 to 199 degrees of freedom."""
-    return np.concatenate([[0.0], chi2.ppf(probability, np.arange(1, _MOST_DOF + 1))])
+    return np.concatenate([[0.0], chi_square_quantile(probability, np.arange(1, _MOST_DOF + 1))])
