@@ -75,7 +75,7 @@ def test_imports_go_one_way(file: Path) -> None:
     name = _name(file)
     everything = set(_imports(file, top_level_only=False))
     if name.startswith(ESTIMATOR):
-        forbidden = {"cv2", "torch", "kornia", "matplotlib", "pycolmap", "frontend", "rich"}
+        forbidden = {"cv2", "torch", "kornia", "matplotlib", "pycolmap", "frontend"}
         assert not forbidden & {i.split(".")[0] for i in everything}
     if name.startswith("vio") and not name.startswith("vio.cli") and name not in KNOW_BOTH:
         assert not any(i.split(".")[0] == "frontend" for i in everything), "only the pipeline knows the front end"
@@ -124,7 +124,7 @@ def _loaded(code: str, suspects: set[str]) -> set[str]:
     return set(done.stderr.split())
 
 
-HEAVY = {"numpy", "scipy", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "rich", "yaml", "threadpoolctl"}
+HEAVY = {"numpy", "scipy", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl"}
 HELP = """
 import contextlib, vio.cli
 with contextlib.suppress(SystemExit):
@@ -148,7 +148,7 @@ def test_nothing_heavy_is_loaded_before_a_command_runs(code: str) -> None:
 
 def test_the_estimator_loads_little_of_scipy() -> None:
     # `scipy.stats` and what it pulls in were 3.5 of the 6.1 seconds that importing the pipeline took.
-    beyond = {"cv2", "torch", "kornia", "matplotlib", "pycolmap", "rich", "scipy.stats", "scipy.optimize", "scipy.io"}
+    beyond = {"cv2", "torch", "kornia", "matplotlib", "pycolmap", "scipy.stats", "scipy.optimize", "scipy.io"}
     assert not _loaded("import vio.pipeline, vio.evaluation", beyond)
     assert _loaded("import vio.pipeline", {"scipy.linalg"}), "so that the test above can fail"
 

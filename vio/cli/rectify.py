@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +36,7 @@ def execute(args: argparse.Namespace) -> int:
     import logging
 
     from vio.atomic import atomic_folder
+    from vio.cli.progress import ProgressBar
     from vio.datasets import DatasetSettings, open_dataset
     from vio.datasets.euroc import write_rectified_euroc
     from vio.datasets.kitti_raw import write_rectified_kitti
@@ -67,8 +65,8 @@ def execute(args: argparse.Namespace) -> int:
         "baseline_m": camera.baseline_m,
     }
     with atomic_folder(args.out, replace=True, marker=MARKER) as folder:
-        with _bar(len(recording.frame_times_ns), recording.path.name) as advance:
-            frames = writers[recording.kind](dataset, folder, advance)
+        with ProgressBar(recording.path.name, len(recording.frame_times_ns)) as bar:
+            frames = writers[recording.kind](dataset, folder, bar.advance)
         facts["frames"] = frames
         (folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8", newline="\n")
     if args.json:
@@ -84,15 +82,3 @@ def execute(args: argparse.Namespace) -> int:
     for name, value in rows:
         print(f"{name:<10} {value}")
     return 0
-
-
-@contextlib.contextmanager
-def _bar(frames: int, label: str) -> Iterator[Callable[[], None]]:
-    """A progress bar on stderr; silent where stderr is no terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as progress:
-        task = progress.add_task(label, total=frames)
-        yield lambda: progress.advance(task)

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
+from vio.cli.progress import ProgressBar
 from vio.config import Config
 from vio.datasets import open_dataset
 from vio.errors import VioError
@@ -26,45 +23,26 @@ from vio.trajectory_io import read_trajectory
 log = logging.getLogger(__name__)
 
 
-def _bar(*, rate: bool) -> Progress:
-    """A progress bar on stderr, silent where stderr is no terminal."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        *([TextColumn("{task.fields[rate]}")] if rate else []),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        disable=not sys.stderr.isatty(),
-    )
-
-
 @contextmanager
 def rendering(label: str) -> Iterator[Callable[[int, int], None]]:
     """Give a function that shows `(done, total)` as a progress bar."""
-    with _bar(rate=False) as bar:
-        task = bar.add_task(label, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    with ProgressBar(label) as bar:
+        yield bar.update
 
 
 class ProgressViewer:
     """A progress bar on stderr with frames per second; silent where stderr is no terminal."""
 
     def __init__(self, frames: int, label: str) -> None:
-        self._progress = _bar(rate=True)
-        self._task = self._progress.add_task(label, total=frames, rate="")
-        self._progress.start()
+        self._bar = ProgressBar(label, frames, unit="frames")
 
     def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
         """Advance by one frame."""
-        task = self._progress.tasks[0]
-        rate = f"{task.speed:.1f} frames/s" if task.speed else ""
-        self._progress.update(self._task, advance=1, rate=rate)
+        self._bar.advance()
 
     def close(self) -> None:
         """Leave the bar as it stands."""
-        self._progress.stop()
+        self._bar.close()
 
 
 def process(
