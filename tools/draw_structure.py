@@ -22,7 +22,16 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-FOUNDATION = ("vio.records", "vio.protocols", "vio.geometry", "vio.errors", "vio.setting", "vio.threads", "vio.atomic")
+FOUNDATION = (
+    "vio.records",
+    "vio.protocols",
+    "vio.geometry",
+    "vio.errors",
+    "vio.setting",
+    "vio.threads",
+    "vio.atomic",
+    "vio.statistics",
+)
 _COLOURS = {"vio.cli": "#e8d5b5", "frontend": "#f0c9c9", "vio.filters": "#cfe3cf", "vio.sim": "#dcd3ea"}
 _PLAIN, _GROUND, _CLOSING = "#d6e2f0", "#e9e9e9", "#c23b5a"
 _WIDTH, _HEIGHT = 1.0, 0.62
