@@ -37,7 +37,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import ImuSample, Observations, VelocitySample, observations
+from vio.records import ImuSample, IntArray, Observations, VelocitySample, observations
 
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
@@ -528,6 +528,54 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion:
 
     J = numeric_jacobian(on_the_body, np.zeros(6))
     np.testing.assert_allclose(estimate.covariance, J @ P[:6, :6] @ J.T, rtol=1e-4, atol=1e-5 * np.abs(P[:6, :6]).max())
+
+
+def test_tracks_have_their_say_when_the_oldest_clone_leaves_and_not_before() -> None:
+    settings = MsckfSettings(clones=4, max_landmarks=0)
+
+    def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
+        return seen.take(seen.ids % 2 == 0) if k == 0 else seen  # odd ones begin in the second frame
+
+    flight, exact = Flight(frames=5), np.random.default_rng(0)
+    _, _, filt = flight.run(settings, None, spoil=spoil)
+    ids = set.intersection(*(set(flight.observe(k, 0.0, exact).ids.tolist()) for k in range(5)))
+    odd, even = {i for i in ids if i % 2}, {i for i in ids if i % 2 == 0}
+    assert min(len(odd), len(even)) > 10
+    table = filt._tracks.table
+    left = dict(zip(table.ids(table.rows()).tolist(), table.rows().tolist(), strict=True))
+    assert odd <= left.keys()
+    assert not even & left.keys()
+    assert table.seen(np.array([left[i] for i in odd]))[:, :4].all()
+
+
+def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its Jacobian by the clones' errors, against triangulating again from moved clones."""
+    made: list[tuple[FloatArray, FloatArray, FloatArray, Views]] = []
+    add = Window.add_landmarks
+
+    def spy(window: Window, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
+        table = filt._tracks.table
+        rows = table.rows()
+        views = table.views(rows[np.isin(table.ids(rows), ids[:1])], len(window.clones))
+        T = np.array([c.T_world_imu for c in window.clones])
+        made.append((T, p_world[:1], A[:3, window.first_clone : window.first_landmark], views))
+        add(window, ids, p_world, A, covariance)
+
+    monkeypatch.setattr(Window, "add_landmarks", spy)
+    settings, flight, noise = MsckfSettings(clones=5), Flight(frames=6), np.random.default_rng(0)
+    filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion=None)
+    for k in range(6):
+        filt.update(flight.observe(k, 0.01, noise))
+    T_world_imu, p, A, views = made[0]
+
+    def own_error(xi: FloatArray) -> FloatArray:
+        T = T_CAM0_IMU @ se3_inverse(se3_exp(xi.reshape(-1, 6)) @ T_world_imu)
+        moved = refine_points(CAMERA, T, p, views, 8, 1e6)
+        # Measured from the newest clone's rotation: p = p_hat + phi x p_hat + own.
+        return (moved - p - np.cross(xi[-3:], p))[0]
+
+    numeric = numeric_jacobian(own_error, np.zeros(36), eps=1e-5)
+    np.testing.assert_allclose(A, numeric, atol=2e-2 * np.abs(numeric).max())
 
 
 @pytest.mark.parametrize("motion", [None, "velocity", "imu"])
