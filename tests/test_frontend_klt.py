@@ -18,7 +18,7 @@ from frontend.settings import FrontendSettings, GridSettings, KltSettings
 from frontend.stereo_match import half_image
 from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
 from vio.errors import ConfigError, DataError
-from vio.geometry.lie import FloatArray, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import FrontendOutput, StereoFrame, TrackPrior
 
@@ -247,6 +247,21 @@ def test_a_prior_bridges_a_jump_that_tracking_alone_cannot() -> None:
     for output in (by_pixels, by_rotation):
         assert output.tracked > 0.6 * len(seen)
         assert np.median(track_errors(FrontendOutput(seen, 0, 0, 0), output, first, second)) < 0.08
+
+
+def test_the_last_motion_counts_by_the_time_it_took() -> None:
+    """Three frames 10 ms apart, the next one 150 ms later: 50 pixels that only the motion so far can tell."""
+    step = np.array([0.4, -0.1, 0.1, 0.01, -0.02, 0.01])
+    frames = [
+        replace(stereo_frame(k, se3_exp(share * step)), time_ns=ms * 1_000_000)
+        for k, (share, ms) in enumerate([(0.0, 0), (0.1, 10), (0.2, 20), (1.7, 170)])
+    ]
+    outputs = run(frames, with_klt(pyramid_levels=0, trusted_levels=0))
+    assert outputs[-1].tracked > 0.7 * outputs[-2].tracked
+
+
+def test_features_that_are_not_found_on_the_way_back_are_dropped() -> None:
+    assert run(FRAMES[:2], with_klt(max_forward_backward_px=1e-4))[1].tracked < 10
 
 
 def test_swapped_images_are_named() -> None:

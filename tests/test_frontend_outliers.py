@@ -144,6 +144,31 @@ def test_a_wrong_predicted_motion_does_not_win_against_all_points() -> None:
     assert found.inliers.mean() > 0.99
 
 
+def test_a_prediction_that_turns_the_other_way_frees_the_consensus_too() -> None:
+    """The camera turns by 3 degrees one way, the truck's points by as much the other way."""
+    wall, truck = scene(70, 12, (15.0, 40.0)), scene(130, 13, (7.0, 8.0))
+    T_wall, T_truck = (se3_exp([x, 0.0, 0.0, 0.0, turn, 0.0]) for x, turn in ((0.0, -0.05), (0.8, 0.05)))
+    uv = np.concatenate([pixels(T_wall, wall, 14), pixels(T_truck, truck, 15)])
+    found = rigid_consensus(vote(), np.concatenate([wall, truck]), uv, np.eye(4), T_wall[:3, :3], None)
+    assert found is not None
+    assert found.inliers[:70].mean() > 0.95
+    assert not found.inliers[70:].any()
+
+
+def test_a_wrong_rotation_that_explains_only_what_the_vote_explains_does_not_win() -> None:
+    """Half of the static points lie at one depth, where a sideways move looks like a turn; many others are wrong."""
+    rng = np.random.default_rng(0)
+    board = np.stack([rng.uniform(-0.6, 0.6, 70), rng.uniform(-0.5, 0.5, 70), rng.uniform(7.9, 8.1, 70)], axis=1)
+    p = np.concatenate([board, scene(60, 100, (15.0, 60.0)), scene(80, 200)])
+    uv = pixels(T_TRUE, p, 0)
+    uv[130:] += rng.choice([-1, 1], (80, 2)) * rng.uniform(20, 80, (80, 2))
+    wrong = se3_exp([0.0, 0.0, 0.0, 0.0, np.radians(2.0), 0.0])[:3, :3] @ T_TRUE[:3, :3]
+    found = rigid_consensus(vote(), p, uv, np.eye(4), wrong, None)
+    assert found is not None
+    assert found.inliers[:130].mean() > 0.98
+    assert np.linalg.norm(se3_log(found.T_curr_prev @ np.linalg.inv(T_TRUE))) < 0.02
+
+
 def test_points_behind_the_camera_are_infinitely_wrong() -> None:
     behind = se3_exp([0.0, 0.0, -50.0, 0.0, 0.0, 0.0])
     p = scene(5, 19)
@@ -157,6 +182,18 @@ def test_fit_recovers_a_motion_from_predicted_pixels() -> None:
     np.testing.assert_allclose(T, T_TRUE, atol=1e-6)
     assert fit_motion(CAMERA, p[:5], np.zeros((5, 2)), np.eye(4), LIMIT_PX) is None
     assert fit_motion(CAMERA, p, np.full((50, 2), np.nan), np.eye(4), LIMIT_PX) is None
+
+
+@pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
+def test_fit_finds_a_motion_near_its_start_however_far_that_turns(turn: float) -> None:
+    T = se3_exp([0.5, -0.3, 0.8, 0.2 * turn, turn, -0.3 * turn])
+    after = scene(60, 30)
+    start = se3_exp([0.1, 0.05, -0.1, 0.02, -0.05, 0.03]) @ T
+    found = fit_motion(
+        CAMERA, transform_points(np.linalg.inv(T), after), project(CAMERA, after)[:, :2], start, LIMIT_PX
+    )
+    assert found is not None
+    np.testing.assert_allclose(found, T, atol=1e-6)
 
 
 def test_epipolar_distance_is_zero_at_any_allowed_depth_and_grows_across_the_line() -> None:

@@ -184,3 +184,15 @@ def test_only_sightings_that_were_used_count() -> None:
         assert L[0, 0].any() == (k > 0)
         assert L[:, 1].any(axis=(1, 2)).all()
         model.use(observations(k, k, [0, 1], z), np.array([True, False]))
+
+
+def test_the_future_of_a_feature_counts_by_how_often_its_like_were_seen_again() -> None:
+    """One feature stays for eight frames; beside it, in every frame, a new one appears that is not seen again."""
+    z, model = np.repeat(project(CAMERA, _points(1, 13)), 2, axis=0), MotionInformation(CAMERA, 3, 0.5)
+    for k in range(8):
+        L = model.look(observations(k, k, [0, 100 + k], z), None)
+    # Nine of ten are believed to survive beforehand; of the new ones, the first alone did, and seven did not.
+    old, new = 9 / 10, (9 + 1) / (10 + 1 + 7)
+    strength = np.sum(L**2, axis=(2, 3))
+    np.testing.assert_allclose(strength[0, 1] / strength[1, 1], old / new)  # the next frame
+    np.testing.assert_allclose(strength[0, 2] / strength[1, 2], (old / new) ** 3)  # the horizon

@@ -584,10 +584,10 @@ MUTATIONS = (
         _VOTE,
     ),
     Mutation(
-        "tracking: a change of depth scales the wrong way",
+        "tracking: disparity to the wrong side",
         "frontend/klt.py",
-        "old.point[:, 2] / np.where(ahead, point[:, 2], 1.0)",
-        "point[:, 2] / np.where(ahead, old.point[:, 2], 1.0)",
+        "warp[:, 0, 2] -= disparity",
+        "warp[:, 0, 2] += disparity",
         _TRACK,
     ),
     Mutation(
@@ -612,10 +612,10 @@ MUTATIONS = (
         _TRACK,
     ),
     Mutation(
-        "tracking: a new anchor forgets its rounding",
+        "tracking: a new anchor in every frame, which drifts",
         "frontend/klt.py",
-        "warp[:, :, 2] += (warp[:, :, :2] @ beside)[:, :, 0]",
-        "warp[:, :, 2] += 0 * (warp[:, :, :2] @ beside)[:, :, 0]",
+        "(change > np.log(settings.max_anchor_scale))",
+        "(change > -1.0)",
         _TRACK,
     ),
     Mutation(
