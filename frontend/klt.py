@@ -13,11 +13,10 @@ from frontend.detect import detect_corners, half_mask, load_mask, min_distance_p
 from frontend.flow import follow, shows_nothing
 from frontend.frames import FrameGate, Stopwatch, SwapAlarm, handed_out
 from frontend.outliers import Consensus, Vote, epipolar_distance, pixel_errors, predicted_motion, static_tracks
-from frontend.patches import FloatImage, View, inside
+from frontend.patches import FloatImage, View, half_image, inside
 from frontend.prediction import moved_pixels, told_pixels, usable_prior
 from frontend.settings import FrontendSettings
 from frontend.stereo_fit import StereoFit
-from frontend.stereo_match import half_image
 from frontend.tracks import AnchorBank, Tracks, newborn, no_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TypeAlias
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
@@ -20,7 +21,12 @@ class View:
     """One image in the forms that tracking needs."""
 
     full: FloatImage  # (H, W) gray levels
-    half: Image  # (H/2, W/2); what lies at (u, v) in the full image lies at (u/2, v/2) there
+    half: Image  # (H/2, W/2) by `half_image`
+
+
+def half_image(image: Image) -> Image:
+    """The image at half resolution; what lies at (u, v) in the full image lies at (u/2, v/2) there."""
+    return np.asarray(cv2.pyrDown(image), dtype=np.uint8)
 
 
 def inside(image: Image | FloatImage, points: npt.NDArray[np.float64], margin: float) -> BoolArray:

@@ -18,8 +18,6 @@ from vio.records import BoolArray, Image, IntArray
 
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
-
-
 _FIELD_MEMORY = 0.95  # weight of what was learned before, per frame
 _FIELD_PRIOR = 4.0  # matches that it takes to believe in a row difference
 _FIELD_SIGMA_PX = 0.5
@@ -59,11 +57,6 @@ class RowField:
             self._normal = kept + (terms * weight[:, None]).T @ terms
             self._moment = moment + terms.T @ (weight * off)
             self._field = np.asarray(np.linalg.solve(self._normal, self._moment), dtype=np.float64)
-
-
-def half_image(image: Image) -> Image:
-    """The image at half resolution; what lies at (u, v) in the full image lies at (u/2, v/2) there."""
-    return np.asarray(cv2.pyrDown(image), dtype=np.uint8)
 
 
 def row_correlation(

@@ -14,8 +14,8 @@ from frontend.detect import cell_index, grid_shape, min_distance_px
 from frontend.flow import circle_gaps
 from frontend.klt import KltFrontend
 from frontend.outliers import fit_motion
+from frontend.patches import half_image
 from frontend.settings import FrontendSettings, GridSettings, KltSettings
-from frontend.stereo_match import half_image
 from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
 from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log

@@ -14,8 +14,8 @@ import pytest
 from frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
 from frontend.detect import detect_corners
 from frontend.flow import lucas_kanade
+from frontend.patches import half_image
 from frontend.settings import FrontendSettings, GridSettings, KltSettings, LearnedSettings, MatchSettings
-from frontend.stereo_match import half_image
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
 from tools.bench_frontend import kornia_options
 from vio.datasets.images import load_gray

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
+from frontend.columns import joined, take
 from frontend.detect import (
     cell_index,
     corner_response,
@@ -15,12 +18,16 @@ from frontend.detect import (
     local_maxima,
     min_distance_px,
     noise_gradient,
+    spread_evenly,
 )
-from frontend.patches import inside
+from frontend.patches import half_image, inside
+from frontend.prediction import moved_pixels, told_pixels
 from frontend.settings import GridSettings, KltSettings
-from frontend.stereo_match import RowField, half_image, match_rows, row_correlation
-from vio.geometry.lie import FloatArray
-from vio.records import Image
+from frontend.stereo_match import RowField, match_rows, row_correlation
+from frontend.tracks import AnchorBank
+from vio.geometry.lie import FloatArray, se3_exp
+from vio.geometry.stereo import StereoCamera
+from vio.records import BoolArray, Image, IntArray, TrackPrior
 
 
 def waves(u: FloatArray, v: FloatArray, seed: int = 0) -> FloatArray:
@@ -306,3 +313,82 @@ def test_noise_in_the_dark_gives_hardly_a_corner() -> None:
         loose = KltSettings(min_gradient_over_noise=1.0)
         found = len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings(), loose))
         assert found > (30 if sigma > 1 else 3)  # the setting is what keeps them away
+
+
+# --- records, anchors, predictions ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Inner:
+    flags: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class Outer:
+    names: IntArray
+    places: FloatArray
+    inner: Inner
+
+
+def test_rows_of_records_are_taken_and_joined_also_in_records_within() -> None:
+    record = Outer(np.arange(4), np.arange(8.0).reshape(4, 2), Inner(np.array([True, False, True, False])))
+    odd = take(record, np.array([3, 1]))
+    assert odd.names.tolist() == [3, 1]
+    np.testing.assert_array_equal(odd.places, [[6.0, 7.0], [2.0, 3.0]])
+    assert not odd.inner.flags.any()
+    both = joined(take(record, record.inner.flags), odd)
+    assert both.names.tolist() == [0, 2, 3, 1]
+    assert both.inner.flags.tolist() == [True, True, False, False]
+
+
+def test_anchors_keep_their_slots_when_the_bank_grows() -> None:
+    image = PLAIN.astype(np.float32)
+    bank = AnchorBank(4, 3)
+    first = bank.put(image, POINTS[:3])
+    before = bank.store.patch[first].copy()
+    more = bank.put(image, POINTS[3:20])
+    assert not set(first) & set(more)
+    np.testing.assert_array_equal(bank.store.patch[first], before)
+    np.testing.assert_array_equal(bank.store.patch[more], templates(cut_patches(image, POINTS[3:20], 3)).patch)
+    bank.keep_only(first)
+    again = bank.put(image, POINTS[20:22])
+    assert not set(first) & set(again)
+    assert set(again) <= set(more) | {3}  # what is free is used again
+
+
+def test_points_that_end_up_behind_the_camera_keep_their_pixels() -> None:
+    camera = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
+    p_prev = np.array([[0.1, 0.2, 5.0], [0.1, 0.2, 1.0], [-1.0, 0.5, 9.0]])
+    T_curr_prev = se3_exp([0.02, -0.01, -2.0, 0.0, 0.05, 0.01])
+    left = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+    found = moved_pixels(camera, T_curr_prev, p_prev, left)
+    p = p_prev @ T_curr_prev[:3, :3].T + T_curr_prev[:3, 3]
+    expected = np.stack([300.0 * p[:, 0] / p[:, 2] + 150.0, 310.0 * p[:, 1] / p[:, 2] + 100.0], axis=1)
+    np.testing.assert_allclose(found[[0, 2]], expected[[0, 2]])
+    np.testing.assert_array_equal(found[1], left[1])
+
+
+def test_the_told_pixels_are_those_of_the_ids_that_a_prior_names() -> None:
+    prior = TrackPrior(np.array([3, 7, 9]), np.arange(12.0).reshape(3, 4))
+    rows, told = told_pixels(np.array([9, 1, 3]), prior)
+    assert dict(zip(rows.tolist(), told.tolist(), strict=True)) == {0: [8.0, 9.0], 2: [0.0, 1.0]}
+
+
+def test_points_spread_as_a_loop_that_fills_the_emptiest_cell_would() -> None:
+    rng = np.random.default_rng(12)
+    points, occupied = rng.uniform([0, 0], [400, 300], (120, 2)), rng.uniform([0, 0], [400, 300], (10, 2))
+    grid = GridSettings(target_features=60, cell_features=3, min_distance=0.0)
+    rows = spread_evenly(points, occupied, (400, 300), grid)
+    shape = grid_shape(400, 300, grid)
+    cell = cell_index(points, 400, 300, shape)
+    held = np.bincount(cell_index(occupied, 400, 300, shape), minlength=shape[0] * shape[1])
+    apart, taken = min_distance_px(400, 300, grid), list(occupied)
+    far = [p for p in range(120) if np.abs(np.concatenate([points[:p], taken]) - points[p]).max(axis=1).min() >= apart]
+    expected: list[int] = []
+    while len(expected) < 50 and far:
+        best = min(far, key=lambda p: (held[cell[p]], p))
+        far.remove(best)
+        held[cell[best]] += 1
+        expected.append(best)
+    assert len(expected) == 50
+    assert rows.tolist() == expected
