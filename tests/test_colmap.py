@@ -21,7 +21,7 @@ from vio.errors import DataError, EstimationError
 from vio.evaluation import rotation_angle_deg
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import project
-from vio.mapping.comparison import Comparison, compare_keyframes
+from vio.mapping.comparison import Comparison, GroundTruth, compare_keyframes
 from vio.mapping.keyframes import TrackedPath, choose_keyframes
 from vio.mapping.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
 from vio.mapping.poses import align_to_points, position_covariances
@@ -407,6 +407,18 @@ def test_a_comparison_finds_scale_and_the_place_of_a_jump(saved: TrackedPath) ->
         int(saved.frames[rows[jump]]),
     )
     assert found.segments[0].difference_m == pytest.approx(0.05, rel=0.2)
+
+
+def test_both_are_compared_with_ground_truth_where_there_is_one(saved: TrackedPath) -> None:
+    rows = choose_keyframes(saved, most=30)
+    longer = saved.trajectory.T_world_body[rows].copy()
+    longer[:, :3, 3] *= 1.02
+    found = compare_keyframes(saved, rows, longer, GroundTruth(saved.trajectory, np.eye(4)))
+    assert found.run_reference_ate_m == pytest.approx(0.0, abs=1e-9)
+    assert found.reference_scale == pytest.approx(1.02, rel=1e-6)
+    assert found.reference_ate_m is not None
+    assert found.reference_ate_m == pytest.approx(found.ate_m, rel=1e-6)
+    assert compare_keyframes(saved, rows, longer).reference_ate_m is None
 
 
 def test_pure_rotation_has_no_scale(saved: TrackedPath) -> None:

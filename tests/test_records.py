@@ -1,0 +1,28 @@
+"""Observations joined into one table and taken out of it again."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.records import feature_tracks, observations
+
+
+def test_frames_come_back_out_of_the_table_and_missing_ones_are_empty() -> None:
+    seen = {
+        3: observations(3, 30, [7, 9], np.arange(8).reshape(2, 4), stale=[False, True]),
+        1: observations(1, 10, [7], [[1, 2, 3, 4]], has_right=[False]),
+    }
+    tracks = feature_tracks(seen, 5)
+    assert tracks.frames.tolist() == [1, 3, 3]
+    for k in range(5):
+        again = tracks.at(k, 10 * k)
+        assert (again.frame_index, again.time_ns) == (k, 10 * k)
+        wanted = seen.get(k, observations(k, 10 * k, [], np.zeros((0, 4))))
+        for name in ("ids", "z", "has_right", "stale"):
+            np.testing.assert_array_equal(getattr(again, name), getattr(wanted, name))
+
+
+def test_no_observations_are_a_table_too() -> None:
+    tracks = feature_tracks({}, 2)
+    assert tracks.offsets.tolist() == [0, 0, 0]
+    assert tracks.z.shape == (0, 4)
