@@ -31,7 +31,7 @@ class RunWatch:
         self._health = RunHealth()
         self._inertial: InertialCheck | None = None
         if imu:
-            from vio.watch.inertial import InertialCheck  # it loads scipy
+            from vio.watch.inertial import InertialCheck  # it loads scipy.optimize
 
             self._inertial = InertialCheck(camera, T_cam0_body)
         self.lines: list[str] = []
