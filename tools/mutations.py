@@ -585,7 +585,7 @@ MUTATIONS = (
     ),
     Mutation(
         "tracking: disparity to the wrong side",
-        "frontend/klt.py",
+        "frontend/stereo_fit.py",
         "warp[:, 0, 2] -= disparity",
         "warp[:, 0, 2] += disparity",
         _TRACK,
@@ -593,13 +593,13 @@ MUTATIONS = (
     Mutation(
         "tracking: the last motion without its time",
         "frontend/klt.py",
-        "se3_log(motion.T_curr_prev) / seconds",
-        "se3_log(motion.T_curr_prev)",
+        "/ ((frame.time_ns - before.time_ns) * 1e-9)",
+        "/ 1.0",
         _TRACK,
     ),
     Mutation(
         "tracking: no look back",
-        "frontend/klt.py",
+        "frontend/flow.py",
         "seen & seen_back & (error",
         "seen & (0 * error",
         _TRACK,
