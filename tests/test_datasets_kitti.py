@@ -275,7 +275,12 @@ BAD = [
     (_write("calib.txt", GOOD.replace("6.0e+02", "x", 1)), CalibrationError, r"line 1: P0 holds no number"),
     (_write("calib.txt", GOOD.replace(" 1 0", " 1", 1)), CalibrationError, r"line 1: P0 holds 11 values where 12"),
     (_write("calib.txt", GOOD.replace(" 1 0", " 2 0", 1)), CalibrationError, r"line 1: P0 is no matrix of intrinsics"),
-    (_write("calib.txt", GOOD.replace("P0: 7", "P0: -7")), CalibrationError, r"P0 and P1 differ in focal length"),
+    (_write("calib.txt", GOOD.replace("P0: 7", "P0: -7")), CalibrationError, r"P0 is no matrix .* fu and fv positive"),
+    (
+        _write("calib.txt", GOOD.replace("P0: 7.0", "P0: 0.0").replace("P1: 7.0", "P1: 0.0")),
+        CalibrationError,
+        r"P0 is no matrix .* fu and fv positive",
+    ),
     (_write("calib.txt", GOOD.replace("6.0e+02", "5.0e+02", 1)), CalibrationError, r"P0 and P1 differ in focal length"),
     (_write("calib.txt", GOOD.replace("1.8e+02 0 0 0 1 0\nTr", "1.8e+02 99 0 0 1 0\nTr")), CalibrationError, "off the"),
     (_remove("times.txt"), DataError, r"times\.txt is missing"),

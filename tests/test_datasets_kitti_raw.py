@@ -134,6 +134,10 @@ def _times(*lines: str) -> Spoil:
     return lambda folder: (folder / "image_00" / "timestamps.txt").write_text("\n".join(lines) + "\n")
 
 
+def _images(folder: Path, camera: int) -> list[Path]:
+    return sorted((folder / f"image_0{camera}" / "data").iterdir())
+
+
 BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
     "no right camera": (
         lambda d: (d / "image_01").rename(d / "image_03"),
@@ -158,7 +162,7 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
     "negative focal": (
         _entry("K_00", "-40 0 31 0 40 24 0 0 1"),
         CalibrationError,
-        "camera 00: focal lengths and image size must be positive",
+        "camera 00 is no matrix of intrinsics .* fu and fv positive",
     ),
     "mirrored": (_entry("R_01", "1 0 0 0 1 0 0 0 -1"), CalibrationError, "R_01: not a rotation but a reflection"),
     "swapped": (_entry("T_01", "0.11 0 0"), CalibrationError, "cam_to_cam.txt: .*the cameras may be swapped"),
@@ -172,6 +176,11 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
         lambda d: (d / "calib_velo_to_cam.txt").write_text("1 0 0\n"),
         CalibrationError,
         r"calib_velo_to_cam.txt, line 1: is not of the form 'name: values'",
+    ),
+    "half a pixel": (
+        _entry("S_00", "64.5 48"),
+        CalibrationError,
+        "calib_cam_to_cam.txt, S_00: an image of 64.5 x 48 pixels; give whole, positive numbers",
     ),
     "another size": (
         _entry("S_00", "100 80"),
@@ -198,6 +207,16 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
         _times(_stamp(0), _stamp(2), _stamp(1), _stamp(3)),
         DataError,
         "timestamps.txt, line 3: the clock runs backwards",
+    ),
+    "times before nanoseconds": (
+        _times(*(f"0001-01-01 00:00:00.{k}" for k in range(4))),
+        DataError,
+        "line 1: '0001-01-01 00:00:00.0' is no time of the form",
+    ),
+    "long names": (
+        lambda d: [p.rename(p.with_name("9" * 20 + p.name)) for k in (0, 1) for p in _images(d, k)],
+        DataError,
+        "0000000100.png: an image of KITTI raw is named by its frame number",
     ),
     "no times": (
         _times(_stamp(0), "yesterday", _stamp(1), _stamp(3)),

@@ -82,6 +82,7 @@ def _edit(key: str, index: object, value: float) -> Callable[[Arrays], Arrays]:
             DataError,
             r"v_vk_vk_i has shape 3 x 4; expected 3 x T with T at least 6",
         ),
+        (lambda a: {**a, "theta_vk_i": "text"}, DataError, r"theta_vk_i is not an array of real numbers"),
         (_set("theta_vk_i", np.zeros((3, 4))), DataError, r"theta_vk_i has shape 3 x 4"),
         (_edit("w_vk_vk_i", (0, 2), np.nan), DataError, r"w_vk_vk_i is not finite in 1 of 6 frames, first in frame 2"),
         (_edit("t", (0, 2), 0.0), DataError, r"t\[2\]: the clock runs backwards"),

@@ -25,8 +25,8 @@ import yaml
 import vio.sim.demo
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_npz
 from vio.cli import build_parser, main
+from vio.cli.arguments import config_from
 from vio.cli.render import scenario_from
-from vio.cli.run import config_from
 from vio.config import Config, describe, merge
 from vio.geometry.lie import se3_inverse
 from vio.records import ImuSample, StereoFrame
@@ -190,11 +190,12 @@ def test_readme_shows_what_the_demo_prints(
     workshop: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Line by line, numbers apart; the small demo is too short for the line `drift`."""
-    from vio.cli.running import report
+    from vio.cli.output import answer
+    from vio.cli.running import rows_of
 
     monkeypatch.chdir(workshop)
     metrics = yaml.safe_load((workshop / "demo/run/metrics.json").read_text(encoding="utf-8"))
-    report({**metrics, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039}, as_json=False)
+    answer({}, rows_of({**metrics, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039}), as_json=False)
     shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
     assert re.sub(r"[\d.]+\d", "#", capsys.readouterr().out) == re.sub(r"[\d.]+\d", "#", shown)
 

@@ -241,6 +241,13 @@ def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
     np.testing.assert_allclose(kitti.positions, (se3_inverse(cam0[0]) @ cam0)[:, :3, 3], atol=1e-9)
 
 
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"T_cam0_imu": "x"}', '{"T_cam0_imu": [[1], [2, 3]]}'])
+def test_damaged_metrics_of_a_run_are_named(text: str, tmp_path: Path) -> None:
+    (tmp_path / "metrics.json").write_text(text)
+    with pytest.raises(DataError, match=r"metrics\.json: is damaged .*; repeat the run"):
+        read_run(tmp_path)
+
+
 def test_landmarks_in_the_ply_are_the_true_points(tmp_path: Path) -> None:
     drive = FakeDrive()
     result = run(drive, Config())

@@ -64,18 +64,26 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     if path is not None:
         config = merge(config, _read_yaml(path), where=str(path))
     for override in overrides:
-        key, equals, text = override.partition("=")
-        if not equals or not key.strip():
-            raise ConfigError(f"--set takes key=value, got '{override}'; for example --set selector.name=grid")
-        try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"--set {override}: the value is not valid YAML ({_first_line(error)})") from error
-        nested: Any = value
-        for part in reversed(key.strip().split(".")):
-            nested = {part: nested}
-        config = merge(config, nested, where=f"--set {override}")
+        config = merge_override(config, override, example="selector.name=grid")
     return config
+
+
+def merge_override(section: _Section, override: str, *, example: str) -> _Section:
+    """Return a copy of a section with one setting replaced, given as `a.b=value` as after `--set`.
+
+    Raises:
+        ConfigError: the text is no such pair (the message gives the example), or a key or value is wrong.
+    """
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"--set takes key=value, got '{override}'; for example --set {example}")
+    try:
+        nested: Any = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {override}: the value is not valid YAML ({_first_line(error)})") from error
+    for part in reversed(key.strip().split(".")):
+        nested = {part: nested}
+    return merge(section, nested, where=f"--set {override}")
 
 
 def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: str = "", root: Any = None) -> _Section:

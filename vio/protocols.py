@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Protocol
+from collections.abc import Callable, Iterator
+from typing import Protocol, TypeAlias
 
 from vio.geometry.lie import FloatArray
 from vio.records import (
@@ -21,6 +21,8 @@ from vio.records import (
     TrackPrior,
     UpdateReport,
 )
+
+Progress: TypeAlias = Callable[[int, int], None]  # told after each frame: frames done, frames in all
 
 
 class Dataset(Protocol):

@@ -18,6 +18,7 @@ import numpy as np
 from vio._version import __version__
 from vio.atomic import atomic_folder
 from vio.config import to_yaml
+from vio.datasets.common import checked_transform
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, transform_points
@@ -153,10 +154,25 @@ def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
     """
     if not path.is_dir():
         return read_trajectory(path), None
-    if not (path / MARKER).is_file():
-        raise DataError(f"{path}: no run folder (it has no {MARKER}); give a trajectory file or a folder of `vio run`")
-    metrics = json.loads((path / MARKER).read_text(encoding="utf-8"))
-    return read_trajectory(path / "trajectory.tum"), np.array(metrics["T_cam0_imu"], dtype=np.float64)
+    _, T_cam0_imu = read_metrics(path)
+    return read_trajectory(path / "trajectory.tum"), T_cam0_imu
+
+
+def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
+    """Read what `metrics_of` wrote into a run's folder, and `T_cam0_imu` (4, 4) from it.
+
+    Raises:
+        DataError: the folder is no run's, or its metrics are damaged.
+    """
+    path = folder / MARKER
+    if not path.is_file():
+        raise DataError(f"{folder}: no run folder (it has no {MARKER}); give a folder that `vio run` wrote")
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
+    return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
 
 
 def landmarks_ply(landmarks: Landmarks) -> bytes:

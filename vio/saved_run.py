@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from vio.geometry.lie import FloatArray
 from vio.mapping.comparison import GroundTruth
 from vio.mapping.keyframes import TrackedPath
 from vio.records import IntArray, StereoFrame
-from vio.run_folder import MARKER
+from vio.run_folder import read_metrics
 from vio.trajectory_io import read_trajectory
 
 OBSERVATIONS = "observations.npz"
@@ -48,15 +47,11 @@ def read_saved_run(folder: Path) -> SavedRun:
     Raises:
         DataError: no such folder, or the observations were not saved.
     """
-    marker = folder / MARKER
-    if not marker.is_file():
-        raise DataError(f"{folder}: no run folder (it has no {MARKER}); give a folder that `vio run` wrote")
+    metrics, T_cam0_imu = read_metrics(folder)
     log = folder / OBSERVATIONS
     if not log.is_file():
         raise DataError(f"{folder} has no {OBSERVATIONS}; repeat its run with --save-observations")
-    metrics = json.loads(marker.read_text(encoding="utf-8"))
     dataset = read_observation_log(log)
-    T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
     trajectory = read_trajectory(folder / "trajectory.tum")
     frames = trajectory.frame_indices
     if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():

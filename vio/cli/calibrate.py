@@ -47,7 +47,8 @@ def execute(args: argparse.Namespace) -> int:
 
     from vio.atomic import atomic_folder
     from vio.cli.output import answer
-    from vio.cli.running import free_folder, rendering
+    from vio.cli.progress import ProgressBar
+    from vio.cli.running import free_folder
     from vio.colmap import quiet
     from vio.errors import ConfigError
     from vio.offline.calibrate import measure
@@ -59,8 +60,8 @@ def execute(args: argparse.Namespace) -> int:
         raise ConfigError("--pairs must be at least 1 and --frames at least 2")
     quiet()
     source = open_source(args.source)
-    with one_blas_thread(), rendering(f"calibrate {source.path.name}") as show:
-        report = measure(source, _frontend, pairs=args.pairs, frames=args.frames, progress=show)
+    with one_blas_thread(), ProgressBar(f"calibrate {source.path.name}") as bar:
+        report = measure(source, _frontend, pairs=args.pairs, frames=args.frames, progress=bar.update)
     out = args.out or free_folder(source.path, Path("calibrations"))
     facts = {"out": str(out), **_facts(report)}
     with atomic_folder(out, replace=True, marker=MARKER) as folder:

@@ -42,7 +42,7 @@ def execute(args: argparse.Namespace) -> int:
 
     from vio.atomic import atomic_folder
     from vio.cli.output import answer
-    from vio.cli.running import rendering
+    from vio.cli.progress import ProgressBar
     from vio.colmap import quiet
     from vio.errors import ConfigError
     from vio.offline.check import check_run
@@ -54,9 +54,9 @@ def execute(args: argparse.Namespace) -> int:
     run = read_saved_run(args.run)
     mappers: tuple[Mapper, ...] = ("incremental", "global") if args.mapper == "both" else (args.mapper,)
     out = args.run / "check"
-    with rendering(f"check {args.run.name}") as show, atomic_folder(out, replace=True, marker=MARKER) as folder:
+    with ProgressBar(f"check {args.run.name}") as bar, atomic_folder(out, replace=True, marker=MARKER) as folder:
         opinions = check_run(
-            run, folder, mappers, most=args.keyframes, source=args.source, threads=args.threads, progress=show
+            run, folder, mappers, most=args.keyframes, source=args.source, threads=args.threads, progress=bar.update
         )
         report = {
             "out": str(out),

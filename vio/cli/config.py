@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from vio.cli.run import add_config_arguments, config_from
+from vio.cli.arguments import add_config_arguments, config_from
 
 
 def add_parser(commands: Any) -> None:

@@ -21,13 +21,14 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.cli.running import check_out, process, rendering, report
+    from vio.cli.output import answer
+    from vio.cli.progress import ProgressBar
+    from vio.cli.running import check_out, process, rows_of
     from vio.config import load_config
     from vio.sim.demo import write_demo_recording
 
     check_out(args.out / "run")
-    with rendering("rendering the street") as progress:
-        recording = write_demo_recording(args.out / "street", progress)
+    with ProgressBar("rendering the street") as bar:
+        recording = write_demo_recording(args.out / "street", bar.update)
     metrics = process(str(recording), load_config(), out=args.out / "run")
-    report(metrics, as_json=args.json)
-    return 0
+    return answer(metrics, rows_of(metrics), as_json=args.json)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.cli.run import lengths
+from vio.cli.arguments import lengths
 
 if TYPE_CHECKING:
     from vio.geometry.lie import FloatArray
@@ -42,8 +42,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    import json
-
+    from vio.cli.output import answer
     from vio.evaluation import KITTI_LENGTHS_M, evaluate
 
     estimate, T_cam0_imu = _read(args.estimate)
@@ -64,13 +63,9 @@ def execute(args: argparse.Namespace) -> int:
         lengths_m=args.lengths or KITTI_LENGTHS_M,
     )
     scores = result.as_dict()
-    if args.json:
-        print(json.dumps(scores))
-    else:
-        for key, value in scores.items():
-            if not isinstance(value, (list, dict)):
-                print(f"{key:<22} {'–' if value is None else value if isinstance(value, str) else f'{value:.6g}'}")
-    return 0
+    figures = ((key, value) for key, value in scores.items() if not isinstance(value, (list, dict)))
+    rows = ((k, "–" if v is None else v if isinstance(v, str) else f"{v:.6g}") for k, v in figures)
+    return answer(scores, rows, as_json=args.json, name_width=22)
 
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:

@@ -36,7 +36,7 @@ def execute(args: argparse.Namespace) -> int:
 
     from vio.atomic import atomic_folder
     from vio.cli.output import answer
-    from vio.cli.running import rendering
+    from vio.cli.progress import ProgressBar
     from vio.colmap import quiet
     from vio.errors import ConfigError
     from vio.offline.export import export_colmap
@@ -52,11 +52,11 @@ def execute(args: argparse.Namespace) -> int:
     out = args.out or args.run / "colmap"
     with (
         one_blas_thread(),
-        rendering(f"export {args.run.name}") as show,
+        ProgressBar(f"export {args.run.name}") as bar,
         atomic_folder(out, replace=True, marker=MARKER) as folder,
     ):
         done = export_colmap(
-            run, folder, most=args.keyframes, images=not args.no_images, source=args.source, progress=show
+            run, folder, most=args.keyframes, images=not args.no_images, source=args.source, progress=bar.update
         )
         facts = {
             "out": str(out),

@@ -36,12 +36,14 @@ def execute(args: argparse.Namespace) -> int:
     import logging
 
     from vio.atomic import atomic_folder
+    from vio.cli.output import answer
     from vio.cli.progress import ProgressBar
     from vio.datasets import DatasetSettings, open_dataset
     from vio.datasets.euroc import write_rectified_euroc
     from vio.datasets.kitti_raw import write_rectified_kitti
     from vio.datasets.rectified import RectifiedDataset, refuse_rectified
     from vio.errors import DataError
+    from vio.text_files import write_text
 
     dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation))
     recording = dataset.recording
@@ -65,13 +67,10 @@ def execute(args: argparse.Namespace) -> int:
         "baseline_m": camera.baseline_m,
     }
     with atomic_folder(args.out, replace=True, marker=MARKER) as folder:
-        with ProgressBar(recording.path.name, len(recording.frame_times_ns)) as bar:
-            frames = writers[recording.kind](dataset, folder, bar.advance)
+        with ProgressBar(f"rectify {recording.path.name}") as bar:
+            frames = writers[recording.kind](dataset, folder, bar.update)
         facts["frames"] = frames
-        (folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8", newline="\n")
-    if args.json:
-        print(json.dumps({"out": str(args.out), **facts}))
-        return 0
+        write_text(folder / MARKER, json.dumps(facts, indent=2) + "\n")
     rows = (
         ("folder", str(args.out)),
         ("frames", f"{frames}"),
@@ -79,6 +78,4 @@ def execute(args: argparse.Namespace) -> int:
         ("focal", f"{camera.fu:.4f} px"),
         ("baseline", f"{camera.baseline_m:.6f} m"),
     )
-    for name, value in rows:
-        print(f"{name:<10} {value}")
-    return 0
+    return answer({"out": str(args.out), **facts}, rows, as_json=args.json)

@@ -40,7 +40,7 @@ def execute(args: argparse.Namespace) -> int:
     import time
 
     from vio.cli.output import answer
-    from vio.cli.running import rendering
+    from vio.cli.progress import ProgressBar
     from vio.colmap import quiet
     from vio.errors import ConfigError
     from vio.offline.refine import STEPS, refine_run
@@ -52,14 +52,14 @@ def execute(args: argparse.Namespace) -> int:
     quiet()
     run = read_saved_run(args.run)
     began = time.perf_counter()
-    with one_blas_thread(), rendering(f"refine {args.run.name}") as show:
-        show(0, STEPS + 1)
+    with one_blas_thread(), ProgressBar(f"refine {args.run.name}") as bar:
+        bar.update(0, STEPS + 1)
         done = refine_run(
             run,
             most=args.keyframes,
             priors=args.priors == "filter",
             threads=args.threads,
-            progress=lambda step: show(step, STEPS + 1),
+            progress=lambda step: bar.update(step, STEPS + 1),
         )
         metrics = {
             "out": str(args.run / FOLDER),
@@ -69,7 +69,7 @@ def execute(args: argparse.Namespace) -> int:
             "T_cam0_imu": run.T_cam0_imu.tolist(),
         }
         _write(args.run / FOLDER, run, done, metrics)
-        show(STEPS + 1, STEPS + 1)
+        bar.update(STEPS + 1, STEPS + 1)
     return answer(metrics, _rows(metrics), as_json=args.json)
 
 

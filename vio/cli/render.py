@@ -71,7 +71,8 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import time
 
-    from vio.cli.running import rendering
+    from vio.cli.output import answer
+    from vio.cli.progress import ProgressBar
     from vio.errors import ConfigError
     from vio.sim.export import export_euroc, export_kitti
     from vio.sim.scenarios import ParallelRecording, plan, usual_workers
@@ -87,12 +88,12 @@ def execute(args: argparse.Namespace) -> int:
     workers = usual_workers(frames) if args.workers is None else args.workers
 
     def write(recording: SimulatedRecording) -> None:
-        with rendering(f"rendering the {scenario.scene}") as progress:
+        with ProgressBar(f"rendering the {scenario.scene}") as bar:
             if form == "kitti":
-                export_kitti(recording, args.out, replace=True, progress=progress)
+                export_kitti(recording, args.out, replace=True, progress=bar.update)
             else:
                 noise = scenario.conditions.imu_noise.densities
-                export_euroc(recording, args.out, replace=True, noise=noise, progress=progress)
+                export_euroc(recording, args.out, replace=True, noise=noise, progress=bar.update)
 
     with one_blas_thread():
         if workers == 1:
@@ -121,25 +122,17 @@ def execute(args: argparse.Namespace) -> int:
         "pairs_per_s": round(frames / seconds, 2),
         "bytes": sum(path.stat().st_size for path in args.out.rglob("*") if path.is_file()),
     }
-    _report(summary, as_json=args.json)
-    return 0
+    return answer(summary, _rows(summary), as_json=args.json)
 
 
-def _report(summary: dict[str, Any], *, as_json: bool) -> None:
-    if as_json:
-        import json
-
-        print(json.dumps(summary))
-        return
-    rows = (
+def _rows(summary: dict[str, Any]) -> tuple[tuple[str, str], ...]:
+    return (
         ("scene", f"{summary['scene']}, trajectory {summary['trajectory']}, seed {summary['seed']}"),
         ("cameras", f"{summary['rig']} ({summary['camera']}), {summary['width']} x {summary['height']}"),
         ("frames", f"{summary['frames']} over {summary['duration_s']:.2f} s, IMU {summary['imu']}"),
         ("time", f"{summary['seconds']:.1f} s, {summary['pairs_per_s']:.1f} pairs/s, processes: {summary['workers']}"),
         ("folder", f"{summary['out']} ({summary['format']}, {summary['bytes'] / 1e6:.1f} MB)"),
     )
-    for name, value in rows:
-        print(f"{name:<10} {value}")
 
 
 def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
@@ -195,22 +188,10 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
 
 def _conditions(args: argparse.Namespace) -> Conditions:
     """The named effects, then single values."""
-    import yaml
-
-    from vio.config import merge
-    from vio.errors import ConfigError
+    from vio.config import merge_override
     from vio.sim.scenarios import conditions_of
 
     conditions = conditions_of([name.strip() for name in args.effects.split(",") if name.strip()])
     for override in args.set:
-        key, equals, text = override.partition("=")
-        if not equals or not key.strip():
-            raise ConfigError(f"--set takes key=value, got '{override}'; for example --set effects.gamma=2.2")
-        try:
-            nested = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"--set {override}: the value is not valid YAML") from error
-        for part in reversed(key.strip().split(".")):
-            nested = {part: nested}
-        conditions = merge(conditions, nested, where=f"--set {override}")
+        conditions = merge_override(conditions, override, example="effects.gamma=2.2")
     return conditions

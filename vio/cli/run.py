@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from vio.cli.arguments import add_config_arguments, config_from, lengths
+
 
 def add_parser(commands: Any) -> None:
     """Add the subcommand."""
@@ -28,47 +30,14 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(execute=execute)
 
 
-def add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that change the configuration."""
-    parser.add_argument(
-        "--config", type=Path, metavar="F", help="YAML file with settings that differ from the defaults"
-    )
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="a.b=c", help="change one setting; may be repeated"
-    )
-    parser.add_argument("--motion", metavar="NAME", help="imu, velocity, none or auto: same as --set motion=NAME")
-    parser.add_argument("--backend", metavar="NAME", help="same as --set backend=NAME")
-    parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
-
-
-def lengths(text: str) -> tuple[float, ...]:
-    """Parse '25,50' into metres."""
-    values = tuple(float(part) for part in text.split(","))
-    if not values or any(not 0 < v < float("inf") for v in values):
-        raise ValueError(text)
-    return values
-
-
-def config_from(args: argparse.Namespace) -> Any:
-    """Build the configuration that the arguments ask for."""
-    from vio.config import load_config
-
-    overrides = list(args.set)
-    for key, value in (("motion", args.motion), ("backend", args.backend), ("frontend.name", args.frontend)):
-        if value is not None:
-            # Quoted: to YAML a bare `none` is text but `null`, `on` or `no` would not be.
-            overrides.append(f'{key}="{value}"')
-    return load_config(args.config, overrides)
-
-
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.cli.running import process
+    from vio.cli.output import answer
+    from vio.cli.running import process, rows_of
 
-    config = config_from(args)
     metrics = process(
         args.source,
-        config,
+        config_from(args),
         out=args.out,
         reference=args.reference,
         start=args.start,
@@ -77,7 +46,4 @@ def execute(args: argparse.Namespace) -> int:
         save_observations=args.save_observations,
         progress=not args.quiet,
     )
-    from vio.cli.running import report
-
-    report(metrics, as_json=args.json)
-    return 0
+    return answer(metrics, rows_of(metrics), as_json=args.json)

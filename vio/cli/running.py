@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +19,6 @@ from vio.threads import one_blas_thread
 from vio.trajectory_io import read_trajectory
 
 log = logging.getLogger(__name__)
-
-
-@contextmanager
-def rendering(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Give a function that shows `(done, total)` as a progress bar."""
-    with ProgressBar(label) as bar:
-        yield bar.update
 
 
 class ProgressViewer:
@@ -96,11 +87,8 @@ def free_folder(source: Path, root: Path = Path("runs")) -> Path:
     return folder
 
 
-def report(metrics: dict[str, Any], *, as_json: bool) -> None:
-    """Print the metrics to stdout: one JSON object for machines, or a few lines for people."""
-    if as_json:
-        print(json.dumps(metrics))
-        return
+def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """Return a run's metrics in a few lines for people."""
     stages = ", ".join(f"{name} {ms:.1f}" for name, ms in metrics["stages_ms"].items())
     rows = [
         ("frames", f"{metrics['frames']}, path {metrics['path_length_m']:.2f} m"),
@@ -120,5 +108,4 @@ def report(metrics: dict[str, Any], *, as_json: bool) -> None:
         rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
     rows.append(("results", metrics["out"]))
     rows.append(("picture", str(Path(metrics["out"]) / "trajectory.png")))
-    for name, value in rows:
-        print(f"{name:<10} {value}")
+    return rows

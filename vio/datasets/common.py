@@ -111,11 +111,27 @@ def numbers_in(text: str, count: int, where: str) -> FloatArray:
 
 
 def check_intrinsics(K: FloatArray, where: str) -> None:
-    """Raise CalibrationError unless a matrix (3, 3) has the form of intrinsics."""
-    if not np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=_EXACT_ENTRY):
+    """Raise CalibrationError unless a matrix (3, 3) has the form of intrinsics, with positive focal lengths."""
+    form = np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=_EXACT_ENTRY)
+    if not (form and K[0, 0] > 0 and K[1, 1] > 0):
         raise CalibrationError(
-            f"{where} is no matrix of intrinsics [fu 0 cu; 0 fv cv; 0 0 1] but {K.tolist()}; check the order"
+            f"{where} is no matrix of intrinsics [fu 0 cu; 0 fv cv; 0 0 1], fu and fv positive, but {K.tolist()}; "
+            "check the order"
         )
+
+
+def image_size(values: Sequence[float], where: str) -> tuple[int, int]:
+    """Return width and height in whole pixels, as a calibration states them.
+
+    Raises:
+        CalibrationError: they are no whole numbers, or none that an image can have.
+    """
+    width, height = (int(value) for value in values)
+    if [width, height] != list(values) or min(width, height) < 1:
+        raise CalibrationError(
+            f"{where}: an image of {values[0]:g} x {values[1]:g} pixels; give whole, positive numbers"
+        )
+    return width, height
 
 
 def finite_rows(values: FloatArray, what: str) -> FloatArray:
@@ -204,14 +220,15 @@ def read_npz(path: Path) -> Mapping[str, np.ndarray]:
         DataError: the file is missing, damaged, no archive, or holds pickled objects.
     """
     try:
-        loaded = np.load(path, allow_pickle=False)
-        if not isinstance(loaded, np.lib.npyio.NpzFile):
-            raise DataError(f"{path}: one array, not an .npz archive of named arrays")
-        with loaded as archive:
+        if not zipfile.is_zipfile(path) and path.is_file():
+            raise DataError(
+                f"{path}: is damaged or no .npz archive of named arrays; copy it again, or give another file"
+            )
+        with np.load(path, allow_pickle=False) as archive:
             return {key: archive[key] for key in archive.files}
     except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError) as error:
-        why = "holds pickled objects" if "pickle" in str(error) else "is damaged or no .npz archive"
+        why = "holds pickled objects" if "pickle" in str(error) else "is damaged"
         remedy = "save it again as plain numeric arrays with numpy.savez" if "pickle" in str(error) else "copy it again"
         raise DataError(f"{path}: {why} ({' '.join(str(error).split())}); {remedy}") from error
     except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+        raise DataError(f"cannot read {path}: {error.strerror or error}; give a readable file") from error

@@ -12,7 +12,7 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -36,6 +36,7 @@ from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.geometry.distortion import CameraModel, StereoRig, rig_from_rectified
 from vio.geometry.lie import FloatArray, se3_inverse
+from vio.protocols import Progress
 from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
 from vio.text_files import write_text
 from vio.trajectory_io import read_trajectory
@@ -231,13 +232,13 @@ def _read_reference(mav: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -
 # --- writing --------------------------------------------------------------------------------------------------------
 
 
-def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Callable[[], None]) -> int:
+def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
     """Write a recording as an EuRoC folder of rectified images; the IMU and the ground truth are copied as they are.
 
     Args:
         dataset: an unrectified EuRoC recording.
         out: an existing, empty folder; `mav0` is made in it.
-        progress: called after each frame.
+        progress: told after each frame.
 
     Returns:
         The number of frames written.

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from vio.datasets.common import checked_transform, naming
+from vio.datasets.common import checked_transform, image_size, naming
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
@@ -69,9 +69,9 @@ def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
     if model == "radtan" and not any(coefficients):
         model, coefficients = "pinhole", ()
     fu, fv, cu, cv = _numbers(sheet, "intrinsics", path, 4)
-    width, height = _numbers(sheet, "resolution", path, 2)
+    width, height = image_size(_numbers(sheet, "resolution", path, 2), f"{path}, resolution")
     with naming(path):
-        camera = CameraModel(fu, fv, cu, cv, int(width), int(height), model, coefficients)
+        camera = CameraModel(fu, fv, cu, cv, width, height, model, coefficients)
     return camera, _T_BS(sheet, path)
 
 

@@ -12,14 +12,15 @@ Reference: Geiger et al., Vision meets robotics: the KITTI dataset (2013).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import check_intrinsics, checked_transform, naming, numbers_in
+from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
 from vio.datasets.image_pairs import ImagePairs, first_readable, pair_images
 from vio.datasets.kitti import write_calibration, write_times
 from vio.datasets.rectified import RectifiedDataset, Rectifier, make_rectifier, rig_sizes, write_frames
@@ -27,6 +28,7 @@ from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.protocols import Progress
 from vio.records import IntArray, Recording, StereoFrame
 from vio.text_files import NS_PER_S, check_increasing, text_lines
 
@@ -36,6 +38,7 @@ IMU = "calib_imu_to_velo.txt"
 _FRAME_NS = 100_000_000
 _MAX_PARENTS = 3
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
+_MAX_SINCE = timedelta(days=100_000)  # nanoseconds then still fit 64 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,13 +142,13 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
     entries = _read_entries(path)
     raw, rect = [], []
     for k in ("00", "01"):
-        width, height = _entry(entries, f"S_{k}", 2, path)
+        size = _size(entries, f"S_{k}", path)
         K = _entry(entries, f"K_{k}", 9, path)
         D = _entry(entries, f"D_{k}", 5, path)
-        raw.append(_camera(K.reshape(3, 3), width, height, tuple(D.tolist()), f"{path}, camera {k}"))
-        width, height = _entry(entries, f"S_rect_{k}", 2, path)
+        raw.append(_camera(K.reshape(3, 3), size, tuple(D.tolist()), f"{path}, camera {k}"))
+        size = _size(entries, f"S_rect_{k}", path)
         P = _entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4)
-        rect.append(_camera(P[:, :3], width, height, (), f"{path}, P_rect_{k}"))
+        rect.append(_camera(P[:, :3], size, (), f"{path}, P_rect_{k}"))
     offsets = [
         np.linalg.solve(P[:, :3], P[:, 3])
         for P in (_entry(entries, f"P_rect_{k}", 12, path).reshape(3, 4) for k in ("00", "01"))
@@ -162,12 +165,16 @@ def read_cam_to_cam(path: Path) -> KittiRawCalibration:
     )
 
 
-def _camera(K: FloatArray, width: float, height: float, coefficients: tuple[float, ...], where: str) -> CameraModel:
+def _camera(K: FloatArray, size: tuple[int, int], coefficients: tuple[float, ...], where: str) -> CameraModel:
     check_intrinsics(K, where)
     kind: DistortionModel = "radtan" if coefficients else "pinhole"
     with naming(where):
         fu, fv, cu, cv = K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
-        return CameraModel(fu, fv, cu, cv, int(width), int(height), kind, coefficients)
+        return CameraModel(fu, fv, cu, cv, *size, kind, coefficients)
+
+
+def _size(entries: Mapping[str, str], name: str, path: Path) -> tuple[int, int]:
+    return image_size(_entry(entries, name, 2, path).tolist(), f"{path}, {name}")
 
 
 def _rigid(entries: Mapping[str, str], k: str, path: Path) -> FloatArray:
@@ -226,7 +233,7 @@ def _entry(entries: Mapping[str, str], name: str, count: int, path: Path) -> Flo
 
 def _frame_numbers(pairs: ImagePairs) -> IntArray:
     """The numbers (F,) that the images are named by."""
-    bad = next((left for left, _ in pairs if not left.stem.isdecimal()), None)
+    bad = next((left for left, _ in pairs if not re.fullmatch(r"\d{1,18}", left.stem)), None)
     if bad is not None:
         raise DataError(f"{bad}: an image of KITTI raw is named by its frame number (0000000000.png); rename it")
     numbers = np.array([int(left.stem) for left, _ in pairs], dtype=np.int64)
@@ -263,8 +270,8 @@ def _parse_time(text: str, path: Path, number: int) -> int:
     whole, _, fraction = text.strip().partition(".")
     try:
         since = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc) - _EPOCH
-        if fraction and not (fraction.isdecimal() and len(fraction) <= 9):
-            raise ValueError(fraction)
+        if not re.fullmatch(r"\d{0,9}", fraction) or abs(since) > _MAX_SINCE:
+            raise ValueError(text)
     except ValueError as error:
         raise DataError(
             f"{path}, line {number}: {text.strip()[:40]!r} is no time of the form '2011-09-26 14:02:25.951199337'"
@@ -275,13 +282,13 @@ def _parse_time(text: str, path: Path, number: int) -> int:
 # --- writing --------------------------------------------------------------------------------------------------------
 
 
-def write_rectified_kitti(dataset: RectifiedDataset, out: Path, progress: Callable[[], None]) -> int:
+def write_rectified_kitti(dataset: RectifiedDataset, out: Path, progress: Progress) -> int:
     """Write a drive as a KITTI odometry folder: `image_0 image_1 calib.txt times.txt` and `T_cam0_imu.txt`.
 
     Args:
         dataset: an unrectified drive.
         out: an existing, empty folder.
-        progress: called after each frame.
+        progress: told after each frame.
 
     Returns:
         The number of frames written.

@@ -13,10 +13,11 @@ from vio.datasets.image_pairs import ImageDataset, ImageSize
 from vio.datasets.images import write_png
 from vio.datasets.settings import Interpolation
 from vio.errors import DataError
-from vio.geometry.distortion import StereoRig
+from vio.geometry.distortion import StereoRig, rectified_pair
 from vio.geometry.lie import FloatArray, se3_inverse
-from vio.geometry.rectify import MapArray, rectified_pair, rectify
+from vio.geometry.rectify import MapArray, rectify
 from vio.geometry.stereo import StereoCamera
+from vio.protocols import Progress
 from vio.records import Image, ImuDensities, IntArray, StereoFrame
 
 
@@ -92,14 +93,14 @@ def refuse_rectified(dataset: RectifiedDataset) -> None:
 
 
 def write_frames(
-    dataset: RectifiedDataset, name: Callable[[StereoFrame, int], tuple[Path, Path]], progress: Callable[[], None]
+    dataset: RectifiedDataset, name: Callable[[StereoFrame, int], tuple[Path, Path]], progress: Progress
 ) -> IntArray:
     """Write every readable frame as two PNG files; return the times (N,) of those written.
 
     Args:
         dataset: what to rectify.
         name: the two files of a frame, given the frame and how many were written before it; folders must exist.
-        progress: called after each frame.
+        progress: told after each frame.
 
     Raises:
         DataError: too many images are unreadable, or one has the wrong size.
@@ -111,7 +112,7 @@ def write_frames(
         for path, image in zip(name(frame, len(times)), (frame.left, frame.right), strict=True):
             write_png(path, image)
         times.append(frame.time_ns)
-        progress()
+        progress(len(times), len(dataset.recording.frame_times_ns))
     if not times:
         raise DataError(f"{dataset.recording.path}: no frame could be read; see the warnings above")
     return np.array(times, dtype=np.int64)

@@ -22,6 +22,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Landmarks, Recording, Trajectory
 
 KEYS = ("y_k_j", "t", "v_vk_vk_i", "w_vk_vk_i", "fu", "fv", "cu", "cv", "b", "C_c_v", "rho_v_c_v")
+OPTIONAL_KEYS = ("r_i_vk_i", "theta_vk_i", "rho_i_pj_i", "v_var", "w_var", "y_var")
 
 
 def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
@@ -72,16 +73,16 @@ def _read_mat(path: Path) -> Mapping[str, FloatArray]:
     except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError, zlib.error) as error:
         raise DataError(f"{path}: is damaged or no MATLAB file ({error}); copy it again") from error
     except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror or error}") from error
+        raise DataError(f"cannot read {path}: {error.strerror or error}; copy it again") from error
     names = [name for name in raw if not name.startswith("__")]
     if missing := [key for key in KEYS if key not in names]:
         raise DataError(
             f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {' '.join(sorted(names))}"
         )
     arrays = {name: raw[name] for name in names if isinstance(raw[name], np.ndarray)}
-    for key in KEYS:
+    for key in (*KEYS, *(key for key in OPTIONAL_KEYS if key in names)):
         if key not in arrays or arrays[key].dtype.kind not in "fiu":
-            raise DataError(f"{path}: {key} is not an array of real numbers")
+            raise DataError(f"{path}: {key} is not an array of real numbers; save it again as one")
     return {name: value.astype(np.float64) for name, value in arrays.items() if value.dtype.kind in "fiu"}
 
 

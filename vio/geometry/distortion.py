@@ -24,7 +24,10 @@ DistortionModel: TypeAlias = Literal["pinhole", "radtan", "equidistant"]
 _COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
-_RECTIFIED_TOLERANCE = 1e-9
+# A pair that is rectified up to the digits of its calibration file: rows off by less than 0.01 px.
+_ALIGNED_RAD = 2e-5
+_ALIGNED_SHARE = 1e-4  # of the baseline
+_SAME_INTRINSICS = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,19 +83,27 @@ class StereoRig:
         return out
 
 
+def rectified_pair(rig: StereoRig) -> StereoCamera | None:
+    """Return the rectified pair that a rig is up to the rounding of its calibration; None: it needs rectifying."""
+    a, b, T_cam0_cam1 = rig.cam0, rig.cam1, rig.T_cam0_cam1
+    x, y, z = T_cam0_cam1[:3, 3]
+    same_size = (a.width, a.height) == (b.width, b.height)
+    same = np.allclose((a.fu, a.fv, a.cu, a.cv), (b.fu, b.fv, b.cu, b.cv), rtol=_SAME_INTRINSICS, atol=0)
+    aligned = np.abs(T_cam0_cam1[:3, :3] - np.eye(3)).max() <= _ALIGNED_RAD and np.hypot(y, z) <= _ALIGNED_SHARE * x
+    if not (a.model == b.model == "pinhole" and same_size and same and aligned and x > 0):
+        return None
+    return StereoCamera(a.fu, a.fv, a.cu, a.cv, float(x), a.width, a.height)
+
+
 def rectified_camera(rig: StereoRig) -> StereoCamera:
     """Return the rectified pair that the rig is.
 
     Raises:
         CalibrationError: the rig is not rectified (distortion, different intrinsics, or rows not aligned).
     """
-    a, b = rig.cam0, rig.cam1
-    T = rig.T_cam0_cam1
-    same = (a.fu, a.fv, a.cu, a.cv, a.width, a.height) == (b.fu, b.fv, b.cu, b.cv, b.width, b.height)
-    aligned = np.abs(T[:3, :3] - np.eye(3)).max() < _RECTIFIED_TOLERANCE and np.abs(T[1:3, 3]).max() < 1e-9
-    if not (a.model == b.model == "pinhole" and same and aligned):
+    if (pair := rectified_pair(rig)) is None:
         raise CalibrationError("the stereo rig is not rectified; rectify its images first")
-    return StereoCamera(a.fu, a.fv, a.cu, a.cv, float(T[0, 3]), a.width, a.height)
+    return pair
 
 
 def rig_from_rectified(camera: StereoCamera, T_cam0_imu: npt.ArrayLike) -> StereoRig:

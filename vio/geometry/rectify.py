@@ -23,10 +23,6 @@ _BORDER_SAMPLES = 60  # points along each image border that decide the common fi
 _MAX_TANGENT = 1.4  # a rectified image is flat: beyond about 54 degrees off axis it only stretches pixels
 _MIN_TANGENT_WIDTH = 0.1
 _MAX_TURN_DEG = 30.0  # a camera that must be turned by more is not one half of a stereo pair
-# A pair that is rectified up to the digits of its calibration file: rows off by less than 0.01 px.
-_ALIGNED_RAD = 2e-5
-_ALIGNED_SHARE = 1e-4  # of the baseline
-_SAME_INTRINSICS = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,18 +94,6 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
                 "so the cameras may be swapped, or an extrinsic T_BS inverted"
             )
     return R_rect_cam0, R_rect_cam1, baseline_m
-
-
-def rectified_pair(rig: StereoRig) -> StereoCamera | None:
-    """Return the rectified pair that a rig is up to the rounding of its calibration; None: it needs rectifying."""
-    a, b, T_cam0_cam1 = rig.cam0, rig.cam1, rig.T_cam0_cam1
-    x, y, z = T_cam0_cam1[:3, 3]
-    same_size = (a.width, a.height) == (b.width, b.height)
-    same = np.allclose((a.fu, a.fv, a.cu, a.cv), (b.fu, b.fv, b.cu, b.cv), rtol=_SAME_INTRINSICS, atol=0)
-    aligned = np.abs(T_cam0_cam1[:3, :3] - np.eye(3)).max() <= _ALIGNED_RAD and np.hypot(y, z) <= _ALIGNED_SHARE * x
-    if not (a.model == b.model == "pinhole" and same_size and same and aligned and x > 0):
-        return None
-    return StereoCamera(a.fu, a.fv, a.cu, a.cv, float(x), a.width, a.height)
 
 
 def rectify_pixels(

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from vio.protocols import Progress
 from vio.sim.effects import SensorEffects
-from vio.sim.export import Progress, export_kitti
+from vio.sim.export import export_kitti
 from vio.sim.imu import VelocityNoise
 from vio.sim.motion import car_loop
 from vio.sim.rigs import kitti_like_rig

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
@@ -26,6 +25,7 @@ from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.errors import CalibrationError
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import se3_inverse
+from vio.protocols import Progress
 from vio.records import ImuDensities
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ADIS16448, sample_times
@@ -33,8 +33,6 @@ from vio.sim.motion import evaluate
 from vio.sim.sequence import SimulatedRecording
 from vio.text_files import exact_text, write_text
 from vio.trajectory_io import in_first_cam0
-
-Progress = Callable[[int, int], None]  # frames written, frames in all
 
 MARKER = "simulation.json"
 _TRUTH_HZ = 200.0

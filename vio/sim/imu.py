@@ -19,7 +19,7 @@ from vio.sim.motion import MotionSpline, evaluate
 
 GRAVITY_MPS2 = 9.81
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_MPS2])
-_NS = 1e-9
+_S_PER_NS = 1e-9
 
 
 ADIS16448 = ImuDensities(gyro=1.6968e-4, gyro_walk=1.9393e-5, accel=2.0e-3, accel_walk=3.0e-3)  # EuRoC's figures
@@ -50,7 +50,7 @@ class VelocityNoise:
 def sample_times(spline: MotionSpline, rate_hz: float, start_ns: int | None = None) -> IntArray:
     """Times (N,) at a fixed rate from `start_ns` (None: the motion's start) to the motion's end."""
     first = spline.start_ns if start_ns is None else start_ns
-    count = int((spline.end_ns - first) * _NS * rate_hz + 1e-9) + 1
+    count = int((spline.end_ns - first) * _S_PER_NS * rate_hz + 1e-9) + 1
     times = first + np.round(np.arange(max(count, 0)) * (1e9 / rate_hz)).astype(np.int64)
     return times[times <= spline.end_ns]
 

@@ -27,7 +27,7 @@ from vio.trajectory_io import read_trajectory
 
 logger = logging.getLogger(__name__)
 
-_NS = 1e-9
+_S_PER_NS = 1e-9
 _ROBUST_ROUNDS = 8
 _OUTLIER_SIGMAS = 5.0
 _OUTLIER_FLOOR = (0.002, 0.01)  # m, rad: smaller residuals are motion that the spline smooths, not jumps
@@ -48,7 +48,7 @@ class MotionSpline:
     @property
     def end_ns(self) -> int:
         """Last nanosecond at which the motion is defined."""
-        return self.start_ns + int(np.floor((len(self.p_control) - self.degree) * self.knot_s / _NS))
+        return self.start_ns + int(np.floor((len(self.p_control) - self.degree) * self.knot_s / _S_PER_NS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +108,7 @@ def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, In
             f"the motion is defined from {spline.start_ns} to {spline.end_ns} ns; "
             f"asked for {t.min()} to {t.max()}: shorten the request or lengthen the trajectory"
         )
-    position = (t - spline.start_ns) * (_NS / spline.knot_s)
+    position = (t - spline.start_ns) * (_S_PER_NS / spline.knot_s)
     segments = len(spline.p_control) - spline.degree
     first = np.clip(np.floor(position).astype(np.int64), 0, segments - 1)
     return t, first, position - first
@@ -158,10 +158,10 @@ def fit_spline(
         DataError: times do not increase, values are not finite, or there are too few poses.
     """
     t, T = _check_record(times_ns, T_world_imu, degree)
-    span = (t[-1] - t[0]) * _NS
+    span = (t[-1] - t[0]) * _S_PER_NS
     segments = max(1, int(np.ceil(span / knot_s - 1e-9)))
     step = span / segments * (1 + 1e-12)
-    position = np.minimum((t - t[0]) * _NS / step, segments - 1e-9)
+    position = np.minimum((t - t[0]) * _S_PER_NS / step, segments - 1e-9)
     first = np.floor(position).astype(np.int64)
     design = _design(first, position - first, segments, degree)
     keep = np.ones(len(t), dtype=np.bool_)
@@ -278,7 +278,7 @@ def spline_from_waypoints(
         DataError: fewer than two waypoints, or one is not finite.
     """
     T = np.asarray(T_world_imu, dtype=np.float64)
-    times = start_ns + np.round(np.arange(len(T)) * (interval_s / _NS)).astype(np.int64)
+    times = start_ns + np.round(np.arange(len(T)) * (interval_s / _S_PER_NS)).astype(np.int64)
     spline, report = fit_spline(times, T, knot_s=interval_s, degree=degree)
     logger.debug("waypoints met within %.2g m, %.2g rad", report.position_max_m, report.rotation_max_rad)
     return spline
@@ -355,7 +355,7 @@ def car_loop(
     R = so3_exp(np.stack([0 * yaw, 0 * yaw, yaw + sway[:, 2]], 1)) @ so3_exp(
         np.stack([sway[:, 0], sway[:, 1], 0 * yaw], 1)
     )
-    times = start_ns + np.round(t / _NS).astype(np.int64)
+    times = start_ns + np.round(t / _S_PER_NS).astype(np.int64)
     return fit_spline(times, se3_from_parts(R, p), knot_s=0.2)[0]
 
 
@@ -428,7 +428,7 @@ def hand_held(
     yaw = angle + shift[0] + np.pi / 2 + 0.35 * np.sin(0.6 * angle + shift[2])
     zero = np.zeros_like(t)
     R = so3_exp(np.stack([zero, zero, yaw + shake[:, 2]], 1)) @ so3_exp(np.stack([shake[:, 0], shake[:, 1], zero], 1))
-    times = start_ns + np.round(t / _NS).astype(np.int64)
+    times = start_ns + np.round(t / _S_PER_NS).astype(np.int64)
     return fit_spline(times, se3_from_parts(R, p + shake[:, 3:]), knot_s=0.1)[0]
 
 
@@ -452,7 +452,7 @@ def recorded_motion(path: Path, *, knot_s: float = 0.1, degree: int = 5) -> tupl
     if truth.body != "imu" or truth.times_ns is None or len(truth) < 2:
         raise DataError(f"{path}: describes {len(truth)} poses of {truth.body}; give two or more of the IMU")
     times = truth.times_ns
-    gap_s = float(np.diff(times).max()) * _NS
+    gap_s = float(np.diff(times).max()) * _S_PER_NS
     if gap_s > 5 * knot_s:
         logger.warning("%s has a gap of %.2f s; the motion is made up there", path, gap_s)
     spline, report = fit_spline(times, truth.T_world_body, knot_s=knot_s, degree=degree, robust=True)

@@ -36,6 +36,7 @@ from vio.sim.rigs import (
 )
 from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
 from vio.sim.world import MovingBox, SceneName, World, corridor, room, street
+from vio.text_files import NS_PER_S
 
 ReadyMotion: TypeAlias = Literal["handheld", "car"]
 RigName: TypeAlias = Literal["euroc", "euroc-rectified", "kitti", "fisheye", "small"]
@@ -53,7 +54,6 @@ _MARGIN_S = 0.25  # of motion before the first and after the last frame, for shu
 _AHEAD = 3  # frames in flight for each process
 _LEAD_M = 14.0  # to the car ahead
 _WALL_GAP_M = 0.4  # from a wall to the middle of a box that moves along it
-_NS = 1e9
 
 FLIGHT_FILES = ("groundtruth_tum.txt", "image_timestamps_ns.txt", "imu0.csv")
 
@@ -197,9 +197,9 @@ def _recorded(scenario: Scenario) -> tuple[MotionSpline, IntArray, ImuRecord | N
     flight = read_flight(scenario.trajectory, scenario.frame_times, csv)
     motion, times = flight.motion, flight.frame_times_ns
     if scenario.frame_times is None:
-        times = _regular(motion.start_ns, (motion.end_ns - motion.start_ns) / _NS, scenario.rate_hz)
+        times = _regular(motion.start_ns, (motion.end_ns - motion.start_ns) / NS_PER_S, scenario.rate_hz)
     if scenario.duration_s is not None:
-        times = times[times < times[0] + round(scenario.duration_s * _NS)]
+        times = times[times < times[0] + round(scenario.duration_s * NS_PER_S)]
     if flight.imu is not None and (flight.imu.times_ns[0] > times[0] or flight.imu.times_ns[-1] < times[-1]):
         raise DataError(
             f"{csv} does not span the frames ({times[0]} to {times[-1]} ns, the IMU {flight.imu.times_ns[0]} to "
@@ -247,7 +247,7 @@ def _walk(duration_s: float, seed: int) -> MotionSpline:
 
 def _regular(start_ns: int, duration_s: float, rate_hz: float, *, first: int = 0) -> IntArray:
     count = max(1, int(duration_s * rate_hz + 1e-6))
-    times: IntArray = start_ns + np.round(np.arange(first, first + count) * (_NS / rate_hz)).astype(np.int64)
+    times: IntArray = start_ns + np.round(np.arange(first, first + count) * (NS_PER_S / rate_hz)).astype(np.int64)
     return times
 
 
@@ -294,7 +294,7 @@ def _patrol(lane: FloatArray, start_ns: int, period_s: float) -> MovingBox:
     """A box that swings between the two ends (2, 3) of a lane."""
 
     def pose(time_ns: int) -> FloatArray:
-        along = 0.5 - 0.5 * np.cos(2 * np.pi * (time_ns - start_ns) / _NS / period_s)
+        along = 0.5 - 0.5 * np.cos(2 * np.pi * (time_ns - start_ns) / NS_PER_S / period_s)
         return se3_from_parts(np.eye(3), lane[0] + along * (lane[1] - lane[0]))
 
     return MovingBox(np.array([0.45, 0.45, 0.6]), pose)
@@ -302,7 +302,7 @@ def _patrol(lane: FloatArray, start_ns: int, period_s: float) -> MovingBox:
 
 def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
     """A car ahead in the same lane, and one that comes towards it on the inner lane again and again."""
-    seconds = (motion.end_ns - motion.start_ns) / _NS
+    seconds = (motion.end_ns - motion.start_ns) / NS_PER_S
     ahead = car_loop(duration_s=seconds, start_m=_LEAD_M, height_m=0.85, seed=seed, start_ns=motion.start_ns)
     inner = car_loop(loop_m=(103.6, 63.6), corner_m=5.0, height_m=0.85, seed=seed + 1)
     loop_ns = inner.end_ns - inner.start_ns

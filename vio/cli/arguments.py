@@ -1,0 +1,43 @@
+"""Arguments that several subcommands take."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vio.config import Config
+
+
+def add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that change the configuration."""
+    parser.add_argument(
+        "--config", type=Path, metavar="F", help="YAML file with settings that differ from the defaults"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="a.b=c", help="change one setting; may be repeated"
+    )
+    parser.add_argument("--motion", metavar="NAME", help="imu, velocity, none or auto: same as --set motion=NAME")
+    parser.add_argument("--backend", metavar="NAME", help="same as --set backend=NAME")
+    parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
+
+
+def lengths(text: str) -> tuple[float, ...]:
+    """Parse '25,50' into metres."""
+    values = tuple(float(part) for part in text.split(","))
+    if not values or any(not 0 < v < float("inf") for v in values):
+        raise ValueError(text)
+    return values
+
+
+def config_from(args: argparse.Namespace) -> Config:
+    """Build the configuration that the arguments ask for."""
+    from vio.config import load_config
+
+    overrides = list(args.set)
+    for key, value in (("motion", args.motion), ("backend", args.backend), ("frontend.name", args.frontend)):
+        if value is not None:
+            # Quoted: to YAML a bare `none` is text but `null`, `on` or `no` would not be.
+            overrides.append(f'{key}="{value}"')
+    return load_config(args.config, overrides)
