@@ -9,7 +9,8 @@ import pytest
 
 from vio.calibration.egomotion import CameraMotion, camera_motion
 from vio.calibration.findings import NotObservable
-from vio.calibration.gyro import ImuAlignment, align_gyro, rates_of
+from vio.calibration.gyro import align_gyro
+from vio.calibration.inertial import ImuAlignment, rates_of
 from vio.calibration.levers import LeverArm, lever_arm
 from vio.calibration.stereo import (
     RayMatches,

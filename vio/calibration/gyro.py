@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.optimize import least_squares
 
 from vio.calibration.egomotion import CameraMotion
 from vio.calibration.findings import NotObservable
-from vio.errors import EstimationError
+from vio.calibration.inertial import ImuAlignment, Rates
 from vio.geometry.lie import FloatArray, nearest_rotation, so3_exp, so3_log
-from vio.records import BoolArray, ImuSample, IntArray, MotionSample
+from vio.records import BoolArray
 from vio.robust import jackknife, robust_sigma
 
 _BLOCKS = 10  # of the jackknife
@@ -23,48 +20,6 @@ _LARGEST_OFFSET_S = 0.1
 _OFFSET_STEP_S = 0.004
 _VELOCITY_WEIGHT = 0.02  # rad/s per m/s: what one velocity's error is worth beside a rotation rate's
 _NS = 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class Rates:
-    """Motion samples as arrays."""
-
-    times_ns: IntArray  # (S,)
-    angular: FloatArray  # (S, 3) rad/s, imu frame
-    linear: FloatArray  # (S, 3) specific force in m/s^2, or velocity in m/s
-    inertial: bool  # the former
-
-
-def rates_of(samples: Sequence[MotionSample]) -> Rates:
-    """Motion samples of one kind as arrays.
-
-    Raises:
-        EstimationError: there is none.
-    """
-    if not samples:
-        raise EstimationError("the recording holds no motion sensor; only the cameras can be calibrated")
-    inertial = isinstance(samples[0], ImuSample)
-    pairs = [(s.gyro, s.accel) if isinstance(s, ImuSample) else (s.angular, s.linear) for s in samples]
-    return Rates(
-        np.array([s.time_ns for s in samples], dtype=np.int64),
-        np.array([p[0] for p in pairs]),
-        np.array([p[1] for p in pairs]),
-        inertial,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class ImuAlignment:
-    """How gyro and camera lie to each other."""
-
-    R_cam0_imu: FloatArray  # (3, 3)
-    rotation_sigma_deg: FloatArray  # (3,) about the axes of cam0
-    time_offset_s: float  # IMU clock minus camera clock: a frame stamped t was exposed at t + offset of the IMU's clock
-    time_offset_sigma_s: float
-    gyro_bias: FloatArray  # (3,) rad/s
-    residual_radps: float  # robust spread of the rotation rates' difference, each axis
-    intervals: int
-    weak: str | None  # what the motion leaves open, in words
 
 
 def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservable:

@@ -9,7 +9,7 @@ import numpy as np
 
 from vio.calibration.egomotion import CameraMotion, stereo_twists
 from vio.calibration.findings import NotObservable
-from vio.calibration.gyro import ImuAlignment, Rates
+from vio.calibration.inertial import ImuAlignment, Rates
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray

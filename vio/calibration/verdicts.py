@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from vio.calibration.findings import Finding, NotObservable
-from vio.calibration.gyro import TIME_OFFSET_S, ImuAlignment, Rates
+from vio.calibration.gyro import TIME_OFFSET_S
+from vio.calibration.inertial import ImuAlignment, Rates
 from vio.calibration.levers import LeverArm, judge_levers
 from vio.calibration.stereo import RayMatches, StereoEstimate, epipolar_spread, too_few
 from vio.evaluation import rotation_angle_deg

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from vio.calibration.gyro import ImuAlignment
+from vio.calibration.inertial import ImuAlignment
 from vio.calibration.levers import LeverArm
 from vio.calibration.stereo import StereoEstimate
 from vio.datasets.euroc_files import camera_yaml, median_rate_hz

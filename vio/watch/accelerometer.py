@@ -8,7 +8,7 @@ import numpy as np
 
 from vio.calibration.egomotion import CameraMotion
 from vio.calibration.findings import NotObservable
-from vio.calibration.gyro import ImuAlignment, Rates
+from vio.calibration.inertial import ImuAlignment, Rates
 from vio.calibration.levers import lever_arm
 from vio.calibration.verdicts import judge_imu
 from vio.geometry.lie import FloatArray

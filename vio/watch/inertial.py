@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vio.calibration.gyro import Rates
+from vio.calibration.inertial import Rates
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import ImuSample, Observations

@@ -1,0 +1,54 @@
+"""What gyro, lever arm and verdicts share: motion samples as arrays, and how the sensor lies to the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.errors import EstimationError
+from vio.geometry.lie import FloatArray
+from vio.records import ImuSample, IntArray, MotionSample
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """Motion samples as arrays."""
+
+    times_ns: IntArray  # (S,)
+    angular: FloatArray  # (S, 3) rad/s, imu frame
+    linear: FloatArray  # (S, 3) specific force in m/s^2, or velocity in m/s
+    inertial: bool  # the former
+
+
+def rates_of(samples: Sequence[MotionSample]) -> Rates:
+    """Motion samples of one kind as arrays.
+
+    Raises:
+        EstimationError: there is none.
+    """
+    if not samples:
+        raise EstimationError("the recording holds no motion sensor; only the cameras can be calibrated")
+    inertial = isinstance(samples[0], ImuSample)
+    pairs = [(s.gyro, s.accel) if isinstance(s, ImuSample) else (s.angular, s.linear) for s in samples]
+    return Rates(
+        np.array([s.time_ns for s in samples], dtype=np.int64),
+        np.array([p[0] for p in pairs]),
+        np.array([p[1] for p in pairs]),
+        inertial,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ImuAlignment:
+    """How gyro and camera lie to each other."""
+
+    R_cam0_imu: FloatArray  # (3, 3)
+    rotation_sigma_deg: FloatArray  # (3,) about the axes of cam0
+    time_offset_s: float  # IMU clock minus camera clock: a frame stamped t was exposed at t + offset of the IMU's clock
+    time_offset_sigma_s: float
+    gyro_bias: FloatArray  # (3,) rad/s
+    residual_radps: float  # robust spread of the rotation rates' difference, each axis
+    intervals: int
+    weak: str | None  # what the motion leaves open, in words
