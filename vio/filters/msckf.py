@@ -49,6 +49,7 @@ _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before an
 _IMU_FACTORS = (5.0, 1.0, 50.0)
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
+_MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
 
 
 class Msckf:
@@ -356,7 +357,7 @@ class Msckf:
     ) -> tuple[LinearTracks, FloatArray]:
         """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the covariance (D, D)."""
         P = window.P
-        for _ in range(self._settings.iterations):
+        for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
             P, shift = posterior(window.P, A, b + A @ window.offset)

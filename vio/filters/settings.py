@@ -80,7 +80,6 @@ class MsckfSettings(Section):
     clones: int = setting(11, "poses kept in the window", at_least=3)
     max_landmarks: int = setting(30, "long-lived landmarks kept in the state", at_least=0)
     max_features: int = setting(150, "tracks without a landmark of their own that enter one update", at_least=1)
-    iterations: int = setting(4, "most Gauss-Newton steps over the window in a frame; one is the rule", at_least=1)
     pixel_sigma_px: float = setting(
         0.5, "noise of one pixel coordinate at the start; then estimated", unit="px", above=0
     )
