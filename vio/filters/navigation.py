@@ -30,6 +30,7 @@ from vio.records import ImuSample, MotionSample, VelocitySample
 DIM = 15  # error dimensions of the navigation state
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
+_START_RATE_SIGMA_RADPS = 1.0  # doubt of the first angular rate without an IMU; the next image settles it
 _MAX_GAP_S = 0.5  # a longer silence of the IMU is an error, not an interval to integrate over
 
 
@@ -287,7 +288,7 @@ class TwistMotion:
             [
                 np.zeros(6),
                 np.full(3, s.start_velocity_sigma_mps),
-                np.full(3, s.start_rate_sigma_radps),
+                np.full(3, _START_RATE_SIGMA_RADPS),
                 np.full(3, s.rate_bias_sigma_radps),
             ]
         )

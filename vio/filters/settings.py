@@ -96,9 +96,6 @@ class MsckfSettings(Section):
     accel_bias_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)", at_least=0)
     start_tilt_sigma_deg: float = setting(8.0, "doubt of the first roll and pitch", unit="deg", at_least=0)
     start_velocity_sigma_mps: float = setting(10.0, "doubt of the first velocity", unit="m/s", at_least=0)
-    start_rate_sigma_radps: float = setting(
-        1.0, "without IMU: doubt of the first angular rate", unit="rad/s", at_least=0
-    )
     gyro_bias_sigma_radps: float = setting(0.1, "doubt of the first gyro bias", unit="rad/s", at_least=0)
     accel_bias_sigma_mps2: float = setting(0.3, "doubt of the first accelerometer bias", unit="m/s^2", at_least=0)
     still_px: float = setting(
