@@ -1,4 +1,4 @@
-"""What `vio run`, `vio demo` and `vio reproduce` share: process a source, show progress, report."""
+"""What `vio run` and `vio demo` share: process a source, show progress, say how it went."""
 
 from __future__ import annotations
 
