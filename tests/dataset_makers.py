@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -164,3 +165,29 @@ def make_kitti(
     header = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
     (sequence / "velocity.csv").write_text("\n".join([header, *rows]) + "\n")
     return sequence
+
+
+# --- spoiling what was made ---------------------------------------------------------------------------------------
+
+Arrays: TypeAlias = dict[str, np.ndarray]
+
+
+def without(*keys: str) -> Callable[[Arrays], Arrays]:
+    """Leave arrays out."""
+    return lambda arrays: {k: v for k, v in arrays.items() if k not in keys}
+
+
+def changed(key: str, value: object) -> Callable[[Arrays], Arrays]:
+    """Put another array in the place of one."""
+    return lambda arrays: {**arrays, key: np.asarray(value)}
+
+
+def edited(key: str, index: object, value: float) -> Callable[[Arrays], Arrays]:
+    """Change entries of an array."""
+
+    def edit(arrays: Arrays) -> Arrays:
+        copy = arrays[key].copy()
+        copy[index] = value
+        return {**arrays, key: copy}
+
+    return edit

@@ -14,9 +14,12 @@ from tests.dataset_makers import (
     LEVER_M,
     R_CAM0_IMU,
     T_CAM0_IMU,
+    Arrays,
     Drive,
+    changed,
     ece276a_arrays,
     ece276a_new_arrays,
+    edited,
     make_drive,
     make_npz,
 )
@@ -32,7 +35,6 @@ from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.records import FeatureTracks
 from vio.trajectory_io import read_trajectory
 
-Arrays = dict[str, np.ndarray]
 DEFAULT = DatasetSettings()
 
 
@@ -217,19 +219,6 @@ def test_moving_is_told_from_noise() -> None:
 # --- bad input ----------------------------------------------------------------------------------------------------
 
 
-def _set(key: str, value: object) -> Callable[[Arrays], Arrays]:
-    return lambda arrays: {**arrays, key: np.asarray(value)}
-
-
-def _edit(key: str, index: object, value: float) -> Callable[[Arrays], Arrays]:
-    def edit(arrays: Arrays) -> Arrays:
-        changed = arrays[key].copy()
-        changed[index] = value
-        return {**arrays, key: changed}
-
-    return edit
-
-
 def _swap_cameras(arrays: Arrays) -> Arrays:
     return {**arrays, "features": arrays["features"][[2, 3, 0, 1]]}
 
@@ -240,25 +229,25 @@ BAD = [
         DataError,
         r"needs the keys time_stamps .*; found K cam_T_imu",
     ),
-    (_set("features", np.zeros((3, 5, 6))), DataError, r"features has shape 3 x 5 x 6 .*expected 4 x M x T"),
-    (_set("features", np.zeros((4, 5, 7))), DataError, r"time_stamps has shape 1 x 6 .*expected 1 x 7"),
-    (_set("linear_velocity", np.zeros((6, 3))), DataError, r"linear_velocity has shape 6 x 3 .*expected 3 x 6"),
-    (_set("K", np.eye(4)), DataError, r"K has shape 4 x 4"),
-    (_set("K", np.ones((3, 3))), CalibrationError, r"K is no matrix of intrinsics \[fu 0 cu; .* but \[\["),
-    (_set("b", 0.0), CalibrationError, r"\.npz: stereo baseline must be positive, got 0 m"),
-    (_set("b", -0.5), CalibrationError, r"\.npz: stereo baseline must be positive, got -0.5 m"),
-    (_set("b", "wide"), DataError, r"b has shape one value and type <U4"),
-    (_edit("cam_T_imu", (0, 0), 2.0), CalibrationError, r"cam_T_imu: not a rotation"),
-    (_set("cam_T_imu", np.diag([1.0, 1, -1, 1])), CalibrationError, r"cam_T_imu: .*reflection"),
-    (_edit("time_stamps", (0, 3), 0.0), DataError, r"time_stamps\[3\]: the clock runs backwards"),
-    (_edit("time_stamps", (0, 3), 1317386425.7), DataError, r"time_stamps\[3\]: the clock repeats"),
+    (changed("features", np.zeros((3, 5, 6))), DataError, r"features has shape 3 x 5 x 6 .*expected 4 x M x T"),
+    (changed("features", np.zeros((4, 5, 7))), DataError, r"time_stamps has shape 1 x 6 .*expected 1 x 7"),
+    (changed("linear_velocity", np.zeros((6, 3))), DataError, r"linear_velocity has shape 6 x 3 .*expected 3 x 6"),
+    (changed("K", np.eye(4)), DataError, r"K has shape 4 x 4"),
+    (changed("K", np.ones((3, 3))), CalibrationError, r"K is no matrix of intrinsics \[fu 0 cu; .* but \[\["),
+    (changed("b", 0.0), CalibrationError, r"\.npz: stereo baseline must be positive, got 0 m"),
+    (changed("b", -0.5), CalibrationError, r"\.npz: stereo baseline must be positive, got -0.5 m"),
+    (changed("b", "wide"), DataError, r"b has shape one value and type <U4"),
+    (edited("cam_T_imu", (0, 0), 2.0), CalibrationError, r"cam_T_imu: not a rotation"),
+    (changed("cam_T_imu", np.diag([1.0, 1, -1, 1])), CalibrationError, r"cam_T_imu: .*reflection"),
+    (edited("time_stamps", (0, 3), 0.0), DataError, r"time_stamps\[3\]: the clock runs backwards"),
+    (edited("time_stamps", (0, 3), 1317386425.7), DataError, r"time_stamps\[3\]: the clock repeats"),
     (
-        _edit("rotational_velocity", (1, 4), np.nan),
+        edited("rotational_velocity", (1, 4), np.nan),
         DataError,
         r"rotational_velocity is not finite in 1 of 6 frames.* 4",
     ),
-    (_edit("linear_velocity", (1, 2), np.inf), DataError, r"linear_velocity is not finite in 1 of 6 frames.* 2"),
-    (_edit("features", (0, 0, 0), np.nan), DataError, r"feature 0 in frame 0 is .*neither a pixel pair nor all -1"),
+    (edited("linear_velocity", (1, 2), np.inf), DataError, r"linear_velocity is not finite in 1 of 6 frames.* 2"),
+    (edited("features", (0, 0, 0), np.nan), DataError, r"feature 0 in frame 0 is .*neither a pixel pair nor all -1"),
     (_swap_cameras, DataError, r"left and right look swapped: \d+ of \d+ disparities"),
 ]
 

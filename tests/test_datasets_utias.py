@@ -9,7 +9,17 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from tests.dataset_makers import CAMERA, T_CAM0_IMU, make_drive, make_mat, utias_arrays
+from tests.dataset_makers import (
+    CAMERA,
+    T_CAM0_IMU,
+    Arrays,
+    changed,
+    edited,
+    make_drive,
+    make_mat,
+    utias_arrays,
+    without,
+)
 from vio.datasets.features import FeatureDataset
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.utias import read_utias
@@ -18,7 +28,6 @@ from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_log, transfor
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.records import VelocitySample
 
-Arrays = dict[str, np.ndarray]
 DEFAULT = DatasetSettings()
 DRIVES = {  # file, frames, features
     "2011_09_26_drive_0001_sync_KLT.mat": (108, 707),
@@ -54,43 +63,26 @@ def test_pose_arrays_may_be_absent(tmp_path: Path) -> None:
     assert read_utias(make_mat(tmp_path / "a.mat", arrays), DEFAULT).recording.reference is None
 
 
-def _without(*keys: str) -> Callable[[Arrays], Arrays]:
-    return lambda arrays: {k: v for k, v in arrays.items() if k not in keys}
-
-
-def _set(key: str, value: object) -> Callable[[Arrays], Arrays]:
-    return lambda arrays: {**arrays, key: np.asarray(value)}
-
-
-def _edit(key: str, index: object, value: float) -> Callable[[Arrays], Arrays]:
-    def edit(arrays: Arrays) -> Arrays:
-        changed = arrays[key].copy()
-        changed[index] = value
-        return {**arrays, key: changed}
-
-    return edit
-
-
 @pytest.mark.parametrize(
     ("spoil", "kind", "message"),
     [
-        (_without("b", "t"), DataError, r"lacks t b; a UTIAS file needs y_k_j .*, found C_c_v"),
-        (_set("y_k_j", np.zeros((4, 6))), DataError, r"y_k_j has shape 4 x 6; expected 4 x T x M"),
-        (_set("y_k_j", "text"), DataError, r"y_k_j is not an array of real numbers"),
+        (without("b", "t"), DataError, r"lacks t b; a UTIAS file needs y_k_j .*, found C_c_v"),
+        (changed("y_k_j", np.zeros((4, 6))), DataError, r"y_k_j has shape 4 x 6; expected 4 x T x M"),
+        (changed("y_k_j", "text"), DataError, r"y_k_j is not an array of real numbers"),
         (
-            _set("v_vk_vk_i", np.zeros((3, 4))),
+            changed("v_vk_vk_i", np.zeros((3, 4))),
             DataError,
             r"v_vk_vk_i has shape 3 x 4; expected 3 x T with T at least 6",
         ),
         (lambda a: {**a, "theta_vk_i": "text"}, DataError, r"theta_vk_i is not an array of real numbers"),
-        (_set("theta_vk_i", np.zeros((3, 4))), DataError, r"theta_vk_i has shape 3 x 4"),
-        (_edit("w_vk_vk_i", (0, 2), np.nan), DataError, r"w_vk_vk_i is not finite in 1 of 6 frames, first in frame 2"),
-        (_edit("t", (0, 2), 0.0), DataError, r"t\[2\]: the clock runs backwards"),
-        (_set("b", 0.0), CalibrationError, r"\.mat: stereo baseline must be positive, got 0 m"),
-        (_set("fu", [1.0, 2.0]), DataError, r"fu has shape 1 x 2; expected 1 finite"),
-        (_set("C_c_v", np.diag([1.0, 1, 2])), CalibrationError, r"C_c_v: not a rotation"),
-        (_set("C_c_v", np.eye(2)), DataError, r"C_c_v has shape 2 x 2"),
-        (_set("rho_v_c_v", np.zeros(2)), DataError, r"rho_v_c_v has shape 1 x 2; expected 3"),
+        (changed("theta_vk_i", np.zeros((3, 4))), DataError, r"theta_vk_i has shape 3 x 4"),
+        (edited("w_vk_vk_i", (0, 2), np.nan), DataError, r"w_vk_vk_i is not finite in 1 of 6 frames, first in frame 2"),
+        (edited("t", (0, 2), 0.0), DataError, r"t\[2\]: the clock runs backwards"),
+        (changed("b", 0.0), CalibrationError, r"\.mat: stereo baseline must be positive, got 0 m"),
+        (changed("fu", [1.0, 2.0]), DataError, r"fu has shape 1 x 2; expected 1 finite"),
+        (changed("C_c_v", np.diag([1.0, 1, 2])), CalibrationError, r"C_c_v: not a rotation"),
+        (changed("C_c_v", np.eye(2)), DataError, r"C_c_v has shape 2 x 2"),
+        (changed("rho_v_c_v", np.zeros(2)), DataError, r"rho_v_c_v has shape 1 x 2; expected 3"),
         (lambda a: {**a, "y_k_j": a["y_k_j"][[2, 3, 0, 1]]}, DataError, r"left and right look swapped"),
     ],
 )

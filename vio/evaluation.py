@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from vio.errors import EvaluationError
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_inverse, so3_exp, so3_hat, so3_log
-from vio.records import BodyFrame, IntArray, Trajectory
+from vio.records import NS_PER_S, BodyFrame, IntArray, Trajectory
 from vio.statistics import chi_square_quantile
 
 AlignMode: TypeAlias = Literal["se3", "sim3", "none"]
@@ -26,7 +26,6 @@ KITTI_STEP_FRAMES = 10
 RPE_DISTANCE_TOLERANCE = 0.1  # a pair counts for a distance when its path length is this close, relatively
 _COLLINEAR = 1e-13  # ratio of squared extents below which points lie on one line, to rounding
 _STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points are one, to rounding
-_NS_PER_S = 10**9
 
 
 @dataclass(frozen=True, slots=True)
@@ -464,7 +463,7 @@ def _in_frame_of(estimate: Trajectory, reference: Trajectory, T_cam0_imu: npt.Ar
 def _max_difference_ns(seconds: float) -> int:
     if not (np.isfinite(seconds) and seconds >= 0):
         raise EvaluationError(f"the largest time difference must be finite and not negative, got {seconds:g} s")
-    return round(seconds * _NS_PER_S)
+    return round(seconds * NS_PER_S)
 
 
 def _no_common_time(estimate_ns: IntArray, reference_ns: IntArray, limit_s: float) -> str:
@@ -472,10 +471,10 @@ def _no_common_time(estimate_ns: IntArray, reference_ns: IntArray, limit_s: floa
     after = np.searchsorted(reference_ns, estimate_ns)
     left, right = np.clip(after - 1, 0, None), np.clip(after, None, len(reference_ns) - 1)
     nearest = np.minimum(np.abs(estimate_ns - reference_ns[left]), np.abs(estimate_ns - reference_ns[right]))
-    spans = [f"{t[0] / _NS_PER_S:.3f} to {t[-1] / _NS_PER_S:.3f} s" for t in (estimate_ns, reference_ns)]
+    spans = [f"{t[0] / NS_PER_S:.3f} to {t[-1] / NS_PER_S:.3f} s" for t in (estimate_ns, reference_ns)]
     return (
         f"no poses within {limit_s:g} s of each other: the estimate covers {spans[0]}, the reference {spans[1]}, "
-        f"closest pair {nearest.min() / _NS_PER_S:.6g} s; check the clocks or allow a larger difference"
+        f"closest pair {nearest.min() / NS_PER_S:.6g} s; check the clocks or allow a larger difference"
     )
 
 
@@ -494,7 +493,7 @@ def _coverage(
     return Coverage(
         estimate=len(rows) / len(estimate),
         reference_span=int(clock[reference_rows[-1]] - clock[reference_rows[0]]) / span if span else None,
-        longest_gap_s=None if gaps is None or len(gaps) == 0 else int(gaps.max()) / _NS_PER_S,
+        longest_gap_s=None if gaps is None or len(gaps) == 0 else int(gaps.max()) / NS_PER_S,
     )
 
 

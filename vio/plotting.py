@@ -1,4 +1,4 @@
-"""Pictures of a run. matplotlib is imported here and nowhere else, and without its global state."""
+"""Pictures of a run, drawn with matplotlib but without its global state."""
 
 from __future__ import annotations
 

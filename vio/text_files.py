@@ -10,9 +10,8 @@ import numpy.typing as npt
 
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
-from vio.records import IntArray
+from vio.records import NS_PER_S, IntArray
 
-NS_PER_S = 10**9
 INT64_MAX = 2**63 - 1
 
 

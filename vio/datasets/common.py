@@ -14,6 +14,7 @@ import numpy.typing as npt
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts
 from vio.records import (
+    NS_PER_S,
     BoolArray,
     Event,
     ImuRecord,
@@ -24,7 +25,7 @@ from vio.records import (
     StereoFrame,
     VelocitySample,
 )
-from vio.text_files import NS_PER_S, check_increasing
+from vio.text_files import check_increasing
 
 _ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I that is still read as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits

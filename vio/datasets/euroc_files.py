@@ -17,8 +17,8 @@ from vio.datasets.common import checked_transform, image_size, naming
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
-from vio.records import ImuDensities, ImuRecord, IntArray
-from vio.text_files import INT64_MAX, NS_PER_S, check_increasing, exact_text, text_lines
+from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
+from vio.text_files import INT64_MAX, check_increasing, exact_text, text_lines
 
 DISTORTION_MODELS: dict[str, DistortionModel] = {
     "radial-tangential": "radtan",

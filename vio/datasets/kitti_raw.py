@@ -29,8 +29,8 @@ from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.protocols import Progress
-from vio.records import IntArray, Recording, StereoFrame
-from vio.text_files import NS_PER_S, check_increasing, text_lines
+from vio.records import NS_PER_S, IntArray, Recording, StereoFrame
+from vio.text_files import check_increasing, text_lines
 
 CAMERAS = "calib_cam_to_cam.txt"
 VELO = "calib_velo_to_cam.txt"

@@ -18,7 +18,6 @@ from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
-BoolArray: TypeAlias = npt.NDArray[np.bool_]
 DistortionModel: TypeAlias = Literal["pinhole", "radtan", "equidistant"]
 
 _COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
@@ -121,7 +120,7 @@ def rig_from_rectified(camera: StereoCamera, T_cam0_imu: npt.ArrayLike) -> Stere
     return StereoRig(one, one, T_imu_cam0, T_imu_cam0 @ T_cam0_cam1)
 
 
-def project_point(camera: CameraModel, p_cam: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
+def project_point(camera: CameraModel, p_cam: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Pixels (..., 2) of points (..., 3) in the camera frame, and a mask (...) of those the model can image.
 
     False in the mask: behind the camera, or beyond the angle where the distortion polynomial folds back. The pixel
@@ -155,7 +154,7 @@ def uv_D_p_cam(camera: CameraModel, p_cam: npt.ArrayLike) -> FloatArray:
     return np.array([camera.fu, camera.fv])[:, None] * xy_D_p
 
 
-def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
+def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     """Unit rays (..., 3) in the camera frame of pixels (..., 2), and a mask (...) of those that Newton's method found.
 
     A pixel that no ray of the model reaches gets False and an arbitrary finite ray.
@@ -164,7 +163,7 @@ def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray,
     xy = (uv - (camera.cu, camera.cv)) / (camera.fu, camera.fv)
     if camera.model == "equidistant":
         return _unproject_equidistant(camera.coefficients, xy)
-    valid: BoolArray = np.asarray(np.isfinite(xy).all(axis=-1))
+    valid: npt.NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=-1))
     if camera.model == "radtan":
         xy, valid = _undistort_radtan(camera.coefficients, xy)
     ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
@@ -212,7 +211,7 @@ def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
     return float(1 / np.sqrt(max(inverse))) if inverse else np.inf
 
 
-def _undistort_radtan(coefficients: tuple[float, ...], target: FloatArray) -> tuple[FloatArray, BoolArray]:
+def _undistort_radtan(coefficients: tuple[float, ...], target: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     xy = np.where(np.isfinite(target), target, 0.0)
     goal = xy
     for _ in range(_NEWTON_STEPS):
@@ -252,7 +251,7 @@ def _max_theta(coefficients: tuple[float, ...]) -> float:
     return float(min([np.pi, *np.sqrt(positive)]))
 
 
-def _equidistant(coefficients: tuple[float, ...], p: FloatArray) -> tuple[FloatArray, BoolArray]:
+def _equidistant(coefficients: tuple[float, ...], p: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
     radius = np.linalg.norm(p[..., :2], axis=-1)
     theta = np.arctan2(radius, p[..., 2])
     valid = (theta < _max_theta(coefficients)) & (np.linalg.norm(p, axis=-1) > 1e-12)
@@ -281,8 +280,8 @@ def _equidistant_D_p(coefficients: tuple[float, ...], p: FloatArray) -> FloatArr
     return np.where(near_axis[..., None, None], on_axis / safe_depth, out)
 
 
-def _unproject_equidistant(coefficients: tuple[float, ...], xy: FloatArray) -> tuple[FloatArray, BoolArray]:
-    finite: BoolArray = np.asarray(np.isfinite(xy).all(axis=-1))
+def _unproject_equidistant(coefficients: tuple[float, ...], xy: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    finite: npt.NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=-1))
     xy = np.where(finite[..., None], xy, 0.0)
     theta_d = np.linalg.norm(xy, axis=-1)
     limit = _max_theta(coefficients)

@@ -21,7 +21,7 @@ from threadpoolctl import threadpool_limits
 from vio.errors import DataError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
-from vio.records import Image, ImuRecord, IntArray
+from vio.records import NS_PER_S, Image, ImuRecord, IntArray
 from vio.sim.effects import CLEAN, SensorEffects
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ImuNoise, VelocityNoise
@@ -36,7 +36,6 @@ from vio.sim.rigs import (
 )
 from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
 from vio.sim.world import MovingBox, SceneName, World, corridor, room, street
-from vio.text_files import NS_PER_S
 
 ReadyMotion: TypeAlias = Literal["handheld", "car"]
 RigName: TypeAlias = Literal["euroc", "euroc-rectified", "kitti", "fisheye", "small"]
