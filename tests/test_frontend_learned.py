@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -70,6 +71,14 @@ def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
         build(LearnedSettings())
     with pytest.raises(MissingDependencyError, match=r"stereo-vio\[learned\]"):
         TorchFlow()
+
+
+def test_a_kornia_without_the_networks_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", ModuleType("torch"))
+    monkeypatch.setitem(sys.modules, "kornia", ModuleType("kornia"))
+    monkeypatch.setitem(sys.modules, "kornia.feature", ModuleType("kornia.feature"))
+    with pytest.raises(MissingDependencyError, match=r"0\.8\.3 or newer.*ALIKED"):
+        build(LearnedSettings())
 
 
 # --- weights and devices --------------------------------------------------------------------------------------------

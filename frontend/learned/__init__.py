@@ -20,7 +20,7 @@ def build_learned(camera: StereoCamera, settings: FrontendSettings) -> Descripto
     """Build the front end that the settings describe.
 
     Raises:
-        MissingDependencyError: torch or kornia is not installed.
+        MissingDependencyError: torch or kornia is not installed, or kornia is too old.
         ConfigError: weights are needed but not named, CUDA is asked for but absent, or parts do not fit together.
         DataError: a file of weights cannot be read, or is of another network.
     """
@@ -36,11 +36,10 @@ def build_learned(camera: StereoCamera, settings: FrontendSettings) -> Descripto
 
 def _require_torch() -> None:
     try:
-        import kornia.feature
         import torch  # noqa: F401
+        from kornia.feature import ALIKED, XFeat  # noqa: F401  (the youngest that are used)
     except ImportError as error:
         raise MissingDependencyError(
-            f"the kornia front end needs torch and kornia ({error}); "
+            f"the kornia front end needs torch and kornia 0.8.3 or newer, on Python 3.11 or newer ({error}); "
             "install them with: pip install 'stereo-vio[learned]'"
         ) from error
-    assert kornia.feature is not None
