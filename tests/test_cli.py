@@ -280,6 +280,27 @@ def test_the_module_runs_as_a_process(recording: Path, tmp_path: Path) -> None:
     assert json.loads(done.stdout)["frames"] == 40
 
 
+def test_where_pycolmap_has_no_wheels_only_its_commands_are_missing(recording: Path, tmp_path: Path) -> None:
+    code = "import sys; sys.modules['pycolmap'] = None; from vio.cli import main; sys.exit(main(sys.argv[1:]))"
+    out = tmp_path / "out"
+
+    def vio(*argv: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run([sys.executable, "-c", code, *argv], capture_output=True, text=True, check=False)
+
+    assert vio("run", str(recording), "--out", str(out), "--save-observations").returncode == 0
+    assert vio("eval", str(out), str(out / "trajectory.tum")).returncode == 0
+    for argv in (
+        ["check", str(out)],
+        ["refine", str(out)],
+        ["export", "colmap", str(out)],
+        ["calibrate", str(recording)],
+    ):
+        done = vio(*argv)
+        assert (done.returncode, done.stdout) == (1, ""), argv
+        assert done.stderr.startswith("error: this command needs pycolmap"), argv
+        assert done.stderr.count("\n") == 1, argv
+
+
 @pytest.mark.skipif(shutil.which("head") is None, reason="needs head")
 def test_a_closed_pipe_is_no_error() -> None:
     done = subprocess.run(

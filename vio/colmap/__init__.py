@@ -11,9 +11,10 @@ from vio.errors import MissingDependencyError
 
 try:
     import pycolmap
-except ImportError as _error:  # pragma: no cover
+except ImportError as _error:
     raise MissingDependencyError(
-        "this command needs pycolmap; install it with `pip install 'pycolmap>=4.2'`"
+        "this command needs pycolmap, which has wheels for Linux and Windows on x86-64 and macOS 14 on ARM; "
+        "install it with: pip install 'pycolmap>=4.2'"
     ) from _error
 
 HALF_PX = 0.5  # COLMAP's pixel coordinates minus ours
