@@ -167,7 +167,7 @@ class KltFrontend:
         old, settings = memory.tracks, self._settings
         expected = se3_exp(memory.twist_per_s * ((frame.time_ns - memory.time_ns) * 1e-9))
         guess = self._guess(old, prior, expected, left.full)
-        trusted = prior is not None or (memory.trusted and settings.guess == "motion")
+        trusted = prior is not None or memory.trusted
         found, seen = follow(memory.left.half, left, old.left, guess, trusted, settings)
         watch.lap("track")
         rng = np.random.default_rng((self._consensus.seed, frame.index))
@@ -181,12 +181,10 @@ class KltFrontend:
         return tracks, motion
 
     def _guess(self, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage) -> FloatArray:
-        """Guess the left pixels (N, 2) in the coming frame."""
-        guess = old.left.copy()
+        """Guess the left pixels (N, 2) in the coming frame: where the filter has them, else by the last motion."""
         if prior is not None and prior.R_cam_prev is not None:
             expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
-        if self._settings.guess == "motion" or prior is not None:
-            guess = moved_pixels(self._camera, expected, self._with_neighbours(old), old.left)
+        guess = moved_pixels(self._camera, expected, self._with_neighbours(old), old.left)
         if prior is not None:
             rows, told = _told(old, np.arange(len(old)), prior)
             guess[rows] = told

@@ -87,9 +87,6 @@ class KltSettings(Section):
     pyramid_levels: int = setting(2, "image levels coarser than half resolution when tracking in time", at_least=0)
     trusted_levels: int = setting(1, "the same where the last motion or the filter predicts the pixels", at_least=0)
     iterations: int = setting(20, "largest number of Lucas-Kanade iterations a level", at_least=1)
-    guess: Literal["previous", "motion"] = setting(
-        "motion", "start of the search where the filter predicts nothing: the old pixel, or the last camera motion"
-    )
     max_forward_backward_px: float = setting(1.5, "largest error after tracking there and back", unit="px", above=0)
     consensus_px: float = setting(
         1.0, "largest distance from where the consensus motion puts a feature", unit="px", above=0
