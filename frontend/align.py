@@ -101,7 +101,7 @@ def templates(wide: Patches) -> Templates:
     gu = ((wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2).reshape(flat)
     gv = ((wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2).reshape(flat)
     x, y, one = offsets(radius)
-    centred = patch - patch.mean(axis=1, keepdims=True)
+    centred = patch - patch.mean(axis=1, keepdims=True, dtype=np.float32)
     basis = np.stack([gu, gv, centred, np.broadcast_to(one, patch.shape), gu * x, gu * y, gv * x, gv * y], axis=1)
     normal = (basis @ basis.transpose(0, 2, 1)).astype(np.float64)
     normal += (_DAMPING * np.einsum("nii->ni", normal) + 1e-6)[:, :, None] * np.eye(_PARAMETERS)

@@ -114,7 +114,7 @@ def _search(
     after = score[rows, np.minimum(best + 1, score.shape[1] - 1)].astype(np.float64)
     bend = before - 2 * top + after
     peaked = (best > 0) & (best < score.shape[1] - 1) & (bend < 0)
-    offset = np.where(peaked, (before - after) / (2 * np.where(peaked, bend, -1.0)), 0.0)
+    offset: FloatArray = np.where(peaked, (before - after) / (2 * np.where(peaked, bend, -1.0)), 0.0)
     # The patches were cut at whole pixels; the shift carries over to the sub-pixel point.
     return low + best + np.clip(offset, -0.5, 0.5), np.where((safe == centres).all(axis=1), top, -1.0), second
 

@@ -108,7 +108,7 @@ def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, In
             f"the motion is defined from {spline.start_ns} to {spline.end_ns} ns; "
             f"asked for {t.min()} to {t.max()}: shorten the request or lengthen the trajectory"
         )
-    position = (t - spline.start_ns) * (_S_PER_NS / spline.knot_s)
+    position: FloatArray = np.multiply(t - spline.start_ns, _S_PER_NS / spline.knot_s, dtype=np.float64)
     segments = len(spline.p_control) - spline.degree
     first = np.clip(np.floor(position).astype(np.int64), 0, segments - 1)
     return t, first, position - first

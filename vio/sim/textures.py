@@ -313,7 +313,7 @@ def _window(canvas: _Canvas, centre: FloatArray, size: FloatArray, per_m: float,
     x, y = centre - size / 2
     w, h = size
     rim = 0.09 * per_m
-    _fill(canvas, (x - rim, y - rim, w + 2 * rim, h + 2 * rim), rng.choice([200.0, 60.0, 175.0]))
+    _fill(canvas, (x - rim, y - rim, w + 2 * rim, h + 2 * rim), float(rng.choice([200.0, 60.0, 175.0])))
     _panel(canvas, (x, y, w, h), per_m, rng, dark=True)
     if rng.random() < 0.7:
         _fill(canvas, (x + w / 2 - rim / 3, y, 2 * rim / 3, h), 190.0)

@@ -22,6 +22,7 @@ from vio.sim.textures import MipTexture, TextureKind, build_mips, paint
 SceneName: TypeAlias = Literal["room", "street", "corridor"]
 ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_object (4, 4)
 
+_OF_WOOD: tuple[TextureKind, ...] = ("wood", "crate")
 _ONWARD_M = 80.0  # how far the streets run on beyond the block
 _CORNER_FREE_M = 13.0  # no parked box this close to a corner, which cars cut
 _FACES: dict[str, tuple[int, int]] = {
@@ -195,7 +196,7 @@ def room(
         solid = _place_furniture(box, clear, solids, rng, scale)
         if solid is not None:
             solids.append(solid)
-            patches += _box_patches(solid, rng.choice(["wood", "crate"]), texel, hidden=("-z",))
+            patches += _box_patches(solid, _OF_WOOD[rng.choice(2)], texel, hidden=("-z",))
             top = _stack(solid, rng, scale)
             if top is not None and _is_clear(top, clear, 0.6):
                 solids.append(top)
@@ -228,7 +229,7 @@ def corridor(
         size = rng.uniform((0.5, 0.25, 0.6), (1.2, 0.4, 1.9))
         solid = Solid(_pose((x, -width_m / 2 + size[1] / 2, size[2] / 2), 0.0), size / 2)
         solids.append(solid)
-        patches += _box_patches(solid, rng.choice(["wood", "crate"]), texel_m, hidden=("-z",))
+        patches += _box_patches(solid, _OF_WOOD[rng.choice(2)], texel_m, hidden=("-z",))
         x += rng.uniform(2.0, 4.5)
     for _ in range(int(length_m / 2.5)):
         picture = _hang_picture(box, rng, 0.8, bare_walls)
