@@ -3,11 +3,14 @@
 PYTHON ?= python3
 VENV ?= .venv
 LEARNED ?=
+VIO_DATA ?=
+WORK ?= results
+RESULTS ?=
 BIN := $(VENV)/bin
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint unit coverage mutations clean constraints
+.PHONY: demo test lint unit coverage mutations results clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -29,6 +32,11 @@ coverage: $(TESTED)
 # Break the code on purpose, a line at a time: some test must fail each time (half an hour).
 mutations: $(TESTED)
 	$(BIN)/python -m tools.mutate
+
+# Measure what docs/results.md tells and write its tables (VIO_DATA=recordings; half an hour and more); RESULTS="--check"
+# only compares, docs/results.md tells what must lie where.
+results: $(VENV)/.base
+	$(BIN)/python -m tools.results --data "$(VIO_DATA)" --work "$(WORK)" $(RESULTS)
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

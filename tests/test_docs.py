@@ -304,6 +304,15 @@ def test_commands_of_the_docs_parse(name: str, command: str) -> None:
         config_from(args)
 
 
+@pytest.mark.parametrize(("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("make ")])
+def test_make_of_the_docs_knows_its_targets_and_variables(name: str, command: str) -> None:
+    _, target, *assignments = shlex.split(command)
+    makefile = _text("Makefile")
+    assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+    for assignment in assignments:
+        assert re.search(rf"^{assignment.partition('=')[0]} \?=", makefile, re.MULTILINE), assignment
+
+
 @pytest.mark.parametrize(("name", "command"), [c for c in _ALL_COMMANDS if c[1].startswith("python tools")])
 def test_tools_of_the_docs_take_their_options(name: str, command: str) -> None:
     _, tool, *argv = shlex.split(command)
