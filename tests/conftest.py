@@ -7,10 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import Phase, settings
 
 from vio.threads import one_blas_thread
 
 ROOT = Path(__file__).resolve().parent.parent
+
+settings.register_profile("vio", deadline=None)  # no test judges a machine by its speed
+# For tools/mutate.py: the same examples each time, and a failure is not made simpler.
+settings.register_profile("once", deadline=None, derandomize=True, phases=[Phase.explicit, Phase.generate])
+settings.load_profile("vio")
 
 
 @pytest.fixture(scope="session", autouse=True)

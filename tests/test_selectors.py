@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vio.errors import ConfigError
@@ -55,6 +55,7 @@ def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
 
 
 @pytest.mark.parametrize("name", ["all", "visibility", "visibility_whole", "grid", "random", "information"])
+@settings(max_examples=40)
 @given(seen=st.lists(st.lists(st.integers(0, 40), unique=True, max_size=30), min_size=1, max_size=8))
 def test_contract(name: str, seen: list[list[int]]) -> None:
     """A mask of the right length, no more than asked for, the same every time."""

@@ -27,8 +27,8 @@ from tools.mutations import MUTATIONS, Mutation
 ROOT = Path(__file__).resolve().parent.parent
 _COPIED = ("configs", "docs", "frontend", "tests", "tools", "vio", "Makefile", "README.md", "pyproject.toml")
 _MOST_S = 900.0
-# The warning: hypothesis is imported before pytest here.
-_PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "-W", "ignore::pytest.PytestAssertRewriteWarning")
+# The profile is one of tests/conftest.py.
+_PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "--hypothesis-profile=once")
 
 
 class MutationError(Exception):
@@ -70,11 +70,9 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
     """
     data = os.environ.get("VIO_DATA", str(ROOT.parent / "shared" / "data"))
     environment = {**os.environ, "PYTHONPATH": str(copy), "VIO_DATA": data}
-    # The process that tests says which packages it would test. Examples are the same each time, and not simplified.
+    # The process that tests says which packages it would test.
     code = (
-        "import frontend, pytest, sys, vio; from hypothesis import Phase, settings; "
-        "settings.register_profile('once', phases=[Phase.explicit, Phase.generate], derandomize=True); "
-        "settings.load_profile('once'); print(vio.__file__, frontend.__file__); "
+        "import frontend, pytest, sys, vio; print(vio.__file__, frontend.__file__); "
         f"sys.exit(pytest.main({[*_PYTEST, *options, *tests]!r}))"
     )
     begin = time.perf_counter()
