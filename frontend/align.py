@@ -44,9 +44,6 @@ class Templates:
     inverse: npt.NDArray[np.float32]  # (N, 8, 8) of the normal matrix
     row_inverse: npt.NDArray[np.float32]  # (N, 6, 6) the same, when the row is expected to stay
 
-    def __len__(self) -> int:
-        return len(self.patch)
-
 
 def empty_templates(count: int, radius: int) -> Templates:
     """Room for `count` templates of a radius."""

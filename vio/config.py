@@ -195,10 +195,6 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
             f"; did you mean '{near[0]}'?" if (near := difflib.get_close_matches(str(value), choices, 1)) else ""
         )
         raise ConfigError(f"{where}: {path} is one of {', '.join(choices)}, not {value!r}{hint_text}")
-    if origin is tuple:
-        if not isinstance(value, (list, tuple)):
-            raise ConfigError(f"{where}: {path} takes a list, got {value!r}")
-        return tuple(_checked(item, get_args(hint)[0], path, where) for item in value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if hint is Path and isinstance(value, str):

@@ -241,11 +241,6 @@ class Msckf:
         if len(ids):
             self._map.append(Landmarks(ids, p_world, covariance))
 
-    @property
-    def pixel_sigma_px(self) -> float:
-        """The pixel noise as estimated from the residuals."""
-        return float(np.sqrt(self._tracks.variance))
-
     def _wait(self, observations: Observations) -> UpdateReport:
         """Let a frame pass that comes before the first motion sample.
 

@@ -61,6 +61,3 @@ class InertialFinding:
     def group(self) -> str:
         """What it is about; of each group, one finding is enough."""
         return _GROUPS.get(self.fault, self.fault)
-
-    def __str__(self) -> str:
-        return self.message
