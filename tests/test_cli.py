@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.dataset_makers import ece276a_arrays, make_drive, make_kitti, make_npz
+from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_kitti, make_npz
 from vio.cli import main
+from vio.errors import DataError
 from vio.trajectory_io import read_trajectory
 
 CONTRACT = ("out", "frames", "path_length_m", "ms_per_frame", "ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")
@@ -26,7 +27,6 @@ def recording(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def truth(tmp_path: Path) -> Path:
-    from tests.dataset_makers import T_CAM0_IMU
     from vio.geometry.lie import se3_inverse
 
     cam0 = make_drive(40).T_world_imu @ se3_inverse(T_CAM0_IMU)
@@ -167,6 +167,11 @@ def test_people_get_lines_and_the_picture_is_named(
         (["eval", "{tmp}/none.tum", "{tmp}/none.txt"], "none.tum"),
         (["eval", "{tmp}/empty", "{tmp}/none.txt"], "no run folder"),
         (["reproduce", "{tmp}/none.npz"], "does not exist"),
+        (["check", "{tmp}/empty", "--keyframes", "1"], "--keyframes at least 2"),
+        (["check", "{tmp}/empty", "--threads", "0"], "--threads must be at least 1"),
+        (["refine", "{tmp}/empty", "--keyframes", "1"], "--keyframes at least 2"),
+        (["refine", "{tmp}/empty", "--threads", "0"], "--threads must be at least 1"),
+        (["export", "colmap", "{tmp}/empty", "--keyframes", "1"], "--keyframes must be at least 2"),
     ],
 )
 def test_mistakes_cost_one_line_and_leave_nothing(
@@ -207,8 +212,37 @@ def test_interrupted_run_leaves_nothing(
     assert not (tmp_path / "deep").exists()
 
 
+def test_debug_shows_where_an_expected_error_came_from(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="does not exist"):
+        main(["--debug", "run", str(tmp_path / "nothing")])
+
+
+def test_eval_takes_the_extrinsics_from_a_file(
+    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A trajectory of the IMU against one of cam0: without the lever arm between them there is nothing to compare."""
+    _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))
+    files = [str(tmp_path / "out" / "trajectory.tum"), str(truth)]
+    assert "give the extrinsic T_cam0_imu" in _error(capsys, "eval", *files)
+    given = tmp_path / "T_cam0_imu.txt"
+    np.savetxt(given, T_CAM0_IMU[:3])
+    assert _json(capsys, "eval", *files, "--extrinsics", str(given))["ate_m"] < 0.05
+    given.unlink()
+    assert "give a file with T_cam0_imu, 3 or 4 rows of 4 numbers" in _error(
+        capsys, "eval", *files, "--extrinsics", str(given)
+    )
+
+
 def test_wrong_usage_is_2() -> None:
-    for argv in ([], ["fly"], ["run"], ["run", "x", "--start", "one"], ["run", "x", "--lengths", "a,b"], ["eval", "x"]):
+    for argv in (
+        [],
+        ["fly"],
+        ["run"],
+        ["run", "x", "--start", "one"],
+        ["run", "x", "--lengths", "a,b"],
+        ["run", "x", "--lengths", "25,0"],
+        ["eval", "x"],
+    ):
         with pytest.raises(SystemExit) as stop:
             main(argv)
         assert stop.value.code == 2

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +12,16 @@ from hypothesis import strategies as st
 
 from tests.numerics import numeric_jacobian
 from vio.errors import CalibrationError
-from vio.geometry.distortion import CameraModel, project_point, unproject_pixel, uv_D_p_cam
+from vio.geometry.distortion import (
+    CameraModel,
+    project_point,
+    rectified_camera,
+    rig_from_rectified,
+    unproject_pixel,
+    uv_D_p_cam,
+)
+from vio.geometry.lie import se3_exp, se3_inverse
+from vio.geometry.stereo import StereoCamera
 
 # Camera 00 of KITTI's 2011_09_26.
 KITTI = CameraModel(
@@ -85,3 +96,23 @@ def test_points_are_valid_up_to_where_the_polynomial_turns(k: tuple[float, float
 def test_other_numbers_of_coefficients_are_refused(count: int) -> None:
     with pytest.raises(CalibrationError, match=f"takes 4 distortion coefficients or 5, got {count}"):
         CameraModel(400, 400, 320, 240, 640, 480, "radtan", (0.01,) * count)
+
+
+def test_impossible_cameras_are_named() -> None:
+    with pytest.raises(CalibrationError, match="unknown distortion model 'fisheye'; use one of pinhole, radtan, equi"):
+        CameraModel(400, 400, 320, 240, 640, 480, "fisheye", (0.1,))  # type: ignore[arg-type]
+    with pytest.raises(CalibrationError, match="are not finite"):
+        CameraModel(400, np.nan, 320, 240, 640, 480)
+    with pytest.raises(CalibrationError, match=r"must be positive, got fu=400, fv=0"):
+        CameraModel(400, 0, 320, 240, 640, 480)
+    with pytest.raises(CalibrationError, match="a rig needs the image size"):
+        rig_from_rectified(StereoCamera(400, 400, 320, 240, 0.1), np.eye(4))
+
+
+def test_a_rectified_pair_becomes_a_rig_and_comes_back() -> None:
+    camera = StereoCamera(400.0, 410.0, 320.0, 240.0, 0.1, 640, 480)
+    T_cam0_imu = se3_exp([0.1, -0.2, 0.3, 0.4, 0.5, 0.6])
+    rig = rig_from_rectified(camera, T_cam0_imu)
+    assert replace(rectified_camera(rig), baseline_m=0.1) == camera
+    assert rectified_camera(rig).baseline_m == pytest.approx(0.1)
+    np.testing.assert_allclose(se3_inverse(rig.T_imu_cam0), T_cam0_imu, atol=1e-12)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from vio.records import feature_tracks, observations
+from vio.records import Trajectory, feature_tracks, observations
 
 
 def test_frames_come_back_out_of_the_table_and_missing_ones_are_empty() -> None:
@@ -26,3 +27,20 @@ def test_no_observations_are_a_table_too() -> None:
     tracks = feature_tracks({}, 2)
     assert tracks.offsets.tolist() == [0, 0, 0]
     assert tracks.z.shape == (0, 4)
+
+
+def test_observations_that_contradict_themselves_are_refused() -> None:
+    with pytest.raises(ValueError, match="disagree in length: 2 ids, 1 z"):
+        observations(0, 0, [1, 2], [[1, 2, 3, 4]])
+    with pytest.raises(ValueError, match="frame 5: an id occurs twice among 3 observations"):
+        observations(5, 0, [1, 2, 1], np.zeros((3, 4)))
+
+
+def test_a_trajectory_is_moved_to_the_other_frame_once() -> None:
+    T_cam0_imu = np.eye(4)
+    T_cam0_imu[:3, 3] = [1.0, 2.0, 3.0]
+    imu = Trajectory(np.tile(np.eye(4), (2, 1, 1)), None, "imu")
+    assert imu.in_imu(T_cam0_imu) is imu
+    cam0 = imu.in_cam0(T_cam0_imu)
+    np.testing.assert_allclose(cam0.positions, [[-1.0, -2.0, -3.0]] * 2)
+    np.testing.assert_allclose(cam0.in_imu(T_cam0_imu).positions, 0.0)

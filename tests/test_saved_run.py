@@ -1,0 +1,87 @@
+"""What a run has saved: where its images are, that its files belong together, and what is said where they do not."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.dataset_makers import calib_text, ece276a_arrays, make_drive, make_kitti, make_npz
+from vio.cli import main
+from vio.errors import DataError
+from vio.saved_run import SavedRun, read_saved_run, stereo_frames, with_poses
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A feature file, its saved run, and the saved run of that run's observations."""
+    place = tmp_path_factory.mktemp("places")
+    recording = make_npz(place / "drive.npz", ece276a_arrays(make_drive(FRAMES)))
+    for source, out in ((recording, "first"), (place / "first" / "observations.npz", "second")):
+        assert main(["run", str(source), "--save-observations", "--out", str(place / out), "--json"]) == 0
+    return place
+
+
+@pytest.fixture
+def run(places: Path) -> SavedRun:
+    return read_saved_run(places / "first")
+
+
+def _without_the_last_pose(file: Path) -> None:
+    lines = file.read_text().replace(f"# frames: 0-{FRAMES - 1}", f"# frames: 0-{FRAMES - 2}").splitlines(keepends=True)
+    file.write_text("".join(lines[:-1]))
+
+
+def test_a_run_of_a_runs_observations_names_the_recording_itself(places: Path) -> None:
+    first, second = (read_saved_run(places / name) for name in ("first", "second"))
+    assert first.source == second.source == f"ece276a:{places / 'drive.npz'}"
+    np.testing.assert_array_equal(second.tracked.trajectory.T_world_body, first.tracked.trajectory.T_world_body)
+    assert first.truth is None
+
+
+def test_a_trajectory_of_another_run_is_told(places: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "spoiled"
+    shutil.copytree(places / "first", folder)
+    _without_the_last_pose(folder / "trajectory.tum")
+    with pytest.raises(DataError, match="are not of one whole run; repeat the run"):
+        read_saved_run(folder)
+
+
+def test_refined_poses_must_be_there_and_of_the_same_frames(run: SavedRun, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="holds no trajectory; make it with `vio refine"):
+        with_poses(run, tmp_path)
+    shutil.copy(run.tracked.where / "trajectory.tum", tmp_path)
+    same = with_poses(run, tmp_path)
+    np.testing.assert_allclose(same.tracked.trajectory.T_world_body, run.tracked.trajectory.T_world_body)
+    _without_the_last_pose(tmp_path / "trajectory.tum")
+    with pytest.raises(DataError, match=r"describes other frames than .*first; refine again"):
+        with_poses(run, tmp_path)
+
+
+def test_images_are_asked_of_the_recording_that_has_them(run: SavedRun, tmp_path: Path) -> None:
+    rows = np.array([0, 2])
+    with pytest.raises(DataError, match="holds no images; name the recording with --source or use --no-images"):
+        list(stereo_frames(run, None, rows))
+    with pytest.raises(DataError, match=r"are not to be had: .*does not exist.*; name the recording with --source"):
+        list(stereo_frames(run, str(tmp_path / "gone"), rows))
+    kitti = make_kitti(tmp_path / "kitti", frames=FRAMES)
+    with pytest.raises(DataError, match="has another calibration than the run"):
+        list(stereo_frames(run, str(kitti), rows))
+
+
+def test_images_of_the_rows_come_in_order_and_a_broken_one_is_named(run: SavedRun, tmp_path: Path) -> None:
+    kitti = make_kitti(tmp_path / "kitti", frames=FRAMES)
+    (kitti / "calib.txt").write_text(calib_text(0.0, 0.54))
+    camera = replace(run.tracked.camera, fu=700.0, fv=700.0, cu=600.0, cv=180.0, baseline_m=0.54)
+    run = replace(run, tracked=replace(run.tracked, camera=camera))
+    frames = list(stereo_frames(run, str(kitti), np.array([1, 4])))
+    assert [frame.index for frame in frames] == [1, 4]
+    broken = kitti / "image_1" / "000004.png"
+    broken.write_bytes(broken.read_bytes()[:40])
+    with pytest.raises(DataError, match="frame 4 cannot be read; see the warnings above"):
+        list(stereo_frames(run, str(kitti), np.array([1, 4])))

@@ -1,0 +1,55 @@
+"""What the simulator refuses, and in which words: sizes, shares and motions that make no recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from vio.errors import VioError
+from vio.sim.motion import car_loop, fit_spline, hand_held
+from vio.sim.oracle import OracleSettings
+from vio.sim.rigs import small_rig
+from vio.sim.sequence import simulate
+from vio.sim.world import room, street
+
+TIMES = np.arange(20) * 100_000_000
+POSES = np.tile(np.eye(4), (20, 1, 1))
+
+
+def _with_hole() -> np.ndarray:
+    poses = POSES.copy()
+    poses[7, 0, 3] = np.nan
+    return poses
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: fit_spline(TIMES, POSES, degree=4), "spline degree must be 3 or 5, got 4"),
+        (lambda: fit_spline(TIMES[:5], POSES), "5 times for poses of shape"),
+        (lambda: fit_spline(TIMES[:1], POSES[:1]), "needs at least two poses, got 1"),
+        (lambda: fit_spline(TIMES, _with_hole()), "pose 7 of the trajectory is not finite"),
+        (lambda: car_loop(loop_m=(20.0, 10.0), corner_m=6.0), "corners of 6 m do not fit a loop of 20 x 10 m"),
+        (lambda: OracleSettings(max_features=0), "must be positive"),
+        (lambda: OracleSettings(sigma_px=-1.0), "must not be negative"),
+        (lambda: OracleSettings(outlier_fraction=1.5), "lie between 0 and 1"),
+        (lambda: OracleSettings(left_only_fraction=-0.1), "lie between 0 and 1"),
+        (lambda: OracleSettings(outlier_px=4.0), "outlier_px must be at least 5"),
+        (lambda: street(0, loop_m=(100.0, 30.0)), "needs loop_m of at least 37.5 m each way"),
+        (lambda: room(0, bounds=[[0, 0, 0], [5, 5, 0.4]]), "at least 0.5 m apart"),
+        (lambda: room(0, bounds=[[0, 0], [5, 5]]), "an upper corner"),
+        (lambda: room(0, bare_walls=("+x", "up")), r"unknown walls \['up'\]; use some of"),
+    ],
+)
+def test_what_makes_no_recording_is_refused(make: Callable[[], object], words: str) -> None:
+    with pytest.raises(VioError, match=words):
+        make()
+
+
+def test_frames_outside_the_motion_are_none() -> None:
+    motion = hand_held(duration_s=1.0, seed=0)
+    late = motion.end_ns + np.array([1, 2]) * 10**9
+    with pytest.raises(VioError, match="no frame lies within the motion"):
+        simulate(room(0, texel_m=0.05), small_rig(64, 48), motion, frame_times_ns=late, seed=0)
