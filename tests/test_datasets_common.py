@@ -228,3 +228,26 @@ def test_settings_are_checked(name: str) -> None:
 
 def test_every_kind_has_a_reader() -> None:
     assert {"kitti", "ece276a", "utias", "log"} <= set(READERS)
+
+
+@pytest.mark.parametrize(("place", "words"), [("folder", "cannot list"), ("file.npz", "cannot read")])
+def test_a_place_that_may_not_be_read_is_an_error_in_one_line(
+    place: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / place
+    if place == "folder":
+        path.mkdir()
+    else:
+        path.write_bytes(b"PK")
+
+    def denied(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir" if place == "folder" else "open", denied)
+    with pytest.raises(DataError, match=f"{words} .*{place}: Permission denied"):
+        open_dataset(path)
+    if place != "folder":
+        monkeypatch.setattr(np, "load", denied)
+        monkeypatch.setattr("zipfile.is_zipfile", lambda _: True)
+        with pytest.raises(DataError, match="Permission denied; give a readable file"):
+            read_npz(path)

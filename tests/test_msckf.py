@@ -717,5 +717,37 @@ def test_a_silent_imu_is_named() -> None:
     flight, rng = Flight(), np.random.default_rng(0)
     filt.propagate(ImuSample(0, np.zeros(3), np.array([0, 0, 9.81])))
     filt.update(flight.observe(0, 0.5, rng))
+    assert filt.predict(20 * STEP_NS) is None
     with pytest.raises(EstimationError, match="silent"):
         filt.update(flight.observe(20, 0.5, rng))
+
+
+def test_before_the_first_frame_there_is_no_map() -> None:
+    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion=None)
+    assert filt.predict(0) is None
+    assert filt.pose_of(0) is None
+    with pytest.raises(EstimationError, match="has not seen a frame yet"):
+        filt.landmarks()
+
+
+@pytest.mark.parametrize("gap", [1, 10**9])
+@pytest.mark.parametrize("seed", range(3))
+def test_garbage_ends_in_an_error_of_ours_or_in_numbers(seed: int, gap: int) -> None:
+    """Features that jump about at random, with gaps: never a NaN passed on, never a foreign exception."""
+    rng = np.random.default_rng(seed)
+    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(clones=5), motion=None)
+    for k in range(40):
+        n = int(rng.integers(0, 25))
+        z = np.column_stack([rng.uniform(60, 740, n), rng.uniform(0, 470, n), np.zeros((n, 2))])
+        z[:, 2], z[:, 3] = z[:, 0] - rng.uniform(1, 50, n), z[:, 1]
+        try:
+            filt.update(observations(k, k * gap * STEP_NS, rng.permutation(40)[:n], z))
+        except EstimationError as error:
+            told = str(error)
+            break
+        assert np.isfinite(filt.estimate().T_world_imu).all()
+        assert np.isfinite(filt.estimate().covariance).all()
+    else:
+        assert gap == 1, "steps of 1.6 years are survived by no filter"
+        return
+    assert f"msckf diverged at frame {k}: too few features for too long" in told

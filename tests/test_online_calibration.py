@@ -289,6 +289,14 @@ def test_pose_at_an_exposure_follows_the_time_offset() -> None:
         np.testing.assert_allclose(T, se3_from_parts(R, p), atol=2e-5)
 
 
+def test_pose_at_a_coming_exposure_is_that_of_its_clone() -> None:
+    window = _window(late_s=0.004)
+    window.calibration = window.calibration.corrected(np.array([0.0, 0, 0, 0, 0, 0, 0.006]))
+    np.testing.assert_allclose(window.exposure(window.nav, 0.004), window.exposures()[-1], atol=1e-12)
+    still = Window(window.motion, window.nav, np.eye(DIM))
+    np.testing.assert_array_equal(still.exposure(window.nav, 0.004), window.nav.T_world_imu)
+
+
 def test_beginning_late_leaves_what_is_known_of_exposures_and_landmarks() -> None:
     """Relative poses of the exposures, and landmarks beside them, are as certain after (C4) as before."""
     window = _window()

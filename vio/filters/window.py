@@ -322,8 +322,7 @@ class Window:
 
     def _correct_twists(self, error: FloatArray) -> None:
         """Let the clones' velocities and rates follow the navigation state's error (15,)."""
-        if not isinstance(self.motion, ImuMotion) or not self.clones:
-            return
+        assert isinstance(self.motion, ImuMotion)  # nothing else is calibrated
         ages = np.array([self.clones[-1].time_ns - c.time_ns for c in self.clones]) * 1e-9
         velocities = self.motion.corrected_earlier(np.array([c.velocity for c in self.clones]), ages, error)
         self.clones = [
