@@ -84,8 +84,12 @@ class KltSettings(Section):
     window_px: int = setting(
         11, "side of the tracking window, in pixels of the half-resolution image", unit="px", at_least=3
     )
-    pyramid_levels: int = setting(2, "image levels coarser than half resolution when tracking in time", at_least=0)
-    trusted_levels: int = setting(1, "the same where the last motion or the filter predicts the pixels", at_least=0)
+    pyramid_levels: int = setting(
+        2, "image levels coarser than half resolution when tracking in time", at_least=0, at_most=8
+    )
+    trusted_levels: int = setting(
+        1, "the same where the last motion or the filter predicts the pixels", at_least=0, at_most=8
+    )
     iterations: int = setting(20, "largest number of Lucas-Kanade iterations a level", at_least=1)
     max_forward_backward_px: float = setting(1.5, "largest error after tracking there and back", unit="px", above=0)
     consensus_px: float = setting(

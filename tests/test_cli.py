@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -135,6 +136,56 @@ def test_runs_without_out_number_themselves(
     assert outs == [str(Path("runs/drive")), str(Path("runs/drive-2"))]
 
 
+def test_an_earlier_run_is_replaced_but_nothing_that_was_put_beside_it(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    run = ["run", str(recording), "--out", str(out)]
+    assert main(run) == main(run) == 0
+    (out / "notes.md").write_text("what I thought")
+    (out / "check").mkdir()
+    before = (out / "metrics.json").read_bytes()
+    capsys.readouterr()
+    assert main(run) == 1
+    said = capsys.readouterr().err
+    assert "holds check, notes.md beside an earlier result" in said
+    assert said.count("\n") == 1
+    assert (out / "notes.md").read_text() == "what I thought"
+    assert (out / "metrics.json").read_bytes() == before
+
+
+def test_features_of_another_recording_are_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = tmp_path / "first"
+    assert main(["run", str(recording), "--save-observations", "--out", str(first)]) == 0
+    arrays = ece276a_arrays(make_drive(9))
+    other = make_npz(tmp_path / "other.npz", {**arrays, "time_stamps": arrays["time_stamps"] + 77.7})
+    capsys.readouterr()
+    features = f"frontend.features={first / 'observations.npz'}"
+    assert main(["run", str(recording), "--set", features, "--out", str(tmp_path / "again")]) == 0
+    assert main(["run", str(other), "--set", features, "--out", str(tmp_path / "mixed")]) == 1
+    assert "its frames are not those of" in capsys.readouterr().err
+    assert not (tmp_path / "mixed").exists()
+
+
+def test_letters_that_the_terminal_lacks_end_nothing() -> None:
+    env = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
+    for words in (["run", "--help"], ["config", "--show"]):
+        done = subprocess.run([sys.executable, "-m", "vio", *words], capture_output=True, env=env, check=False)
+        assert done.returncode == 0, done.stderr.decode()
+        assert done.stderr == b""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
+def test_output_that_cannot_be_written_is_said_in_a_line() -> None:
+    with Path("/dev/full").open("w") as full:
+        words = [sys.executable, "-m", "vio", "config", "--show"]
+        done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, check=False, text=True)
+    assert done.returncode == 1
+    assert done.stderr == "error: cannot write the output: No space left on device\n"
+
+
 def test_people_get_lines_and_the_picture_is_named(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -162,7 +213,7 @@ def test_people_get_lines_and_the_picture_is_named(
         (["run", "{rec}", "--start", "400"], "past the last frame"),
         (["run", "{rec}", "--start", "5", "--stop", "5"], "no range"),
         (["run", "{rec}", "--set", "vislam.iterations=0"], "at least 1"),
-        (["run", "{rec}", "--out", "{tmp}/thesis"], "no run of ours"),
+        (["run", "{rec}", "--out", "{tmp}/thesis"], "was not made by this program"),
         (["run", "{rec}", "--out", "{rec}"], "is a file"),
         (["eval", "{tmp}/none.tum", "{tmp}/none.txt"], "none.tum"),
         (["eval", "{tmp}/empty", "{tmp}/none.txt"], "no run folder"),

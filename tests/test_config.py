@@ -59,6 +59,7 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("vislam:\n  use_stale: 1\n", r"takes true or false, got 1"),
         ("vislam:\n  noise: litral\n", r"is one of consistent, literal, not 'litral'; did you mean 'literal'"),
         ("- 1\n- 2\n", r"is a mapping of settings, not a list"),
+        ("msckf:\n  clones: 5\nmsckf:\n  clones: 7\n", r"'msckf' is there twice"),
         ("vislam: [\n", r"not valid YAML"),
         ("motion:\n", r"motion is one of auto"),
     ],

@@ -302,3 +302,13 @@ def test_a_reference_that_does_not_fit_is_a_warning_not_a_lost_run(
     metrics = write_run_folder(tmp_path / "out", run(drive, Config()), late)
     assert metrics["ate_m"] is None
     assert "reference was not used" in caplog.text
+
+
+def test_a_recording_that_shows_nothing_is_said_so() -> None:
+    class Dark(FakeDrive):
+        def observations(self, index: int) -> Observations | None:
+            return observations(index, index * STEP_NS, [], np.zeros((0, 4)))
+
+    result = run(Dark(frames=4, velocity=False), Config())
+    assert result.warnings[-1] == "no feature in any of 4 frames: the trajectory says nothing of the motion"
+    assert not any("no feature in any" in line for line in run(FakeDrive(frames=4), Config()).warnings)

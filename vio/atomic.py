@@ -8,7 +8,7 @@ import logging
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 from vio.errors import DataError, VioError
@@ -58,19 +58,21 @@ def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 @contextlib.contextmanager
-def atomic_folder(path: str | os.PathLike[str], *, replace: bool, marker: str | None = None) -> Iterator[Path]:
+def atomic_folder(
+    path: str | os.PathLike[str], *, replace: bool, marker: str | None = None, own: Collection[str] | None = None
+) -> Iterator[Path]:
     """Give a temporary folder that becomes `path` when the block ends well, and vanishes when it does not.
 
     Missing parent folders are made (and taken away again on failure). With `replace`, an old folder is moved aside at
-    the end and removed only after the new one stands; it must be empty or hold the file named by `marker`, so that
-    a mistyped path never costs a user's own files.
+    the end and removed only after the new one stands; it must be empty or hold the file named by `marker`, and nothing
+    beside the names in `own` where those are given, so that a mistyped path never costs a user's own files.
 
     Raises:
         VioError: `path` exists and may not be replaced.
         DataError: the parent is not writable, or the disk is full.
     """
     target = Path(path).absolute()
-    _refuse_to_lose(target, replace, marker)
+    refuse_to_lose(target, replace, marker, own)
     partial = _sibling(target, "partial")
     parents = [parent for parent in target.parents if not parent.exists()]
     done = False
@@ -85,7 +87,7 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool, marker: str | 
             if error.errno in _NO_SPACE:
                 raise _unwritable(target, error) from error
             raise
-        _refuse_to_lose(target, replace, marker)  # someone may have made it meanwhile
+        refuse_to_lose(target, replace, marker, own)  # someone may have made it meanwhile
         try:
             _swap_in(partial, target)
         except OSError as error:
@@ -99,8 +101,8 @@ def atomic_folder(path: str | os.PathLike[str], *, replace: bool, marker: str | 
                     parent.rmdir()
 
 
-def _refuse_to_lose(target: Path, replace: bool, marker: str | None) -> None:
-    """Raise VioError unless `target` is free or may be replaced."""
+def refuse_to_lose(target: Path, replace: bool, marker: str | None, own: Collection[str] | None = None) -> None:
+    """Raise VioError unless `target` is free or may be replaced, as `atomic_folder` has it."""
     if not os.path.lexists(target):
         return
     if not replace:
@@ -110,6 +112,13 @@ def _refuse_to_lose(target: Path, replace: bool, marker: str | None) -> None:
     if any(target.iterdir()) and (marker is None or not (target / marker).is_file()):
         wanted = "" if marker is None else f" (it has no {marker})"
         raise VioError(f"{target} was not made by this program{wanted} and will not be replaced; choose another place")
+    foreign = [] if own is None else sorted(path.name for path in target.iterdir() if path.name not in own)
+    if foreign:
+        names = ", ".join(foreign[:3]) + (" and more" if len(foreign) > 3 else "")
+        raise VioError(
+            f"{target} holds {names} beside an earlier result and will not be replaced; move that away, or choose "
+            "another place"
+        )
 
 
 def _swap_in(partial: Path, target: Path) -> None:

@@ -161,6 +161,19 @@ def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
             yield SettingInfo(f"{prefix}{f.name}", value, unit, choices, str(f.metadata.get("range", Range())), doc)
 
 
+class _StrictLoader(yaml.SafeLoader):
+    """YAML in which a setting stands once; YAML itself lets the last of several win."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key that is there already."""
+        seen: set[str] = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is there twice", key.start_mark)
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
@@ -169,7 +182,7 @@ def _read_yaml(path: Path) -> Mapping[str, Any]:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: the configuration is not UTF-8 text") from error
     try:
-        values = yaml.safe_load(text)
+        values = yaml.load(text, Loader=_StrictLoader)
     except yaml.YAMLError as error:
         raise ConfigError(f"{path}: not valid YAML ({_first_line(error)})") from error
     if values is None:

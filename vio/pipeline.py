@@ -319,7 +319,14 @@ def _feature_source(dataset: Dataset, config: Config) -> Dataset:
         raise ConfigError(f"frontend.features is given, but frontend.name is {config.frontend.name}; use precomputed")
     from vio.datasets import open_dataset
 
-    return open_dataset(config.frontend.features, config.dataset)
+    features = open_dataset(config.frontend.features, config.dataset)
+    ours, theirs = dataset.recording, features.recording
+    if not np.isin(theirs.frame_times_ns, ours.frame_times_ns).all():
+        raise ConfigError(
+            f"{config.frontend.features}: its frames are not those of {ours.path} (other times); give the features of "
+            "this very recording"
+        )
+    return features
 
 
 def _build_frontend(features: Dataset, config: Config) -> Frontend:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,9 @@ def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_
     _draw_counts(figure.add_subplot(grid[1, 1]), seconds, result)
     _draw_time(figure.add_subplot(grid[2, 1]), seconds, result)
     figure.suptitle(_title(result, evaluation), fontsize=12)
-    figure.savefig(path)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a name in other letters
+        figure.savefig(path)
 
 
 def _title(result: RunResult, evaluation: Evaluation | None) -> str:

@@ -28,7 +28,18 @@ from vio.trajectory_io import in_first_cam0, read_trajectory, write_kitti, write
 
 log = logging.getLogger(__name__)
 
-MARKER = "metrics.json"  # a folder that holds it is one of ours and may be replaced
+MARKER = "metrics.json"  # a folder that holds it, and nothing but FILES, is one of ours and may be replaced
+FILES = (
+    MARKER,
+    "config.yaml",
+    "trajectory.tum",
+    "trajectory.kitti",
+    "dead_reckoning.tum",
+    "landmarks.ply",
+    "frames.csv",
+    "observations.npz",
+    "trajectory.png",
+)
 
 
 def write_run_folder(
@@ -53,7 +64,7 @@ def write_run_folder(
     """
     evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
     metrics = metrics_of(result, evaluation, dead_reckoning, folder)
-    with atomic_folder(folder, replace=True, marker=MARKER) as inside:
+    with atomic_folder(folder, replace=True, marker=MARKER, own=FILES) as inside:
         (inside / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
         write_tum(inside / "trajectory.tum", result.trajectory)
         write_kitti(inside / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))

@@ -128,7 +128,7 @@ def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     if frames is not None and not np.array_equal(frames, np.arange(len(trajectory))):
         logger.warning(
             "%s: its rows are the frames %s; tools that number rows from 0 will misread them",
-            path,
+            Path(path).name,
             _format_frames(frames),
         )
     rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from vio.atomic import refuse_to_lose
 from vio.cli.progress import ProgressBar
 from vio.config import Config
 from vio.datasets import open_dataset
@@ -14,7 +15,7 @@ from vio.errors import VioError
 from vio.evaluation import KITTI_LENGTHS_M
 from vio.pipeline import run
 from vio.records import Estimate, FrontendOutput, UpdateReport
-from vio.run_folder import MARKER, write_run_folder
+from vio.run_folder import FILES, MARKER, write_run_folder
 from vio.threads import one_blas_thread
 from vio.trajectory_io import read_trajectory
 
@@ -71,10 +72,9 @@ def check_out(folder: Path) -> Path:
     Raises:
         VioError: the folder is not an earlier run's, or the path is a file.
     """
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / MARKER).is_file():
-        raise VioError(f"{folder}: the folder holds something that is no run of ours; give --out another folder")
     if folder.exists() and not folder.is_dir():
         raise VioError(f"{folder}: is a file; --out takes a folder")
+    refuse_to_lose(folder, replace=True, marker=MARKER, own=FILES)
     return folder
 
 

@@ -42,5 +42,5 @@ class DatasetSettings(Section):
         5, "image folders: unreadable stereo frames skipped before the reader gives up", at_least=0
     )
     prefetch_frames: int = setting(
-        4, "image folders: stereo frames decoded ahead in a thread; 0: no thread", at_least=0
+        4, "image folders: stereo frames decoded ahead in a thread; 0: no thread", at_least=0, at_most=1000
     )

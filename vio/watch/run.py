@@ -34,6 +34,7 @@ class RunWatch:
             from vio.watch.inertial import InertialCheck  # it loads scipy.optimize
 
             self._inertial = InertialCheck(camera, T_cam0_body)
+        self._frames = self._features = 0
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
@@ -43,6 +44,8 @@ class RunWatch:
 
     def observations(self, seen: Observations) -> None:
         """See what the front end gave, before any selection."""
+        self._frames += 1
+        self._features += len(seen)
         if self._inertial is not None:
             self._say(finding.message for finding in self._inertial.frame(seen))
 
@@ -52,6 +55,8 @@ class RunWatch:
 
     def close(self) -> None:
         """See the end of the run, also of one that failed."""
+        if self._frames and not self._features:
+            self._say([f"no feature in any of {self._frames} frames: the trajectory says nothing of the motion"])
         if self._inertial is not None:
             self._say(finding.message for finding in self._inertial.finish())
 
