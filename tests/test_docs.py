@@ -320,6 +320,15 @@ def test_tools_of_the_docs_take_their_options(name: str, command: str) -> None:
     assert [option for option in argv if option.startswith("--") and f'"{option}"' not in source] == []
 
 
+def test_every_dependency_has_its_row() -> None:
+    tomllib = pytest.importorskip("tomllib", reason="part of Python 3.11")
+    project = tomllib.loads(_text("pyproject.toml"))["project"]
+    declared = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
+    plain = [requirement.partition(";")[0].strip() for requirement in declared]
+    rows = re.findall(r"^\| ([\w-]+) \| ([<>=][^|]*) \|", _text("docs/dependencies.md"), re.MULTILINE)
+    assert sorted("".join(row) for row in rows) == sorted(plain)
+
+
 @pytest.mark.parametrize("name", DOCS)
 def test_inline_code_names_what_exists(name: str) -> None:
     """Subcommands with their options, settings, files, tools with their options, make's targets."""
