@@ -677,6 +677,19 @@ def test_window_and_map_stay_bounded() -> None:
     assert window.P.shape[0] <= DIM + 36 + 24
 
 
+def test_the_map_is_the_same_however_often_it_is_merged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standing still, all features are told again every few frames; the map holds each of them once, or twice."""
+    settings, maps, held = MsckfSettings(clones=4), [], []
+    for least in (0, 10**9):
+        monkeypatch.setattr("vio.filters.msckf._LEAST_MERGE", least)
+        _, _, filt = Flight(frames=60, still=True).run(settings, "imu", sigma=0.2)
+        maps.append(filt.landmarks())
+        held.append(sum(len(part.ids) for part in filt._map))
+    for name in ("ids", "p_world", "covariance"):
+        np.testing.assert_array_equal(getattr(maps[0], name), getattr(maps[1], name))
+    assert held[0] <= 2 * len(maps[0].ids) < 0.5 * held[1]
+
+
 def test_left_only_views_count() -> None:
     """Half of the rows have no right match; they still pull the pose."""
 

@@ -184,10 +184,10 @@ def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
 
     tracemalloc.start()
     try:
-        run(Standing(frames=400), load_config(None, ["motion=none"]), viewer=Watch())
+        run(Standing(frames=200), load_config(None, ["motion=none"]), viewer=Watch())
     finally:
         tracemalloc.stop()
-    growth = (Watch.sizes[399] - Watch.sizes[199]) / 200
+    growth = (Watch.sizes[199] - Watch.sizes[99]) / 100
     assert growth < 4096, f"{growth:.0f} bytes a frame"
 
 

@@ -48,6 +48,7 @@ _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before an
 # Factors on the motion model's densities: at the start, at least, at most.
 _IMU_FACTORS = (5.0, 1.0, 50.0)
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
+_LEAST_MERGE = 1000  # points told again beside which merging the map costs nothing
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 _MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
 
@@ -96,6 +97,7 @@ class Msckf:
         self._since_frame = NO_STEP  # how the error has grown since the last frame
         self._foreseen: tuple[int, Transition] | None = None  # the step that `predict` has integrated, and its end
         self._map: list[Landmarks] = []
+        self._told = 0  # points in the map since it was merged
 
     def propagate(self, sample: MotionSample) -> None:
         """Take a motion sample.
@@ -223,12 +225,9 @@ class Msckf:
         window = self._started()
         first, n = window.first_landmark, len(window.landmarks)
         blocks = [window.P[first + 3 * k : first + 3 * k + 3, first + 3 * k : first + 3 * k + 3] for k in range(n)]
-        parts = [*self._map, Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))]
-        ids = np.concatenate([part.ids for part in parts])[::-1]
-        points = np.concatenate([part.p_world for part in parts])[::-1]
-        covariances = np.concatenate([part.covariance for part in parts])[::-1]
-        kept, last = np.unique(ids, return_index=True)
-        return Landmarks(kept, points[last], covariances[last])
+        return _newest(
+            [*self._map, Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))]
+        )
 
     def _remember_landmarks(self, window: Window, chosen: BoolArray) -> None:
         first = window.first_landmark
@@ -240,6 +239,10 @@ class Msckf:
         """Add points to the map that is only told, never used."""
         if len(ids):
             self._map.append(Landmarks(ids, p_world, covariance))
+            self._told += len(ids)
+            # Features that stay in view are told again and again.
+            if self._told > _LEAST_MERGE + len(self._map[0].ids):
+                self._map, self._told = [_newest(self._map)], 0
 
     def _wait(self, observations: Observations) -> UpdateReport:
         """Let a frame pass that comes before the first motion sample.
@@ -452,3 +455,12 @@ class Msckf:
         covariance = np.asarray(self._tracks.variance * C_inverse, dtype=np.float64)
         window.add_landmarks(table.ids(tracks.rows[chosen]), p, A.reshape(-1, len(window.P)), covariance)
         return chosen
+
+
+def _newest(parts: list[Landmarks]) -> Landmarks:
+    """Join parts of a map; of points that came back under their ids, the last ones."""
+    ids = np.concatenate([part.ids for part in parts])[::-1]
+    points = np.concatenate([part.p_world for part in parts])[::-1]
+    covariances = np.concatenate([part.covariance for part in parts])[::-1]
+    kept, last = np.unique(ids, return_index=True)
+    return Landmarks(kept, points[last], covariances[last])
