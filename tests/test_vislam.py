@@ -136,6 +136,22 @@ def test_each_landmark_is_moved_by_its_own_residual_only() -> None:
     assert np.linalg.norm(moved[1] - m[1]) > 1e-3
 
 
+def test_new_landmarks_doubt_is_that_of_its_pixels_seen_from_the_world() -> None:
+    """Against central differences of the point in the world by its pixels."""
+    settings = VislamSettings()
+    filt = Vislam(CAMERA, T_CAM0_IMU, settings, motion_sensor=False)
+    z = project(CAMERA, np.array([2.0, -1.0, 9.0]))
+    filt.update(observations(0, 0, [1], z[None]))
+
+    def in_the_world(pixels: FloatArray) -> FloatArray:
+        return transform_points(se3_inverse(T_CAM0_IMU), triangulate(CAMERA, pixels[None])[0])[0]
+
+    J = numeric_jacobian(in_the_world, z)
+    np.testing.assert_allclose(
+        filt.landmarks().covariance[0], settings.pixel_sigma_px**2 * J @ J.T, rtol=1e-5, atol=1e-9
+    )
+
+
 @pytest.mark.parametrize("tau_s", [0.05, 0.2])
 def test_noise_readings_differ_as_named(tau_s: float) -> None:
     """Literal: the paper's numbers are variances per step. Consistent: standard deviations times the step."""
