@@ -33,3 +33,10 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no recordings at {folder}; set VIO_DATA to the folder that holds them")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _no_make_around_us(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where `make` runs the tests, a `make` that a test runs must not take itself for a part of that one."""
+    for name in ("MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES"):
+        monkeypatch.delenv(name, raising=False)
