@@ -73,7 +73,7 @@ def test_standard_errors_keep_the_usual_prior_when_the_means_move() -> None:
     window.relinearise(np.random.default_rng(1).normal(0, 0.1, len(window.P)))
     after = window.standard_D_error()
     np.testing.assert_allclose(after @ window.P @ after.T, P_usual, atol=1e-12)
-    np.testing.assert_allclose(after @ window.offset, _usual_difference(window, start), atol=1e-12)
+    np.testing.assert_allclose(after @ window.prior_delta, _usual_difference(window, start), atol=1e-12)
     assert np.abs(after - before).max() > 0.1  # so the window's own covariance did change
     assert np.abs(window.P - start.P).max() > 1e-3
 
@@ -85,7 +85,7 @@ def test_first_estimates_keep_their_levers_and_tell_the_same_covariance() -> Non
     window.relinearise(np.random.default_rng(1).normal(0, 0.1, len(window.P)))
     np.testing.assert_array_equal(window.P, start.P)
     np.testing.assert_array_equal(window.standard_D_error(), M)
-    np.testing.assert_allclose(M @ window.offset, _usual_difference(window, start), atol=1e-12)
+    np.testing.assert_allclose(M @ window.prior_delta, _usual_difference(window, start), atol=1e-12)
     # What is told are right-invariant errors at the present means: the same usual errors by another lever.
     present = StandardErrors(window.motion, window.nav, np.eye(DIM)).standard_D_error()
     told = present @ window.right_invariant(window.P[:DIM, :DIM]) @ present.T

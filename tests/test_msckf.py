@@ -16,7 +16,7 @@ from vio.filters.multiview import (
     Views,
     eliminate_points,
     first_points,
-    point_lever,
+    point_D_pose,
     refine_points,
     residuals,
     track_information,
@@ -97,7 +97,7 @@ def test_clone_jacobian_is_that_of_the_right_invariant_error() -> None:
         moved = T_CAM0_IMU @ se3_inverse(se3_exp(xi) @ T_world_imu)
         return project(CAMERA, transform_points(moved, p[0]))
 
-    analytic = at.z_D_p[0, 0] @ point_lever(p)[0]
+    analytic = at.z_D_p[0, 0] @ point_D_pose(p)[0]
     np.testing.assert_allclose(analytic, numeric_jacobian(pixels, np.zeros(6)), rtol=1e-5, atol=1e-4)
 
 
@@ -117,7 +117,7 @@ def test_points_are_found_from_noisy_views() -> None:
 def _stacked(at: Residuals, p: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
     """Per track: H_clones (4N, 6N), H_point (4N, 3), r (4N,)."""
     N = at.r.shape[1]
-    B = point_lever(p)
+    B = point_D_pose(p)
     out = []
     for f in range(len(p)):
         H = np.zeros((4 * N, 6 * N))
@@ -343,7 +343,7 @@ def test_new_anchor_of_the_landmarks_changes_no_prediction() -> None:
     window.add_clone(9, 9)
     first = window.first_landmark
     J = np.zeros((3, len(window.P)))
-    lever = point_lever(p)[0][:, 3:]
+    lever = point_D_pose(p)[0][:, 3:]
     new = window.clone_rows(4)
     J[:, first : first + 3], J[:, newest.start : newest.start + 3] = np.eye(3), -np.eye(3)
     J[:, newest.start + 3 : newest.stop] += lever
@@ -357,9 +357,9 @@ def test_relinearising_moves_the_means_and_not_the_prior() -> None:
     error = np.random.default_rng(2).normal(size=len(P)) * 0.01
     window.relinearise(error)
     np.testing.assert_array_equal(window.P, P)
-    np.testing.assert_allclose(window.offset, error)
-    window.relinearise(-window.offset)
-    np.testing.assert_allclose(window.offset, 0, atol=1e-15)
+    np.testing.assert_allclose(window.prior_delta, error)
+    window.relinearise(-window.prior_delta)
+    np.testing.assert_allclose(window.prior_delta, 0, atol=1e-15)
     np.testing.assert_allclose(window.clones[2].T_world_imu, _window().clones[2].T_world_imu, atol=1e-4)
 
 
@@ -367,11 +367,11 @@ def test_commit_in_two_parts_equals_commit_at_once() -> None:
     rng = np.random.default_rng(7)
     H, r = rng.normal(size=(40, DIM + 24)), rng.normal(size=40)
     once, twice = _window(), _window()
-    once.commit(H.T @ H, H.T @ r)
-    once.relinearise(-once.offset)
+    once.absorb(H.T @ H, H.T @ r)
+    once.relinearise(-once.prior_delta)
     for part in (slice(0, 15), slice(15, 40)):
-        twice.commit(H[part].T @ H[part], H[part].T @ r[part])
-    twice.relinearise(-twice.offset)
+        twice.absorb(H[part].T @ H[part], H[part].T @ r[part])
+    twice.relinearise(-twice.prior_delta)
     np.testing.assert_allclose(twice.P, once.P, atol=1e-12)
     np.testing.assert_allclose(twice.nav.T_world_imu, once.nav.T_world_imu, atol=1e-10)
 

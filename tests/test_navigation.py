@@ -97,7 +97,7 @@ def test_mean_rate_of_a_step_is_what_the_gyro_read_and_the_present_rate_lacks_th
 
 def test_rest_of_an_imu_is_measured_by_velocity_and_bias() -> None:
     motion, reading = ImuMotion(SETTINGS), MOVING.gyro_bias + np.array([0.02, 0.01, -0.03])
-    measurement = motion.standing(MOVING, reading)
+    measurement = motion.zero_velocity(MOVING, reading)
     assert measurement is not None
 
     def seen(error: FloatArray) -> FloatArray:
@@ -112,8 +112,8 @@ def test_rest_of_an_imu_is_measured_by_velocity_and_bias() -> None:
 
 def test_rest_is_denied_where_the_gyro_turns_or_is_not_known() -> None:
     motion = ImuMotion(SETTINGS)
-    assert motion.standing(MOVING, MOVING.gyro_bias + np.array([0.0, 0.34, 0.0])) is None
-    assert motion.standing(MOVING, None) is None
+    assert motion.zero_velocity(MOVING, MOVING.gyro_bias + np.array([0.0, 0.34, 0.0])) is None
+    assert motion.zero_velocity(MOVING, None) is None
 
 
 def test_velocities_are_measured_by_the_twist_and_the_rates_bias() -> None:

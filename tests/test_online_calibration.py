@@ -12,7 +12,7 @@ from tests.numerics import numeric_jacobian
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight, _world_points
 from vio.errors import ConfigError
 from vio.filters.msckf import Msckf
-from vio.filters.multiview import Views, landmark_information, point_lever, residuals
+from vio.filters.multiview import Views, landmark_information, point_D_pose, residuals
 from vio.filters.navigation import DIM, ImuMotion, NavState
 from vio.filters.online_calibration import (
     body_twists,
@@ -176,7 +176,7 @@ def test_pose_jacobian_equals_central_differences_of_pixels() -> None:
 
     views = Views(np.zeros((2, 1, 4)), np.ones((2, 1, 4)))
     at = residuals(CAMERA, (T_CAM0_IMU @ se3_inverse(T))[None], points, views)
-    analytic = at.z_D_p[:, 0] @ point_lever(points) @ pose_D_calibration(T[None], twist[None])[0]
+    analytic = at.z_D_p[:, 0] @ point_D_pose(points) @ pose_D_calibration(T[None], twist[None])[0]
     np.testing.assert_allclose(analytic.reshape(8, 7), numeric_jacobian(pixels, np.zeros(7)), rtol=1e-5, atol=1e-3)
 
 
@@ -193,7 +193,7 @@ def test_track_jacobian_over_the_window_equals_central_differences() -> None:
     at = residuals(CAMERA, T, points, Views(np.zeros((3, 5, 4)), np.ones((3, 5, 4))))
     z_D_poses = np.zeros((5, 3, 4, 30))
     for n in range(5):
-        z_D_poses[n, :, :, 6 * n : 6 * n + 6] = at.z_D_p[:, n] @ point_lever(points)
+        z_D_poses[n, :, :, 6 * n : 6 * n + 6] = at.z_D_p[:, n] @ point_D_pose(points)
     numeric = numeric_jacobian(pixels, np.zeros(len(window.P) - DIM))
     np.testing.assert_allclose(window.chain(z_D_poses).reshape(60, -1)[:, DIM:], numeric, rtol=1e-5, atol=1e-3)
 
@@ -215,7 +215,7 @@ def test_landmark_information_equals_that_of_central_differences() -> None:
     window.add_landmark_information(
         A, b, *landmark_information(CAMERA, T, points, Views(z, np.ones((4, 4))), sigma2=1e8)
     )
-    A, b = window.spread(A, b)
+    A, b = window.lift_information(A, b)
     r = (z - project(CAMERA, transform_points(T, points))).reshape(-1)
     np.testing.assert_allclose(A[DIM:, DIM:], J.T @ J, rtol=1e-4, atol=1e-5 * np.abs(A).max())
     np.testing.assert_allclose(b[DIM:], J.T @ r, rtol=1e-4, atol=1e-5 * np.abs(b).max())
@@ -258,7 +258,7 @@ def test_moving_the_world_is_no_information_whatever_the_calibration() -> None:
     T = window.T_cam0_world()
     J = np.random.default_rng(4).normal(size=(40, 30))
     J -= J @ np.tile(np.eye(6), (5, 5)) / 5  # sees relative poses only
-    A, _ = window.spread(J.T @ J, np.zeros(30))
+    A, _ = window.lift_information(J.T @ J, np.zeros(30))
     for direction in np.eye(6):
         moves = np.concatenate([np.zeros(DIM + 7), np.tile(direction, 5)])
         assert np.abs(A @ moves).max() < 1e-9 * np.abs(A).max()
@@ -319,7 +319,7 @@ def test_beginning_late_leaves_what_is_known_of_exposures_and_landmarks() -> Non
         return out
 
     before = known(window)
-    window.begin_calibration()
+    window.start_calibration()
     np.testing.assert_allclose(known(window), before, atol=1e-12)
     assert np.trace(window.P[window.clone_rows(0), window.clone_rows(0)]) > 0
 

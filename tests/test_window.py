@@ -42,14 +42,14 @@ def test_every_change_keeps_the_covariance_symmetric_and_positive() -> None:
     window, rng = _window(), np.random.default_rng(1)
     assert _symmetric_and_positive(window.P)
     H = rng.normal(size=(20, len(window.P)))
-    window.commit(H.T @ H, H.T @ rng.normal(size=20))
+    window.absorb(H.T @ H, H.T @ rng.normal(size=20))
     assert _symmetric_and_positive(window.P)
-    window.widen(np.eye(DIM) * 1e-4)
+    window.inflate_process_noise(np.eye(DIM) * 1e-4)
     assert _symmetric_and_positive(window.P)
     window.keep_landmarks(np.array([False, True]))
     window.drop_oldest_clone()
     assert _symmetric_and_positive(window.P)
-    assert len(window.P) == DIM + 18 + 3 == len(window.offset)
+    assert len(window.P) == DIM + 18 + 3 == len(window.prior_delta)
 
 
 def test_a_landmark_whose_error_is_its_anchors_moves_with_it() -> None:
@@ -74,7 +74,7 @@ def test_widening_the_last_step_is_the_same_as_having_known_it_less() -> None:
     early.add_clone(4, 4 * STEP_NS)
     late.propagate(step)
     late.add_clone(4, 4 * STEP_NS)
-    late.widen(extra)
+    late.inflate_process_noise(extra)
     np.testing.assert_allclose(late.P, early.P, atol=1e-13)
 
 
@@ -98,10 +98,10 @@ def test_new_landmarks_are_correlated_with_what_made_them() -> None:
     J = np.concatenate([np.eye(D), A])
     expected = J @ window.P @ J.T
     expected[D:, D:] += noise
-    window.offset = np.linspace(-1, 1, D)
+    window.prior_delta = np.linspace(-1, 1, D)
     window.add_landmarks(np.array([9]), np.array([[1.0, 2.0, 3.0]]), A, noise[None])
     np.testing.assert_allclose(window.P, expected, atol=1e-12)
-    np.testing.assert_allclose(window.offset, J @ np.linspace(-1, 1, D), atol=1e-12)
+    np.testing.assert_allclose(window.prior_delta, J @ np.linspace(-1, 1, D), atol=1e-12)
     assert window.landmark_ids.tolist() == [3, 8, 9]
 
 
@@ -127,12 +127,12 @@ def test_a_measurement_is_a_kalman_update_of_all_that_is_correlated() -> None:
     moved = copy.deepcopy(window)
     moved.measure(told)
     np.testing.assert_allclose(moved.P, expected, atol=1e-9)
-    np.testing.assert_allclose(moved.offset, 0.0, atol=1e-12)
+    np.testing.assert_allclose(moved.prior_delta, 0.0, atol=1e-12)
     np.testing.assert_allclose(
         moved.clones[0].T_world_imu, se3_exp(shift[DIM : DIM + 6]) @ window.clones[0].T_world_imu
     )
-    window.commit_measurement(told)
-    np.testing.assert_allclose(window.offset, -shift, atol=1e-9)
+    window.absorb_measurement(told)
+    np.testing.assert_allclose(window.prior_delta, -shift, atol=1e-9)
     np.testing.assert_array_equal(window.clones[0].T_world_imu, _window().clones[0].T_world_imu)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from vio.filters.multiview import Residuals, eliminate_points, point_lever
+from vio.filters.multiview import Residuals, eliminate_points, point_D_pose
 from vio.filters.settings import MsckfSettings
 from vio.filters.window_tracks import WindowTracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
@@ -65,17 +65,17 @@ def test_pixel_noise_follows_the_median_slowly(nis: float, count: int, change: f
     before = tracks.variance
     values = np.full(count, nis)
     values[:6] = 1e6  # wrong tracks below half
-    tracks.follow_noise(np.append(values, np.full(6, 0.0)) if count >= 15 else values)
+    tracks.update_pixel_noise(np.append(values, np.full(6, 0.0)) if count >= 15 else values)
     np.testing.assert_allclose(tracks.variance, before * change**0.05)
 
 
 def test_pixel_noise_stays_in_its_bounds() -> None:
     tracks = WindowTracks(CAMERA, SETTINGS)
     for _ in range(200):
-        tracks.follow_noise(np.full(20, 100.0))
+        tracks.update_pixel_noise(np.full(20, 100.0))
     assert tracks.variance == SETTINGS.pixel_sigma_max_px**2
     for _ in range(500):
-        tracks.follow_noise(np.zeros(20))
+        tracks.update_pixel_noise(np.zeros(20))
     assert tracks.variance == SETTINGS.pixel_sigma_min_px**2
 
 
@@ -90,9 +90,9 @@ def test_pixel_noise_stays_in_its_bounds() -> None:
     ],
 )
 def test_the_image_stands_still_where_nearly_all_of_it_does(pixels: FloatArray, still: bool) -> None:
-    assert _moving_by(pixels).stand_still(2) is still
-    assert not _moving_by(pixels).stand_still(1)
-    assert not _moving_by(pixels, replace(SETTINGS, still_px=0.0)).stand_still(2)
+    assert _moving_by(pixels).is_stationary(2) is still
+    assert not _moving_by(pixels).is_stationary(1)
+    assert not _moving_by(pixels, replace(SETTINGS, still_px=0.0)).is_stationary(2)
 
 
 def test_tracks_that_end_come_first_then_the_longest() -> None:
@@ -150,7 +150,7 @@ def test_points_follow_the_poses_as_the_joint_problem_says() -> None:
     before = linear.p_world.copy()
     tracks.move_points(linear, poses)
     H, r = np.zeros((5 * 16, 24 + 15)), np.zeros(5 * 16)
-    lever = point_lever(before)
+    lever = point_D_pose(before)
     weight = 1 / (1 + np.sum(linear.at.r**2, axis=2) / (4 * _scales(linear.at, tracks.variance) * 9.0))
     for f in range(5):
         for n in range(4):

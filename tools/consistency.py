@@ -140,7 +140,7 @@ class StandardErrors(Window):
             replace(c, T_world_imu=_moved(c.T_world_imu, move)) for c, move in zip(self.clones, moves, strict=True)
         ]
         self.landmarks = self.landmarks + change[self.first_landmark :].reshape(-1, 3)
-        self.offset = self.offset + error
+        self.prior_delta = self.prior_delta + error
         self._follow(before)
 
     def right_invariant(self, P: FloatArray) -> FloatArray:
@@ -155,7 +155,7 @@ class StandardErrors(Window):
         # M = I + L with L L = 0, so the inverse is I - L.
         change = np.eye(len(before)) + before - self.standard_D_error()
         self.P = change @ self.P @ change.T
-        self.offset = change @ self.offset
+        self.prior_delta = change @ self.prior_delta
 
 
 class FirstEstimates(StandardErrors):
@@ -181,10 +181,10 @@ class FirstEstimates(StandardErrors):
             super().add_clone(frame_index, time_ns, *rest)
         self._first_clones = [*self._first_clones, self.clones[-1]]
 
-    def widen(self, extra: FloatArray) -> None:
+    def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise to the last step."""
         with self._landmarks_at_first():
-            super().widen(extra)
+            super().inflate_process_noise(extra)
 
     def drop_oldest_clone(self) -> None:
         """Forget the oldest clone."""

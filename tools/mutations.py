@@ -275,8 +275,8 @@ MUTATIONS = (
     Mutation(
         "twist: covariance of the pose with tau/2 for tau/3",
         "vio/filters/navigation.py",
-        "lever.T * (tau / 3)",
-        "lever.T * (tau / 2)",
+        "xi_D_twist.T * (tau / 3)",
+        "xi_D_twist.T * (tau / 2)",
         _WINDOW,
     ),
     Mutation(
@@ -310,14 +310,14 @@ MUTATIONS = (
     Mutation(
         "window: new anchor with the sign of the old one",
         "vio/filters/window.py",
-        "A[rows, newest : newest + 3] += lever[k]",
-        "A[rows, newest : newest + 3] -= lever[k]",
+        "A[rows, newest : newest + 3] += p_cross[k]",
+        "A[rows, newest : newest + 3] -= p_cross[k]",
         _WINDOW,
     ),
     Mutation(
         "window: commit forgets where the means are",
         "vio/filters/window.py",
-        "vector + information @ self.offset",
+        "vector + information @ self.prior_delta",
         "vector",
         _WINDOW,
     ),

@@ -142,60 +142,60 @@ def run(
     viewer = viewer or NullViewer()
     dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
     watch = RunWatch(recording.camera, T_cam0_body, imu=motion == "imu")
-    diary = _Diary(backend, config.lag_frames, keep_observations=keep_observations)
-    laps = _Laps()
+    recorder = _RunRecorder(backend, config.lag_frames, keep_observations=keep_observations)
+    timer = _StageTimer()
     try:
         for event in dataset.events(start, stop, images=_needs_images(dataset, config)):
             if not isinstance(event, StereoFrame):
                 watch.sample(event)
-                diary.sample(event)
+                recorder.sample(event)
                 if motion is not None:
                     backend.propagate(event)
                 if dead_reckoning is not None:
                     dead_reckoning.propagate(event)
                 continue
-            laps.end("read")
+            timer.end("read")
             expected = backend.predict(event.time_ns)
-            laps.end("predict")
+            timer.end("predict")
             output = frontend.process(event, expected.tracks if expected and config.frontend.prior else None)
-            laps.end("frontend")
+            timer.end("frontend")
             watch.observations(output.observations)
-            laps.end("watch")
+            timer.end("watch")
             seen = (
                 output.observations.take(output.observations.has_right) if backend.stereo_only else output.observations
             )
             selection = selector.select(seen, expected.motion if expected else None)
-            laps.end("select")
+            timer.end("select")
             report = backend.update(seen.take(selection.chosen))
             estimate = backend.estimate()
-            laps.end("update")
+            timer.end("update")
 
             watch.update(event.index, report, estimate)
-            diary.frame(estimate, _frame_log(event, laps, output, selection, report), output.observations)
+            recorder.frame(estimate, _frame_log(event, timer, output, selection, report), output.observations)
             if dead_reckoning is not None:
                 dead_reckoning.frame(event)
             viewer.frame(output, estimate, report)
-            laps.begin()
+            timer.begin()
     finally:
         watch.close()
         viewer.close()
-    if not diary.frames:
+    if not recorder.frames:
         raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
-    diary.finish()
+    recorder.finish()
     return RunResult(
         recording=recording,
         config=config,
         motion=motion,
         body=body,
         T_cam0_body=T_cam0_body,
-        estimates=tuple(diary.estimates),
-        dead_reckoning=_trajectory(dead_reckoning.poses, diary.frames, body) if dead_reckoning is not None else None,
+        estimates=tuple(recorder.estimates),
+        dead_reckoning=_trajectory(dead_reckoning.poses, recorder.frames, body) if dead_reckoning is not None else None,
         landmarks=backend.landmarks(),
-        frames=tuple(diary.frames),
-        observations=tuple(diary.observations) if keep_observations else None,
-        motion_samples=tuple(diary.samples) if keep_observations else None,
+        frames=tuple(recorder.frames),
+        observations=tuple(recorder.observations) if keep_observations else None,
+        motion_samples=tuple(recorder.samples) if keep_observations else None,
         warnings=tuple(watch.lines),
-        wall_s=laps.since_start(),
+        wall_s=timer.since_start(),
     )
 
 
@@ -238,7 +238,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     return config.motion
 
 
-class _Laps:
+class _StageTimer:
     """Wall time of the stages of one frame, the end of one being the beginning of the next."""
 
     def __init__(self) -> None:
@@ -261,7 +261,7 @@ class _Laps:
         return time.perf_counter() - self._start
 
 
-class _Diary:
+class _RunRecorder:
     """What a run keeps: an estimate and a row of the log per frame and, on request, what went in."""
 
     def __init__(self, backend: Backend, lag_frames: int, *, keep_observations: bool) -> None:
@@ -367,16 +367,16 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
 
 
 def _frame_log(
-    frame: StereoFrame, laps: _Laps, output: FrontendOutput, selection: Selection, report: UpdateReport
+    frame: StereoFrame, timer: _StageTimer, output: FrontendOutput, selection: Selection, report: UpdateReport
 ) -> FrameLog:
     return FrameLog(
         index=frame.index,
         time_ns=frame.time_ns,
-        read_ms=laps.ms["read"],
-        frontend_ms=laps.ms["frontend"],
-        watch_ms=laps.ms["watch"],
-        select_ms=laps.ms["select"],
-        filter_ms=laps.ms["predict"] + laps.ms["update"],
+        read_ms=timer.ms["read"],
+        frontend_ms=timer.ms["frontend"],
+        watch_ms=timer.ms["watch"],
+        select_ms=timer.ms["select"],
+        filter_ms=timer.ms["predict"] + timer.ms["update"],
         detected=output.detected,
         tracked=output.tracked,
         matched=output.matched,

@@ -95,9 +95,11 @@ class Msckf:
         self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._since_frame = NO_STEP  # how the error has grown since the last frame
-        self._foreseen: tuple[int, Transition] | None = None  # the step that `predict` has integrated, and its end
+        self._predicted_step: tuple[int, Transition] | None = (
+            None  # integrated by `predict`, with its end
+        )
         self._map: list[Landmarks] = []
-        self._told = 0  # points in the map since it was merged
+        self._points_stored = 0  # points in the map since it was merged
 
     def propagate(self, sample: MotionSample) -> None:
         """Take a motion sample.
@@ -109,7 +111,7 @@ class Msckf:
         if expected is None or not isinstance(sample, expected):
             raise ConfigError(f"msckf was built for motion {self._source or 'none'}, got a {type(sample).__name__}")
         self._motion.take(sample)
-        self._foreseen = None  # the sample may change what the step looks like
+        self._predicted_step = None  # the sample may change what the step looks like
         if isinstance(sample, VelocitySample) and self._window is not None:
             self._advance(sample.time_ns)
             self._measure()
@@ -189,7 +191,7 @@ class Msckf:
             return Estimate(self._time_ns, np.eye(4), np.eye(6))
         window = self._window
         output = self._grown_output()
-        T, covariance = window.present(output)
+        T, covariance = window.current_pose(output)
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
         A = se3_adjoint(se3_inverse(T))
         estimate = Estimate(
@@ -200,7 +202,7 @@ class Msckf:
             gyro_bias=window.nav.gyro_bias,
             accel_bias=window.nav.accel_bias,
         )
-        return window.calibration.tell(estimate, output[DIM:, DIM:])
+        return window.calibration.add_to_estimate(estimate, output[DIM:, DIM:])
 
     def _grown_output(self) -> FloatArray:
         """Covariance of navigation state and calibration at the time of the last event."""
@@ -229,20 +231,20 @@ class Msckf:
             [*self._map, Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))]
         )
 
-    def _remember_landmarks(self, window: Window, chosen: BoolArray) -> None:
+    def _store_landmarks(self, window: Window, chosen: BoolArray) -> None:
         first = window.first_landmark
         rows = [slice(first + 3 * k, first + 3 * k + 3) for k in np.flatnonzero(chosen).tolist()]
         blocks = np.array([window.P[r, r] for r in rows]).reshape(-1, 3, 3)
-        self._remember(window.landmark_ids[chosen], window.landmarks[chosen], blocks)
+        self._store_points(window.landmark_ids[chosen], window.landmarks[chosen], blocks)
 
-    def _remember(self, ids: IntArray, p_world: FloatArray, covariance: FloatArray) -> None:
+    def _store_points(self, ids: IntArray, p_world: FloatArray, covariance: FloatArray) -> None:
         """Add points to the map that is only told, never used."""
         if len(ids):
             self._map.append(Landmarks(ids, p_world, covariance))
-            self._told += len(ids)
+            self._points_stored += len(ids)
             # Features that stay in view are told again and again.
-            if self._told > _LEAST_MERGE + len(self._map[0].ids):
-                self._map, self._told = [_newest(self._map)], 0
+            if self._points_stored > _LEAST_MERGE + len(self._map[0].ids):
+                self._map, self._points_stored = [_newest(self._map)], 0
 
     def _wait(self, observations: Observations) -> UpdateReport:
         """Let a frame pass that comes before the first motion sample.
@@ -273,27 +275,27 @@ class Msckf:
             step = self._step_to(body_ns)
             self._motion.forget_before(body_ns)
             window.propagate(step)
-            self._let_calibration_walk(window, (body_ns - self._body_ns) * 1e-9)
+            self._propagate_calibration(window, (body_ns - self._body_ns) * 1e-9)
             self._since_frame = self._since_frame.then(step)
             self._gyro = step.gyro
             self._body_ns = body_ns
-        self._foreseen = None
+        self._predicted_step = None
         self._time_ns = time_ns
 
     def _step_to(self, body_ns: int) -> Transition:
         """The motion model's step from the present state; what `predict` has integrated is not integrated again."""
-        if self._foreseen is None or self._foreseen[0] != body_ns:
+        if self._predicted_step is None or self._predicted_step[0] != body_ns:
             step = self._motion.advance(self._started().nav, self._body_ns, body_ns, self._noise.factors)
-            self._foreseen = body_ns, step
-        return self._foreseen[1]
+            self._predicted_step = body_ns, step
+        return self._predicted_step[1]
 
-    def _let_calibration_walk(self, window: Window, step_s: float) -> None:
+    def _propagate_calibration(self, window: Window, step_s: float) -> None:
         """Estimate the calibration once the motion is known, and let it walk from then on."""
         if window.calibration.dim:
             if not window.calibrating and self._time_ns - self._began_ns >= 1e9 * self._settings.calibrate_after_s:
-                window.begin_calibration()
+                window.start_calibration()
             if window.calibrating:
-                window.let_calibration_walk(self._calibration[2] * step_s)
+                window.add_calibration_noise(self._calibration[2] * step_s)
 
     def _body_time(self, time_ns: int) -> int:
         """The time on the IMU's clock to which the navigation state is carried for a frame."""
@@ -310,20 +312,20 @@ class Msckf:
         if self._blind:
             window.measure(measurement)
         else:  # the frame's fit will move the means, and better
-            window.commit_measurement(measurement)
+            window.absorb_measurement(measurement)
 
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Everything that a frame's observations do."""
         z, weight, found = latest_pixels(seen, window.landmark_ids)
-        self._remember_landmarks(window, ~found)
+        self._store_landmarks(window, ~found)
         window.keep_landmarks(found)
         pixels = Views(z[found], weight[found])
         self._tracks.table.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
 
-        if self._tracks.stand_still(len(window.clones)):
-            rest = self._motion.standing(window.nav, self._gyro)
+        if self._tracks.is_stationary(len(window.clones)):
+            rest = self._motion.zero_velocity(window.nav, self._gyro)
             if rest is not None:
-                window.commit_measurement(rest)
+                window.absorb_measurement(rest)
         predicted, expected = window.last_move(), self._expected_error(self._since_frame)
         tracks = self._tracks.linearise(window.T_cam0_world(), self._tracks.choose(len(window.clones)), _FIRST_STEPS)
         innovation = tracks.newest_innovation()
@@ -332,14 +334,14 @@ class Msckf:
         if step is not None:
             missing = step.missing_noise()
             if missing.any() and self._tracks.agree(tracks.at):
-                window.widen(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
+                window.inflate_process_noise(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
                 tracks, _ = self._fit(window, tracks, pixels, innovation)
             self._noise.follow(step)
         self._since_frame = NO_STEP
 
         tracks = self._tracks.without_wrong_views(tracks)
         good, nis = self._tracks.gate(tracks.at)
-        self._tracks.follow_noise(nis)
+        self._tracks.update_pixel_noise(nis)
         report = self._commit(window, tracks, good, pixels)
         return UpdateReport(
             used=int(good.sum()) + len(pixels.z),
@@ -358,8 +360,8 @@ class Msckf:
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
-            P, shift = posterior(window.P, A, b + A @ window.offset)
-            error = shift - window.offset
+            P, shift = posterior(window.P, A, b + A @ window.prior_delta)
+            error = shift - window.prior_delta
             self._tracks.move_points(tracks, window.exposure_errors(error))
             window.relinearise(error)
             tracks = self._tracks.linearise(window.T_cam0_world(), tracks.rows, _LATER_STEPS)
@@ -403,7 +405,7 @@ class Msckf:
             T = window.T_cam0_world()[-1]
             C, g = landmark_information(self._camera, T, window.landmarks, pixels, variance)
             window.add_landmark_information(A, b, C, g)
-        return window.spread(A / variance, b / variance)
+        return window.lift_information(A / variance, b / variance)
 
     def _commit(self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views) -> int:
         """Commit what ends in this frame, keep the output covariance, make room; return how many landmarks are new."""
@@ -413,11 +415,11 @@ class Msckf:
         lost, leaving = ~seen[:, newest], seen[:, 0] & full
         ending = lost | leaving
         A, b = self._information(window, tracks, ending & good, pixels)
-        window.commit(A, b)
+        window.absorb(A, b)
 
         done = ending & good
         told = np.asarray(self._tracks.variance * np.linalg.inv(tracks.information.C[done]), dtype=np.float64)
-        self._remember(table.ids(tracks.rows[done]), tracks.p_world[done], told)
+        self._store_points(table.ids(tracks.rows[done]), tracks.p_world[done], told)
 
         going_on = good & ~ending
         own = slice(0, window.first_clone)

@@ -181,7 +181,7 @@ def track_information(at: Residuals, p_world: FloatArray, weight: FloatArray) ->
     Jt = np.swapaxes(J * weight[..., None, None], 2, 3)
     C_i = Jt @ J
     g_i = (Jt @ at.r[..., None])[..., 0]
-    B = point_lever(p_world)
+    B = point_D_pose(p_world)
     Bt = np.swapaxes(B, 1, 2)
     G_i = Bt[:, None] @ C_i
     diagonal = G_i @ B[:, None]
@@ -208,7 +208,7 @@ def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatAr
     return A, b
 
 
-def point_lever(p_world: FloatArray) -> FloatArray:
+def point_D_pose(p_world: FloatArray) -> FloatArray:
     """`B = [-I, p^]` (F, 3, 6): how a clone's error `[rho; phi]` moves a point as that clone sees it."""
     B = np.zeros((len(p_world), 3, 6))
     B[:, :, :3] = -np.eye(3)

@@ -164,7 +164,7 @@ class ImuMotion:
         """The IMU drives the state and measures nothing."""
         return None
 
-    def standing(self, nav: NavState, gyro: FloatArray | None) -> Measurement | None:
+    def zero_velocity(self, nav: NavState, gyro: FloatArray | None) -> Measurement | None:
         """Rest as a measurement, equation (N7): no velocity, and the gyro reads its bias.
 
         None where the gyro contradicts.
@@ -251,8 +251,8 @@ class ImuMotion:
         densities = factors * [s.accel_noise_density, s.gyro_noise_density]
         Q_parts = np.zeros((2, DIM, DIM))
         for part, columns, density in zip(Q_parts, (slice(3, 6), slice(0, 3)), densities, strict=True):
-            lever = moved[:, :, columns] * (density * np.sqrt(dt))[:, None, None]
-            part[:9, :9] = np.einsum("kij,klj->il", lever, lever)
+            out_D_noise = moved[:, :, columns] * (density * np.sqrt(dt))[:, None, None]
+            part[:9, :9] = np.einsum("kij,klj->il", out_D_noise, out_D_noise)
         Q = Q_parts.sum(axis=0)
         walks = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * total
         Q[9:, 9:] = np.diag(walks)
@@ -301,16 +301,16 @@ class TwistMotion:
         T = nav.T_world_imu
         moved = T @ se3_exp(tau * u)
         # T exp(tau (u + du)) = exp(tau Ad(T) J_l(tau u) du) T exp(tau u)
-        lever = tau * se3_adjoint(T) @ se3_left_jacobian(tau * u)
+        xi_D_twist = tau * se3_adjoint(T) @ se3_left_jacobian(tau * u)
         Phi = np.eye(DIM)
-        Phi[:6, 6:12] = lever
+        Phi[:6, 6:12] = xi_D_twist
         Q_parts = np.zeros((2, DIM, DIM))
         for k, part in enumerate(Q_parts):
             density = np.zeros(6)
             density[3 * k : 3 * k + 3] = self._density[3 * k : 3 * k + 3] * factors[k] ** 2
             D = np.diag(density)
-            part[:6, :6] = lever @ D @ lever.T * (tau / 3)
-            part[:6, 6:12] = lever @ D * (tau / 2)
+            part[:6, :6] = xi_D_twist @ D @ xi_D_twist.T * (tau / 3)
+            part[:6, 6:12] = xi_D_twist @ D * (tau / 2)
             part[6:12, :6] = part[:6, 6:12].T
             part[6:12, 6:12] = D * tau
         Q = Q_parts.sum(axis=0)
@@ -333,7 +333,7 @@ class TwistMotion:
         sigmas = np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3)
         return Measurement(H, residual, np.diag(sigmas**2))
 
-    def standing(self, nav: NavState, gyro: FloatArray | None) -> Measurement:
+    def zero_velocity(self, nav: NavState, gyro: FloatArray | None) -> Measurement:
         """Rest as a measurement: no twist."""
         s = self._settings
         H = np.zeros((6, DIM))

@@ -48,7 +48,7 @@ class Calibration:
             time_offset_s=self.time_offset_s + float(full[6]),
         )
 
-    def tell(self, estimate: Estimate, covariance: FloatArray) -> Estimate:
+    def add_to_estimate(self, estimate: Estimate, covariance: FloatArray) -> Estimate:
         """Return an estimate with what is estimated of the calibration, whose errors have a covariance (C, C)."""
         if self.extrinsics:
             estimate = replace(estimate, T_cam0_imu=self.T_cam0_imu, T_cam0_imu_covariance=covariance[:6, :6])
@@ -95,16 +95,16 @@ def pose_D_calibration(T_world_imu: FloatArray, twists: FloatArray) -> FloatArra
     return np.concatenate([-A, A @ twists[..., None]], axis=-1)
 
 
-def with_calibration(A: FloatArray, b: FloatArray, lever: FloatArray) -> tuple[FloatArray, FloatArray]:
+def with_calibration(A: FloatArray, b: FloatArray, pose_D_calib: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Turn information about poses into information about calibration and poses, equation (C3).
 
     Args:
         A: information matrix (6N, 6N).
         b: information vector (6N,).
-        lever: what the calibration does to the poses (6N, C).
+        pose_D_calib: what the calibration does to the poses (6N, C).
 
     Returns:
         Information matrix (C + 6N, C + 6N) and vector (C + 6N,).
     """
-    AM = A @ lever
-    return np.block([[lever.T @ AM, AM.T], [AM, A]]), np.concatenate([lever.T @ b, b])
+    AM = A @ pose_D_calib
+    return np.block([[pose_D_calib.T @ AM, AM.T], [AM, A]]), np.concatenate([pose_D_calib.T @ b, b])

@@ -249,7 +249,7 @@ class Vislam:
         outvoted = len(z) >= _MIN_FEATURES and 2 * accepted.sum() < len(z)
         if outvoted and isinstance(self._motion, DriftingTwist):
             # When most features contradict the motion model, it is the model that is wrong.
-            self._state = self._motion.released(self._state, step_s)
+            self._state = self._motion.with_inflated_covariance(self._state, step_s)
             residual, nis = self._innovation(z, m, P)
             accepted = nis <= self._gate
         gated = unseen + int((~accepted).sum())

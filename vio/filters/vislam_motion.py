@@ -154,7 +154,7 @@ class DriftingTwist:
         residual = np.concatenate([sample.linear, sample.angular]) - state.twist
         return state.corrected(K @ residual, IKH @ Sigma @ IKH.T + K @ self._sensor @ K.T)
 
-    def released(self, state: PoseState, tau_s: float) -> PoseState:
+    def with_inflated_covariance(self, state: PoseState, tau_s: float) -> PoseState:
         """Return the state with at least as much doubt about the last step's twist as at the start."""
         start = np.diag(np.maximum(self._start - np.diag(state.Sigma)[6:], 0.0))
         doubt = np.block([[start * tau_s**2, -start * tau_s], [-start * tau_s, start]])

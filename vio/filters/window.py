@@ -31,7 +31,7 @@ class Clone:
     late_s: float = 0.0  # the pose's time on the IMU's clock minus the frame's stamp
 
 
-_VELOCITY_DOUBT = 0.05  # m/s, for what a wrong calibration did to the velocity
+_VELOCITY_SIGMA_MPS = 0.05  # m/s, for what a wrong calibration did to the velocity
 _NO_CALIBRATION = Calibration(np.eye(4))
 
 
@@ -53,7 +53,7 @@ class Window:
         self.landmark_ids: IntArray = np.zeros(0, dtype=np.int64)
         self.landmarks: FloatArray = np.zeros((0, 3))
         self.P = P
-        self.offset: FloatArray = np.zeros(len(P))
+        self.prior_delta: FloatArray = np.zeros(len(P))
 
     @property
     def first_clone(self) -> int:
@@ -97,14 +97,14 @@ class Window:
         T = np.array([c.T_world_imu for c in self.clones])
         return body_twists(T, np.array([c.velocity for c in self.clones]), np.array([c.rate for c in self.clones]))
 
-    def _lever(self) -> FloatArray:
+    def _pose_D_calibration(self) -> FloatArray:
         """What the calibration's errors do to the exposures' poses (6N, C)."""
         if not self.calibrating:
             return np.zeros((6 * len(self.clones), self.calibration.dim))
         full = pose_D_calibration(self.exposures(), self._twists())
         return full[:, :, self.calibration.columns].reshape(6 * len(full), -1)
 
-    def present(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def current_pose(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pose (4, 4) at the newest exposure and its covariance (6, 6).
 
         Args:
@@ -113,20 +113,20 @@ class Window:
         if not self.calibration.timing:
             return self.nav.T_world_imu, covariance[:6, :6]
         J = np.eye(6, self.first_clone)
-        J[:, -1] = self._lever()[-6:, -1]
+        J[:, -1] = self._pose_D_calibration()[-6:, -1]
         return self.exposures()[-1], J @ covariance @ J.T
 
     def exposure_errors(self, error: FloatArray) -> FloatArray:
         """How an error vector (D,) moves the exposures' poses (6N,), up to where they move pixels."""
         clones = error[self.first_clone : self.first_landmark]
-        return clones + self._lever() @ error[DIM : self.first_clone] if self.calibration.dim else clones
+        return clones + self._pose_D_calibration() @ error[DIM : self.first_clone] if self.calibration.dim else clones
 
     def chain(self, out_D_exposures: FloatArray) -> FloatArray:
         """Turn Jacobians (..., 6N) by the exposures' poses into Jacobians (..., D) by the error vector."""
         out = np.zeros((*out_D_exposures.shape[:-1], len(self.P)))
         out[..., self.first_clone : self.first_landmark] = out_D_exposures
         if self.calibration.dim:
-            out[..., DIM : self.first_clone] = out_D_exposures @ self._lever()
+            out[..., DIM : self.first_clone] = out_D_exposures @ self._pose_D_calibration()
         return out
 
     def add_landmark_information(self, A: FloatArray, b: FloatArray, C: FloatArray, g: FloatArray) -> None:
@@ -149,12 +149,12 @@ class Window:
             A[rho, own] -= C[k]
             b[own] += g[k]
 
-    def spread(self, A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def lift_information(self, A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Turn information about exposures' poses and landmarks (6N + 3M) into that about the error vector (D)."""
         out, vector = np.zeros_like(self.P), np.zeros(len(self.P))
         if self.calibration.dim:
             landmarks = np.zeros((3 * len(self.landmarks), self.calibration.dim))
-            A, b = with_calibration(A, b, np.concatenate([self._lever(), landmarks]))
+            A, b = with_calibration(A, b, np.concatenate([self._pose_D_calibration(), landmarks]))
         out[DIM:, DIM:], vector[DIM:] = A, b
         return out, vector
 
@@ -178,16 +178,16 @@ class Window:
         P[:DIM] = Phi @ P[:DIM]
         P[:, :DIM] = P[:, :DIM] @ Phi.T
         P[:DIM, :DIM] += step.Q
-        self.offset[:DIM] = Phi @ self.offset[:DIM]
+        self.prior_delta[:DIM] = Phi @ self.prior_delta[:DIM]
 
-    def begin_calibration(self) -> None:
+    def start_calibration(self) -> None:
         """Take the calibration for uncertain from now on, equation (C4).
 
         What has been learned with a calibration that counted as known is how exposures and landmarks lie to each other
         and how fast they pass; all of it moves with the calibration's error as one, and body and IMU do not.
         """
         self.calibrating = True
-        M, first = self._lever(), self.first_clone
+        M, first = self._pose_D_calibration(), self.first_clone
         J = np.zeros((len(self.P), self.calibration.dim))
         J[6:9] = -so3_hat(self.nav.velocity) @ M[-3:]
         J[first : self.first_landmark] = np.tile(M[-6:], (len(self.clones), 1)) - M
@@ -195,15 +195,15 @@ class Window:
         S = np.eye(len(self.P))
         S[:, DIM:first] += J
         P = S @ self.P @ S.T
-        P[6:9, 6:9] += np.eye(3) * _VELOCITY_DOUBT**2
-        self.P, self.offset = 0.5 * (P + P.T), S @ self.offset
+        P[6:9, 6:9] += np.eye(3) * _VELOCITY_SIGMA_MPS**2
+        self.P, self.prior_delta = 0.5 * (P + P.T), S @ self.prior_delta
 
-    def let_calibration_walk(self, extra: FloatArray) -> None:
+    def add_calibration_noise(self, extra: FloatArray) -> None:
         """Add noise (C, C) to the calibration's errors."""
         rows = slice(DIM, self.first_clone)
         self.P[rows, rows] += extra
 
-    def widen(self, extra: FloatArray) -> None:
+    def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise (15, 15) to the last step, as if its motion had been known less; the newest clone ends it."""
         newest = self.clone_rows(len(self.clones) - 1)
         J = np.zeros((len(self.P), DIM))
@@ -223,7 +223,7 @@ class Window:
         at = self.first_landmark
         rows = np.concatenate([np.arange(at), np.arange(6), np.arange(at, len(self.P))])
         self.P = self.P[np.ix_(rows, rows)]
-        self.offset = self.offset[rows]
+        self.prior_delta = self.prior_delta[rows]
         previous = len(self.clones) - 1
         nav = self.nav
         self.clones.append(Clone(frame_index, time_ns, nav.T_world_imu, nav.velocity, nav.rate, late_s))
@@ -234,19 +234,19 @@ class Window:
         """Measure the landmarks' errors from the newest exposure's rotation: xi_f += p^ (phi_new - phi_old)."""
         first, newest = self.first_landmark, self.clone_rows(len(self.clones) - 1).start + 3
         A = np.eye(len(self.P))
-        lever = so3_hat(self.landmarks)
+        p_cross = so3_hat(self.landmarks)
         for k in range(len(self.landmarks)):
             rows = slice(first + 3 * k, first + 3 * k + 3)
-            A[rows, newest : newest + 3] += lever[k]
-            A[rows, previous_rotation : previous_rotation + 3] -= lever[k]
+            A[rows, newest : newest + 3] += p_cross[k]
+            A[rows, previous_rotation : previous_rotation + 3] -= p_cross[k]
         if self.calibration.dim:
-            M = self._lever()
-            A[first:, DIM : self.first_clone] += lever.reshape(-1, 3) @ (M[-3:] - M[-9:-6])
+            M = self._pose_D_calibration()
+            A[first:, DIM : self.first_clone] += p_cross.reshape(-1, 3) @ (M[-3:] - M[-9:-6])
         changed = A[first:]
         moved = changed @ self.P
         self.P[first:] = moved
         self.P[:, first:] = np.concatenate([moved.T[:first], moved @ changed.T])
-        self.offset[first:] = changed @ self.offset
+        self.prior_delta[first:] = changed @ self.prior_delta
 
     def drop_oldest_clone(self) -> None:
         """Forget the oldest clone."""
@@ -263,7 +263,7 @@ class Window:
 
     def _keep_rows(self, rows: IntArray) -> None:
         self.P = self.P[np.ix_(rows, rows)]
-        self.offset = self.offset[rows]
+        self.prior_delta = self.prior_delta[rows]
 
     def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
         """Add landmarks (K, 3) whose errors are `A xi + noise`, with A (3K, D) and noise covariance (K, 3, 3)."""
@@ -274,34 +274,34 @@ class Window:
         P[D:, D:] = AP @ A.T
         for k, block in enumerate(covariance):
             P[D + 3 * k : D + 3 * k + 3, D + 3 * k : D + 3 * k + 3] += block
-        self.offset = np.concatenate([self.offset, A @ self.offset])
+        self.prior_delta = np.concatenate([self.prior_delta, A @ self.prior_delta])
         self.P = 0.5 * (P + P.T)
         self.landmark_ids = np.concatenate([self.landmark_ids, ids])
         self.landmarks = np.concatenate([self.landmarks, p_world])
 
-    def commit(self, information: FloatArray, vector: FloatArray) -> None:
+    def absorb(self, information: FloatArray, vector: FloatArray) -> None:
         """Take measurements into the prior for good.
 
         Args:
             information: `H' R^-1 H` (D, D) of the residuals at the present means.
             vector: `H' R^-1 r` (D,).
         """
-        self.P, shift = posterior(self.P, information, vector + information @ self.offset)
-        self.offset = self.offset - shift
+        self.P, shift = posterior(self.P, information, vector + information @ self.prior_delta)
+        self.prior_delta = self.prior_delta - shift
 
     def measure(self, measurement: Measurement) -> None:
         """Commit a measurement of the navigation state and move the means to the new prior."""
-        self.commit_measurement(measurement)
-        self.relinearise(-self.offset)
+        self.absorb_measurement(measurement)
+        self.relinearise(-self.prior_delta)
 
-    def commit_measurement(self, measurement: Measurement) -> None:
+    def absorb_measurement(self, measurement: Measurement) -> None:
         """Commit a measurement of the navigation state; the means stay where they are."""
         RiH = np.linalg.solve(measurement.R, measurement.H)
         information = np.zeros_like(self.P)
         information[:DIM, :DIM] = measurement.H.T @ RiH
         vector = np.zeros(len(self.P))
         vector[:DIM] = RiH.T @ measurement.residual
-        self.commit(information, vector)
+        self.absorb(information, vector)
 
     def relinearise(self, error: FloatArray) -> None:
         """Move the means by an error vector (D,); the prior stays where it is."""
@@ -318,7 +318,7 @@ class Window:
         if self.calibration.dim:
             self.calibration = self.calibration.corrected(error[DIM : self.first_clone])
             self._correct_twists(error[:DIM])
-        self.offset = self.offset + error
+        self.prior_delta = self.prior_delta + error
 
     def _correct_twists(self, error: FloatArray) -> None:
         """Let the clones' velocities and rates follow the navigation state's error (15,)."""

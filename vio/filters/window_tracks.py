@@ -60,7 +60,7 @@ class WindowTracks:
         self.table = TrackTable(settings.clones + 1)
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
 
-    def stand_still(self, clones: int) -> bool:
+    def is_stationary(self, clones: int) -> bool:
         """Whether the image stands still: the median track, and nine tenths of all within twice its limit."""
         limit = self._settings.still_px
         moved = self.table.moved_px(clones - 1) if clones > 1 and limit > 0 else np.zeros(0)
@@ -140,7 +140,7 @@ class WindowTracks:
         passed: BoolArray = squares <= limit
         return passed, squares / dof
 
-    def follow_noise(self, nis_per_dof: FloatArray) -> None:
+    def update_pixel_noise(self, nis_per_dof: FloatArray) -> None:
         """Let the pixel noise follow the median of the squared residuals (F,), robustly and slowly."""
         if len(nis_per_dof) < MIN_TRACKS_FOR_NOISE:
             return
