@@ -1,4 +1,4 @@
-"""Images in, tracked stereo observations out. Knows OpenCV; nothing in `vio`'s filters imports it."""
+"""Front ends: stereo images to tracked observations. They use OpenCV; the filters of `vio` do not import them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset], Frontend
 
 
 def build_frontend(name: str, camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
-    """Build the front end called `name`; "auto" is chosen by what the recording holds.
+    """Build the front end called `name`; "auto" selects by what the recording contains.
 
     Raises:
         ConfigError: no front end has this name.

@@ -1,8 +1,8 @@
-"""Sub-pixel alignment of many small templates at once, by Gauss-Newton over an affine warp, gain and offset.
+"""Batched sub-pixel alignment of small templates, by Gauss-Newton over an affine warp, gain and offset.
 
-The gradients of the template serve in every iteration (inverse-compositional form), so that one iteration costs one
-interpolation of the image under each template, and a template is prepared once for as long as it lives. A warp (2, 3)
-maps template offsets `[x, y, 1]` to image pixels `[u, v]`.
+The inverse-compositional form uses the gradients of the template in every iteration: an iteration costs one
+interpolation of the image under each template, and a template is prepared only once. A warp (2, 3) maps
+template offsets `[x, y, 1]` to image pixels `[u, v]`.
 Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004).
 """
 
@@ -19,34 +19,34 @@ from frontend.patches import FloatImage, Patches, inside
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray
 
-_PARAMETERS = 8  # shift u, v; gain; offset; linear part by rows
+_PARAMETERS = 8  # shift u, v; gain; offset; linear part in row-major order
 _ROW_PARAMETERS = 6  # the same without the second row of the linear part
-_ROW_SIGMA_PX = 0.3  # how far from its row a feature may lie in the other image of a rectified pair
-_GRAY_SIGMA = 4.0  # difference of the two cameras' views of one patch, after gain and offset
+_ROW_SIGMA_PX = 0.3  # standard deviation of a feature's row in the other image of a rectified pair
+_GRAY_SIGMA = 4.0  # standard deviation between the two images of one patch, after gain and offset
 _ROW_WEIGHT = (_GRAY_SIGMA / _ROW_SIGMA_PX) ** 2
 _MAX_MOVE_PX = 2.5
-_DONE_PX = 0.05  # the last step is taken; what then remains is a small fraction of it
+_DONE_PX = 0.05  # step at which a template has converged; the remaining error is a small fraction of it
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
-_DAMPING = 1e-6  # relative to the diagonal: weakly textured directions move slowly instead of wildly
-_SUBPIXELS = 32  # cv2.remap rounds coordinates to this fraction of a pixel, so shifts are rounded before it does
+_DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
+_SUBPIXELS = 32  # cv2.remap rounds coordinates to this fraction of a pixel, so shifts are rounded beforehand
 _REMAP_ROWS = 30_000  # cv2.remap takes fewer than 32768 rows
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
 
 @dataclass(frozen=True, slots=True)
 class Templates:
-    """Patches ready to be found again; S = (2r + 1)^2 pixels each."""
+    """Patches prepared for alignment; S = (2r + 1)^2 pixels each."""
 
     patch: npt.NDArray[np.float32]  # (N, S) gray levels minus their mean
     gradient: npt.NDArray[np.float32]  # (N, 2, S) along u and v
     energy: npt.NDArray[np.float32]  # (N,) sum of squares of the patch
     inverse: npt.NDArray[np.float32]  # (N, 8, 8) of the normal matrix
-    row_inverse: npt.NDArray[np.float32]  # (N, 6, 6) the same, when the row is expected to stay
+    row_inverse: npt.NDArray[np.float32]  # (N, 6, 6) the same, with the expected row as a prior
 
 
 def empty_templates(count: int, radius: int) -> Templates:
-    """Room for `count` templates of a radius."""
+    """Allocate `count` empty templates of a radius."""
     size = (2 * radius + 1) ** 2
     shapes = ((size,), (2, size), (), (_PARAMETERS, _PARAMETERS), (_ROW_PARAMETERS, _ROW_PARAMETERS))
     return Templates(*(np.zeros((count, *shape), np.float32) for shape in shapes))
@@ -54,7 +54,7 @@ def empty_templates(count: int, radius: int) -> Templates:
 
 @lru_cache(maxsize=8)
 def offsets(radius: int) -> npt.NDArray[np.float32]:
-    """Offsets (3, S) `[x, y, 1]` of the pixels of a patch from its centre, row by row; not to be written to."""
+    """Offsets (3, S) `[x, y, 1]` of the pixels of a patch from its centre, in row-major order; read-only."""
     y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(np.float32).reshape(2, -1)
     out = np.stack([x, y, np.ones_like(x)])
     out.flags.writeable = False
@@ -125,12 +125,12 @@ def align(
 
     Args:
         store: templates (M,).
-        slots: which of them (N,) to find.
-        image: where.
-        warp: where to start.
-        iterations: largest number of steps.
-        rows: expected image rows (N,) of the centres, as in the other image of a rectified pair: the centre is drawn to
-            its row as strongly as the patch leaves it undetermined, and the warp shears and stretches along rows only.
+        slots: rows (N,) of the templates to align.
+        image: the image to align with.
+        warp: initial warps (N, 2, 3).
+        iterations: largest number of iterations.
+        rows: expected image rows (N,) of the centres, as in the other image of a rectified pair: the expected
+            row acts as a prior on the centre, and the warp shears and stretches along rows only.
 
     Returns:
         The refined warps (N, 2, 3), and the normalised correlation (N,) just before the last step; -1 where the
@@ -153,7 +153,7 @@ def align(
             moments[:, 1] += np.float32(_ROW_WEIGHT) * gain * (here[:, 1, 2] - rows[active]).astype(np.float32)
         size = inverse.shape[1]
         fit = (inverse[chosen] @ moments[:, :size, None])[:, :, 0].astype(np.float64)
-        # The image under the current warp is gain * template(step(x)) + offset, so the step is undone.
+        # The image under the current warp is gain * template(step(x)) + offset, so the inverse step is applied.
         fit /= np.maximum(fit[:, 2:3], 0.1)
         shift = np.clip(fit[:, :2], -_MAX_STEP_PX, _MAX_STEP_PX)
         linear = np.zeros((len(active), 4))
@@ -164,7 +164,7 @@ def align(
 
 
 def _moments(store: Templates, chosen: IntArray, view: npt.NDArray[np.float32], radius: int) -> npt.NDArray[np.float32]:
-    """Products (N, 8) of pixels (N, S) with the derivatives by the parameters; the linear part by rows comes last."""
+    """Products (N, 8) of pixels (N, S) with the derivatives by the parameters; the linear part comes last."""
     size = view.shape[1]
     by_gradient = ((store.gradient[chosen] * view[:, None]).reshape(-1, size) @ offsets(radius).T).reshape(-1, 2, 3)
     out = np.empty((len(view), _PARAMETERS), dtype=np.float32)
@@ -188,7 +188,7 @@ def _undo(warp: FloatArray, shift: FloatArray, linear: FloatArray) -> FloatArray
 def _correlation(
     energy: npt.NDArray[np.float32], moments: npt.NDArray[np.float32], view: npt.NDArray[np.float32]
 ) -> FloatArray:
-    """Normalised correlation (N,) of patches of known energy with pixels (N, S); -1 where one has no contrast."""
+    """Normalised correlation (N,) of patches of known energy with pixels (N, S); -1 where either has no contrast."""
     size = view.shape[1]
     other = np.maximum(np.einsum("ns,ns->n", view, view) - moments[:, 3] ** 2 / size, 0.0)
     flat = FLAT_RMS**2 * size
@@ -198,7 +198,7 @@ def _correlation(
 
 
 def shift_warps(centres: FloatArray) -> FloatArray:
-    """Warps (N, 2, 3) that put the template's centre at image points (N, 2), unturned and unscaled."""
+    """Warps (N, 2, 3) that put the template's centre at image points (N, 2), without rotation or scale."""
     warp = np.zeros((len(centres), 2, 3))
     warp[:, 0, 0] = warp[:, 1, 1] = 1.0
     warp[:, :, 2] = centres
@@ -206,7 +206,7 @@ def shift_warps(centres: FloatArray) -> FloatArray:
 
 
 def on_peak(place: FloatArray, start: FloatArray) -> BoolArray:
-    """Mask (N,) of fitted pixels (N, 2) near where the fit began (N, 2): one that moved further has left its peak."""
+    """Mask (N,) of fitted pixels (N, 2) near their start (N, 2); others have left the correlation peak."""
     return np.asarray(np.abs(place - start).max(axis=1) <= _MAX_MOVE_PX)
 
 

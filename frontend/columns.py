@@ -1,4 +1,4 @@
-"""Records of equally long columns, such as the features of a frame: rows of one, two of them on end."""
+"""Records of equally long columns, such as the features of a frame: select rows, concatenate records."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Record = TypeVar("Record")
 
 
 def take(record: Record, index: BoolArray | IntArray) -> Record:
-    """The rows of a record that a mask (N,) or indices (K,) name."""
+    """Select rows of a record by a mask (N,) or indices (K,)."""
     return type(record)(*(take(c, index) if is_dataclass(c) else c[index] for c in _columns(record)))
 
 
 def joined(first: Record, second: Record) -> Record:
-    """The rows of one record, then those of another."""
+    """Concatenate the rows of two records."""
     pairs = zip(_columns(first), _columns(second), strict=True)
     return type(first)(*(joined(a, b) if is_dataclass(a) else np.concatenate([a, b]) for a, b in pairs))
 

@@ -1,4 +1,4 @@
-"""Front ends that find key points in every image and match them by descriptor: in time, and from left to right."""
+"""Front ends that detect key points in every image and match them by descriptor, in time and from left to right."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy.typing as npt
 from frontend.align import align, cut_patches, on_peak, rounded, shift_warps, template_points, templates
 from frontend.columns import joined, take
 from frontend.detect import spread_evenly
-from frontend.frames import FrameGate, Stopwatch, SwapAlarm, handed_out
-from frontend.outliers import Vote, predicted_motion, static_tracks
+from frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from frontend.outliers import RansacProblem, predicted_motion, static_tracks
 from frontend.patches import FloatImage, inside
-from frontend.prediction import moved_pixels, told_pixels, usable_prior
+from frontend.prediction import moved_pixels, prior_pixels, usable_prior
 from frontend.settings import FrontendSettings, MatchSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, triangulate
@@ -26,15 +26,15 @@ Descriptors: TypeAlias = npt.NDArray[np.float32] | npt.NDArray[np.uint8]
 _REFINE_RADIUS = 6  # half side of the patches, pixels
 _REFINE_ITERATIONS = 6
 _REFINE_MIN_CORRELATION = 0.8
-_FAR_M = 1e6  # depth that stands in for an unknown one
+_FAR_M = 1e6  # depth assumed where it is unknown
 _MIN_DEPTH_M = 0.05
 _SWAP_FEW = 0.2  # share of matches below which left and right may be swapped
-_BORDER_PX = 8.0  # key points nearer to the image's border are left out: their patch would not fit
+_BORDER_PX = 8.0  # key points closer to the image border are dropped: their patch would not fit
 
 
 @dataclass(frozen=True, slots=True)
 class Keypoints:
-    """What an extractor finds in one image, strongest first."""
+    """The key points of one image, strongest first."""
 
     pixels: FloatArray  # (N, 2)
     descriptors: Descriptors  # (N, D) unit vectors, or (N, D / 8) bytes of D bits
@@ -58,7 +58,7 @@ class Matcher(Protocol):
 
 
 def distances(a: Descriptors, b: Descriptors) -> npt.NDArray[np.float32]:
-    """Distances (N, M) between descriptors: angles' chords for unit vectors, differing bits for bytes."""
+    """Distances (N, M) between descriptors: Euclidean for unit vectors, Hamming for bytes."""
     if a.dtype == np.uint8:
         bits_a, bits_b = (np.unpackbits(d.astype(np.uint8), axis=1).astype(np.float32) for d in (a, b))
         return bits_a.sum(axis=1)[:, None] + bits_b.sum(axis=1) - 2 * bits_a @ bits_b.T
@@ -68,7 +68,7 @@ def distances(a: Descriptors, b: Descriptors) -> npt.NDArray[np.float32]:
 
 @dataclass(frozen=True, slots=True)
 class MutualNearest:
-    """Pairs that are each other's nearest among the allowed ones, and clearly nearer than the second.
+    """Mutual nearest neighbours among the allowed pairs that pass the ratio test.
 
     Reference: Lowe, Distinctive image features from scale-invariant keypoints, IJCV (2004), section 7.1.
     """
@@ -124,22 +124,22 @@ def sift_extractor(settings: MatchSettings) -> OpenCvExtractor:
 
 @dataclass(frozen=True, slots=True)
 class _Pair:
-    """The key points of the left image, and where the right image shows them."""
+    """The key points of the left image and their right pixels."""
 
-    looks: Keypoints  # (N,)
+    keypoints: Keypoints  # (N,)
     right: FloatArray  # (N, 2) pixels, arbitrary where has_right is False
     has_right: BoolArray  # (N,)
 
 
 @dataclass(frozen=True, slots=True)
 class _Tracks:
-    """The features alive after a frame."""
+    """The active features after a frame."""
 
     ids: IntArray  # (N,)
     left: FloatArray  # (N, 2) pixels
     right: FloatArray  # (N, 2) pixels, arbitrary where has_right is False
     has_right: BoolArray  # (N,)
-    looks: Keypoints  # (N,) as last seen
+    keypoints: Keypoints  # (N,) of the last frame
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -147,18 +147,18 @@ class _Tracks:
 
 @dataclass(frozen=True, slots=True)
 class _Memory:
-    """What the front end keeps of the frame before."""
+    """State kept from the previous frame."""
 
     time_ns: int
     left: FloatImage
     tracks: _Tracks
-    twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` of the last consensus, over its time
+    twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
 
 
 class DescriptorFrontend:
     """Match key points from frame to frame in the left image, and into the right one.
 
-    One instance serves one recording: ids count up for ever and are never reused.
+    One instance processes one recording: ids increase and are never reused.
     """
 
     def __init__(
@@ -169,15 +169,15 @@ class DescriptorFrontend:
         self._disparity, self._consensus = settings.disparity, settings.consensus
         self._extract = extract
         self._match = match
-        self._gate = FrameGate(camera, name)
-        self._swap = SwapAlarm(_SWAP_FEW)
+        self._validator = FrameValidator(camera, name)
+        self._swap = SwapDetector(_SWAP_FEW)
         self._memory: _Memory | None = None
         self._next_id = 0
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Extract, match and reject in one rectified stereo pair; see `vio.protocols.Frontend`."""
         watch = Stopwatch()
-        images = self._gate.admit(frame)
+        images = self._validator.validate(frame)
         views = images[0].astype(np.float32), images[1].astype(np.float32)
         watch.lap("prepare")
         found = [self._extract(image) for image in images]
@@ -185,10 +185,10 @@ class DescriptorFrontend:
         watch.lap("extract")
         pair = self._stereo(left, right, views)
         watch.lap("stereo")
-        tracks, twist, used = self._tracked(frame, pair, views[0], usable_prior(prior))
+        tracks, twist, used = self._track(frame, pair, views[0], usable_prior(prior))
         watch.lap("track")
-        carried = len(tracks)
-        tracks = self._completed(tracks, pair, used, images[0])
+        tracked = len(tracks)
+        tracks = self._add_new_features(tracks, pair, used, images[0])
         self._memory = _Memory(frame.time_ns, views[0], tracks, twist)
         width = images[0].shape[1]
         self._swap.check(
@@ -198,7 +198,7 @@ class DescriptorFrontend:
             lambda: len(self._match(right, left, self._allowed(right, left, width))),
         )
         watch.lap("check")
-        return handed_out(frame, tracks, carried, watch)
+        return make_output(frame, tracks, tracked, watch)
 
     # --- left and right ---------------------------------------------------------------------------------------------
 
@@ -218,12 +218,12 @@ class DescriptorFrontend:
         pairs = self._match(left, right, self._allowed(left, right, views[0].shape[1]))
         rows = pairs[:, 0]
         target = right.pixels[pairs[:, 1]]
-        place[rows], alike = self._refined(views[0], left.pixels[rows], views[1], target, target[:, 1])
+        place[rows], alike = self._refine(views[0], left.pixels[rows], views[1], target, target[:, 1])
         disparity = left.pixels[rows, 0] - place[rows, 0]
         has_right[rows] = alike & (disparity >= self._disparity.min_disparity_px)
         return _Pair(left, place, has_right)
 
-    def _refined(
+    def _refine(
         self,
         source: FloatImage,
         points: FloatArray,
@@ -231,89 +231,89 @@ class DescriptorFrontend:
         start: FloatArray,
         rows: FloatArray | None = None,
     ) -> tuple[FloatArray, BoolArray]:
-        """Pixels (N, 2) in the target where the patches around source points lie, and a mask (N,) of those that fit."""
+        """Align the patches around source points with the target; return pixels (N, 2) and a mask (N,) of good fits."""
         if self._settings.refine == "none" or len(points) == 0:
             return start, np.ones(len(start), dtype=np.bool_)
         centres = rounded(points)
-        beside = points - centres
+        offset = points - centres
         store, slots = templates(cut_patches(source, centres, _REFINE_RADIUS)), np.arange(len(points))
-        warp, score = align(store, slots, target, shift_warps(start - beside), _REFINE_ITERATIONS, rows)
-        place = template_points(warp, beside)
+        warp, score = align(store, slots, target, shift_warps(start - offset), _REFINE_ITERATIONS, rows)
+        place = template_points(warp, offset)
         good = (score >= _REFINE_MIN_CORRELATION) & on_peak(place, start)
         return np.where(good[:, None], place, start), good
 
-    # --- before and now ---------------------------------------------------------------------------------------------
+    # --- tracking in time ---------------------------------------------------------------------------------------------
 
-    def _tracked(
+    def _track(
         self, frame: StereoFrame, pair: _Pair, view: FloatImage, prior: TrackPrior | None
     ) -> tuple[_Tracks, FloatArray, BoolArray]:
-        """Tracks of the frame before found among the key points; the motion per second; the mask of points used."""
-        memory, used = self._memory, np.zeros(len(pair.looks), dtype=np.bool_)
+        """Match the previous tracks to key points; return tracks, motion per second, and the mask of used points."""
+        memory, used = self._memory, np.zeros(len(pair.keypoints), dtype=np.bool_)
         if memory is None or len(memory.tracks) == 0:
             nothing = np.zeros(0, dtype=np.int64)
             empty = _Tracks(
-                nothing, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), take(pair.looks, nothing)
+                nothing, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), take(pair.keypoints, nothing)
             )
             return empty, np.zeros(6) if memory is None else memory.twist_per_s, used
-        old, left = memory.tracks, pair.looks.pixels
+        old, left = memory.tracks, pair.keypoints.pixels
         seconds = (frame.time_ns - memory.time_ns) * 1e-9
         expected = se3_exp(memory.twist_per_s * seconds)
-        p_prev, deep = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
-        deep &= old.has_right
+        p_prev, has_depth = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
+        has_depth &= old.has_right
         far = left_rays(self._camera, old.left) * _FAR_M
-        guess = self._guess(old, np.where(deep[:, None], p_prev, far), expected, prior)
-        pairs = self._match(old.looks, pair.looks, self._near(old, guess, left, view.shape[1]))
+        guess = self._guess(old, np.where(has_depth[:, None], p_prev, far), expected, prior)
+        pairs = self._match(old.keypoints, pair.keypoints, self._near_guess(old, guess, left, view.shape[1]))
         rows, found = pairs[:, 0], pairs[:, 1]
-        pixels, alike = self._refined(memory.left, old.left[rows], view, left[found])
+        pixels, alike = self._refine(memory.left, old.left[rows], view, left[found])
         rows, found, pixels = rows[alike], found[alike], pixels[alike]
         R_prior = T_prior = None
         if prior is not None:
-            named, told = told_pixels(old.ids[deep], prior)
+            named, predicted = prior_pixels(old.ids[has_depth], prior)
             R_prior = prior.R_cam_prev
-            T_prior = predicted_motion(self._camera, p_prev[deep][named], told, expected)
+            T_prior = predicted_motion(self._camera, p_prev[has_depth][named], predicted, expected)
         rng = np.random.default_rng((self._consensus.seed, frame.index))
-        vote = Vote(self._camera, self._consensus, self._settings.consensus_px, rng)
-        voters, p_rows = deep[rows], p_prev[rows]
-        keep, motion = static_tracks(vote, old.left[rows], p_rows, voters, pixels, expected, R_prior, T_prior)
-        # The right pixel belongs to the key point; it moves along with the refinement.
+        problem = RansacProblem(self._camera, self._consensus, self._settings.consensus_px, rng)
+        known, p_rows = has_depth[rows], p_prev[rows]
+        keep, motion = static_tracks(problem, old.left[rows], p_rows, known, pixels, expected, R_prior, T_prior)
+        # The right pixel belongs to the key point; it is shifted by the refinement.
         right = pair.right[found] + np.stack([pixels[:, 0] - left[found, 0], np.zeros(len(found))], axis=1)
         agrees, twist = pair.has_right[found], memory.twist_per_s
         if motion is not None:
-            keep[~voters] = False
+            keep[~known] = False
             twist = se3_log(motion.T_curr_prev) / seconds
             depth = np.maximum(transform_points(motion.T_curr_prev, p_rows)[:, 2], _MIN_DEPTH_M)
             change = np.abs(pixels[:, 0] - right[:, 0] - self._camera.fu * self._camera.baseline_m / depth)
-            agrees = agrees & (~voters | (change <= self._settings.consensus_px))
+            agrees = agrees & (~known | (change <= self._settings.consensus_px))
         rows, found = rows[keep], found[keep]
         used[found] = True
-        return _Tracks(old.ids[rows], pixels[keep], right[keep], agrees[keep], take(pair.looks, found)), twist, used
+        return _Tracks(old.ids[rows], pixels[keep], right[keep], agrees[keep], take(pair.keypoints, found)), twist, used
 
     def _guess(self, old: _Tracks, p_prev: FloatArray, expected: FloatArray, prior: TrackPrior | None) -> FloatArray:
-        """Guess the left pixels (N, 2) of tracks at points (N, 3) in the coming frame."""
+        """Predict the left pixels (N, 2) of tracks at points (N, 3) in the current frame."""
         if prior is not None and prior.R_cam_prev is not None:
             expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
         guess = moved_pixels(self._camera, expected, p_prev, old.left)
         if prior is not None:
-            rows, told = told_pixels(old.ids, prior)
-            guess[rows] = told
+            rows, predicted = prior_pixels(old.ids, prior)
+            guess[rows] = predicted
         return guess
 
-    def _near(self, old: _Tracks, guess: FloatArray, points: FloatArray, width: int) -> BoolArray:
-        """Pairs (N, M) of tracks and left key points (M, 2) near where the track is guessed (N, 2), or where it was."""
+    def _near_guess(self, old: _Tracks, guess: FloatArray, points: FloatArray, width: int) -> BoolArray:
+        """Pairs (N, M) of tracks and left key points (M, 2) close to the predicted (N, 2) or the old pixel."""
         reach = self._settings.search_radius * width
         near = np.zeros((len(old), len(points)), dtype=np.bool_)
-        # The last motion may be wrong, so that the old pixel is a second centre of the search.
+        # The last motion may be wrong, so the old pixel is a second centre of the search.
         for centre in (guess, old.left):
             near |= np.abs(centre[:, None] - points).max(axis=2) <= reach
         return near
 
-    def _completed(self, tracks: _Tracks, pair: _Pair, used: BoolArray, image: Image) -> _Tracks:
-        """Add new features from key points with a right match, evenly over the image."""
+    def _add_new_features(self, tracks: _Tracks, pair: _Pair, used: BoolArray, image: Image) -> _Tracks:
+        """Add new features from key points with a right match, spread evenly over the image."""
         height, width = image.shape
-        left = pair.looks.pixels
+        left = pair.keypoints.pixels
         free = np.flatnonzero(~used & pair.has_right)
         chosen = free[spread_evenly(left[free], tracks.left, (width, height), self._grid)]
         ids = np.arange(len(chosen), dtype=np.int64) + self._next_id
         self._next_id += len(chosen)
-        new = _Tracks(ids, left[chosen], pair.right[chosen], pair.has_right[chosen], take(pair.looks, chosen))
+        new = _Tracks(ids, left[chosen], pair.right[chosen], pair.has_right[chosen], take(pair.keypoints, chosen))
         return joined(tracks, new)

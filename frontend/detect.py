@@ -1,4 +1,4 @@
-"""Corners for new tracks: strongest first, spread over a grid, at a distance from the features that are tracked."""
+"""Corner detection for new tracks: strongest first, spread over a grid, at a minimum distance from tracked features."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ _BLOCK_PX = 3
 _GRADIENT_PX = 3
 # cornerMinEigenVal takes gray levels as fractions of 255 and makes the Sobel derivative twice the gradient.
 _EIGENVALUE_OF_UNIT_GRADIENT = (2.0 / 255.0) ** 2
-_CURVATURE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)  # blind to planes and straight edges
-_CURVATURE_OF_UNIT_NOISE = 6.0 * math.sqrt(2.0 / math.pi)  # mean size; the root of the sum of squares is 6
+_CURVATURE = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], dtype=np.float32)  # zero on planes and straight edges
+_CURVATURE_OF_UNIT_NOISE = 6.0 * math.sqrt(2.0 / math.pi)  # mean absolute value; the norm of the kernel is 6
 _ROUNDING_NOISE = 1.0 / math.sqrt(12.0)  # of whole gray levels
 _GRADIENT_OF_UNIT_NOISE = math.sqrt(12.0) / 8.0  # of the Sobel derivative, gray levels per pixel
 
@@ -43,7 +43,7 @@ def grid_shape(width: int, height: int, grid: GridSettings) -> tuple[int, int]:
 
 
 def cell_index(points: FloatArray, width: int, height: int, shape: tuple[int, int]) -> IntArray:
-    """Number (N,) of the grid cell, row by row, that holds each point (N, 2)."""
+    """Index (N,) of the grid cell, in row-major order, that contains each point (N, 2)."""
     rows, columns = shape
     column = np.clip((points[:, 0] * columns / width).astype(np.int64), 0, columns - 1)
     row = np.clip((points[:, 1] * rows / height).astype(np.int64), 0, rows - 1)
@@ -60,9 +60,9 @@ def corner_response(image: Image) -> Response:
 
 
 def noise_gradient(image: Image) -> float:
-    """Root mean square gradient in gray levels per pixel that the noise of an image (H, W) makes, from above.
+    """Upper bound of the root mean square gradient due to the noise of an image (H, W), in gray levels per pixel.
 
-    Fine texture counts as noise, and so does the rounding to gray levels.
+    Fine texture and the rounding to gray levels count as noise.
     Reference: Immerkær, Fast noise variance estimation, CVIU (1996).
     """
     curvature = cv2.filter2D(image, cv2.CV_32F, _CURVATURE)
@@ -73,7 +73,7 @@ def noise_gradient(image: Image) -> float:
 def local_maxima(response: Response, occupied: FloatArray, distance: int, border: int, least: float) -> IntArray:
     """Pixels (K, 2) `[u v]` that are the largest response within `distance` and not near `occupied` (N, 2).
 
-    Near is meant in the maximum norm. Neither the outermost `border` pixels nor responses below `least` give any.
+    Distances are in the maximum norm. The outermost `border` pixels and responses below `least` are excluded.
     """
     height, width = response.shape
     blocked = np.zeros((height, width), dtype=np.uint8)
@@ -99,21 +99,21 @@ def detect_corners(
 ) -> FloatArray:
     """Find up to `wanted` new corners (K, 2), sub-pixel, where the grid has few tracked points `occupied` (N, 2).
 
-    Corners are looked for at half resolution: what is a corner there lasts longer, and costs a quarter. The emptiest
-    cells are filled first, each by its strongest corners, up to twice a cell's even share; a corner much weaker than
-    the best of its cell is none. In the dark, where too few corners are strong, the strongest of the weak ones are
-    taken as long as they stand out from the image's noise.
+    Corners are detected at half resolution: they are tracked for longer, at a quarter of the cost. The emptiest cells
+    are filled first, each with its strongest corners, up to twice a cell's even share; corners much weaker than the
+    best of their cell are dropped. If too few corners are strong, as in the dark, the strongest of the weak ones are
+    added if they exceed the image noise.
 
     Args:
         half: image (H/2, W/2) at half resolution.
         occupied: tracked points in pixels of the full image.
         wanted: largest number of corners.
-        grid: how densely and evenly features should lie.
-        settings: what a corner is.
-        allowed: mask (H/2, W/2) of pixels that may hold corners; None: all.
+        grid: density and spacing of the features.
+        settings: thresholds of a corner.
+        allowed: mask (H/2, W/2) of pixels that may be corners; None: all.
 
     Returns:
-        Corners in pixels of the full image, in the order in which they should be taken.
+        Corners in pixels of the full image, best first.
     """
     height, width = half.shape
     if wanted <= 0 or min(height, width) <= 4 * _border(settings):
@@ -129,7 +129,7 @@ def detect_corners(
     strongest = np.zeros(shape[0] * shape[1], dtype=np.float32)
     np.maximum.at(strongest, cell, strength)
     kept = np.flatnonzero(strength >= settings.min_relative_gradient**2 * strongest[cell])
-    # Of equally strong corners those of the first cell come first, so that equal images give equal corners.
+    # Ties are ordered by cell, so that equal images give equal corners.
     kept = kept[np.lexsort((corners[kept, 0], corners[kept, 1], cell[kept], -strength[kept]))]
     level = _filling(cell[kept], cell_index(occupied, 2 * width, 2 * height, shape), len(strongest))
     order = np.argsort(level, kind="stable")
@@ -138,14 +138,14 @@ def detect_corners(
 
 
 def _border(settings: KltSettings) -> int:
-    """Pixels of the half image at its border that can hold no corner: its anchor would not fit into the full one."""
+    """Width of the border of the half image without corners: their anchor would not fit into the full image."""
     return settings.anchor_radius_px // 2 + 2
 
 
 def _candidates(
     half: Image, response: Response, occupied: FloatArray, grid: GridSettings, settings: KltSettings
 ) -> IntArray:
-    """Pixels (K, 2) of the half image that are corners; in the dark, weaker ones, the strongest first."""
+    """Corner pixels (K, 2) of the half image; if these are too few, weaker ones, strongest first."""
     height, width = half.shape
     distance = max(1, min_distance_px(2 * width, 2 * height, grid) // 2)
     found = local_maxima(response, occupied / 2, distance, _border(settings), settings.min_gradient**2)
@@ -160,14 +160,14 @@ def _candidates(
 
 
 def _filling(cell: IntArray, occupied: IntArray, cells: int) -> IntArray:
-    """How many features (N,) the cell of each point holds before it, if points are taken in their order.
+    """Number (N,) of features in the cell of each point before it is added, if points are added in their order.
 
-    Taking the points by this number fills all cells evenly, the emptiest first.
+    Sorting the points by this number fills all cells evenly, the emptiest first.
 
     Args:
-        cell: number of the cell (N,) of each point.
-        occupied: number of the cell (M,) of each feature that is there already.
-        cells: how many cells there are.
+        cell: index of the cell (N,) of each point.
+        occupied: index of the cell (M,) of each existing feature.
+        cells: number of cells.
     """
     order = np.argsort(cell, kind="stable")
     first = np.searchsorted(cell[order], np.arange(cells))
@@ -177,9 +177,9 @@ def _filling(cell: IntArray, occupied: IntArray, cells: int) -> IntArray:
 
 
 def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int], grid: GridSettings) -> IntArray:
-    """Rows of points (N, 2), strongest first, that fill the grid evenly beside `occupied` (M, 2).
+    """Select rows of points (N, 2), strongest first, that fill the grid evenly together with `occupied` (M, 2).
 
-    At most what `target_features` leaves room for; none closer than the least distance to another or to an occupied
+    The total is at most `target_features`; no point is closer than the minimum distance to another or to an occupied
     one; the emptiest cells are filled first. `size` is the image's width and height.
     """
     width, height = size
@@ -190,7 +190,7 @@ def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int
     together = np.concatenate([occupied, points])
     near = np.abs(points[:, :1] - together[:, 0]) < distance
     near &= np.abs(points[:, 1:] - together[:, 1]) < distance
-    # A point counts as too close to stronger ones only, itself and weaker ones excepted.
+    # A point is compared with stronger points only, not with itself or weaker ones.
     near[:, len(occupied) :] &= np.tril(np.ones((len(points), len(points)), dtype=np.bool_), -1)
     candidates = np.flatnonzero(~near.any(axis=1))
     shape = grid_shape(width, height, grid)
@@ -200,7 +200,7 @@ def spread_evenly(points: FloatArray, occupied: FloatArray, size: tuple[int, int
 
 
 def load_mask(path: Path) -> Image:
-    """Read the image (H, W) whose black pixels must not hold corners.
+    """Read the image (H, W) whose black pixels are excluded from corner detection.
 
     Raises:
         ConfigError: the file does not decode.
@@ -212,10 +212,10 @@ def load_mask(path: Path) -> Image:
 
 
 def half_mask(mask: Image, shape: tuple[int, ...], half_shape: tuple[int, ...]) -> BoolArray:
-    """The mask (H, W) at half resolution: True where all pixels around are allowed.
+    """The mask (H, W) at half resolution: True where all neighbouring pixels are allowed.
 
     Raises:
-        ConfigError: the mask is not of the images' shape.
+        ConfigError: the mask has another shape than the images.
     """
     if mask.shape != shape:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Lucas-Kanade at half resolution, there and back, between images of one brightness; pixels are of the full image."""
+"""Forward-backward Lucas-Kanade at half resolution, with brightness matching; pixels are of the full image."""
 
 from __future__ import annotations
 
@@ -12,77 +12,77 @@ from vio.records import BoolArray, Image
 
 _LK_EPSILON_PX = 0.02  # of the half-resolution image
 _LK_MIN_EIGENVALUE = 1e-4  # as OpenCV's own default
-_RETRY_SHARE = 0.25  # share of failures at which tracking is tried again with all pyramid levels
-_LOST_SHARE = 0.5  # the same for the last attempt, from the old pixels
-_SPARSE = 4  # every so many pixels of the half image tell its brightness
-_SPARSE_CONTRAST = 1.0  # gray levels; less is no contrast to compare
-_BLIND_CONTRAST = 0.1  # share of the last image's contrast below which an image shows nothing
-_SAME_GAIN = 0.06  # change of contrast, and
-_SAME_LEVEL = 6.0  # of the mean gray level, that tracking bears
+_RETRY_SHARE = 0.25  # share of lost points above which tracking is repeated with all pyramid levels
+_LOST_SHARE = 0.5  # the same for the last attempt, which starts from the old pixels
+_STRIDE = 4  # brightness is computed from every fourth pixel of the half image
+_MIN_CONTRAST = 1.0  # gray levels, lower bound of the contrast in the gain
+_LOST_CONTRAST_SHARE = 0.1  # share of the last image's contrast below which the contrast counts as lost
+_MAX_CONTRAST_CHANGE = 0.06  # relative change of contrast, and
+_MAX_MEAN_CHANGE = 6.0  # change of the mean gray level, up to which images are not adjusted
 _MAX_GAIN = 4.0
 
 
-def follow(
+def track_with_retries(
     last: Image, view: View, points: FloatArray, guess: FloatArray, trusted: bool, settings: KltSettings
 ) -> tuple[FloatArray, BoolArray]:
-    """Follow points of the last image into the present one.
+    """Track points from the last image into the current one; repeat with a wider search where many are lost.
 
-    Where the guess is trusted, few pyramid levels are searched; should many fail, all levels; should most fail even so,
-    the guess as a whole was wrong, and the search starts from where the points were.
+    A trusted guess is searched with few pyramid levels first. If many points are lost, all levels are used. If most are
+    still lost, the guess is discarded and the search starts from the old pixels.
 
     Args:
         last: last image (H/2, W/2) at half resolution.
-        view: the present image.
+        view: the current image.
         points: pixels (N, 2) in the last image.
-        guess: pixels (N, 2) in the present one to start from.
-        trusted: whether the guess is known to be good.
+        guess: pixels (N, 2) in the current image to start from.
+        trusted: whether the guess comes from a prior or from a motion with consensus.
         settings: of the tracking.
 
     Returns:
         Pixels (N, 2), and a mask (N,) of those found.
     """
-    last = as_bright(last, view.half)
+    last = match_brightness(last, view.half)
     few = min(settings.trusted_levels, settings.pyramid_levels) if trusted else settings.pyramid_levels
-    found, good = _both_ways(last, view, points, guess, few, settings)
+    found, good = _track_forward_backward(last, view, points, guess, few, settings)
     attempts = [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
     for start, share in attempts:
         retry = np.flatnonzero(~good)
         if len(retry) <= share * len(points):
             break
-        found[retry], good[retry] = _both_ways(
+        found[retry], good[retry] = _track_forward_backward(
             last, view, points[retry], start[retry], settings.pyramid_levels, settings
         )
     return found, good
 
 
-def circle_gaps(
-    last: Image, present: Image, before: FloatArray, after: FloatArray, settings: KltSettings
+def circle_errors(
+    last: Image, current: Image, before: FloatArray, after: FloatArray, settings: KltSettings
 ) -> FloatArray:
-    """Distances (N,) in pixels between right pixels and where tracking in the right images leads; infinite where lost.
+    """Distances (N,) in pixels between matched and temporally tracked right pixels; infinite where tracking fails.
 
     Args:
         last: last right image (H/2, W/2) at half resolution.
-        present: present one.
+        current: current one.
         before: right pixels (N, 2) matched in the last frame.
-        after: right pixels (N, 2) matched in the present one.
+        after: right pixels (N, 2) matched in the current one.
         settings: of the tracking.
     """
     if len(before) == 0:
         return np.zeros(0)
-    found, seen = _flow(last, present, before, after, settings.trusted_levels, settings)
+    found, seen = _flow(last, current, before, after, settings.trusted_levels, settings)
     return np.where(seen, np.linalg.norm(found - after, axis=1), np.inf)
 
 
-def shows_nothing(image: Image, last: Image) -> bool:
-    """Whether an image (H, W) has next to no contrast where the last one had: black, saturated or covered."""
-    return _contrast(image) < _BLIND_CONTRAST * _contrast(last)
+def lost_contrast(image: Image, last: Image) -> bool:
+    """Whether an image (H, W) has almost no contrast although the last one had: black, saturated or covered."""
+    return _contrast(image) < _LOST_CONTRAST_SHARE * _contrast(last)
 
 
-def as_bright(image: Image, other: Image) -> Image:
-    """The image with the other's mean and contrast where they differ clearly: Lucas-Kanade compares gray levels."""
-    a, b = (part[::_SPARSE, ::_SPARSE].astype(np.float64) for part in (image, other))
-    gain = float(b.std() / max(a.std(), _SPARSE_CONTRAST))
-    if (abs(gain - 1) < _SAME_GAIN and abs(float(b.mean() - a.mean())) < _SAME_LEVEL) or gain <= 0:
+def match_brightness(image: Image, other: Image) -> Image:
+    """Adjust an image to another's mean and contrast if they differ clearly: Lucas-Kanade compares gray levels."""
+    a, b = (part[::_STRIDE, ::_STRIDE].astype(np.float64) for part in (image, other))
+    gain = float(b.std() / max(a.std(), _MIN_CONTRAST))
+    if (abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(float(b.mean() - a.mean())) < _MAX_MEAN_CHANGE) or gain <= 0:
         return image
     gain = min(max(gain, 1 / _MAX_GAIN), _MAX_GAIN)
     levels = gain * (np.arange(256) - a.mean()) + b.mean()
@@ -91,19 +91,19 @@ def as_bright(image: Image, other: Image) -> Image:
 
 def _contrast(image: Image) -> float:
     """Standard deviation of an image's gray levels, from a sparse grid of them."""
-    return float(image[::_SPARSE, ::_SPARSE].astype(np.float64).std())
+    return float(image[::_STRIDE, ::_STRIDE].astype(np.float64).std())
 
 
-def _both_ways(
+def _track_forward_backward(
     last: Image, view: View, points: FloatArray, guess: FloatArray, levels: int, settings: KltSettings
 ) -> tuple[FloatArray, BoolArray]:
-    """Track points (N, 2) forth and back; return the new pixels and the mask of those that came back."""
-    forth, seen = _flow(last, view.half, points, guess, levels, settings)
-    back, seen_back = _flow(view.half, last, forth, points, levels, settings)
-    error = np.linalg.norm(back - points, axis=1)
+    """Track points (N, 2) forward and backward; return the new pixels and the mask of consistent ones."""
+    forward, seen = _flow(last, view.half, points, guess, levels, settings)
+    backward, seen_back = _flow(view.half, last, forward, points, levels, settings)
+    error = np.linalg.norm(backward - points, axis=1)
     margin = settings.anchor_radius_px + 2
-    good = seen & seen_back & (error <= settings.max_forward_backward_px) & inside(view.full, forth, margin)
-    return forth, good
+    good = seen & seen_back & (error <= settings.max_forward_backward_px) & inside(view.full, forward, margin)
+    return forward, good
 
 
 def _flow(
@@ -141,14 +141,14 @@ def lucas_kanade(
     """Track points by OpenCV's pyramidal Lucas-Kanade.
 
     Args:
-        source: image (H, W) that the points lie in.
+        source: image (H, W) that contains the points.
         target: image (H, W) to find them in.
         points: pixels (N, 2).
         guess: pixels (N, 2) to start from.
         window_px: side of the window.
         levels: pyramid levels beside the images themselves.
-        iterations: largest number of steps a level.
-        epsilon_px: step below which a point has settled.
+        iterations: largest number of iterations per level.
+        epsilon_px: step below which a point has converged.
 
     Returns:
         Pixels (N, 2), arbitrary where not found, and a mask (N,) of those found.

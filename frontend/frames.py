@@ -1,4 +1,4 @@
-"""What every front end that looks at images needs: checks of a frame, a stopwatch, an alarm for swaps, the output."""
+"""Parts shared by all image-based front ends: frame validation, a stopwatch, swap detection, the output."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, observations
 
-_SWAP_FRAMES = 3  # frames without matches before the mirrored search is believed
-_SWAP_MIN_POINTS = 20  # with fewer features nothing is suspicious
-_SWAP_MANY = 0.4  # share of matches in the mirrored images that proves the swap
+_SWAP_FRAMES = 3  # consecutive suspicious frames before an error is raised
+_SWAP_MIN_POINTS = 20  # with fewer features the check is skipped
+_SWAP_MANY = 0.4  # share of features matched in the mirrored images that indicates a swap
 
 
 @dataclass(slots=True)
@@ -34,8 +34,8 @@ class Stopwatch:
 
 
 @dataclass(slots=True)
-class FrameGate:
-    """Lets frames through that fit the calibration, each other, and the order of time."""
+class FrameValidator:
+    """Checks that frames fit the calibration, have one image size, and are in order of time."""
 
     camera: StereoCamera
     name: str  # of the front end, for messages
@@ -43,11 +43,11 @@ class FrameGate:
     _time_ns: int | None = None
     _shape: tuple[int, ...] | None = None
 
-    def admit(self, frame: StereoFrame) -> tuple[Image, Image]:
-        """Return both images of a frame, (H, W) uint8.
+    def validate(self, frame: StereoFrame) -> tuple[Image, Image]:
+        """Check a frame and return both of its images, (H, W) uint8.
 
         Raises:
-            DataError: no images, images of a wrong size or type, or a time not after the last one's.
+            DataError: no images, images of a wrong size or type, or a time not after the previous frame's.
         """
         if frame.left is None or frame.right is None:
             raise DataError(
@@ -59,7 +59,7 @@ class FrameGate:
                 f"frame {frame.index} is not later than frame {self._index} ({frame.time_ns} ns after "
                 f"{self._time_ns} ns); sort the frames by time"
             )
-        known = (self.camera.height, self.camera.width)
+        expected = (self.camera.height, self.camera.width)
         for name, image in (("left", frame.left), ("right", frame.right)):
             if image.ndim != 2 or image.dtype != np.uint8:
                 raise DataError(
@@ -67,14 +67,14 @@ class FrameGate:
                     f"the {self.name} front end needs 8-bit gray images: read them with vio.datasets.images.load_gray"
                 )
             size = image.shape
-            if None not in known and size != known:
+            if None not in expected and size != expected:
                 raise DataError(
                     f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, but the calibration is for "
                     f"{self.camera.width}x{self.camera.height}; check that calibration and images belong together"
                 )
             if size != frame.left.shape or (self._shape is not None and size != self._shape):
                 raise DataError(
-                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, unlike the images before; "
+                    f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, unlike the previous images; "
                     "all images of a recording must have one size"
                 )
         self._index, self._time_ns, self._shape = frame.index, frame.time_ns, frame.left.shape
@@ -82,14 +82,14 @@ class FrameGate:
 
 
 @dataclass(slots=True)
-class SwapAlarm:
-    """Raises when left and right are exchanged: few matches, many in the mirrored images, repeatedly."""
+class SwapDetector:
+    """Detects swapped left and right images: few matches, but many in the mirrored images, in several frames."""
 
-    few: float  # share of features with a match, below which the mirrored images are looked at
+    few: float  # share of features with a match, below which the mirrored images are checked
     _suspicious: int = 0
 
     def check(self, frame: StereoFrame, features: int, matched: int, count_mirrored: Callable[[], int]) -> None:
-        """Take in how many features of a frame matched; `count_mirrored` tells how many do in the mirrored images.
+        """Check the number of matched features; `count_mirrored` counts the matches in the mirrored images.
 
         Raises:
             DataError: left and right look swapped.
@@ -107,12 +107,12 @@ class SwapAlarm:
             )
 
 
-class Seen(Protocol):
-    """Features as any front end keeps them."""
+class Features(Protocol):
+    """Tracked features of any front end."""
 
     @property
     def ids(self) -> IntArray:
-        """Names (N,)."""
+        """Ids (N,)."""
 
     @property
     def left(self) -> FloatArray:
@@ -127,13 +127,13 @@ class Seen(Protocol):
         """Mask (N,)."""
 
 
-def handed_out(frame: StereoFrame, seen: Seen, carried: int, watch: Stopwatch) -> FrontendOutput:
-    """What a front end says of a frame: features, of which `carried` were handed out with the frame before."""
-    z = np.concatenate([seen.left, seen.right], axis=1)
+def make_output(frame: StereoFrame, features: Features, tracked: int, watch: Stopwatch) -> FrontendOutput:
+    """Return the output of a front end for a frame; `tracked` features were in the previous output, too."""
+    z = np.concatenate([features.left, features.right], axis=1)
     return FrontendOutput(
-        observations(frame.index, frame.time_ns, seen.ids, z, seen.has_right),
-        tracked=carried,
-        matched=int(seen.has_right.sum()),
-        detected=len(seen.ids) - carried,
+        observations(frame.index, frame.time_ns, features.ids, z, features.has_right),
+        tracked=tracked,
+        matched=int(features.has_right.sum()),
+        detected=len(features.ids) - tracked,
         stages_ms=watch.stages_ms,
     )

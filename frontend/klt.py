@@ -1,4 +1,4 @@
-"""The default front end: corners tracked in time by Lucas-Kanade and matched left to right along the row."""
+"""The default front end: corners tracked in time by Lucas-Kanade and matched from left to right along the row."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
 from frontend.columns import joined, take
 from frontend.detect import detect_corners, half_mask, load_mask, min_distance_px
-from frontend.flow import follow, shows_nothing
-from frontend.frames import FrameGate, Stopwatch, SwapAlarm, handed_out
-from frontend.outliers import Consensus, Vote, epipolar_distance, pixel_errors, predicted_motion, static_tracks
+from frontend.flow import lost_contrast, track_with_retries
+from frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from frontend.outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors, predicted_motion, static_tracks
 from frontend.patches import FloatImage, View, half_image, inside
-from frontend.prediction import moved_pixels, told_pixels, usable_prior
+from frontend.prediction import moved_pixels, prior_pixels, usable_prior
 from frontend.settings import FrontendSettings
 from frontend.stereo_fit import StereoFit
 from frontend.tracks import AnchorBank, Tracks, newborn, no_tracks
@@ -23,43 +23,43 @@ from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
 
 _ITERATIONS = 5
-_ANCHOR_LOST = 0.5  # correlation with its anchor below which a feature is taken for another
+_ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
-_NEIGHBOURS = 3  # matched features whose depths stand in for an unknown one
-_FAR_M = 1e6  # depth that stands in for an unknown one where too few neighbours have any
-_FEW = 0.5  # share of the least number of features below which corners without depth are taken
-_TRIED = 1.5  # corners aligned for each one that is missing
-_VERY_FEW = 0.25  # share below which new features are shown at once
-_BANK_SPARE = 3  # templates in memory, over the number of features
+_NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
+_FAR_M = 1e6  # depth assumed where too few features have one
+_FEW = 0.5  # share of the least number of features below which corners without depth are added
+_TRIED = 1.5  # corners aligned per missing feature
+_VERY_FEW = 0.25  # share of the target below which new features are output at once
+_BANK_SPARE = 3  # templates allocated, over the number of features
 
 
 @dataclass(frozen=True, slots=True)
 class _Memory:
-    """What the front end keeps of the frame before."""
+    """State kept from the previous frame."""
 
     time_ns: int
     left: View
     right_half: Image
     tracks: Tracks
-    twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` of the last consensus, over its time
-    trusted: bool  # the last motion was one that most features followed
+    twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
+    trusted: bool  # the last motion had a consensus
 
 
 @dataclass(frozen=True, slots=True)
 class _Start:
-    """Where the features of the frame before are looked for with their anchors."""
+    """Start of the alignment of the previous frame's features with their anchors."""
 
     place: FloatArray  # (N, 2) left pixels
-    scale: FloatArray  # (N,) how much larger they look than before
-    point: FloatArray  # (N, 3) moved along with the camera where its motion is known, cam0 frame, metres
-    tried: BoolArray  # (N,) worth a try
+    scale: FloatArray  # (N,) predicted change of scale since the previous frame
+    point: FloatArray  # (N, 3) moved by the camera motion where it is known, cam0 frame, metres
+    tried: BoolArray  # (N,) to be aligned
 
 
 class KltFrontend:
     """Track corners from frame to frame in the left image and match them into the right one.
 
-    One instance serves one recording: ids count up for ever and are never reused. The result depends on the images,
-    the priors and the settings only, to the bit.
+    One instance processes one recording: ids increase and are never reused. The result is deterministic to the bit: it
+    depends on the images, the priors and the settings only.
     """
 
     def __init__(self, camera: StereoCamera, settings: FrontendSettings | None = None) -> None:
@@ -69,13 +69,13 @@ class KltFrontend:
         self._camera = camera
         self._clahe = cv2.createCLAHE(2.0, (8, 8)) if self._settings.equalise == "clahe" else None
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
-        self._gate = FrameGate(camera, "klt")
-        self._swap = SwapAlarm(_SWAP_FEW)
+        self._validator = FrameValidator(camera, "klt")
+        self._swap = SwapDetector(_SWAP_FEW)
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, self._settings.anchor_radius_px)
         self._memory: _Memory | None = None
-        self._sized: tuple[StereoFit, BoolArray | None] | None = None  # what the first frame's size allows to make
+        self._sized: tuple[StereoFit, BoolArray | None] | None = None  # set up with the image size of the first frame
         self._next_id = 0
-        self._passed_over = 0  # frames in a row
+        self._skipped = 0  # frames in a row
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Track, match and detect in one rectified stereo pair; see `vio.protocols.Frontend`.
@@ -84,64 +84,64 @@ class KltFrontend:
             ConfigError: the mask is not of the images' size.
         """
         watch = Stopwatch()
-        left, right = (self._view(image) for image in self._gate.admit(frame))
+        left, right = (self._view(image) for image in self._validator.validate(frame))
         stereo, allowed = self._for_size(left)
         watch.lap("prepare")
-        if self._blinded(left):
-            return handed_out(frame, no_tracks(), 0, watch)
-        tracks, motion = self._tracked(frame, left, right, usable_prior(prior), stereo, watch)
+        if self._contrast_lost(left):
+            return make_output(frame, no_tracks(), 0, watch)
+        tracks, motion = self._track(frame, left, right, usable_prior(prior), stereo, watch)
         missing = self._grid.target_features - len(tracks)
         wanted = round(missing * (1.0 + self._settings.spare_corners))
         corners = detect_corners(left.half, tracks.left, wanted, self._grid, self._settings, allowed)
         watch.lap("detect")
-        tracks = self._completed(left, right, tracks, corners, motion, stereo)
+        tracks = self._add_new_features(left, right, tracks, corners, motion, stereo)
         stereo.learn_rows(tracks)
         watch.lap("stereo")
         points, matched = tracks.left, int(tracks.has_right.sum())
         self._swap.check(frame, len(points), matched, lambda: stereo.count_mirrored(left, right, points))
-        tracks = self._with_shown(tracks)
+        tracks = self._promote(tracks)
         seen = take(tracks, tracks.shown)
-        carried = self._carried(seen)
+        tracked = self._count_tracked(seen)
         self._remember(frame, left, right, tracks, motion)
         watch.lap("check")
-        return handed_out(frame, seen, carried, watch)
+        return make_output(frame, seen, tracked, watch)
 
     def _view(self, image: Image) -> View:
-        """Equalise an image and convert it; nothing of the result shares memory with it."""
+        """Equalise and convert an image; the result does not share memory with it."""
         if self._clahe is not None:
             image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
         return View(image.astype(np.float32), half_image(image))
 
     def _for_size(self, left: View) -> tuple[StereoFit, BoolArray | None]:
-        """The fit into the right image and the mask (H/2, W/2) of allowed corners, made with the first frame."""
+        """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame."""
         if self._sized is None:
             height, width = left.full.shape
             allowed = None if self._mask is None else half_mask(self._mask, left.full.shape, left.half.shape)
             self._sized = StereoFit(self._camera, self._settings, self._disparity, self._bank, (width, height)), allowed
         return self._sized
 
-    def _blinded(self, left: View) -> bool:
-        """Whether the image shows nothing where the one before did: black, saturated or covered for a moment.
+    def _contrast_lost(self, left: View) -> bool:
+        """Whether the image has no contrast although the previous one had: black, saturated or covered for a moment.
 
-        Such a frame is passed over, and tracking goes on from the one before, for as many frames as the setting says.
+        Such a frame is skipped and tracking continues from the one before, for at most `max_blind_frames` frames.
         """
-        memory, before = self._memory, self._passed_over
-        self._passed_over = 0
+        memory, before = self._memory, self._skipped
+        self._skipped = 0
         if memory is None or len(memory.tracks) == 0 or before >= self._settings.max_blind_frames:
             return False
-        if shows_nothing(left.half, memory.left.half):
-            self._passed_over = before + 1
-        return self._passed_over > 0
+        if lost_contrast(left.half, memory.left.half):
+            self._skipped = before + 1
+        return self._skipped > 0
 
-    def _carried(self, seen: Tracks) -> int:
-        """How many of the features were handed out with the frame before."""
+    def _count_tracked(self, seen: Tracks) -> int:
+        """Count the features that were output in the previous frame, too."""
         if self._memory is None:
             return 0
         old = self._memory.tracks
         return int(np.isin(seen.ids, old.ids[old.shown], assume_unique=True).sum())
 
     def _remember(self, frame: StereoFrame, left: View, right: View, tracks: Tracks, motion: Consensus | None) -> None:
-        """Keep what the next frame needs of this one."""
+        """Store the state that the next frame needs."""
         self._bank.keep_only(tracks.slot)
         before = self._memory
         twist = np.zeros(6) if before is None else before.twist_per_s
@@ -149,9 +149,9 @@ class KltFrontend:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
         self._memory = _Memory(frame.time_ns, left, right.half, tracks, twist, motion is not None)
 
-    # --- features of the frame before -------------------------------------------------------------------------------
+    # --- features of the previous frame -------------------------------------------------------------------------------
 
-    def _tracked(
+    def _track(
         self,
         frame: StereoFrame,
         left: View,
@@ -160,7 +160,7 @@ class KltFrontend:
         stereo: StereoFit,
         watch: Stopwatch,
     ) -> tuple[Tracks, Consensus | None]:
-        """Follow the features of the frame before into both images; return the survivors and the voted motion."""
+        """Track the features of the previous frame into both images; return those kept and the consensus motion."""
         memory = self._memory
         if memory is None or len(memory.tracks) == 0:
             return no_tracks(), None
@@ -168,45 +168,45 @@ class KltFrontend:
         expected = se3_exp(memory.twist_per_s * ((frame.time_ns - memory.time_ns) * 1e-9))
         guess = self._guess(old, prior, expected, left.full)
         trusted = prior is not None or memory.trusted
-        found, seen = follow(memory.left.half, left, old.left, guess, trusted, settings)
+        found, seen = track_with_retries(memory.left.half, left, old.left, guess, trusted, settings)
         watch.lap("track")
         rng = np.random.default_rng((self._consensus.seed, frame.index))
-        vote = Vote(self._camera, self._consensus, settings.consensus_px, rng)
-        seen, motion = self._voted(vote, old, found, seen, prior, expected, stereo.max_disparity_px)
+        problem = RansacProblem(self._camera, self._consensus, settings.consensus_px, rng)
+        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, stereo.max_disparity_px)
         watch.lap("reject")
-        tracks = self._aligned(memory, left, found, seen, motion)
+        tracks = self._align_with_anchors(memory, left, found, seen, motion)
         watch.lap("align")
-        tracks = stereo.again(tracks, right, memory.right_half, motion is not None)
+        tracks = stereo.track_right(tracks, right, memory.right_half, motion is not None)
         watch.lap("stereo")
         return tracks, motion
 
     def _guess(self, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage) -> FloatArray:
-        """Guess the left pixels (N, 2) in the coming frame: where the filter has them, else by the last motion."""
+        """Predict the left pixels (N, 2) in the current frame: from the prior, else by the last motion."""
         if prior is not None and prior.R_cam_prev is not None:
             expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
-        guess = moved_pixels(self._camera, expected, self._with_neighbours(old), old.left)
+        guess = moved_pixels(self._camera, expected, self._points_with_borrowed_depth(old), old.left)
         if prior is not None:
-            rows, told = _told(old, np.arange(len(old)), prior)
-            guess[rows] = told
-        # A guess outside the image cannot be tracked; the old pixel may still be found inside.
+            rows, predicted = _prior_rows(old, np.arange(len(old)), prior)
+            guess[rows] = predicted
+        # A prediction outside the image cannot be tracked; the search then starts at the old pixel.
         outside = ~inside(image, guess, 0.0)
         guess[outside] = old.left[outside]
         return guess
 
-    def _with_neighbours(self, old: Tracks) -> FloatArray:
-        """Points (N, 3) of the features, those of unknown depth as deep as their nearest neighbours in the image."""
-        known, unknown = np.flatnonzero(old.placed), np.flatnonzero(~old.placed)
+    def _points_with_borrowed_depth(self, old: Tracks) -> FloatArray:
+        """Points (N, 3) of the features; unknown depths are the median depth of the nearest neighbours in the image."""
+        known, unknown = np.flatnonzero(old.has_point), np.flatnonzero(~old.has_point)
         if len(unknown) == 0 or len(known) < _NEIGHBOURS:
-            return np.where(old.placed[:, None], old.point, left_rays(self._camera, old.left) * _FAR_M)
+            return np.where(old.has_point[:, None], old.point, left_rays(self._camera, old.left) * _FAR_M)
         gap = np.abs(old.left[unknown, None] - old.left[known]).sum(axis=2)
         nearest = known[np.argpartition(gap, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]]
         point = old.point.copy()
         point[unknown] = left_rays(self._camera, old.left[unknown]) * np.median(old.point[nearest, 2], axis=1)[:, None]
         return point
 
-    def _voted(
+    def _reject_outliers(
         self,
-        vote: Vote,
+        problem: RansacProblem,
         old: Tracks,
         found: FloatArray,
         seen: BoolArray,
@@ -214,34 +214,34 @@ class KltFrontend:
         expected: FloatArray,
         max_disparity_px: float,
     ) -> tuple[BoolArray, Consensus | None]:
-        """Mask (N,) of the found features that move as the static world does, and that motion where there is one."""
+        """Return the mask (N,) of the found features that are static, and the consensus motion if there is one."""
         camera, rows = self._camera, np.flatnonzero(seen)
-        deep = (old.has_right & old.placed)[rows]
+        has_depth = (old.has_right & old.has_point)[rows]
         R_prior = T_prior = None
         if prior is not None:
-            known, told = _told(old, rows[deep], prior)
+            known, predicted = _prior_rows(old, rows[has_depth], prior)
             R_prior = prior.R_cam_prev
-            T_prior = predicted_motion(camera, old.point[known], told, expected)
+            T_prior = predicted_motion(camera, old.point[known], predicted, expected)
         before, after = old.left[rows], found[rows]
-        kept, motion = static_tracks(vote, before, old.point[rows], deep, after, expected, R_prior, T_prior)
-        if motion is not None and not deep.all():
+        kept, motion = static_tracks(problem, before, old.point[rows], has_depth, after, expected, R_prior, T_prior)
+        if motion is not None and not has_depth.all():
             near_m = camera.fu * camera.baseline_m / max_disparity_px
-            distance = epipolar_distance(camera, motion.T_curr_prev, before[~deep], after[~deep], near_m)
-            kept[~deep] = distance <= vote.limit_px
+            distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)
+            kept[~has_depth] = distance <= problem.limit_px
         keep = np.zeros(len(old), dtype=np.bool_)
         keep[rows[kept]] = True
         return keep, motion
 
-    # --- their anchors ----------------------------------------------------------------------------------------------
+    # --- alignment with anchors ---------------------------------------------------------------------------------------
 
-    def _aligned(
+    def _align_with_anchors(
         self, memory: _Memory, left: View, found: FloatArray, seen: BoolArray, motion: Consensus | None
     ) -> Tracks:
-        """Align the features with their anchors; return the survivors as they are now.
+        """Align the features with their anchors; return those kept, with their new pixels.
 
-        Lucas-Kanade steps add up to a drift; the anchor does not drift. Features that Lucas-Kanade lost are looked
-        for where the consensus motion puts them. Features that were found, but look unlike their anchor, are aligned
-        with their looks in the frame before, which become their new anchor.
+        Lucas-Kanade from frame to frame drifts; the anchor does not. Features that Lucas-Kanade lost are searched at
+        the pixels predicted by the consensus motion. Features that were found, but differ from their anchor, get a new
+        anchor from the previous frame.
         """
         settings, old = self._settings, memory.tracks
         start = self._start(old, left, found, seen, motion)
@@ -253,16 +253,16 @@ class KltFrontend:
         change = np.abs(np.log(scale_change(warp)))
         good = (score >= settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.place[rows])
         good &= change <= np.log(2 * settings.max_anchor_scale)
-        kept, placed = good.copy(), old.placed.copy()
+        kept, has_point = good.copy(), old.has_point.copy()
         again = np.flatnonzero(~good & seen[rows] & (score >= _ANCHOR_LOST))
         if len(again):
-            warp[again], kept[again] = self._realigned(memory, left, rows[again], start)
+            warp[again], kept[again] = self._realign(memory, left, rows[again], start)
         if motion is not None:
             astray = (
                 pixel_errors(self._camera, motion.T_curr_prev, old.point[rows], warp[:, :, 2]) > settings.consensus_px
             )
-            kept &= ~(astray & old.placed[rows] & old.has_right[rows])
-            placed[rows[astray]] = False  # its depth was carried along without being measured, and was wrong
+            kept &= ~(astray & old.has_point[rows] & old.has_right[rows])
+            has_point[rows[astray]] = False  # its depth was propagated without a measurement, and was wrong
         far = good & (change > np.log(settings.max_anchor_scale))
         rows, warp, far = rows[kept], warp[kept], far[kept]
         if far.any():
@@ -274,43 +274,43 @@ class KltFrontend:
             left=warp[:, :, 2].copy(),
             warp=warp,
             point=start.point[rows],
-            placed=placed[rows],
+            has_point=has_point[rows],
             age=old.age[rows] + 1,
             has_right=np.zeros(len(rows), dtype=np.bool_),
         )
         height, width = left.full.shape
-        return take(now, _apart(now.left, 0.5 * min_distance_px(width, height, self._grid)))
+        return take(now, _spaced(now.left, 0.5 * min_distance_px(width, height, self._grid)))
 
     def _start(self, old: Tracks, left: View, found: FloatArray, seen: BoolArray, motion: Consensus | None) -> _Start:
-        """Start the alignment where Lucas-Kanade found a feature, else where the voted motion puts it."""
+        """Start the alignment at the pixel found by Lucas-Kanade, else at the pixel predicted by the motion."""
         if motion is None:
             return _Start(found, np.ones(len(old)), old.point, seen)
         point = transform_points(motion.T_curr_prev, old.point)
         predicted = moved_pixels(self._camera, motion.T_curr_prev, old.point, old.left)
         margin = self._settings.anchor_radius_px + 2.0
-        ahead = old.placed & (point[:, 2] > 0.1)
+        ahead = old.has_point & (point[:, 2] > 0.1)
         return _Start(
             np.where(seen[:, None], found, predicted),
             np.where(ahead, old.point[:, 2] / np.where(ahead, point[:, 2], 1.0), 1.0),
             point,
-            seen | (old.placed & inside(left.full, predicted, margin)),
+            seen | (old.has_point & inside(left.full, predicted, margin)),
         )
 
-    def _realigned(self, memory: _Memory, left: View, rows: IntArray, start: _Start) -> tuple[FloatArray, BoolArray]:
-        """Align features with a new anchor cut from the frame before; return warps (N, 2, 3) and a mask (N,)."""
+    def _realign(self, memory: _Memory, left: View, rows: IntArray, start: _Start) -> tuple[FloatArray, BoolArray]:
+        """Align features with a new anchor from the previous frame; return warps (N, 2, 3) and a mask (N,)."""
         old = memory.tracks
         centres = rounded(old.left[rows])
         self._bank.renew(old.slot[rows], memory.left.full, centres)
         warp = shift_warps(start.place[rows] + centres - old.left[rows])
         warp[:, :, :2] *= start.scale[rows, None, None]
         warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _ITERATIONS)
-        # The anchor was cut beside the feature by the rounding; give the feature its own place back.
+        # The anchor was cut at a rounded pixel; correct the offset to the feature.
         warp[:, :, 2] = template_points(warp, old.left[rows] - centres)
         return warp, (score >= self._settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.place[rows])
 
     # --- new features -----------------------------------------------------------------------------------------------
 
-    def _completed(
+    def _add_new_features(
         self,
         left: View,
         right: View,
@@ -319,34 +319,34 @@ class KltFrontend:
         motion: Consensus | None,
         stereo: StereoFit,
     ) -> Tracks:
-        """Search right matches for features that lack one and for new corners; add the best new ones."""
+        """Search right matches for new corners and for features without one; add the best new corners."""
         lacking = ~tracks.has_right
         if motion is not None:
-            # What was placed before, but was not found again near its place, must not turn up elsewhere.
-            lacking &= ~tracks.placed
+            # A feature with a known point that was not matched near it must not be matched elsewhere.
+            lacking &= ~tracks.has_point
         rows = np.flatnonzero(lacking)
         disparity, unique = stereo.search(left, right, np.concatenate([tracks.left[rows], corners]))
         again, fresh = np.split(disparity, [len(rows)])
         known, unique = np.split(unique, [len(rows)])
-        tracks = stereo.near(tracks, right, rows[known], again[known])
-        tracks = replace(tracks, blind=np.where(tracks.has_right, 0, tracks.blind + 1))
-        tracks = take(tracks, tracks.blind <= self._settings.max_left_only_frames)
+        tracks = stereo.match_near(tracks, right, rows[known], again[known])
+        tracks = replace(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
+        tracks = take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames)
         stays = self._stays(corners, fresh, motion, left.full)
-        chosen, deep = self._worth_trying(tracks, unique, stays)
+        chosen, with_depth = self._select_corners(tracks, unique, stays)
         centres = rounded(corners[chosen])
         born = newborn(centres, self._bank.put(left.full, centres))
-        born = stereo.near(born, right, np.arange(deep), fresh[chosen[:deep]])
-        born = replace(born, blind=np.where(born.has_right, 0, 1))
+        born = stereo.match_near(born, right, np.arange(with_depth), fresh[chosen[:with_depth]])
+        born = replace(born, left_only_frames=np.where(born.has_right, 0, 1))
         room = max(0, self._grid.target_features - len(tracks))
-        good = np.flatnonzero(born.has_right | (len(chosen) > deep))
+        good = np.flatnonzero(born.has_right | (len(chosen) > with_depth))
         return joined(tracks, take(born, good[np.argsort(~born.has_right[good], kind="stable")][:room]))
 
-    def _worth_trying(self, tracks: Tracks, unique: BoolArray, stays: BoolArray) -> tuple[IntArray, int]:
-        """Rows of the corners (K,) to try beside the tracks, in this order, and how many of them have a depth.
+    def _select_corners(self, tracks: Tracks, unique: BoolArray, stays: BoolArray) -> tuple[IntArray, int]:
+        """Return the rows of the corners (K,) to try, in this order, and how many of them have a depth.
 
-        Wanted are those with depth (`unique` in the coarse search) that will stay in the image. Those that will soon
-        leave are tried only while less than the least number of features is there; those without depth only while few
-        are.
+        Corners with depth (`unique` in the coarse search) that will stay in the image come first. Corners that will
+        soon leave it are tried only below the least number of matched features, corners without depth only below half
+        of that number.
         """
         target, matched = self._grid.target_features, int(tracks.has_right.sum())
         room, least = max(0, target - len(tracks)), self._settings.least_features * target
@@ -361,7 +361,7 @@ class KltFrontend:
     def _stays(
         self, corners: FloatArray, disparity: FloatArray, motion: Consensus | None, image: FloatImage
     ) -> BoolArray:
-        """Mask (K,) of corners that remain in view for a while if the camera goes on as it does."""
+        """Mask (K,) of corners that stay in the image for a while if the camera motion continues."""
         if motion is None or self._settings.wanted_life_frames == 0:
             return np.ones(len(corners), dtype=np.bool_)
         T = np.linalg.matrix_power(motion.T_curr_prev, self._settings.wanted_life_frames)
@@ -371,8 +371,8 @@ class KltFrontend:
         pixels = project(self._camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
         return np.asarray(ahead & inside(image, pixels, 0.0))
 
-    def _with_shown(self, tracks: Tracks) -> Tracks:
-        """Show features that outlived their probation, under new ids; all of them where few would be left."""
+    def _promote(self, tracks: Tracks) -> Tracks:
+        """Output features that passed their probation from now on, under new ids; all features if these are few."""
         proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & tracks.has_right)
         if proven.sum() < _VERY_FEW * self._grid.target_features:
             proven[:] = True
@@ -382,14 +382,14 @@ class KltFrontend:
         return replace(tracks, ids=ids, shown=proven)
 
 
-def _told(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
-    """Those of the rows that a prior names, for features that were shown, and the left pixels (K, 2) it expects."""
+def _prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
+    """Return those of the rows that were output and are in a prior, and the left pixels (K, 2) that it predicts."""
     shown = rows[tracks.shown[rows]]
-    named, told = told_pixels(tracks.ids[shown], prior)
-    return shown[named], told
+    named, predicted = prior_pixels(tracks.ids[shown], prior)
+    return shown[named], predicted
 
 
-def _apart(points: FloatArray, distance: float) -> BoolArray:
+def _spaced(points: FloatArray, distance: float) -> BoolArray:
     """Mask (N,) of points (N, 2) without an earlier point closer than `distance` in the maximum norm."""
     u, v = points[:, 0], points[:, 1]
     near = (np.abs(u[:, None] - u) < distance) & (np.abs(v[:, None] - v) < distance)

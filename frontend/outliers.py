@@ -1,13 +1,13 @@
-"""Which tracks move as the static world does: consensus on the camera's motion between two frames.
+"""Outlier rejection for tracks: RANSAC on the camera motion between two frames.
 
 Points triangulated in the previous frame are fitted to their pixels in the current one. Minimal sets of three points
-start from an expected motion and are refined by Gauss-Newton, all sets at once; the best is refined on its inliers.
+are solved by Gauss-Newton from an expected motion, all sets at once; the best motion is refined on its inliers.
 Reference: Fischler & Bolles, Random sample consensus, CACM (1981); Torr & Zisserman, MLESAC, CVIU (2000), for the
 truncated cost; Geiger et al., StereoScan, IV (2011), for Gauss-Newton on minimal sets of stereo points.
 
-Without depth, left pixels of two frames alone agree on a rotation and a direction of translation.
+Without depth, left pixels of two frames give a consensus on a rotation and a direction of translation.
 Reference: Nistér, An efficient solution to the five-point relative pose problem, PAMI (2004); Kneip et al., Finding the
-exact rotation between two images independently of the translation, ECCV (2012), for what a turning camera leaves open.
+exact rotation between two images independently of the translation, ECCV (2012), for the case of pure rotation.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
 from vio.records import BoolArray, IntArray
 
 _MIN_DEPTH_M = 0.05
-_MIN_POINTS = 8  # with fewer, agreement by chance cannot be told from motion
-_MIN_SHARE = 0.2  # a consensus of fewer points says nothing
-_TOLD_POINTS = 64  # predicted pixels that are looked at
-_TOLD_PX = 2.0  # median distance of a motion from them at which it stands for them
-_TOLD_SETTLED = 1e-4  # change of that motion, in radians and metres, below which it is not refined further
+_MIN_POINTS = 8  # with fewer points, a consensus may be chance
+_MIN_SHARE = 0.2  # smallest share of inliers of a consensus
+_PRIOR_POINTS = 64  # predicted pixels that are used
+_PRIOR_PX = 2.0  # median distance from them below which a motion represents them
+_PRIOR_CONVERGED = 1e-4  # change of that motion, in radians and metres, below which it is not refined further
 _SAMPLE_ITERATIONS = 5
 _REFINE_ITERATIONS = 6
 _DAMPING = 1e-4
-_SETTLED = 3e-6  # change of a motion, in radians and metres, below which it is not refined further
-_MIN_BEARING_SHARE = 0.5  # two views constrain a track in one direction only, so that most must agree
-_SURE_BEARING_SHARE = 0.9  # share of tracks that a predicted rotation must explain for no other to be tried
+_CONVERGED = 3e-6  # change of a motion, in radians and metres, below which it is not refined further
+_MIN_BEARING_SHARE = 0.5  # two views constrain a track in one direction only, so most tracks must be inliers
+_SURE_BEARING_SHARE = 0.9  # share of inliers of a predicted rotation above which no other rotation is tried
 _FIVE_POINT_CONFIDENCE = 0.999
-_SCATTER = 1e-9  # added to a sum of squares before it is divided by
+_EPSILON = 1e-9  # added to denominators
 
 
 @dataclass(frozen=True, slots=True)
-class Vote:
-    """What a vote on the motion goes by."""
+class RansacProblem:
+    """Camera, settings, threshold and random generator of a RANSAC run."""
 
     camera: StereoCamera
     settings: ConsensusSettings
-    limit_px: float  # largest distance from where the motion puts a feature, for the feature to agree
+    limit_px: float  # inlier threshold on the reprojection error
     rng: np.random.Generator  # source of the samples; the same state gives the same result to the bit
 
 
 @dataclass(frozen=True, slots=True)
 class Consensus:
-    """The camera motion that most points agree on."""
+    """The camera motion with most inliers."""
 
     T_curr_prev: FloatArray  # (4, 4) maps the previous cam0 frame into the current one
     inliers: BoolArray  # (N,)
@@ -59,7 +59,7 @@ class Consensus:
 def pixel_errors(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, pixels: FloatArray) -> FloatArray:
     """Distances (..., N) in pixels between points (N, 3) moved by motions (..., 4, 4) and pixels (N, 2).
 
-    Points that end up behind the camera have infinite distance.
+    Points behind the camera have infinite distance.
     """
     p = p_prev @ np.swapaxes(T_curr_prev[..., :3, :3], -1, -2) + T_curr_prev[..., None, :3, 3]
     ahead = p[..., 2] > _MIN_DEPTH_M
@@ -81,7 +81,7 @@ def _gauss_newton(
 ) -> FloatArray:
     """Refine motions (H, 4, 4), each on its own points (H, K, 3), pixels (H, K, 2) and weights (H, K).
 
-    `free` names the part of the twist `[rho; phi]` that may change: all of it, or the translation alone.
+    `free` selects the part of the twist `[rho; phi]` that is estimated: all of it, or the translation alone.
     """
     for _ in range(iterations):
         p = p_prev @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
@@ -109,105 +109,106 @@ def _refine(
     pixels: FloatArray,
     scale_px: float,
     free: slice,
-    settled: float = _SETTLED,
+    converged: float = _CONVERGED,
 ) -> FloatArray:
-    """Refine one motion (4, 4) on all points, those far from it counting little (Geman-McClure weights)."""
+    """Refine one motion (4, 4) on all points, with Geman-McClure weights."""
     for _ in range(_REFINE_ITERATIONS):
         error = pixel_errors(camera, T, p_prev, pixels)
         weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
         before = T
         T = _gauss_newton(camera, T[None], p_prev[None], pixels[None], weight[None], iterations=1, free=free)[0]
-        if np.abs(T - before).max() < settled:
+        if np.abs(T - before).max() < converged:
             break
     return T
 
 
-def _search(
-    vote: Vote, p_prev: FloatArray, pixels: FloatArray, starts: FloatArray, free: slice
+def _ransac(
+    problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, starts: FloatArray, free: slice
 ) -> tuple[FloatArray, BoolArray]:
-    """Best motion (4, 4) over minimal sets and over the starts (S, 4, 4) themselves, with its inliers (N,)."""
-    camera, limit = vote.camera, vote.limit_px
+    """Return the best motion (4, 4) over minimal sets and the starts (S, 4, 4) themselves, with its inliers (N,)."""
+    camera, limit = problem.camera, problem.limit_px
     begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
-    sure = _refine(camera, begin, p_prev, pixels, limit / 2, free)
-    inliers = pixel_errors(camera, sure, p_prev, pixels) <= limit
-    if inliers.mean() >= vote.settings.sure_share:
-        return sure, inliers
-    sets = vote.rng.integers(0, len(p_prev), size=(vote.settings.samples, 3))
+    refined = _refine(camera, begin, p_prev, pixels, limit / 2, free)
+    inliers = pixel_errors(camera, refined, p_prev, pixels) <= limit
+    if inliers.mean() >= problem.settings.sure_share:
+        return refined, inliers
+    sets = problem.rng.integers(0, len(p_prev), size=(problem.settings.samples, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
     T = _gauss_newton(
         camera, T, p_prev[sets], pixels[sets], np.ones(sets.shape), iterations=_SAMPLE_ITERATIONS, free=free
     )
-    T = np.concatenate([starts, sure[None], T])
+    T = np.concatenate([starts, refined[None], T])
     cost = np.minimum(pixel_errors(camera, T, p_prev, pixels), limit) ** 2
     best = _refine(camera, T[int(np.argmin(cost.sum(axis=1)))], p_prev, pixels, limit / 2, free)
     return best, pixel_errors(camera, best, p_prev, pixels) <= limit
 
 
 def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:
-    """Index of the start whose median error is smallest; far beyond the limit all starts are alike."""
+    """Return the index of the start with the smallest median error; errors far beyond the limit are clipped."""
     error = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)
     return int(np.argmin(np.median(error, axis=1)))
 
 
 def static_tracks(
-    vote: Vote,
+    problem: RansacProblem,
     left: FloatArray,
     p_prev: FloatArray,
-    deep: BoolArray,
+    has_depth: BoolArray,
     pixels: FloatArray,
     expected: FloatArray,
     R_prior: FloatArray | None,
     T_prior: FloatArray | None,
 ) -> tuple[BoolArray, Consensus | None]:
-    """Tell which tracks move as the static world does: by those of known depth, else by both left images alone.
+    """Find the tracks of static points: by the tracks with depth, else by two-view geometry of the left images.
 
     Args:
-        vote: camera, thresholds and samples.
+        problem: camera, thresholds and random generator.
         left: left pixels (N, 2) in the previous frame.
-        p_prev: points (N, 3) triangulated there, metres, previous cam0 frame; arbitrary where `deep` is False.
-        deep: mask (N,) of tracks of known depth.
+        p_prev: points (N, 3) triangulated there, metres, previous cam0 frame; arbitrary where `has_depth` is False.
+        has_depth: mask (N,) of tracks with known depth.
         pixels: left pixels (N, 2) in the current frame.
-        expected: motion (4, 4) `T_curr_prev` to start from, of no authority.
-        R_prior: predicted rotation (3, 3) from the previous to the current cam0 frame, or None.
-        T_prior: predicted motion (4, 4) `T_curr_prev`, or None.
+        expected: motion (4, 4) `T_curr_prev` to start from.
+        R_prior: prior rotation (3, 3) from the previous to the current cam0 frame, or None.
+        T_prior: prior motion (4, 4) `T_curr_prev`, or None.
 
     Returns:
-        Mask (N,) of the tracks to keep, and the motion that those of known depth agree on (its inliers are among them
-        alone), or None. With a motion, tracks without depth are all kept: the caller may hold them against it.
+        Mask (N,) of the tracks to keep, and the consensus motion of the tracks with depth (its inliers are a mask over
+        these tracks), or None. With a motion, all tracks without depth are kept: the caller may check them against it.
     """
-    motion = rigid_consensus(vote, p_prev[deep], pixels[deep], expected, R_prior, T_prior)
+    motion = rigid_consensus(problem, p_prev[has_depth], pixels[has_depth], expected, R_prior, T_prior)
     keep = np.ones(len(left), dtype=np.bool_)
     if motion is not None:
-        keep[deep] = motion.inliers
-    elif (agree := bearing_consensus(vote, left, pixels, expected[:3, :3], R_prior)) is not None:
+        keep[has_depth] = motion.inliers
+    elif (agree := bearing_consensus(problem, left, pixels, expected[:3, :3], R_prior)) is not None:
         keep = agree
     return keep, motion
 
 
 def rigid_consensus(
-    vote: Vote,
+    problem: RansacProblem,
     p_prev: FloatArray,
     pixels: FloatArray,
     expected: FloatArray,
     R_prior: FloatArray | None,
     T_prior: FloatArray | None,
 ) -> Consensus | None:
-    """Find the motion that most static points follow.
+    """Estimate the camera motion from static points.
 
-    A large moving object can win the vote. Where a rotation is predicted from outside (`R_prior`) and the vote turns
-    away from it, the best motion with that rotation is preferred; where a whole motion is predicted (`T_prior`), the
-    motion nearest to it is. Either must explain points that the vote denies, at least a share of the vote's own.
+    A large moving object can win the consensus. If the consensus rotation deviates from a prior rotation (`R_prior`),
+    the best motion with the prior rotation replaces it; if the consensus deviates from a prior motion (`T_prior`), the
+    motion refined from the prior does. Either needs enough inliers among the outliers of the consensus, relative to the
+    number of its inliers.
 
     Args:
-        vote: camera, thresholds and samples.
+        problem: camera, thresholds and random generator.
         p_prev: points (N, 3) triangulated in the previous frame, metres, previous cam0 frame.
         pixels: left pixels (N, 2) of the same points in the current frame.
-        expected: motion (4, 4) `T_curr_prev` to start from, of no authority.
-        R_prior: predicted rotation (3, 3) from the previous to the current cam0 frame, or None.
-        T_prior: predicted motion (4, 4) `T_curr_prev`, or None.
+        expected: motion (4, 4) `T_curr_prev` to start from.
+        R_prior: prior rotation (3, 3) from the previous to the current cam0 frame, or None.
+        T_prior: prior motion (4, 4) `T_curr_prev`, or None.
 
     Returns:
-        None where there are too few points, or too few that agree.
+        None with too few points or too few inliers.
     """
     if len(p_prev) < _MIN_POINTS:
         return None
@@ -216,23 +217,23 @@ def rigid_consensus(
         starts.append(se3_from_parts(R_prior, expected[:3, 3]))
     if T_prior is not None:
         starts.append(T_prior)
-    T, inliers = _search(vote, p_prev, pixels, np.stack(starts), slice(0, 6))
-    # Only what the vote denies speaks for another motion: a prediction that agrees with the vote need not compete.
-    needed = max(_MIN_POINTS, vote.settings.prior_min_support * inliers.sum())
+    T, inliers = _ransac(problem, p_prev, pixels, np.stack(starts), slice(0, 6))
+    # Only outliers of the consensus support another motion: a prior that agrees with the consensus is not tried.
+    needed = max(_MIN_POINTS, problem.settings.prior_min_support * inliers.sum())
     if (~inliers).sum() >= needed:
-        for T_near in _near_prior(vote, p_prev, pixels, T, expected, R_prior, T_prior):
-            kept = pixel_errors(vote.camera, T_near, p_prev, pixels) <= vote.limit_px
+        for T_near in _prior_candidates(problem, p_prev, pixels, T, expected, R_prior, T_prior):
+            kept = pixel_errors(problem.camera, T_near, p_prev, pixels) <= problem.limit_px
             if (kept & ~inliers).sum() >= needed:
-                T = _refine(vote.camera, T_near, p_prev[kept], pixels[kept], vote.limit_px / 2, slice(0, 6))
-                inliers = pixel_errors(vote.camera, T, p_prev, pixels) <= vote.limit_px
+                T = _refine(problem.camera, T_near, p_prev[kept], pixels[kept], problem.limit_px / 2, slice(0, 6))
+                inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
                 break
     if inliers.sum() < max(_MIN_POINTS, _MIN_SHARE * len(inliers)):
         return None
     return Consensus(T, inliers)
 
 
-def _near_prior(
-    vote: Vote,
+def _prior_candidates(
+    problem: RansacProblem,
     p_prev: FloatArray,
     pixels: FloatArray,
     T: FloatArray,
@@ -240,28 +241,28 @@ def _near_prior(
     R_prior: FloatArray | None,
     T_prior: FloatArray | None,
 ) -> list[FloatArray]:
-    """Motions (4, 4) near to what is predicted, where the voted motion `T` (4, 4) is not: they compete with it."""
+    """Return motions (4, 4) near the priors that the consensus motion `T` (4, 4) deviates from."""
     near: list[FloatArray] = []
-    if T_prior is not None and not _agree(vote.camera, T, T_prior, p_prev):
-        near.append(_refine(vote.camera, T_prior, p_prev, pixels, vote.limit_px, slice(0, 6)))
-    if R_prior is not None and _turn_deg(T, R_prior) > vote.settings.prior_max_deviation_deg:
+    if T_prior is not None and not _motions_agree(problem.camera, T, T_prior, p_prev):
+        near.append(_refine(problem.camera, T_prior, p_prev, pixels, problem.limit_px, slice(0, 6)))
+    if R_prior is not None and _rotation_difference_deg(T, R_prior) > problem.settings.prior_max_deviation_deg:
         fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
-        near.append(_search(vote, p_prev, pixels, fixed, slice(0, 3))[0])
+        near.append(_ransac(problem, p_prev, pixels, fixed, slice(0, 3))[0])
     return near
 
 
-def _agree(camera: StereoCamera, T: FloatArray, T_other: FloatArray, p_prev: FloatArray) -> bool:
-    """Whether two motions (4, 4) put most points (N, 3) at nearly the same pixels."""
+def _motions_agree(camera: StereoCamera, T: FloatArray, T_other: FloatArray, p_prev: FloatArray) -> bool:
+    """Whether two motions (4, 4) project most points (N, 3) to nearly the same pixels."""
     moved = transform_points(T, p_prev)
     ahead = moved[:, 2] > _MIN_DEPTH_M
     if not ahead.any():
         return False
     gap = pixel_errors(camera, T_other, p_prev[ahead], project(camera, moved[ahead])[:, :2])
-    return bool(np.median(gap) <= _TOLD_PX)
+    return bool(np.median(gap) <= _PRIOR_PX)
 
 
-def _turn_deg(T: FloatArray, R: FloatArray) -> float:
-    """Angle between the rotations of a motion (4, 4) and of a prediction (3, 3)."""
+def _rotation_difference_deg(T: FloatArray, R: FloatArray) -> float:
+    """Angle between the rotation of a motion (4, 4) and a predicted rotation (3, 3)."""
     return float(np.degrees(np.linalg.norm(so3_log(T[:3, :3] @ R.T))))
 
 
@@ -287,9 +288,9 @@ def epipolar_distance(
 def fit_motion(
     camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, start: FloatArray, limit_px: float
 ) -> FloatArray | None:
-    """Motion (4, 4) `T_curr_prev` that pixels (N, 2) of points (N, 3) stand for, from a start (4, 4).
+    """Fit a motion (4, 4) `T_curr_prev` to pixels (N, 2) of points (N, 3), from a start (4, 4).
 
-    None with too few points, or where half of them lie further than the limit from where the motion puts them.
+    None with too few points, or if half of them have an error above the limit.
     """
     finite = np.isfinite(pixels).all(axis=1)
     if finite.sum() < _MIN_POINTS:
@@ -306,29 +307,29 @@ def fit_motion(
 def predicted_motion(
     camera: StereoCamera, p_prev: FloatArray, pixels: FloatArray, expected: FloatArray
 ) -> FloatArray | None:
-    """Motion (4, 4) behind predicted pixels, from some of them, as a start; `expected` where that will do.
+    """Estimate a start motion (4, 4) from some of the predicted pixels; return `expected` if it already fits them.
 
-    None with too few points, or where most follow no motion.
+    None with too few points, or if no motion fits most of them.
     """
-    few = slice(None, None, max(1, len(p_prev) // _TOLD_POINTS))
+    few = slice(None, None, max(1, len(p_prev) // _PRIOR_POINTS))
     p, z = p_prev[few], pixels[few]
     if len(p) < _MIN_POINTS:
         return None
     T, weight = expected, np.ones((1, len(p)))
     for _ in range(_SAMPLE_ITERATIONS):
-        if np.median(pixel_errors(camera, T, p, z)) <= _TOLD_PX:
+        if np.median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX:
             return T
         T = _gauss_newton(camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6))[0]
-    T = _refine(camera, T, p, z, _TOLD_PX, slice(0, 6), settled=_TOLD_SETTLED)
-    return T if np.median(pixel_errors(camera, T, p, z)) <= _TOLD_PX else None
+    T = _refine(camera, T, p, z, _PRIOR_PX, slice(0, 6), converged=_PRIOR_CONVERGED)
+    return T if np.median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
 
 
 # --- two views, no depth --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
-class _Sights:
-    """What two left images show of the same features."""
+class _TwoViews:
+    """The same features in two left images."""
 
     before: FloatArray  # (N, 3) rays of unit depth, previous cam0 frame
     after: FloatArray  # (N, 2) pixels, current
@@ -336,48 +337,56 @@ class _Sights:
 
 
 def bearing_consensus(
-    vote: Vote, previous: FloatArray, current: FloatArray, expected_R: FloatArray, R_prior: FloatArray | None
+    problem: RansacProblem,
+    previous: FloatArray,
+    current: FloatArray,
+    expected_R: FloatArray,
+    R_prior: FloatArray | None,
 ) -> BoolArray | None:
-    """Find the tracks that one motion of the camera can explain, whatever their depths.
+    """Find the tracks that are consistent with one camera motion at some depth.
 
-    A rotation and a direction of translation put every feature on a ray of the image: it starts where the rotation
-    alone would put the feature and leads where nearer points go. What has moved little beyond the rotation lies near
-    the start of its ray under any translation, so that a camera that stands still or only turns loses no track.
-    With known rotation, two features give the direction; without, five give both.
+    A rotation and a direction of translation constrain every feature to an epipolar ray: it starts at the pixel of
+    infinite depth, given by the rotation alone, and extends towards nearer points. A feature with little parallax is
+    near the start of its ray under any translation, so that standstill and pure rotation lose no track. With known
+    rotation, two features give the direction; without, five give both.
 
     Args:
-        vote: camera, thresholds and samples.
+        problem: camera, thresholds and random generator.
         previous: left pixels (N, 2) in the previous frame.
         current: left pixels (N, 2) in the current frame.
-        expected_R: rotation (3, 3) from the previous to the current cam0 frame to begin with, of no authority.
-        R_prior: the same, predicted from outside, or None; see `rigid_consensus`.
+        expected_R: rotation (3, 3) from the previous to the current cam0 frame to start from.
+        R_prior: the same as a prior, or None; see `rigid_consensus`.
 
     Returns:
-        Mask (N,) of the tracks that agree; None where there are too few, or most do not agree.
+        Mask (N,) of the inliers; None with too few tracks, or if most are outliers.
     """
     if len(previous) < _MIN_POINTS:
         return None
-    camera, settings = vote.camera, vote.settings
-    seen = _Sights(left_rays(camera, previous), current, left_rays(camera, current))
+    camera, settings = problem.camera, problem.settings
+    seen = _TwoViews(left_rays(camera, previous), current, left_rays(camera, current))
     near_prior = None
     if R_prior is not None:
-        near_prior = _follows(vote, seen, _bearing_vote(vote, seen, [R_prior]))
+        near_prior = _bearing_inliers(problem, seen, _bearing_ransac(problem, seen, [R_prior]))
         if near_prior.mean() >= _SURE_BEARING_SHARE:
             return near_prior
-    rotations = [expected_R, _turn_of(vote, seen)]
-    T = _bearing_vote(vote, seen, rotations, _five_point(vote, previous, current))
-    kept = _follows(vote, seen, T)
-    if R_prior is not None and near_prior is not None and _turn_deg(T, R_prior) > settings.prior_max_deviation_deg:
-        # A wrong rotation, too, explains a part of what the vote explains: only what the vote denies speaks for it.
-        apart = (near_prior & ~kept).sum() >= max(_MIN_POINTS, settings.prior_min_support * kept.sum())
-        kept = near_prior if apart else kept
+    rotations = [expected_R, _pure_rotation(problem, seen)]
+    T = _bearing_ransac(problem, seen, rotations, _five_point(problem, previous, current))
+    kept = _bearing_inliers(problem, seen, T)
+    if (
+        R_prior is not None
+        and near_prior is not None
+        and _rotation_difference_deg(T, R_prior) > settings.prior_max_deviation_deg
+    ):
+        # A wrong prior shares some inliers with the consensus: only outliers of the consensus support the prior.
+        supported = (near_prior & ~kept).sum() >= max(_MIN_POINTS, settings.prior_min_support * kept.sum())
+        kept = near_prior if supported else kept
     return kept if kept.sum() >= max(_MIN_POINTS, _MIN_BEARING_SHARE * len(kept)) else None
 
 
-def _ray_distance(camera: StereoCamera, seen: _Sights, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Distances (..., N) in pixels from the image rays of rotations (..., 3, 3) and directions (..., 3).
+def _ray_distance(camera: StereoCamera, seen: _TwoViews, R: FloatArray, t: FloatArray) -> FloatArray:
+    """Distances (..., N) in pixels from the epipolar rays of rotations (..., 3, 3) and directions (..., 3).
 
-    A ray is the epipolar line from infinite depth on; behind its start, the distance to the start counts.
+    A ray is the part of the epipolar line at positive depth; before its start, the distance to the start is used.
     """
     turned = seen.before @ np.swapaxes(R, -1, -2)
     ahead = turned[..., 2] > _MIN_DEPTH_M
@@ -387,104 +396,104 @@ def _ray_distance(camera: StereoCamera, seen: _Sights, R: FloatArray, t: FloatAr
     off_v = seen.after[:, 1] - camera.fv * y - camera.cv
     way_u = camera.fu * (t[..., 0, None] - x * t[..., 2, None])
     way_v = camera.fv * (t[..., 1, None] - y * t[..., 2, None])
-    along = np.maximum(off_u * way_u + off_v * way_v, 0.0) / (way_u**2 + way_v**2 + _SCATTER)
+    along = np.maximum(off_u * way_u + off_v * way_v, 0.0) / (way_u**2 + way_v**2 + _EPSILON)
     distance = np.hypot(off_u - along * way_u, off_v - along * way_v)
     return np.where(ahead, distance, np.inf)
 
 
-def _follows(vote: Vote, seen: _Sights, T: FloatArray) -> BoolArray:
-    """Mask (N,) of the tracks that a motion (4, 4) explains."""
-    return np.asarray(_ray_distance(vote.camera, seen, T[:3, :3], T[:3, 3]) <= vote.limit_px)
+def _bearing_inliers(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> BoolArray:
+    """Mask (N,) of the inliers of a motion (4, 4)."""
+    return np.asarray(_ray_distance(problem.camera, seen, T[:3, :3], T[:3, 3]) <= problem.limit_px)
 
 
-def _cost(vote: Vote, seen: _Sights, R: FloatArray, t: FloatArray) -> FloatArray:
+def _cost(problem: RansacProblem, seen: _TwoViews, R: FloatArray, t: FloatArray) -> FloatArray:
     """Truncated squared distances, summed over the tracks (...)."""
-    return np.asarray((np.minimum(_ray_distance(vote.camera, seen, R, t), vote.limit_px) ** 2).sum(axis=-1))
+    return np.asarray((np.minimum(_ray_distance(problem.camera, seen, R, t), problem.limit_px) ** 2).sum(axis=-1))
 
 
-def _bearing_vote(
-    vote: Vote, seen: _Sights, rotations: list[FloatArray], others: FloatArray | None = None
+def _bearing_ransac(
+    problem: RansacProblem, seen: _TwoViews, rotations: list[FloatArray], others: FloatArray | None = None
 ) -> FloatArray:
-    """Best rotation and direction of translation, as a motion (4, 4) with a translation of length one.
+    """Return the best rotation and direction of translation, as a motion (4, 4) with a unit translation.
 
-    For each rotation, pairs of tracks give the direction; `others` (K, 4, 4) are motions that compete with them.
+    For each rotation, pairs of tracks give the direction; `others` (K, 4, 4) are further candidate motions.
     """
     models = [np.zeros((0, 4, 4)) if others is None else others]
-    pairs = _pairs(len(seen.before), vote)
+    pairs = _pairs(len(seen.before), problem)
     for R in rotations:
-        # The direction of translation, both rays and the rotation's normal: t . (R f x g) = 0.
+        # Epipolar constraint on the direction of translation: t . (R f x g) = 0.
         normal = np.cross(seen.before @ R.T, seen.rays)
         t = np.cross(normal[pairs[:, 0]], normal[pairs[:, 1]])
         length = np.linalg.norm(t, axis=1, keepdims=True)
-        # Where a pair tells no direction, any will do: each is better than none.
+        # A degenerate pair gives no direction; use an arbitrary one.
         t = np.where(length > 0.0, t / np.maximum(length, np.finfo(np.float64).tiny), [0.0, 0.0, 1.0])
         models += [se3_from_parts(np.broadcast_to(R, (len(t), 3, 3)), sign * t) for sign in (1.0, -1.0)]
     T = np.concatenate(models)
-    best = T[int(np.argmin(_cost(vote, seen, T[:, :3, :3], T[:, :3, 3])))]
+    best = T[int(np.argmin(_cost(problem, seen, T[:, :3, :3], T[:, :3, 3])))]
     for _ in range(_REFINE_ITERATIONS):
-        better = _bearing_step(vote, seen, best)
-        if _cost(vote, seen, better[:3, :3], better[:3, 3]) >= _cost(vote, seen, best[:3, :3], best[:3, 3]):
+        better = _bearing_step(problem, seen, best)
+        if _cost(problem, seen, better[:3, :3], better[:3, 3]) >= _cost(problem, seen, best[:3, :3], best[:3, 3]):
             break
         best = better
     return best
 
 
-def _bearing_step(vote: Vote, seen: _Sights, T: FloatArray) -> FloatArray:
-    """One Gauss-Newton step of a motion (4, 4), its translation of length one, on the distances from epipolar lines."""
-    camera, limit = vote.camera, vote.limit_px
+def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> FloatArray:
+    """One Gauss-Newton step of a motion (4, 4) with unit translation, on the distances from epipolar lines."""
+    camera, limit = problem.camera, problem.limit_px
     R, t = T[:3, :3], T[:3, 3]
     turned = seen.before @ R.T
     line = np.cross(t, turned)
-    scale = np.hypot(line[:, 0] / camera.fu, line[:, 1] / camera.fv) + _SCATTER
+    scale = np.hypot(line[:, 0] / camera.fu, line[:, 1] / camera.fv) + _EPSILON
     distance = _ray_distance(camera, seen, R, t)
     weight = np.where(distance < 1.5 * limit, 1.0 / (1.0 + (np.minimum(distance, 1e6) / limit * 2) ** 2), 0.0) / scale
     residual = weight * np.einsum("ni,ni->n", seen.rays, line)
-    plane = np.linalg.svd(t[None])[2][1:]  # two directions across the translation
+    plane = np.linalg.svd(t[None])[2][1:]  # two directions perpendicular to the translation
     r_D_turn = np.cross(turned, np.cross(seen.rays, t))
     r_D_t = np.cross(turned, seen.rays) @ plane.T
     J = weight[:, None] * np.concatenate([r_D_turn, r_D_t], axis=1)
     A = J.T @ J
-    step = -np.linalg.solve(A + (_DAMPING * np.trace(A) / 5 + _SCATTER) * np.eye(5), J.T @ residual)
+    step = -np.linalg.solve(A + (_DAMPING * np.trace(A) / 5 + _EPSILON) * np.eye(5), J.T @ residual)
     moved = t + step[3:] @ plane
     return se3_from_parts(so3_exp(step[:3]) @ R, moved / np.linalg.norm(moved))
 
 
-def _turn_of(vote: Vote, seen: _Sights) -> FloatArray:
-    """Rotation (3, 3) that alone explains most tracks: two tracks give one, and those that follow it mend it."""
+def _pure_rotation(problem: RansacProblem, seen: _TwoViews) -> FloatArray:
+    """Estimate the pure rotation (3, 3) with most inliers: from pairs of tracks, then refined on its inliers."""
     f, g = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (seen.before, seen.rays))
-    pairs = _pairs(len(f), vote)
+    pairs = _pairs(len(f), problem)
     R = _triads(g, pairs) @ np.swapaxes(_triads(f, pairs), 1, 2)
     still = np.zeros(3)
-    R_best = R[int(np.argmin(_cost(vote, seen, R, np.broadcast_to(still, (len(R), 3)))))]
-    near = _ray_distance(vote.camera, seen, R_best, still) <= vote.limit_px
+    R_best = R[int(np.argmin(_cost(problem, seen, R, np.broadcast_to(still, (len(R), 3)))))]
+    near = _ray_distance(problem.camera, seen, R_best, still) <= problem.limit_px
     # Reference: Kabsch, A solution for the best rotation to relate two sets of vectors, Acta Cryst. (1976).
     U, _, Vt = np.linalg.svd(g[near].T @ f[near])
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
-def _pairs(count: int, vote: Vote) -> IntArray:
-    """Random pairs (H, 2) of two different numbers below `count`."""
-    first = vote.rng.integers(0, count, size=vote.settings.samples)
-    return np.stack([first, (first + vote.rng.integers(1, count, size=len(first))) % count], axis=1)
+def _pairs(count: int, problem: RansacProblem) -> IntArray:
+    """Random pairs (H, 2) of different indices below `count`."""
+    first = problem.rng.integers(0, count, size=problem.settings.samples)
+    return np.stack([first, (first + problem.rng.integers(1, count, size=len(first))) % count], axis=1)
 
 
 def _triads(rays: FloatArray, pairs: IntArray) -> FloatArray:
     """Right-handed orthonormal axes (H, 3, 3) in columns, spanned by pairs (H, 2) of unit rays (N, 3)."""
     a, b = rays[pairs[:, 0]], rays[pairs[:, 1]]
     across = np.cross(a, b)
-    across = across / (np.linalg.norm(across, axis=1, keepdims=True) + _SCATTER)
+    across = across / (np.linalg.norm(across, axis=1, keepdims=True) + _EPSILON)
     return np.stack([a, across, np.cross(a, across)], axis=2)
 
 
-def _five_point(vote: Vote, previous: FloatArray, current: FloatArray) -> FloatArray | None:
-    """Motions (K, 4, 4), translations of length one, that the best essential matrices stand for; None if none fits."""
-    camera = vote.camera
+def _five_point(problem: RansacProblem, previous: FloatArray, current: FloatArray) -> FloatArray | None:
+    """Motions (K, 4, 4) with unit translation, decomposed from the best essential matrices; None if none fits."""
+    camera = problem.camera
     K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
     params = cv2.UsacParams()
     params.confidence = _FIVE_POINT_CONFIDENCE
-    params.threshold = vote.limit_px
-    params.maxIterations = 10 * vote.settings.samples
-    params.randomGeneratorState = int(vote.rng.integers(0, 2**31 - 1))
+    params.threshold = problem.limit_px
+    params.maxIterations = 10 * problem.settings.samples
+    params.randomGeneratorState = int(problem.rng.integers(0, 2**31 - 1))
     params.isParallel = False
     none = np.zeros(4)
     essential, _ = cv2.findEssentialMat(previous, current, K, K, none, none, params)

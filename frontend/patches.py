@@ -1,4 +1,4 @@
-"""Images as tracking needs them, and small patches of them around many points at once."""
+"""Images in the forms that tracking needs, and extraction of many small patches at once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class View:
 
 
 def half_image(image: Image) -> Image:
-    """The image at half resolution; what lies at (u, v) in the full image lies at (u/2, v/2) there."""
+    """The image at half resolution; pixel (u, v) of the full image is at (u/2, v/2) there."""
     return np.asarray(cv2.pyrDown(image), dtype=np.uint8)
 
 
@@ -37,6 +37,6 @@ def inside(image: Image | FloatImage, points: npt.NDArray[np.float64], margin: f
 
 
 def integer_patches(image: Image, top_left: IntArray, height: int, width: int) -> Patches:
-    """Patches (N, height, width) whose first pixel is `top_left` (N, 2) `[u v]`; all must lie inside the image."""
+    """Patches (N, height, width) whose first pixel is `top_left` (N, 2) `[u v]`; all must be inside the image."""
     windows = sliding_window_view(image, (height, width))
     return windows[top_left[:, 1], top_left[:, 0]].astype(np.float32)

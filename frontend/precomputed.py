@@ -1,4 +1,4 @@
-"""Replays features that somebody else tracked: a course file, or the observations saved by an earlier run."""
+"""Replay of features tracked elsewhere: from a course file, or from the observations of an earlier run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vio.records import FrontendOutput, IntArray, Observations, StereoFrame, Tra
 
 
 class PrecomputedFrontend:
-    """Hand out recorded observations in place of tracking."""
+    """Return recorded observations in place of tracking."""
 
     def __init__(self, source: Callable[[int], Observations | None]) -> None:
         self._source = source  # frame index to observations, such as `Dataset.observations`
@@ -20,10 +20,10 @@ class PrecomputedFrontend:
         self._highest = -1
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
-        """Return the recorded observations of the frame, unchanged; images and prior are not looked at.
+        """Return the recorded observations of the frame, unchanged; images and prior are not used.
 
         Raises:
-            DataError: the recording holds no observations of this frame.
+            DataError: the recording has no observations of this frame.
         """
         start = time.perf_counter()
         found = self._source(frame.index)

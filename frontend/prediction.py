@@ -1,4 +1,4 @@
-"""Where the features of the last frame are expected in the coming one: by a prior, or by a motion of the camera."""
+"""Predicted pixels of the tracked features in the next frame: from a prior, or from a camera motion."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import IntArray, TrackPrior
 
-_ROTATION_SLACK = 1e-3  # how far a predicted rotation may be from one
+_ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
 _MIN_DEPTH_M = 0.1
 
 
 def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
-    """The part of a prior that says something: rows of finite left pixels, one an id, and a rotation that is one."""
+    """Return the valid part of a prior: finite left pixels, one row per id, and the rotation if it is orthonormal."""
     if prior is None:
         return None
     ids, first = np.unique(prior.ids, return_index=True)
@@ -26,14 +26,14 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
     return TrackPrior(ids[finite], prior.z[first[finite]], R)
 
 
-def told_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
-    """Rows (K,) of the ids (N,) that a usable prior names, and the left pixels (K, 2) where it expects them."""
+def prior_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
+    """Rows (K,) of the ids (N,) that a usable prior contains, and the left pixels (K, 2) that it predicts."""
     _, rows, given = np.intersect1d(ids, prior.ids, assume_unique=True, return_indices=True)
     return rows, prior.z[given, :2]
 
 
 def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, left: FloatArray) -> FloatArray:
-    """Left pixels (N, 2) of points (N, 3) after a camera motion; those that end up behind keep their pixels `left`."""
+    """Left pixels (N, 2) of points (N, 3) after a camera motion; points behind the camera keep their pixels `left`."""
     moved = transform_points(T_curr_prev, p_prev)
     ahead = moved[:, 2] > _MIN_DEPTH_M
     pixels = project(camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]

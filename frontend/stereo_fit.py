@@ -1,7 +1,7 @@
-"""Right pixels of features to a fraction of a pixel: their anchors, fitted into the right image near their row.
+"""Sub-pixel stereo matching: the anchors of features are aligned with the right image near the expected row.
 
-Where a feature has a depth, it is looked for at the disparity that follows; else where a search along the row
-(`frontend.stereo_match`) finds it.
+The alignment starts at the disparity of a known depth, else at the result of a search along the row
+(`frontend.stereo_match`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from frontend.align import align, on_peak
 from frontend.columns import take
-from frontend.flow import as_bright, circle_gaps
+from frontend.flow import circle_errors, match_brightness
 from frontend.patches import View
 from frontend.settings import DisparitySettings, KltSettings
 from frontend.stereo_match import RowField, match_rows
@@ -23,12 +23,12 @@ from vio.records import BoolArray, Image, IntArray
 
 _ITERATIONS = 5
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
-_COARSE_SLACK = 0.2  # by how much the coarse stereo search may correlate worse than the fine fit
+_COARSE_SLACK = 0.2  # how much lower the correlation of the coarse search may be than that of the alignment
 _MIN_DEPTH_M = 0.05
 
 
 class StereoFit:
-    """Find features in the right image, and learn meanwhile how far matched rows differ over the image."""
+    """Match features in the right image, and estimate the row differences of matches over the image."""
 
     def __init__(
         self,
@@ -38,7 +38,7 @@ class StereoFit:
         bank: AnchorBank,
         size: tuple[int, int],
     ) -> None:
-        """Prepare for images of one size, width and height; the bank holds the features' anchors."""
+        """Prepare for images of one size (width, height); the bank contains the features' anchors."""
         self.max_disparity_px = disparity.max_disparity * size[0]
         self._min_disparity_px = disparity.min_disparity_px
         self._camera = camera
@@ -46,43 +46,43 @@ class StereoFit:
         self._bank = bank
         self._rows = RowField(*size)
 
-    def again(self, tracks: Tracks, right: View, last_half: Image, moved: bool) -> Tracks:
-        """Find features of known depth; with a known motion (`moved`) the disparity must agree with it.
+    def track_right(self, tracks: Tracks, right: View, last_half: Image, moved: bool) -> Tracks:
+        """Match features of known depth; with a consensus motion (`moved`), check the disparity against the depth.
 
         Args:
             tracks: features at their new left pixels; right pixels are still those of the last frame.
             right: the right image.
             last_half: the last right image at half resolution.
-            moved: whether the depths were moved along with the camera.
+            moved: whether the depths were propagated with a consensus motion.
         """
-        rows = np.flatnonzero(tracks.placed & (tracks.point[:, 2] > _MIN_DEPTH_M))
-        deep = take(tracks, rows)
-        expected = self._camera.fu * self._camera.baseline_m / deep.point[:, 2]
-        place, skew, valid = self._fitted(deep, right, expected)
+        rows = np.flatnonzero(tracks.has_point & (tracks.point[:, 2] > _MIN_DEPTH_M))
+        known = take(tracks, rows)
+        expected = self._camera.fu * self._camera.baseline_m / known.point[:, 2]
+        place, skew, valid = self._fit(known, right, expected)
         if moved:
-            valid &= np.abs(deep.left[:, 0] - place[:, 0] - expected) <= self._settings.consensus_px
+            valid &= np.abs(known.left[:, 0] - place[:, 0] - expected) <= self._settings.consensus_px
         if self._settings.circle_check:
-            valid &= self._closes_circle(deep, place, last_half, right)
-        return self._taken_in(tracks, rows[valid], place[valid], skew[valid])
+            valid &= self._closes_circle(known, place, last_half, right)
+        return self._with_right_pixels(tracks, rows[valid], place[valid], skew[valid])
 
-    def near(self, tracks: Tracks, right: View, rows: IntArray, disparity: FloatArray) -> Tracks:
-        """Give the named rows (K,) right pixels near their disparities (K,), where they are found."""
-        place, skew, valid = self._fitted(take(tracks, rows), right, disparity)
-        return self._taken_in(tracks, rows[valid], place[valid], skew[valid])
+    def match_near(self, tracks: Tracks, right: View, rows: IntArray, disparity: FloatArray) -> Tracks:
+        """Match the given rows (K,) near their disparities (K,)."""
+        place, skew, valid = self._fit(take(tracks, rows), right, disparity)
+        return self._with_right_pixels(tracks, rows[valid], place[valid], skew[valid])
 
     def search(self, left: View, right: View, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are unique."""
         return self._search(left.half, right.half, points, self._settings.min_correlation - _COARSE_SLACK)
 
     def count_mirrored(self, left: View, right: View, points: FloatArray) -> int:
-        """How many left pixels (N, 2) have a match with a negative disparity."""
+        """Count the left pixels (N, 2) that have a match with a negative disparity."""
         a, b = (np.ascontiguousarray(view.half[:, ::-1]) for view in (left, right))
         flipped = points * [-1.0, 1.0] + [2.0 * (a.shape[1] - 1), 0.0]
         disparity, unique = self._search(a, b, flipped, self._settings.min_correlation)
         return int((unique & (disparity >= 1.0)).sum())
 
     def learn_rows(self, tracks: Tracks) -> None:
-        """Take in how far the rows of the matches of a frame differ."""
+        """Update the row differences with the matches of a frame."""
         self._rows.learn(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
 
     def _search(
@@ -91,8 +91,8 @@ class StereoFit:
         margin = self._settings.min_peak_margin
         return match_rows(left_half, right_half, points, self.max_disparity_px, min_correlation, margin)
 
-    def _fitted(self, tracks: Tracks, right: View, disparity: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Fit anchors into the right image near expected disparities (N,).
+    def _fit(self, tracks: Tracks, right: View, disparity: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Align anchors with the right image near expected disparities (N,).
 
         Returns:
             Right pixels (N, 2), the change of the warp's linear part (N, 2, 2), and a mask (N,) of the good ones.
@@ -117,22 +117,22 @@ class StereoFit:
         return place, skew, valid
 
     def _closes_circle(self, tracks: Tracks, place: FloatArray, last_half: Image, right: View) -> BoolArray:
-        """Mask (N,) of right pixels (N, 2) that tracking in time from the last right image leads to as well.
+        """Mask (N,) of right pixels (N, 2) that agree with temporal tracking from the last right image.
 
-        Features that had no right match in the last frame have no circle to close, and pass.
+        Features without a right match in the last frame cannot be checked, and pass.
         """
-        closes = tracks.blind > 0
+        closes = tracks.left_only_frames > 0
         rows = np.flatnonzero(~closes)
-        last = as_bright(last_half, right.half)
-        gap = circle_gaps(last, right.half, tracks.right[rows], place[rows], self._settings)
+        last = match_brightness(last_half, right.half)
+        gap = circle_errors(last, right.half, tracks.right[rows], place[rows], self._settings)
         closes[rows] = gap <= self._settings.max_circle_px
         return closes
 
-    def _taken_in(self, tracks: Tracks, rows: IntArray, place: FloatArray, skew: FloatArray) -> Tracks:
-        """Give the named rows (K,) their right pixels (K, 2), their skews (K, 2, 2), and the depth that follows."""
+    def _with_right_pixels(self, tracks: Tracks, rows: IntArray, place: FloatArray, skew: FloatArray) -> Tracks:
+        """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of the given rows (K,)."""
         right, has_right, skews = tracks.right.copy(), tracks.has_right.copy(), tracks.skew.copy()
         right[rows], has_right[rows], skews[rows] = place, True, skew
         p_cam, valid = triangulate(self._camera, np.concatenate([tracks.left[rows], place], axis=1))
-        point, placed = tracks.point.copy(), tracks.placed.copy()
-        point[rows[valid]], placed[rows[valid]] = p_cam[valid], True
-        return replace(tracks, right=right, has_right=has_right, skew=skews, point=point, placed=placed)
+        point, has_point = tracks.point.copy(), tracks.has_point.copy()
+        point[rows[valid]], has_point[rows[valid]] = p_cam[valid], True
+        return replace(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)

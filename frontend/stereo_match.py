@@ -1,7 +1,7 @@
-"""Left-right matching on a rectified pair: a normalised search along the row over all disparities.
+"""Left-right matching on a rectified pair: normalised correlation along the row over all disparities.
 
 The search compares zero-mean, unit-norm patches, so that exposure and gain may differ between the cameras. It runs at
-half resolution, both ways; the sub-pixel place in the full image is found afterwards by alignment (`frontend.align`).
+half resolution, left to right and back; `frontend.align` then finds the sub-pixel position in the full image.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from vio.records import BoolArray, Image, IntArray
 
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
-_FIELD_MEMORY = 0.95  # weight of what was learned before, per frame
-_FIELD_PRIOR = 4.0  # matches that it takes to believe in a row difference
+_FIELD_MEMORY = 0.95  # forgetting factor of previous frames, per frame
+_FIELD_PRIOR = 4.0  # weight of the prior of zero row difference, in matches
 _FIELD_SIGMA_PX = 0.5
 _FIELD_ITERATIONS = 3
 
 
 class RowField:
-    """How far matched rows differ over the image, learned from the matches: what the rectification left over.
+    """Row differences of matches over the image, estimated from the matches: the residual error of the rectification.
 
     A small error of the relative rotation or principal point moves rows by a low polynomial in the pixel. On KITTI it
-    reaches 0.9 px in the corners, and a feature on a slanted edge turns it into an error of its disparity.
+    reaches 0.9 px in the corners, and at a slanted edge it causes an error of the disparity.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -47,7 +47,7 @@ class RowField:
         return left[:, 1] + self._terms(left) @ self._field
 
     def learn(self, left: FloatArray, right: FloatArray) -> None:
-        """Take in the matches (N, 2) and (N, 2) of one frame; those far from what is known count little."""
+        """Update the estimate with the matches (N, 2) and (N, 2) of one frame; outliers have little weight."""
         terms = self._terms(left)
         off = right[:, 1] - left[:, 1]
         prior = (1 - _FIELD_MEMORY) * _FIELD_PRIOR * np.eye(5)
@@ -88,7 +88,7 @@ def row_correlation(
 
 
 def _window_norms(image: Image, side: int) -> npt.NDArray[np.float32]:
-    """Norm (H, W) of the window around each pixel after its mean is taken away."""
+    """Norm (H, W) of the window around each pixel after its mean is subtracted."""
     total = cv2.boxFilter(image, cv2.CV_32F, (side, side), normalize=False)
     square = cv2.sqrBoxFilter(image, cv2.CV_32F, (side, side), normalize=False)
     return np.asarray(np.sqrt(np.maximum(square - total * total / side**2, 0.0)), dtype=np.float32)
@@ -100,7 +100,7 @@ def _search(
     """Search shifts `low..high` along the row for points (N, 2).
 
     Returns:
-        The best shift (N,), sub-pixel; its score (N,), -1 too close to the border; the best score off its peak.
+        The best shift (N,), sub-pixel; its score (N,), -1 too close to the border; the best score outside its peak.
     """
     rows = np.arange(len(points))
     centres = np.rint(points).astype(np.int64)
@@ -130,11 +130,11 @@ def match_rows(
         points: left pixels (N, 2) of the full image.
         max_disparity: largest disparity, pixels of the full image.
         min_correlation: smallest normalised correlation.
-        margin: least lead over the second-best place in the row.
+        margin: smallest lead over the second-best match in the row.
 
     Returns:
-        Disparities (N,) in pixels of the full image, and a mask (N,) of those that are good enough, unique, and found
-        again when searching back.
+        Disparities (N,) in pixels of the full image, and a mask (N,) of those with sufficient correlation, unique,
+        and confirmed by the reverse search.
     """
     if len(points) == 0:
         return np.zeros(0), np.zeros(0, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""The features that the front end `klt` keeps alive, and the patches that it finds them again by."""
+"""The features that the front end `klt` tracks, and the anchor patches that it aligns them with."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from vio.records import BoolArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """The features alive after a frame; older features come first."""
+    """The active features after a frame; older features come first."""
 
-    ids: IntArray  # (N,) given when a feature is first shown; arbitrary before
+    ids: IntArray  # (N,) assigned when a feature is first output; arbitrary before
     left: FloatArray  # (N, 2) pixels
     right: FloatArray  # (N, 2) pixels, arbitrary where has_right is False
     has_right: BoolArray  # (N,)
-    blind: IntArray  # (N,) frames in a row without a right match
-    age: IntArray  # (N,) frames since birth
-    shown: BoolArray  # (N,) handed out as observations
-    point: FloatArray  # (N, 3) cam0 frame, metres; arbitrary where placed is False
-    placed: BoolArray  # (N,)
+    left_only_frames: IntArray  # (N,) frames in a row without a right match
+    age: IntArray  # (N,) frames since detection
+    shown: BoolArray  # (N,) output as observations
+    point: FloatArray  # (N, 3) cam0 frame, metres; arbitrary where has_point is False
+    has_point: BoolArray  # (N,)
     slot: IntArray  # (N,) row of the anchor in the bank
     warp: FloatArray  # (N, 2, 3) from offsets in the anchor to pixels of the left image
-    skew: FloatArray  # (N, 2, 2) what is added to the warp's linear part for the right image
+    skew: FloatArray  # (N, 2, 2) added to the linear part of the warp for the right image
 
     def __len__(self) -> int:
         return len(self.ids)
 
 
 def newborn(left: FloatArray, slot: IntArray) -> Tracks:
-    """Features that begin at left pixels (N, 2), with anchors in slots (N,)."""
+    """New features at left pixels (N, 2), with anchors in slots (N,)."""
     n = len(left)
     return Tracks(
         ids=np.zeros(n, dtype=np.int64),
         left=left,
         right=np.zeros((n, 2)),
         has_right=np.zeros(n, dtype=np.bool_),
-        blind=np.zeros(n, dtype=np.int64),
+        left_only_frames=np.zeros(n, dtype=np.int64),
         age=np.zeros(n, dtype=np.int64),
         shown=np.zeros(n, dtype=np.bool_),
         point=np.zeros((n, 3)),
-        placed=np.zeros(n, dtype=np.bool_),
+        has_point=np.zeros(n, dtype=np.bool_),
         slot=slot,
         warp=shift_warps(left),
         skew=np.zeros((n, 2, 2)),
@@ -59,7 +59,7 @@ def no_tracks() -> Tracks:
 
 
 class AnchorBank:
-    """Templates of the living features, in slots that are used again: anchors stay where they are while tracks move."""
+    """Anchor templates of the active features, in reusable slots: anchors keep their slot while rows of tracks move."""
 
     def __init__(self, count: int, radius_px: int) -> None:
         self.store = empty_templates(count, radius_px)
@@ -77,7 +77,7 @@ class AnchorBank:
         return free
 
     def renew(self, slots: IntArray, image: FloatImage, centres: FloatArray) -> None:
-        """Replace the anchors in slots (N,) by what lies around pixels (N, 2) of an image."""
+        """Replace the anchors in slots (N,) by the patches around pixels (N, 2) of an image."""
         new = templates(cut_patches(image, centres, self._radius_px))
         for column in fields(Templates):
             getattr(self.store, column.name)[slots] = getattr(new, column.name)

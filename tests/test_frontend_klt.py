@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from frontend.detect import cell_index, grid_shape, min_distance_px
-from frontend.flow import circle_gaps
+from frontend.flow import circle_errors
 from frontend.klt import KltFrontend
 from frontend.outliers import fit_motion
 from frontend.patches import half_image
@@ -370,11 +370,11 @@ def test_the_circle_closes_where_both_ways_lead_to_one_pixel(outputs: list[Front
         halves.append(half_image(frame.right))
     wrong = np.arange(len(z)) % 3 == 0
     off = np.where(wrong[:, None], [3.0, -1.5], [0.0, 0.0])
-    gap = circle_gaps(halves[0], halves[1], z[:, 2:], z_next[:, 2:] + off, SETTINGS.klt)
+    gap = circle_errors(halves[0], halves[1], z[:, 2:], z_next[:, 2:] + off, SETTINGS.klt)
     assert np.median(gap[~wrong]) < 0.2
     assert np.mean(gap[~wrong] <= SETTINGS.klt.max_circle_px) > 0.98
     assert np.mean(gap[wrong] > SETTINGS.klt.max_circle_px) > 0.95
-    assert len(circle_gaps(halves[0], halves[1], z[:0, 2:], z[:0, 2:], SETTINGS.klt)) == 0
+    assert len(circle_errors(halves[0], halves[1], z[:0, 2:], z[:0, 2:], SETTINGS.klt)) == 0
 
 
 def test_the_circle_check_costs_hardly_a_good_match(outputs: list[FrontendOutput]) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from frontend.outliers import (
-    Vote,
+    RansacProblem,
     bearing_consensus,
     epipolar_distance,
     fit_motion,
@@ -23,9 +23,9 @@ LIMIT_PX = 1.0
 T_TRUE = se3_exp([0.05, -0.02, -1.1, 0.004, -0.02, 0.003])  # a car driving 1.1 m forward and turning
 
 
-def vote(seed: int = 0, settings: ConsensusSettings | None = None) -> Vote:
+def make_problem(seed: int = 0, settings: ConsensusSettings | None = None) -> RansacProblem:
     settings = ConsensusSettings() if settings is None else settings
-    return Vote(CAMERA, settings, LIMIT_PX, np.random.default_rng(seed))
+    return RansacProblem(CAMERA, settings, LIMIT_PX, np.random.default_rng(seed))
 
 
 def scene(n: int, seed: int, depth: tuple[float, float] = (5.0, 40.0)) -> FloatArray:
@@ -47,7 +47,7 @@ def test_outliers_are_told_from_inliers(share: float) -> None:
     uv = pixels(T_TRUE, p, 2)
     bad = np.arange(300) < 300 * share
     uv[bad] += np.random.default_rng(3).choice([-1, 1], (bad.sum(), 2)) * np.linspace(8, 60, bad.sum())[:, None]
-    found = rigid_consensus(vote(), p, uv, np.eye(4), None, None)
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
     assert found is not None
     assert not found.inliers[bad].any()
     assert found.inliers[~bad].mean() > 0.99
@@ -59,7 +59,7 @@ def test_outliers_are_told_from_inliers(share: float) -> None:
 def test_the_same_seed_gives_the_same_bits() -> None:
     p = scene(200, 4)
     uv = pixels(T_TRUE, p, 5, noise=1.0)
-    a, b = (rigid_consensus(vote(7), p, uv, np.eye(4), None, None) for _ in range(2))
+    a, b = (rigid_consensus(make_problem(7), p, uv, np.eye(4), None, None) for _ in range(2))
     assert a is not None
     assert b is not None
     np.testing.assert_array_equal(a.T_curr_prev, b.T_curr_prev)
@@ -68,7 +68,7 @@ def test_the_same_seed_gives_the_same_bits() -> None:
 
 def test_standing_still_is_a_motion_too() -> None:
     p = scene(100, 6)
-    found = rigid_consensus(vote(), p, pixels(np.eye(4), p, 7), T_TRUE, None, None)
+    found = rigid_consensus(make_problem(), p, pixels(np.eye(4), p, 7), T_TRUE, None, None)
     assert found is not None
     assert np.linalg.norm(se3_log(found.T_curr_prev)) < 0.02
     assert found.inliers.all()
@@ -77,13 +77,13 @@ def test_standing_still_is_a_motion_too() -> None:
 @pytest.mark.parametrize("n", [0, 1, 7])
 def test_too_few_points_give_no_consensus(n: int) -> None:
     p = scene(n, 8)
-    assert rigid_consensus(vote(), p, pixels(T_TRUE, p, 9), np.eye(4), None, None) is None
+    assert rigid_consensus(make_problem(), p, pixels(T_TRUE, p, 9), np.eye(4), None, None) is None
 
 
 def test_scattered_pixels_give_no_consensus() -> None:
     p = scene(100, 10)
     uv = np.random.default_rng(11).uniform([0, 0], [1242, 375], (100, 2))
-    assert rigid_consensus(vote(), p, uv, np.eye(4), None, None) is None
+    assert rigid_consensus(make_problem(), p, uv, np.eye(4), None, None) is None
 
 
 def crossing_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
@@ -98,7 +98,7 @@ def crossing_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
 def test_a_crossing_truck_wins_the_vote_when_nothing_is_predicted() -> None:
     """Shows that the trap is real: the next test would pass for free otherwise."""
     p, uv, truck = crossing_truck()
-    found = rigid_consensus(vote(), p, uv, np.eye(4), None, None)
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
     assert found is not None
     assert found.inliers[truck].mean() > 0.9
 
@@ -116,7 +116,7 @@ def test_a_prediction_frees_the_consensus_from_a_truck(turning: bool, predicted:
     p, uv, truck = turning_truck() if turning else crossing_truck()
     R_prior = None if predicted == "motion" else np.eye(3)
     T_prior = None if predicted == "rotation" else se3_exp([0.05, 0.0, -0.1, 0.0, 0.002, 0.0])
-    found = rigid_consensus(vote(), p, uv, np.eye(4), R_prior, T_prior)
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), R_prior, T_prior)
     assert found is not None
     if predicted == "rotation" and not turning:
         # A truck that only slides sideways contradicts no rotation; known limit.
@@ -130,7 +130,7 @@ def test_a_prediction_frees_the_consensus_from_a_truck(turning: bool, predicted:
 def test_a_wrong_predicted_rotation_does_not_win_against_all_points() -> None:
     p = scene(200, 17)
     wrong = se3_exp([0.0, 0.0, 0.0, 0.0, 0.1, 0.0])[:3, :3]
-    found = rigid_consensus(vote(), p, pixels(T_TRUE, p, 18), np.eye(4), wrong, None)
+    found = rigid_consensus(make_problem(), p, pixels(T_TRUE, p, 18), np.eye(4), wrong, None)
     assert found is not None
     assert found.inliers.mean() > 0.99
 
@@ -139,7 +139,7 @@ def test_a_wrong_predicted_motion_does_not_win_against_all_points() -> None:
     p = scene(200, 17)
     wrong = se3_exp([0.5, 0.0, 0.0, 0.0, 0.1, 0.0])
     uv = pixels(T_TRUE, p, 18)
-    found = rigid_consensus(vote(), p, uv, np.eye(4), None, wrong)
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, wrong)
     assert found is not None
     assert found.inliers.mean() > 0.99
 
@@ -149,7 +149,7 @@ def test_a_prediction_that_turns_the_other_way_frees_the_consensus_too() -> None
     wall, truck = scene(70, 12, (15.0, 40.0)), scene(130, 13, (7.0, 8.0))
     T_wall, T_truck = (se3_exp([x, 0.0, 0.0, 0.0, turn, 0.0]) for x, turn in ((0.0, -0.05), (0.8, 0.05)))
     uv = np.concatenate([pixels(T_wall, wall, 14), pixels(T_truck, truck, 15)])
-    found = rigid_consensus(vote(), np.concatenate([wall, truck]), uv, np.eye(4), T_wall[:3, :3], None)
+    found = rigid_consensus(make_problem(), np.concatenate([wall, truck]), uv, np.eye(4), T_wall[:3, :3], None)
     assert found is not None
     assert found.inliers[:70].mean() > 0.95
     assert not found.inliers[70:].any()
@@ -163,7 +163,7 @@ def test_a_wrong_rotation_that_explains_only_what_the_vote_explains_does_not_win
     uv = pixels(T_TRUE, p, 0)
     uv[130:] += rng.choice([-1, 1], (80, 2)) * rng.uniform(20, 80, (80, 2))
     wrong = se3_exp([0.0, 0.0, 0.0, 0.0, np.radians(2.0), 0.0])[:3, :3] @ T_TRUE[:3, :3]
-    found = rigid_consensus(vote(), p, uv, np.eye(4), wrong, None)
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), wrong, None)
     assert found is not None
     assert found.inliers[:130].mean() > 0.98
     assert np.linalg.norm(se3_log(found.T_curr_prev @ np.linalg.inv(T_TRUE))) < 0.02
@@ -242,7 +242,7 @@ def two_views(T: FloatArray, seed: int, share: float, noise: float = 0.2) -> tup
 
 
 def agreeing(before: FloatArray, after: FloatArray, R_prior: FloatArray | None, seed: int = 0) -> np.ndarray | None:
-    return bearing_consensus(vote(seed), before, after, np.eye(3), R_prior)
+    return bearing_consensus(make_problem(seed), before, after, np.eye(3), R_prior)
 
 
 @pytest.mark.parametrize("prior_error_deg", [None, 0.0, 1.0, 5.0])
@@ -268,7 +268,7 @@ def test_two_views_tell_outliers_and_lose_no_good_track(name: str, share: float,
 def test_a_known_rotation_takes_no_more_than_two_tracks_for_a_direction() -> None:
     """With the rotation at hand the direction is found among 45 % outliers from a handful of pairs."""
     before, after, bad = two_views(T_TRUE, 5, 0.45)
-    few = vote(settings=ConsensusSettings(samples=12))
+    few = make_problem(settings=ConsensusSettings(samples=12))
     kept = bearing_consensus(few, before, after, np.eye(3), T_TRUE[:3, :3])
     assert kept is not None
     assert kept[~bad].mean() > 0.97
@@ -328,16 +328,16 @@ def test_depth_votes_where_there_is_enough_and_the_images_alone_where_not() -> N
     before, after, bad = two_views(T_TRUE, 9, 0.3)
     p = scene(300, 9)
     deep = np.arange(300) % 2 == 0
-    kept, motion = static_tracks(vote(), before, p, deep, after, np.eye(4), None, None)
+    kept, motion = static_tracks(make_problem(), before, p, deep, after, np.eye(4), None, None)
     assert motion is not None
     np.testing.assert_array_equal(kept[deep], motion.inliers)
     assert not kept[deep & bad].any()
     assert kept[~deep].all()
     few = np.arange(300) < 5
-    kept, motion = static_tracks(vote(), before, p, few, after, np.eye(4), None, None)
+    kept, motion = static_tracks(make_problem(), before, p, few, after, np.eye(4), None, None)
     assert motion is None
     assert kept[bad].mean() < 0.15
     assert kept[~bad].mean() > 0.97
-    kept, motion = static_tracks(vote(), before[:5], p[:5], few[:5], after[:5], np.eye(4), None, None)
+    kept, motion = static_tracks(make_problem(), before[:5], p[:5], few[:5], after[:5], np.eye(4), None, None)
     assert motion is None
     assert kept.all()  # too few to say anything: nothing is dropped

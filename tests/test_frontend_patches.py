@@ -21,7 +21,7 @@ from frontend.detect import (
     spread_evenly,
 )
 from frontend.patches import half_image, inside
-from frontend.prediction import moved_pixels, told_pixels
+from frontend.prediction import moved_pixels, prior_pixels
 from frontend.settings import GridSettings, KltSettings
 from frontend.stereo_match import RowField, match_rows, row_correlation
 from frontend.tracks import AnchorBank
@@ -370,7 +370,7 @@ def test_points_that_end_up_behind_the_camera_keep_their_pixels() -> None:
 
 def test_the_told_pixels_are_those_of_the_ids_that_a_prior_names() -> None:
     prior = TrackPrior(np.array([3, 7, 9]), np.arange(12.0).reshape(3, 4))
-    rows, told = told_pixels(np.array([9, 1, 3]), prior)
+    rows, told = prior_pixels(np.array([9, 1, 3]), prior)
     assert dict(zip(rows.tolist(), told.tolist(), strict=True)) == {0: [8.0, 9.0], 2: [0.0, 1.0]}
 
 

@@ -12,7 +12,7 @@ from frontend import FrontendSettings, build_frontend
 from frontend.outliers import pixel_errors, predicted_motion, rigid_consensus
 from frontend.prediction import usable_prior
 from frontend.settings import ConsensusSettings, GridSettings, MatchSettings
-from tests.test_frontend_outliers import CAMERA, T_TRUE, pixels, scene, vote
+from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
 from tools.frontend_accuracy import accuracy_scenario
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse
@@ -210,7 +210,7 @@ def test_a_prior_wins_against_a_truck_of_any_size_that_leaves_it_enough_points(s
     )
     predicted = se3_exp([0.05, 0.0, -0.1, 0.0, 0.002, 0.0])
     for R_prior, T_prior in ((np.eye(3), None), (None, predicted)):
-        found = rigid_consensus(vote(settings=settings), p, uv, np.eye(4), R_prior, T_prior)
+        found = rigid_consensus(make_problem(settings=settings), p, uv, np.eye(4), R_prior, T_prior)
         assert found is not None
         assert found.inliers[:still].mean() > 0.95
         assert not found.inliers[still:].any()

@@ -1,8 +1,8 @@
-"""What needs torch (extra `learned`): the front end `kornia`, and Lucas-Kanade of many tracks at once.
+"""Parts that need torch (extra `learned`): the front end `kornia`, and batched Lucas-Kanade.
 
-Nothing is ever downloaded: every network is built without weights and filled from a file, read with
-`weights_only=True`. Detectors gftt and harris with descriptor sift need no weights. torch and kornia are imported only
-when a part that needs them is built.
+Nothing is ever downloaded: networks are built without weights and loaded from a file with `weights_only=True`.
+Detectors gftt and harris with descriptor sift need no weights. torch and kornia are imported only when a part that
+needs them is built.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from vio.geometry.stereo import StereoCamera
 
 
 def build_learned(camera: StereoCamera, settings: FrontendSettings) -> DescriptorFrontend:
-    """Build the front end that the settings describe.
+    """Build the front end `kornia` from the settings.
 
     Raises:
         MissingDependencyError: torch or kornia is not installed, or kornia is too old.
-        ConfigError: weights are needed but not named, CUDA is asked for but absent, or parts do not fit together.
+        ConfigError: a required weights file is not set, CUDA is requested but absent, or parts do not fit together.
         DataError: a file of weights cannot be read, or is of another network.
     """
     _require_torch()
@@ -37,7 +37,7 @@ def build_learned(camera: StereoCamera, settings: FrontendSettings) -> Descripto
 def _require_torch() -> None:
     try:
         import torch  # noqa: F401
-        from kornia.feature import ALIKED, XFeat  # noqa: F401  (the youngest that are used)
+        from kornia.feature import ALIKED, XFeat  # noqa: F401  (the newest that are used)
     except ImportError as error:
         raise MissingDependencyError(
             f"the kornia front end needs torch and kornia 0.8.3 or newer, on Python 3.11 or newer ({error}); "

@@ -1,4 +1,4 @@
-"""Key points and descriptors by kornia's networks and operators."""
+"""Key points and descriptors from kornia's networks and operators."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 Tensor: TypeAlias = "torch.Tensor"
 
-_PATCH_RADIUS_PX = 12.0  # of what sift, mkd, ... describe around a corner
+_PATCH_RADIUS_PX = 12.0  # of the patch around a corner that sift, mkd, ... describe
 _PATCH_PX = {"sift": 41}
 _NMS_PX = 5
 
 
 def build_extractor(learned: LearnedSettings, match: MatchSettings, device: torch.device) -> Extractor:
-    """Build what finds and describes key points.
+    """Build the detector and descriptor of key points.
 
     Raises:
-        ConfigError: weights are needed but not named.
+        ConfigError: a required weights file is not set.
         DataError: a file of weights cannot be read, or is of another network.
     """
     import kornia.feature as kf
@@ -85,7 +85,7 @@ def _descriptor(learned: LearnedSettings) -> Module:
 
 
 def _mkd(path: Path | None) -> Module:
-    """Multiple kernel descriptor; its weights are the whitening, which also tells which kernels it is for.
+    """Multiple kernel descriptor; its weights are the whitening, whose size determines the kernels.
 
     Reference: Mukundan et al., Understanding and improving kernel local descriptors, IJCV (2019).
     """
@@ -116,7 +116,7 @@ def _as_tensor(image: Image, device: torch.device) -> Tensor:
 
 
 def _keypoints(pixels: Tensor, descriptors: Tensor, strength: Tensor) -> Keypoints:
-    """Move key points (N, ...) to NumPy, strongest first, descriptors as unit vectors; those not finite are dropped."""
+    """Move key points (N, ...) to NumPy, strongest first, descriptors as unit vectors; non-finite ones are dropped."""
     columns = (np.asarray(t.detach().float().cpu().numpy()) for t in (pixels, descriptors, strength))
     uv, described, weight = columns
     order = np.argsort(-weight, kind="stable")

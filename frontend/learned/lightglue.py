@@ -1,4 +1,4 @@
-"""Key points paired by LightGlue."""
+"""Key point matching by LightGlue."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 Tensor: TypeAlias = "torch.Tensor"
 
-_DETECTORS = ("aliked", "disk", "xfeat")  # kornia calls the weights as the detectors that they go with
+_DETECTORS = ("aliked", "disk", "xfeat")  # kornia names the weights after their detectors
 
 
 @dataclass(frozen=True, slots=True)
 class _LightGlueMatcher:
-    """Pairs key points by attention over both images; pairs that are not allowed are dropped afterwards.
+    """Matches key points by attention over both images; pairs that are not allowed are dropped afterwards.
 
     Reference: Lindenberger et al., LightGlue: local feature matching at light speed, ICCV (2023).
     """
@@ -56,10 +56,10 @@ class _LightGlueMatcher:
 
 
 def build_lightglue(learned: LearnedSettings, camera: StereoCamera, device: torch.device) -> Matcher:
-    """Build what pairs the key points of the detector in use.
+    """Build the matcher for the key points of the detector in use.
 
     Raises:
-        ConfigError: LightGlue does not go with the detector, or its weights are not named.
+        ConfigError: LightGlue does not support the detector, or its weights are not set.
         DataError: the file of weights cannot be read, or is of another network or detector.
     """
     import kornia.feature as kf

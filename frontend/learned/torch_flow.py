@@ -1,7 +1,7 @@
-"""Pyramidal Lucas-Kanade in torch: all tracks at once, between any pairs of images, on CPU or CUDA.
+"""Batched pyramidal Lucas-Kanade in torch, between any pairs of images, on CPU or CUDA.
 
-Tracks name the images that they start and end in, so one call follows features in time, from left to right and back.
-Pyramid, derivatives, windows and stopping rule are those of OpenCV's `calcOpticalFlowPyrLK`, so that the numbers agree.
+Each track has the index of its source and target image, so one call tracks in time, from left to right and back.
+Pyramid, derivatives, windows and stopping rule are those of OpenCV's `calcOpticalFlowPyrLK`, so that results agree.
 Reference: Bouguet, Pyramidal implementation of the Lucas Kanade feature tracker, Intel (2001).
 """
 
@@ -27,7 +27,7 @@ _SCHARR_TAPS = (3 / 16, 10 / 16, 3 / 16)
 
 
 class TorchFlow:
-    """Tracks points between images of one size; holds the device and the search's settings."""
+    """Tracks points between images of one size; keeps the device and the settings of the search."""
 
     def __init__(
         self,
@@ -38,18 +38,18 @@ class TorchFlow:
         epsilon_px: float = 0.01,
         device: str = "cpu",
     ) -> None:
-        """Prepare.
+        """Set up the tracker.
 
         Args:
             window_px: odd side of the tracking window.
             levels: image levels coarser than the full one.
-            iterations: largest number of steps a level.
-            epsilon_px: step below which a track has settled on its level.
+            iterations: largest number of iterations per level.
+            epsilon_px: step below which a track has converged on its level.
             device: "cpu" or "cuda".
 
         Raises:
             MissingDependencyError: torch is not installed.
-            ConfigError: CUDA is asked for but absent.
+            ConfigError: CUDA is requested but absent.
         """
         try:
             import torch  # noqa: F401
@@ -78,12 +78,12 @@ class TorchFlow:
     def track(
         self, pyramid: list[Tensor], source: IntArray, target: IntArray, points: FloatArray, guess: FloatArray
     ) -> tuple[FloatArray, BoolArray]:
-        """Follow points from their source to their target images.
+        """Track points from their source to their target images.
 
         Args:
             pyramid: levels of the images, from `pyramid`.
-            source: row of the image (N,) that each point lies in.
-            target: row of the image (N,) to find it in.
+            source: index of the source image (N,) of each point.
+            target: index of the target image (N,) of each point.
             points: pixels (N, 2) in the source images.
             guess: pixels (N, 2) in the target images to start from.
 
@@ -105,7 +105,7 @@ class TorchFlow:
                 here, textured = self._on_level(pyramid[level], images, start * scale, place * scale)
                 inside = _inside(here, pyramid[level], self._window_px)
                 found = found & textured & inside if level == 0 else found
-                # As in OpenCV, a level on which a point cannot be tracked leaves it where the coarser one put it.
+                # As in OpenCV, a point that cannot be tracked on a level keeps the result of the coarser level.
                 place = torch.where((textured & inside)[:, None], here / scale, place)
             pixels = place.double().cpu().numpy()
             good = found.cpu().numpy()
@@ -114,7 +114,7 @@ class TorchFlow:
     def _on_level(
         self, level: Tensor, images: tuple[Tensor, Tensor], start: Tensor, place: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Gauss-Newton on one level (K, H, W) from places (N, 2); returns places and the mask of textured windows."""
+        """Gauss-Newton on one level (K, H, W) from pixels (N, 2); return pixels and the mask of textured windows."""
         import torch
 
         source, target = images
@@ -174,19 +174,19 @@ def _sample(level: Tensor, image: Tensor, centre: Tensor, offset: Tensor) -> Ten
     row = base[:, 1:] + offset
     flat = level.reshape(-1)
 
-    def reading(du: int, dv: int) -> Tensor:
+    def value(du: int, dv: int) -> Tensor:
         u = (column + du).long().clamp(0, width - 1)
         v = (row + dv).long().clamp(0, height - 1)
         return flat[(image[:, None, None] * height + v[:, :, None]) * width + u[:, None, :]]
 
     a, b = fraction[:, 0, None, None], fraction[:, 1, None, None]
-    upper = reading(0, 0) * (1 - a) + reading(1, 0) * a
-    lower = reading(0, 1) * (1 - a) + reading(1, 1) * a
+    upper = value(0, 0) * (1 - a) + value(1, 0) * a
+    lower = value(0, 1) * (1 - a) + value(1, 1) * a
     return (upper * (1 - b) + lower * b).reshape(len(centre), -1)
 
 
 def _inside(place: Tensor, level: Tensor, window_px: int) -> Tensor:
-    """Mask (N,) of finite places (N, 2) whose window touches the image."""
+    """Mask (N,) of finite pixels (N, 2) whose window overlaps the image."""
     import torch
 
     height, width = level.shape[1:]

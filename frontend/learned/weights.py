@@ -1,4 +1,4 @@
-"""Files of weights and the device of torch."""
+"""Loading of weights, and selection of the torch device."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def pick_device(name: str) -> torch.device:
     """The torch device of a setting, "cpu" or "cuda".
 
     Raises:
-        ConfigError: CUDA is asked for, but there is none.
+        ConfigError: CUDA is requested but absent.
     """
     import torch
 
@@ -30,21 +30,21 @@ def pick_device(name: str) -> torch.device:
 
 
 def half_precision(device: torch.device) -> Any:
-    """Context in which networks compute in half precision on CUDA, and as they are elsewhere."""
+    """Context for half precision on CUDA; no change on other devices."""
     import torch
 
     return torch.autocast("cuda", dtype=torch.float16, enabled=device.type == "cuda")
 
 
 def load_weights(path: Path | None, setting: str) -> dict[str, Any]:
-    """Read a file of weights; what lies below "state_dict" where there is such a key.
+    """Read a file of weights; the entry "state_dict" where there is such a key.
 
     Args:
-        path: the file; None is an error that names the setting.
+        path: the file; None raises an error with the name of the setting.
         setting: name of the setting in `frontend.learned`, for messages.
 
     Raises:
-        ConfigError: no file is named.
+        ConfigError: no file is set.
         DataError: the file cannot be read as weights.
     """
     import torch
@@ -67,11 +67,11 @@ def load_weights(path: Path | None, setting: str) -> dict[str, Any]:
 
 
 def filled(module: Any, path: Path | None, setting: str) -> Module:
-    """Fill a module with the weights of a file, all of them, for inference."""
+    """Load all weights of a module from a file, for inference."""
     state = load_weights(path, setting)
     try:
         result = module.load_state_dict(state, strict=False)
-        # Tables that the constructor computes need not be in the file; what was learned must be.
+        # Buffers that the constructor computes need not be in the file; learned parameters must be.
         learned = dict(module.named_parameters()).keys() | {k for k in module.state_dict() if k.endswith("running_var")}
         wrong = sorted(set(result.missing_keys) & learned) + sorted(result.unexpected_keys)
         problem = f"{len(wrong)} entries do not fit, such as {wrong[0]}" if wrong else None
