@@ -200,7 +200,7 @@ class DescriptorFrontend:
         watch.lap("check")
         return make_output(frame, tracks, tracked, watch)
 
-    # --- left and right ---------------------------------------------------------------------------------------------
+    # --- left and right -----------------------------------------------------------------------------------------------
 
     def _allowed(self, left: Keypoints, right: Keypoints, width: int) -> BoolArray:
         """Pairs (N, M) near one row with a disparity in range."""

@@ -308,7 +308,7 @@ class KltFrontend:
         warp[:, :, 2] = template_points(warp, old.left[rows] - centres)
         return warp, (score >= self._settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.place[rows])
 
-    # --- new features -----------------------------------------------------------------------------------------------
+    # --- new features -------------------------------------------------------------------------------------------------
 
     def _add_new_features(
         self,

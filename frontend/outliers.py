@@ -324,7 +324,7 @@ def predicted_motion(
     return T if np.median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
 
 
-# --- two views, no depth --------------------------------------------------------------------------------------------
+# --- two views, no depth ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

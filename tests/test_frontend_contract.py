@@ -1,4 +1,4 @@
-"""One contract for every front end: what its observations promise, and what bad input does to it."""
+"""Contract tests for every front end: properties of the observations, and behaviour on bad input."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ needs_torch = pytest.mark.skipif(
     importlib.util.find_spec("kornia") is None or importlib.util.find_spec("torch") is None,
     reason="torch and kornia are not installed: pip install 'stereo-vio[learned]'",
 )
-LOOKING = ["klt", "orb", "sift", pytest.param("kornia", marks=needs_torch)]
-ALL = [*LOOKING, "precomputed", "oracle"]
+IMAGE_BASED = ["klt", "orb", "sift", pytest.param("kornia", marks=needs_torch)]
+ALL = [*IMAGE_BASED, "precomputed", "oracle"]
 
 
 class _NoDataset:
-    """Builders of front ends that look at images need nothing of a recording."""
+    """A dataset without observations: image-based front ends do not use it."""
 
     def observations(self, index: int) -> Observations | None:
         return None
@@ -67,7 +67,7 @@ def run(name: str, frames: list[StereoFrame], camera: StereoCamera = CAMERA) -> 
 
 @pytest.fixture(scope="module")
 def ran() -> Callable[[str], list[FrontendOutput]]:
-    """Outputs of a front end on the plain frames, made once."""
+    """Outputs of a front end on the plain frames, computed once."""
     made: dict[str, list[FrontendOutput]] = {}
 
     def outputs(name: str) -> list[FrontendOutput]:
@@ -81,12 +81,12 @@ def ran() -> Callable[[str], list[FrontendOutput]]:
 Ran = Callable[[str], list[FrontendOutput]]
 
 
-def test_every_front_end_that_can_be_named_is_in_this_suite() -> None:
+def test_suite_covers_every_front_end() -> None:
     assert set(BUILDERS) | {"oracle"} == {"klt", "orb", "sift", "kornia", "precomputed", "oracle"}
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_observations_keep_their_promises(name: str, ran: Ran) -> None:
+def test_observations_fulfil_the_contract(name: str, ran: Ran) -> None:
     newest = -1
     for k, output in enumerate(ran(name)):
         seen = output.observations
@@ -98,7 +98,9 @@ def test_observations_keep_their_promises(name: str, ran: Ran) -> None:
         assert np.isfinite(seen.z[:, :2]).all()
         assert np.isfinite(seen.z[seen.has_right]).all()
         stereo = seen.z[seen.has_right]
-        assert (stereo[:, 0] > stereo[:, 2]).all() or name == "oracle"  # the oracle's noise may turn far points around
+        assert (
+            stereo[:, 0] > stereo[:, 2]
+        ).all() or name == "oracle"  # the oracle's noise may make the disparity of far points negative
         assert not seen.stale.any()
         assert output.tracked + output.detected == len(seen)
         assert output.matched == seen.has_right.sum()
@@ -108,15 +110,15 @@ def test_observations_keep_their_promises(name: str, ran: Ran) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_equal_input_gives_equal_bits(name: str, ran: Ran) -> None:
+def test_equal_input_gives_identical_output(name: str, ran: Ran) -> None:
     for a, b in zip(ran(name), run(name, FRAMES), strict=True):
         np.testing.assert_array_equal(a.observations.ids, b.observations.ids)
         np.testing.assert_array_equal(a.observations.z, b.observations.z)
         np.testing.assert_array_equal(a.observations.has_right, b.observations.has_right)
 
 
-@pytest.mark.parametrize("name", LOOKING)
-def test_tracks_and_disparities_are_right(name: str, ran: Ran) -> None:
+@pytest.mark.parametrize("name", IMAGE_BASED)
+def test_tracks_and_disparities_are_accurate(name: str, ran: Ran) -> None:
     outputs = ran(name)
     temporal, disparity = [], []
     for k, pose in enumerate(POSES):
@@ -135,13 +137,13 @@ def test_tracks_and_disparities_are_right(name: str, ran: Ran) -> None:
     assert np.mean(np.abs(np.concatenate(disparity)) > 1) < 0.02
 
 
-@pytest.mark.parametrize("name", LOOKING)
+@pytest.mark.parametrize("name", IMAGE_BASED)
 @pytest.mark.parametrize("level", [0, 255])
-def test_black_and_saturated_images_give_nothing(name: str, level: int, ran: Ran) -> None:
-    """A moment later there are features again; old ids among them name the same points."""
+def test_black_and_saturated_images_give_no_features(name: str, level: int, ran: Ran) -> None:
+    """Afterwards there are features again; features with old ids are the same points."""
     flat = np.full((300, 480), level, dtype=np.uint8)
-    blind = StereoFrame(1, FRAMES[1].time_ns, flat, flat)
-    outputs = run(name, [FRAMES[0], blind, *FRAMES[2:4]])
+    no_contrast = StereoFrame(1, FRAMES[1].time_ns, flat, flat)
+    outputs = run(name, [FRAMES[0], no_contrast, *FRAMES[2:4]])
     assert len(outputs[0].observations) > 50
     assert len(outputs[1].observations) == 0
     assert outputs[1].observations.z.shape == (0, 4)
@@ -156,26 +158,26 @@ def test_black_and_saturated_images_give_nothing(name: str, level: int, ran: Ran
         assert len(a) == 0
 
 
-@pytest.mark.parametrize("name", LOOKING)
+@pytest.mark.parametrize("name", IMAGE_BASED)
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_a_frozen_camera_gives_hardly_any_stereo_rows(name: str, side: str, ran: Ran) -> None:
-    """One camera repeats its first image while the rig moves 2 px a frame and more."""
+def test_frozen_camera_gives_few_stereo_matches(name: str, side: str, ran: Ran) -> None:
+    """One camera repeats its first image while the image motion is at least 2 px per frame."""
     first = {side: getattr(FRAMES[0], side)}
     frozen = [FRAMES[0], *(replace(frame, **first) for frame in FRAMES[1:])]
     outputs = run(name, frozen)
     assert outputs[-1].matched < 0.35 * outputs[0].matched
 
 
-@pytest.mark.parametrize("name", LOOKING)
-def test_colour_and_16_bit_images_are_refused_with_the_remedy(name: str) -> None:
+@pytest.mark.parametrize("name", IMAGE_BASED)
+def test_rejects_colour_and_16_bit_images(name: str) -> None:
     gray = np.zeros((300, 480), dtype=np.uint8)
     for image in (np.zeros((300, 480, 3), dtype=np.uint8), gray.astype(np.uint16), gray.astype(np.float32)):
         with pytest.raises(DataError, match=r"frame 7: the left image .* needs 8-bit gray images"):
             make(name).process(StereoFrame(7, 0, image, gray))  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("name", LOOKING)
-def test_a_frame_without_images_or_out_of_order_is_refused(name: str) -> None:
+@pytest.mark.parametrize("name", IMAGE_BASED)
+def test_rejects_frames_without_images_or_out_of_order(name: str) -> None:
     with pytest.raises(DataError, match=f"frame 3 has no images, but the {name} front end"):
         make(name).process(StereoFrame(3, 0, None, None))
     frontend = make(name)
@@ -184,7 +186,7 @@ def test_a_frame_without_images_or_out_of_order_is_refused(name: str) -> None:
         frontend.process(FRAMES[0])
 
 
-@pytest.mark.parametrize("name", LOOKING)
+@pytest.mark.parametrize("name", IMAGE_BASED)
 @pytest.mark.parametrize(("width", "height"), [(479, 299), (127, 95), (33, 21), (8, 5)])
 def test_odd_and_tiny_sizes_work(name: str, width: int, height: int) -> None:
     camera = replace(CAMERA, cu=width / 2, cv=height / 2, width=width, height=height)

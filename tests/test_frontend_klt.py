@@ -1,4 +1,4 @@
-"""The KLT front end on images whose truth is known, on broken images, and on a real drive."""
+"""The KLT front end on images with known ground truth, on invalid images, and on a real drive."""
 
 from __future__ import annotations
 
@@ -43,20 +43,20 @@ def outputs() -> list[FrontendOutput]:
 
 
 def common(a: FrontendOutput, b: FrontendOutput) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 4) of the features that both outputs hold."""
+    """Pixels (N, 4) of the features that are in both outputs."""
     _, i, j = np.intersect1d(a.observations.ids, b.observations.ids, return_indices=True)
     return a.observations.z[i], b.observations.z[j]
 
 
 def track_errors(a: FrontendOutput, b: FrontendOutput, T_world_a: FloatArray, T_world_b: FloatArray) -> FloatArray:
-    """Distances (N,) in pixels between where features of `a` are in `b` and where their points are."""
+    """Distances (N,) in pixels between the tracked and the true pixels in `b` of the features of `a`."""
     before, after = common(a, b)
     expected = truth(SLANTED, T_world_a, before[:, :2], T_world_b)[:, :2]
     return np.asarray(np.linalg.norm(after[:, :2] - expected, axis=1))
 
 
 def step_errors(outputs: list[FrontendOutput], k: int) -> FloatArray:
-    """The same from frame k of the flight to the next."""
+    """The same, from frame k of the flight to the next."""
     return track_errors(outputs[k], outputs[k + 1], POSES[k], POSES[k + 1])
 
 
@@ -73,10 +73,10 @@ def test_tracks_do_not_drift_over_five_frames(outputs: list[FrontendOutput]) -> 
     assert np.median(error) < 0.08
 
 
-def test_tracks_do_not_drift_while_the_camera_sways() -> None:
-    """After 24 frames features lie as well as after six: each is aligned with its first looks, not with its last."""
-    sway = 4 * np.sin(2 * np.pi * np.arange(25) / 24)
-    poses = [se3_exp(share * se3_log(POSES[1])) for share in sway]
+def test_tracks_do_not_drift_while_the_camera_oscillates() -> None:
+    """After 24 frames features are as accurate as after six: each is aligned with its first patch, not its last."""
+    oscillation = 4 * np.sin(2 * np.pi * np.arange(25) / 24)
+    poses = [se3_exp(share * se3_log(POSES[1])) for share in oscillation]
     outputs = run([stereo_frame(k, pose) for k, pose in enumerate(poses)])
     errors = []
     for k in (6, 24):
@@ -112,7 +112,7 @@ def test_most_features_are_kept_and_the_counts_add_up(outputs: list[FrontendOutp
     assert {"prepare", "track", "reject", "align", "detect", "stereo"} <= set(outputs[-1].stages_ms)
 
 
-def test_disparity_is_positive_wherever_there_is_a_right_pixel(outputs: list[FrontendOutput]) -> None:
+def test_stereo_matches_have_positive_disparity_on_one_row(outputs: list[FrontendOutput]) -> None:
     for output in outputs:
         z = output.observations.z[output.observations.has_right]
         assert (z[:, 0] - z[:, 2] > 0).all()
@@ -127,7 +127,7 @@ def _with_black_frames(n: int) -> list[StereoFrame]:
 
 
 @pytest.mark.parametrize("n", [1, 5])
-def test_tracks_go_on_over_black_frames(n: int) -> None:
+def test_tracks_continue_after_black_frames(n: int) -> None:
     outputs = run(_with_black_frames(n))
     assert [len(output.observations) for output in outputs[2:-1]] == [0] * n
     before, after = common(outputs[1], outputs[-1])
@@ -135,14 +135,14 @@ def test_tracks_go_on_over_black_frames(n: int) -> None:
     assert np.abs(before - after).max() < 0.2  # the picture is the same
 
 
-def test_tracks_are_given_up_when_the_camera_stays_black() -> None:
+def test_tracks_are_dropped_when_the_camera_stays_black() -> None:
     outputs = run(_with_black_frames(6))
     assert len(outputs[-1].observations) > 100
     assert outputs[-1].observations.ids.min() > outputs[1].observations.ids.max()
 
 
 def test_ids_are_never_reused() -> None:
-    """A black frame kills every track; what is found afterwards is new, even where the picture is the same."""
+    """A black frame ends every track; features found afterwards are new, even in the same image."""
     outputs = run(_with_black_frames(1), with_klt(max_blind_frames=0))
     assert len(outputs[2].observations) == 0
     early = np.concatenate([output.observations.ids for output in outputs[:2]])
@@ -159,7 +159,7 @@ def test_images_without_contrast_give_no_features(level: int) -> None:
 
 
 def test_noise_alone_gives_no_tracks() -> None:
-    """Corners of noise differ from frame to frame and from left to right."""
+    """Corners of noise are uncorrelated between frames and between left and right."""
     rng = np.random.default_rng(1)
     frames = [StereoFrame(k, k * 50_000_000, *rng.integers(0, 255, (2, 300, 480), dtype=np.uint8)) for k in range(3)]
     for output in run(frames)[1:]:
@@ -179,8 +179,8 @@ def test_features_keep_their_distance_and_fill_the_grid(outputs: list[FrontendOu
         assert np.mean(held > 0) > 0.85
 
 
-def test_features_without_a_right_view_stay_as_left_only_rows_for_a_while() -> None:
-    """The right camera goes blind; tracks go on in the left image, for the configured number of frames."""
+def test_features_without_right_match_stay_as_left_only_rows() -> None:
+    """The right camera loses contrast; tracks continue in the left image for the configured number of frames."""
     settings = with_klt(max_left_only_frames=2)
     gray = np.full_like(FRAMES[0].right, 128)
     frames = [FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:5])]
@@ -193,9 +193,9 @@ def test_features_without_a_right_view_stay_as_left_only_rows_for_a_while() -> N
     assert not outputs[1].observations.has_right.any()
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_without_depth_what_moves_against_the_rest_is_dropped(told: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The right camera goes blind; two frames later a part of the left image jumps up by 8 px."""
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_moving_features_without_depth_are_rejected(with_prior: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The right camera loses contrast; two frames later a part of the left image jumps up by 8 px."""
     gray = np.full_like(FRAMES[0].right, 128)
     frames = [FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:4])]
     left = frames[3].left
@@ -209,20 +209,20 @@ def test_without_depth_what_moves_against_the_rest_is_dropped(told: bool, monkey
         outputs = [frontend.process(frame) for frame in frames[:3]]
         step = se3_inverse(POSES[3]) @ POSES[2]
         prior = TrackPrior(np.zeros(0, dtype=np.int64), np.zeros((0, 4)), step[:3, :3])
-        outputs.append(frontend.process(frames[3], prior if told else None))
+        outputs.append(frontend.process(frames[3], prior if with_prior else None))
         error = step_errors(outputs, 2)
         return float(np.median(error)), int((error < 1).sum()), int((error > 4).sum())
 
     median, good, wrong = jumped()
     monkeypatch.setattr("frontend.outliers.bearing_consensus", lambda *_: None)
     _, all_good, all_wrong = jumped()
-    assert all_wrong >= 15  # the trap is real
+    assert all_wrong >= 15  # control: without rejection there are outliers
     assert wrong <= 0.15 * all_wrong
     assert good >= 0.97 * all_good
     assert median < 0.05
 
 
-def test_tracks_hidden_by_a_passing_board_are_dropped() -> None:
+def test_occluded_tracks_are_dropped() -> None:
     """A board with another texture covers a part of the next frame."""
     board = view(Wall(np.array([0.0, 0.0, 1.0]), 2.0, seed=9), POSES[1])
     left, right = FRAMES[1].left, FRAMES[1].right
@@ -242,14 +242,14 @@ def test_tracks_hidden_by_a_passing_board_are_dropped() -> None:
     assert hidden.sum() <= 1
 
 
-def test_a_prior_bridges_a_jump_that_tracking_alone_cannot() -> None:
+def test_prior_bridges_a_jump_too_large_for_tracking_alone() -> None:
     """Between the two frames the camera turns by 12 degrees, about 64 pixels."""
     first, second = POSES[0], POSES[0].copy()
     angle = np.radians(12.0)
     second[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     frames = [stereo_frame(0, first), stereo_frame(1, second)]
     settings = with_klt(pyramid_levels=1)
-    blind = run(frames, settings)[1]
+    without_prior = run(frames, settings)[1]
     frontend = KltFrontend(CAMERA, settings)
     seen = frontend.process(frames[0]).observations
     z = truth(SLANTED, first, seen.z[:, :2], second) + np.random.default_rng(0).normal(0, 2, (len(seen), 4))
@@ -258,14 +258,14 @@ def test_a_prior_bridges_a_jump_that_tracking_alone_cannot() -> None:
     frontend.process(frames[0])
     nothing = TrackPrior(np.zeros(0, dtype=np.int64), np.zeros((0, 4)), (se3_inverse(second) @ first)[:3, :3])
     by_rotation = frontend.process(frames[1], nothing)
-    assert blind.tracked < 0.3 * len(seen)
+    assert without_prior.tracked < 0.3 * len(seen)
     for output in (by_pixels, by_rotation):
         assert output.tracked > 0.6 * len(seen)
         assert np.median(track_errors(FrontendOutput(seen, 0, 0, 0), output, first, second)) < 0.08
 
 
-def test_the_last_motion_counts_by_the_time_it_took() -> None:
-    """Three frames 10 ms apart, the next one 150 ms later: 50 pixels that only the motion so far can tell."""
+def test_last_motion_is_scaled_by_time() -> None:
+    """Three frames 10 ms apart, the next one 150 ms later: 50 pixels that only the last motion predicts."""
     step = np.array([0.4, -0.1, 0.1, 0.01, -0.02, 0.01])
     frames = [
         replace(stereo_frame(k, se3_exp(share * step)), time_ns=ms * 1_000_000)
@@ -275,11 +275,11 @@ def test_the_last_motion_counts_by_the_time_it_took() -> None:
     assert outputs[-1].tracked > 0.7 * outputs[-2].tracked
 
 
-def test_features_that_are_not_found_on_the_way_back_are_dropped() -> None:
+def test_features_failing_the_forward_backward_check_are_dropped() -> None:
     assert run(FRAMES[:2], with_klt(max_forward_backward_px=1e-4))[1].tracked < 10
 
 
-def test_swapped_images_are_named() -> None:
+def test_swapped_images_are_detected() -> None:
     frontend = KltFrontend(CAMERA, SETTINGS)
     swapped = [replace(frame, left=frame.right, right=frame.left) for frame in FRAMES]
     for frame in swapped[:2]:
@@ -288,13 +288,13 @@ def test_swapped_images_are_named() -> None:
         frontend.process(swapped[2])
 
 
-def test_a_right_image_of_something_else_is_not_called_swapped() -> None:
+def test_unrelated_right_image_is_not_reported_as_swapped() -> None:
     other = [eight_bit(view(Wall(SLANTED.normal, SLANTED.offset, seed=77), right_of(pose)), 50) for pose in POSES[:5]]
     outputs = run([replace(frame, right=image) for frame, image in zip(FRAMES[:5], other, strict=True)])
     assert max(output.matched for output in outputs) < 20
 
 
-def test_swapped_images_of_a_real_drive_are_named(data_dir: Path) -> None:
+def test_swapped_images_of_a_real_drive_are_detected(data_dir: Path) -> None:
     camera, frames, _ = kitti(data_dir / "kitti_06_head", 3)
     frontend = KltFrontend(camera)
     swapped = [replace(frame, left=frame.right, right=frame.left) for frame in frames]
@@ -304,7 +304,7 @@ def test_swapped_images_of_a_real_drive_are_named(data_dir: Path) -> None:
         frontend.process(swapped[2])
 
 
-def test_wrong_images_are_refused_with_a_reason() -> None:
+def test_rejects_invalid_images() -> None:
     image = np.zeros((300, 480), dtype=np.uint8)
     cases = [
         (StereoFrame(4, 0, image, None), "frame 4 has no images"),
@@ -316,7 +316,7 @@ def test_wrong_images_are_refused_with_a_reason() -> None:
             KltFrontend(CAMERA, SETTINGS).process(frame)
 
 
-def test_without_a_stated_size_the_first_frame_sets_it() -> None:
+def test_first_frame_sets_the_size_if_the_calibration_has_none() -> None:
     frontend = KltFrontend(replace(CAMERA, width=None, height=None), SETTINGS)
     frontend.process(FRAMES[0])
     small = np.zeros((200, 480), dtype=np.uint8)
@@ -324,7 +324,7 @@ def test_without_a_stated_size_the_first_frame_sets_it() -> None:
         frontend.process(StereoFrame(1, 50_000_000, small, small))
 
 
-def test_a_darker_right_camera_changes_little() -> None:
+def test_darker_right_camera_keeps_accuracy() -> None:
     """Different gain left and right, as in EuRoC V2_03: the patches are normalised."""
     dark = []
     for frame in FRAMES[:3]:
@@ -337,7 +337,7 @@ def test_a_darker_right_camera_changes_little() -> None:
         assert np.median(np.abs(error)) < 0.05
 
 
-def test_the_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutput]) -> None:
+def test_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutput]) -> None:
     """A reader may reuse its buffer."""
     frontend = KltFrontend(CAMERA, SETTINGS)
     assert FRAMES[0].left is not None
@@ -348,8 +348,8 @@ def test_the_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutp
     np.testing.assert_array_equal(frontend.process(FRAMES[1]).observations.z, outputs[1].observations.z)
 
 
-def test_new_features_are_shown_after_their_probation(outputs: list[FrontendOutput]) -> None:
-    """Every id that appears after the first frame was found in an earlier frame: it was never new and fresh at once."""
+def test_new_features_are_output_after_probation(outputs: list[FrontendOutput]) -> None:
+    """A feature with a new id was detected at least one frame earlier."""
     held = run(FRAMES, replace(with_klt(probation_frames=1), grid=GridSettings(target_features=300)))
     free = run(FRAMES, replace(with_klt(probation_frames=0), grid=GridSettings(target_features=300)))
     late = [later.observations.ids[later.observations.ids > held[0].observations.ids.max()] for later in held[1:]]
@@ -361,7 +361,7 @@ def test_new_features_are_shown_after_their_probation(outputs: list[FrontendOutp
     assert shares[0] <= shares[1]
 
 
-def test_the_circle_closes_where_both_ways_lead_to_one_pixel(outputs: list[FrontendOutput]) -> None:
+def test_circle_errors_separate_right_from_wrong_matches(outputs: list[FrontendOutput]) -> None:
     before, after = common(outputs[2], outputs[3])
     z, z_next = (truth(SLANTED, POSES[k], rows[:, :2], POSES[k]) for k, rows in ((2, before), (3, after)))
     halves = []
@@ -377,15 +377,15 @@ def test_the_circle_closes_where_both_ways_lead_to_one_pixel(outputs: list[Front
     assert len(circle_errors(halves[0], halves[1], z[:0, 2:], z[:0, 2:], SETTINGS.klt)) == 0
 
 
-def test_the_circle_check_costs_hardly_a_good_match(outputs: list[FrontendOutput]) -> None:
+def test_circle_check_keeps_good_matches(outputs: list[FrontendOutput]) -> None:
     checked = run(FRAMES, with_klt(circle_check=True))
     strict = run(FRAMES, with_klt(circle_check=True, max_circle_px=0.02))
     for plain, output in zip(outputs[1:], checked[1:], strict=True):
         assert output.matched >= 0.98 * plain.matched
-    assert strict[-1].matched < 0.5 * outputs[-1].matched  # the setting does something
+    assert strict[-1].matched < 0.5 * outputs[-1].matched  # control: the setting has an effect
 
 
-def test_rectification_that_is_off_is_learned_and_costs_no_disparity() -> None:
+def test_rectification_error_is_estimated_and_does_not_bias_disparity() -> None:
     """The right camera is rolled by 0.15 degrees: rows differ by up to 0.6 px at the sides."""
     roll = np.radians(0.15)
     frames = []
@@ -405,7 +405,7 @@ def test_rectification_that_is_off_is_learned_and_costs_no_disparity() -> None:
         assert np.median(np.abs(seen.z[:, 2] - turned[:, 0])) < 0.05
 
 
-def test_a_step_of_exposure_keeps_the_tracks(outputs: list[FrontendOutput]) -> None:
+def test_tracks_survive_exposure_steps(outputs: list[FrontendOutput]) -> None:
     brighter = []
     for k, frame in enumerate(FRAMES[:4]):
         assert frame.left is not None
@@ -421,7 +421,7 @@ def test_a_step_of_exposure_keeps_the_tracks(outputs: list[FrontendOutput]) -> N
 
 
 def at_night(share: float, read_noise: float) -> list[StereoFrame]:
-    """The flight with a share of the light, and noise that stays."""
+    """The flight with a share of the light and constant read noise."""
     rng, frames = np.random.default_rng(11), []
     for k, pose in enumerate(POSES[:4]):
         pair = [
@@ -432,8 +432,8 @@ def at_night(share: float, read_noise: float) -> list[StereoFrame]:
     return frames
 
 
-def test_a_twentieth_of_the_light_is_enough_where_the_noise_is_low() -> None:
-    """Mean gray level 6: corners need not be strong to be good, they must stand out from the noise."""
+def test_tracks_in_the_dark_where_noise_is_low() -> None:
+    """Mean gray level 6: weak corners are usable if they exceed the noise."""
     frames = at_night(0.05, 0.5)
     absolute = run(frames, with_klt(min_gradient_over_noise=1e6))
     outputs = run(frames)
@@ -446,12 +446,12 @@ def test_a_twentieth_of_the_light_is_enough_where_the_noise_is_low() -> None:
         assert np.mean(error > 1) < 0.03
 
 
-def test_in_good_light_the_noise_does_not_matter(outputs: list[FrontendOutput]) -> None:
+def test_noise_threshold_is_inactive_in_good_light(outputs: list[FrontendOutput]) -> None:
     for a, b in zip(outputs, run(FRAMES, with_klt(min_gradient_over_noise=1e6)), strict=True):
         np.testing.assert_array_equal(a.observations.z, b.observations.z)
 
 
-def test_the_mask_keeps_features_away(tmp_path: Path) -> None:
+def test_mask_excludes_features(tmp_path: Path) -> None:
     mask = np.full((300, 480), 255, dtype=np.uint8)
     mask[150:] = 0
     path = tmp_path / "mask.png"
@@ -461,7 +461,7 @@ def test_the_mask_keeps_features_away(tmp_path: Path) -> None:
     assert first.z[:, 1].max() < 151
 
 
-def test_a_wrong_mask_is_named(tmp_path: Path) -> None:
+def test_rejects_invalid_mask(tmp_path: Path) -> None:
     small = tmp_path / "small.png"
     cv2.imwrite(str(small), np.zeros((20, 30), dtype=np.uint8))
     with pytest.raises(ConfigError, match="mask is 30x20, but the images are 480x300"):
@@ -470,21 +470,21 @@ def test_a_wrong_mask_is_named(tmp_path: Path) -> None:
         KltFrontend(CAMERA, with_klt(mask=tmp_path / "none.png"))
 
 
-def test_a_wrong_prediction_is_given_up() -> None:
-    """The prior is off by 60 px everywhere; the search starts again from where the features were."""
+def test_wrong_prior_is_discarded() -> None:
+    """The prior is off by 60 px everywhere; the search is repeated from the old pixels."""
     frontend = KltFrontend(CAMERA, SETTINGS)
     seen = frontend.process(FRAMES[0]).observations
     wrong = TrackPrior(seen.ids, seen.z + np.array([60.0, 25.0, 60.0, 25.0]))
     assert frontend.process(FRAMES[1], wrong).tracked > 0.8 * len(seen)
 
 
-def test_a_prior_may_name_unknown_ids_and_hold_no_number() -> None:
-    plain, told = KltFrontend(CAMERA, SETTINGS), KltFrontend(CAMERA, SETTINGS)
+def test_prior_with_unknown_ids_and_nan_is_harmless() -> None:
+    plain, with_prior = KltFrontend(CAMERA, SETTINGS), KltFrontend(CAMERA, SETTINGS)
     seen = plain.process(FRAMES[0]).observations
-    told.process(FRAMES[0])
+    with_prior.process(FRAMES[0])
     ids = np.concatenate([seen.ids[:5], np.array([10**6, 10**6 + 1])])
     nothing = TrackPrior(ids, np.full((7, 4), np.nan))
-    a, b = plain.process(FRAMES[1]), told.process(FRAMES[1], nothing)
+    a, b = plain.process(FRAMES[1]), with_prior.process(FRAMES[1], nothing)
     assert abs(a.tracked - b.tracked) <= 2
 
 
@@ -504,11 +504,11 @@ def kitti(folder: Path, count: int) -> tuple[StereoCamera, list[StereoFrame], Fl
     return camera, frames, poses
 
 
-def test_real_drive_moves_as_the_ground_truth_says(data_dir: Path) -> None:
-    """Stereo points of one frame, moved by one rigid motion a pair, must meet the tracks of the next frame.
+def test_real_drive_agrees_with_ground_truth(data_dir: Path) -> None:
+    """Stereo points of one frame, moved by one rigid motion per pair, must agree with the tracks in the next frame.
 
-    The motion is fitted to the tracks and then compared with the ground truth, because the true poses of this drive
-    (GPS and inertial, sampled out of step with the camera) jump by up to 50 mm a frame themselves.
+    The motion is fitted to the tracks and then compared with the ground truth, because the reference poses of this
+    drive (GPS and inertial, not synchronised with the camera) jump by up to 50 mm per frame.
     """
     camera, frames, poses = kitti(data_dir / "kitti_0039", 8)
     frontend = KltFrontend(camera)

@@ -1,4 +1,4 @@
-"""The parts that need torch: weights from files only, clear errors, and Lucas-Kanade with OpenCV's numbers."""
+"""The parts that need torch: weights from files only, clear errors, and Lucas-Kanade that agrees with OpenCV."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def build(settings: LearnedSettings, match: MatchSettings = MATCH) -> Descriptor
 
 
 def small_frame(index: int, pose: FloatArray) -> StereoFrame:
-    """The upper left part of the rendered pair, where pixels keep their numbers."""
+    """The upper left part of the rendered pair, where pixel coordinates are unchanged."""
     frame = stereo_frame(index, pose)
     assert frame.left is not None
     assert frame.right is not None
@@ -53,7 +53,7 @@ def small_frame(index: int, pose: FloatArray) -> StereoFrame:
     return replace(frame, left=left, right=right)
 
 
-# --- without torch --------------------------------------------------------------------------------------------------
+# --- without torch ----------------------------------------------------------------------------------------------------
 
 
 def test_importing_the_packages_does_not_import_torch() -> None:
@@ -62,7 +62,7 @@ def test_importing_the_packages_does_not_import_torch() -> None:
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
-def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_without_torch_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     from frontend.learned.torch_flow import TorchFlow
 
     for module in ("torch", "kornia", "kornia.feature"):
@@ -73,7 +73,7 @@ def test_without_torch_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> No
         TorchFlow()
 
 
-def test_a_kornia_without_the_networks_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rejects_kornia_without_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch", ModuleType("torch"))
     monkeypatch.setitem(sys.modules, "kornia", ModuleType("kornia"))
     monkeypatch.setitem(sys.modules, "kornia.feature", ModuleType("kornia.feature"))
@@ -81,7 +81,7 @@ def test_a_kornia_without_the_networks_is_too_old(monkeypatch: pytest.MonkeyPatc
         build(LearnedSettings())
 
 
-# --- weights and devices --------------------------------------------------------------------------------------------
+# --- weights and devices ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -95,12 +95,12 @@ def test_a_kornia_without_the_networks_is_too_old(monkeypatch: pytest.MonkeyPatc
         (LearnedSettings(descriptor="hardnet"), "descriptor_weights"),
     ],
 )
-def test_weights_that_are_needed_must_be_named(torch: Any, settings: LearnedSettings, named: str) -> None:
+def test_required_weights_must_be_set(torch: Any, settings: LearnedSettings, named: str) -> None:
     with pytest.raises(ConfigError, match=f"frontend.learned.{named} is not set"):
         build(settings)
 
 
-def test_files_that_are_no_weights_are_named(torch: Any, tmp_path: Path) -> None:
+def test_rejects_files_that_are_not_weights(torch: Any, tmp_path: Path) -> None:
     text, lists = tmp_path / "text.pth", tmp_path / "list.pth"
     text.write_text("not weights")
     torch.save([1, 2, 3], lists)
@@ -116,14 +116,14 @@ class _Evil:
         return exec, ("raise SystemExit('a file of weights ran code')",)
 
 
-def test_a_file_of_weights_cannot_run_code(torch: Any, tmp_path: Path) -> None:
+def test_weights_file_cannot_run_code(torch: Any, tmp_path: Path) -> None:
     path = tmp_path / "evil.pth"
     torch.save({"state_dict": _Evil()}, path)
     with pytest.raises(DataError, match="cannot be read as weights"):
         build(LearnedSettings(detector="aliked", detector_weights=path))
 
 
-def test_weights_of_another_network_are_refused(torch: Any, tmp_path: Path) -> None:
+def test_rejects_weights_of_another_network(torch: Any, tmp_path: Path) -> None:
     import kornia.feature as kf
 
     path = tmp_path / "hardnet.pth"
@@ -140,7 +140,7 @@ def test_weights_of_another_network_are_refused(torch: Any, tmp_path: Path) -> N
         build(LearnedSettings(descriptor="mkd", descriptor_weights=path))
 
 
-def test_cuda_that_is_absent_is_refused(torch: Any) -> None:
+def test_rejects_absent_cuda(torch: Any) -> None:
     from frontend.learned.torch_flow import TorchFlow
 
     if torch.cuda.is_available():
@@ -151,12 +151,12 @@ def test_cuda_that_is_absent_is_refused(torch: Any) -> None:
         TorchFlow(device="cuda")
 
 
-def test_lightglue_needs_a_detector_that_it_was_trained_for(torch: Any) -> None:
+def test_lightglue_rejects_unsupported_detectors(torch: Any) -> None:
     with pytest.raises(ConfigError, match="goes with the detectors aliked, disk, xfeat"):
         build(LearnedSettings(matcher="lightglue"))
 
 
-def test_weights_of_lightglue_for_other_descriptors_are_refused(torch: Any, tmp_path: Path) -> None:
+def test_rejects_lightglue_weights_for_other_descriptors(torch: Any, tmp_path: Path) -> None:
     files = networks(torch, tmp_path)
     for name, weights in (("disk", "hardnet"), ("xfeat", "lightglue")):
         settings = LearnedSettings(
@@ -172,11 +172,11 @@ def test_weights_of_lightglue_for_other_descriptors_are_refused(torch: Any, tmp_
         build(replace(small, matcher_weights=files["lightglue"]))
 
 
-# --- networks filled from files -------------------------------------------------------------------------------------
+# --- networks filled from files ---------------------------------------------------------------------------------------
 
 
 def networks(torch: Any, folder: Path) -> dict[str, Path]:
-    """Files of random weights of every supported network; what they find is nonsense, but of the right form."""
+    """Files of random weights of every supported network; the results are meaningless, but of the right form."""
     import kornia.feature as kf
 
     torch.manual_seed(1)
@@ -217,7 +217,7 @@ def test_every_network_runs_with_weights_from_a_file(torch: Any, name: str, tmp_
 
 @pytest.mark.parametrize("name", ["kornia-aliked-t16", "kornia-aliked-n16", "kornia-keynet-affnet-mkd"])
 def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> None:
-    """On the rendered wall, whose truth is known."""
+    """On the rendered wall, with known ground truth."""
     if not (data_dir / "weights").is_dir():
         pytest.skip("no weights in VIO_DATA")
     options: Any = kornia_options(name, data_dir / "weights")
@@ -234,8 +234,8 @@ def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> 
 
 
 @pytest.mark.parametrize("detector", ["gftt", "harris"])
-def test_corners_lie_at_corners(torch: Any, detector: str) -> None:
-    """White squares: the four kinds of corner err inwards alike, so that a shift of half a pixel would show."""
+def test_corner_positions_are_unbiased(torch: Any, detector: str) -> None:
+    """White squares: the errors of the four corners cancel, so that a shift of half a pixel would be detected."""
     from frontend.learned.extractors import build_extractor
     from frontend.learned.weights import pick_device
 
@@ -253,7 +253,7 @@ def test_corners_lie_at_corners(torch: Any, detector: str) -> None:
     assert np.abs(offset.mean(axis=0)).max() < 0.01
 
 
-# --- matching -------------------------------------------------------------------------------------------------------
+# --- matching ---------------------------------------------------------------------------------------------------------
 
 
 def points_of(descriptors: FloatArray) -> Keypoints:
@@ -277,7 +277,7 @@ def test_mutual_nearest_equals_a_loop() -> None:
     np.testing.assert_array_equal(MutualNearest(0.9)(a, b, allowed), expected)
 
 
-def test_bits_are_compared_by_how_many_differ() -> None:
+def test_binary_descriptors_use_hamming_distance() -> None:
     from frontend.descriptors import distances
 
     rng = np.random.default_rng(4)
@@ -286,7 +286,7 @@ def test_bits_are_compared_by_how_many_differ() -> None:
     np.testing.assert_array_equal(distances(a, b), expected)
 
 
-# --- Lucas-Kanade in torch ------------------------------------------------------------------------------------------
+# --- Lucas-Kanade in torch --------------------------------------------------------------------------------------------
 
 
 def compare(images: list[Image]) -> None:
@@ -303,7 +303,7 @@ def compare(images: list[Image]) -> None:
     for k, (a, b) in enumerate(legs):
         expected, status = lucas_kanade(images[a], images[b], points, points, **search)
         back, _ = lucas_kanade(images[b], images[a], expected, points, **search)
-        # Where OpenCV itself does not return, it found nothing that a number could agree with.
+        # Only tracks that pass OpenCV's own forward-backward check are compared.
         settled = status & (np.linalg.norm(back - points, axis=1) < 0.5)
         rows = slice(k * n, (k + 1) * n)
         assert settled.sum() > 0.3 * n
@@ -313,7 +313,7 @@ def compare(images: list[Image]) -> None:
         assert np.percentile(error, 95) < 0.05
 
 
-def test_torch_flow_has_opencvs_numbers_on_rendered_images(torch: Any) -> None:
+def test_torch_flow_agrees_with_opencv_on_rendered_images(torch: Any) -> None:
     a, b = (stereo_frame(k, pose) for k, pose in enumerate(flight(2)))
     assert a.left is not None
     assert b.left is not None
@@ -321,14 +321,14 @@ def test_torch_flow_has_opencvs_numbers_on_rendered_images(torch: Any) -> None:
     compare([a.left, b.left, a.right])
 
 
-def test_torch_flow_has_opencvs_numbers_on_a_real_drive(torch: Any, data_dir: Path) -> None:
+def test_torch_flow_agrees_with_opencv_on_a_real_drive(torch: Any, data_dir: Path) -> None:
     folder = data_dir / "kitti_0039"
     compare(
         [load_gray(folder / path)[0] for path in ("image_0/000000.png", "image_0/000001.png", "image_1/000000.png")]
     )
 
 
-def test_torch_flow_of_nothing_and_of_flat_images(torch: Any) -> None:
+def test_torch_flow_of_no_points_and_of_flat_images(torch: Any) -> None:
     from frontend.learned.torch_flow import TorchFlow
 
     engine = TorchFlow(levels=1)

@@ -1,4 +1,4 @@
-"""Consensus on the camera's motion, with depth and without: unmoved by outliers, not captured by a large mover."""
+"""RANSAC on the camera motion, with depth and without: robust to outliers and to large moving objects."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def pixels(T: FloatArray, p: FloatArray, seed: int, noise: float = 0.2) -> Float
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.5])
-def test_outliers_are_told_from_inliers(share: float) -> None:
+def test_ransac_separates_outliers_from_inliers(share: float) -> None:
     p = scene(300, 1)
     uv = pixels(T_TRUE, p, 2)
     bad = np.arange(300) < 300 * share
@@ -56,7 +56,7 @@ def test_outliers_are_told_from_inliers(share: float) -> None:
     assert np.linalg.norm(error[3:]) < 5e-4
 
 
-def test_the_same_seed_gives_the_same_bits() -> None:
+def test_same_seed_gives_identical_consensus() -> None:
     p = scene(200, 4)
     uv = pixels(T_TRUE, p, 5, noise=1.0)
     a, b = (rigid_consensus(make_problem(7), p, uv, np.eye(4), None, None) for _ in range(2))
@@ -66,7 +66,7 @@ def test_the_same_seed_gives_the_same_bits() -> None:
     np.testing.assert_array_equal(a.inliers, b.inliers)
 
 
-def test_standing_still_is_a_motion_too() -> None:
+def test_standstill_gives_zero_motion() -> None:
     p = scene(100, 6)
     found = rigid_consensus(make_problem(), p, pixels(np.eye(4), p, 7), T_TRUE, None, None)
     assert found is not None
@@ -87,7 +87,7 @@ def test_scattered_pixels_give_no_consensus() -> None:
 
 
 def crossing_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """Points, pixels and the mask of the truck's: 65 % of all points, passing sideways in front of a parked car."""
+    """Points, pixels and the mask of the truck: 65 % of the points, crossing in front of a stationary camera."""
     wall, truck = scene(70, 12, (15.0, 40.0)), scene(130, 13, (7.0, 8.0))
     uv = np.concatenate(
         [pixels(np.eye(4), wall, 14), pixels(se3_exp([0.8, 0.0, 0.0, 0.0, 0.0, 0.0]), truck, 15)],
@@ -95,8 +95,8 @@ def crossing_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
     return np.concatenate([wall, truck]), uv, np.arange(200) >= 70
 
 
-def test_a_crossing_truck_wins_the_vote_when_nothing_is_predicted() -> None:
-    """Shows that the trap is real: the next test would pass for free otherwise."""
+def test_crossing_truck_wins_consensus_without_prior() -> None:
+    """Control for the next test, which would be trivial otherwise."""
     p, uv, truck = crossing_truck()
     found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
     assert found is not None
@@ -104,7 +104,7 @@ def test_a_crossing_truck_wins_the_vote_when_nothing_is_predicted() -> None:
 
 
 def turning_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
-    """As above, but the truck also turns, so that its motion is a false rotation of the camera."""
+    """As above, but the truck also turns, so that its apparent motion is a wrong camera rotation."""
     p, uv, truck = crossing_truck()
     uv[truck] = pixels(se3_exp([0.8, 0.0, 0.0, 0.0, 0.1, 0.0]), p[truck], 16)
     return p, uv, truck
@@ -112,14 +112,14 @@ def turning_truck() -> tuple[FloatArray, FloatArray, np.ndarray]:
 
 @pytest.mark.parametrize("predicted", ["rotation", "motion", "both"])
 @pytest.mark.parametrize("turning", [False, True])
-def test_a_prediction_frees_the_consensus_from_a_truck(turning: bool, predicted: str) -> None:
+def test_prior_rejects_crossing_truck(turning: bool, predicted: str) -> None:
     p, uv, truck = turning_truck() if turning else crossing_truck()
     R_prior = None if predicted == "motion" else np.eye(3)
     T_prior = None if predicted == "rotation" else se3_exp([0.05, 0.0, -0.1, 0.0, 0.002, 0.0])
     found = rigid_consensus(make_problem(), p, uv, np.eye(4), R_prior, T_prior)
     assert found is not None
     if predicted == "rotation" and not turning:
-        # A truck that only slides sideways contradicts no rotation; known limit.
+        # A prior rotation cannot reject a truck that only translates; known limit.
         assert found.inliers[truck].mean() > 0.9
         return
     assert found.inliers[~truck].mean() > 0.95
@@ -127,7 +127,7 @@ def test_a_prediction_frees_the_consensus_from_a_truck(turning: bool, predicted:
     assert np.linalg.norm(se3_log(found.T_curr_prev)) < 0.05
 
 
-def test_a_wrong_predicted_rotation_does_not_win_against_all_points() -> None:
+def test_wrong_prior_rotation_does_not_override_consensus() -> None:
     p = scene(200, 17)
     wrong = se3_exp([0.0, 0.0, 0.0, 0.0, 0.1, 0.0])[:3, :3]
     found = rigid_consensus(make_problem(), p, pixels(T_TRUE, p, 18), np.eye(4), wrong, None)
@@ -135,7 +135,7 @@ def test_a_wrong_predicted_rotation_does_not_win_against_all_points() -> None:
     assert found.inliers.mean() > 0.99
 
 
-def test_a_wrong_predicted_motion_does_not_win_against_all_points() -> None:
+def test_wrong_prior_motion_does_not_override_consensus() -> None:
     p = scene(200, 17)
     wrong = se3_exp([0.5, 0.0, 0.0, 0.0, 0.1, 0.0])
     uv = pixels(T_TRUE, p, 18)
@@ -144,8 +144,8 @@ def test_a_wrong_predicted_motion_does_not_win_against_all_points() -> None:
     assert found.inliers.mean() > 0.99
 
 
-def test_a_prediction_that_turns_the_other_way_frees_the_consensus_too() -> None:
-    """The camera turns by 3 degrees one way, the truck's points by as much the other way."""
+def test_prior_rejects_truck_that_turns_the_other_way() -> None:
+    """The camera turns by 3 degrees one way, the truck's points by 3 degrees the other way."""
     wall, truck = scene(70, 12, (15.0, 40.0)), scene(130, 13, (7.0, 8.0))
     T_wall, T_truck = (se3_exp([x, 0.0, 0.0, 0.0, turn, 0.0]) for x, turn in ((0.0, -0.05), (0.8, 0.05)))
     uv = np.concatenate([pixels(T_wall, wall, 14), pixels(T_truck, truck, 15)])
@@ -155,8 +155,8 @@ def test_a_prediction_that_turns_the_other_way_frees_the_consensus_too() -> None
     assert not found.inliers[70:].any()
 
 
-def test_a_wrong_rotation_that_explains_only_what_the_vote_explains_does_not_win() -> None:
-    """Half of the static points lie at one depth, where a sideways move looks like a turn; many others are wrong."""
+def test_wrong_rotation_that_shares_the_inliers_does_not_override_consensus() -> None:
+    """Half of the static points are at one depth, where translation resembles rotation; many others are outliers."""
     rng = np.random.default_rng(0)
     board = np.stack([rng.uniform(-0.6, 0.6, 70), rng.uniform(-0.5, 0.5, 70), rng.uniform(7.9, 8.1, 70)], axis=1)
     p = np.concatenate([board, scene(60, 100, (15.0, 60.0)), scene(80, 200)])
@@ -169,7 +169,7 @@ def test_a_wrong_rotation_that_explains_only_what_the_vote_explains_does_not_win
     assert np.linalg.norm(se3_log(found.T_curr_prev @ np.linalg.inv(T_TRUE))) < 0.02
 
 
-def test_points_behind_the_camera_are_infinitely_wrong() -> None:
+def test_points_behind_the_camera_have_infinite_error() -> None:
     behind = se3_exp([0.0, 0.0, -50.0, 0.0, 0.0, 0.0])
     p = scene(5, 19)
     assert np.isinf(pixel_errors(CAMERA, behind, p, np.zeros((5, 2)))).all()
@@ -185,7 +185,7 @@ def test_fit_recovers_a_motion_from_predicted_pixels() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 1.0, 2.5])
-def test_fit_finds_a_motion_near_its_start_however_far_that_turns(turn: float) -> None:
+def test_fit_converges_near_its_start_at_any_rotation(turn: float) -> None:
     T = se3_exp([0.5, -0.3, 0.8, 0.2 * turn, turn, -0.3 * turn])
     after = scene(60, 30)
     start = se3_exp([0.1, 0.05, -0.1, 0.02, -0.05, 0.03]) @ T
@@ -207,13 +207,13 @@ def test_epipolar_distance_is_zero_at_any_allowed_depth_and_grows_across_the_lin
     np.testing.assert_allclose(shifted, 5.0, atol=1e-6)
 
 
-def test_epipolar_distance_of_a_still_camera_is_the_distance_itself() -> None:
+def test_epipolar_distance_at_standstill_is_the_pixel_distance() -> None:
     before = scene(20, 23)[:, :2] + 100
     distance = epipolar_distance(CAMERA, np.eye(4), before, before + np.array([3.0, 4.0]), near_m=3.0)
     np.testing.assert_allclose(distance, 5.0)
 
 
-# --- two views, no depth --------------------------------------------------------------------------------------------
+# --- two views, no depth ----------------------------------------------------------------------------------------------
 
 MOTIONS = {
     "driving": T_TRUE,
@@ -248,10 +248,10 @@ def agreeing(before: FloatArray, after: FloatArray, R_prior: FloatArray | None, 
 @pytest.mark.parametrize("prior_error_deg", [None, 0.0, 1.0, 5.0])
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.45])
 @pytest.mark.parametrize("name", MOTIONS)
-def test_two_views_tell_outliers_and_lose_no_good_track(name: str, share: float, prior_error_deg: float | None) -> None:
-    """Not even where there is no parallax, or where the predicted rotation is wrong.
+def test_two_views_reject_outliers_and_keep_inliers(name: str, share: float, prior_error_deg: float | None) -> None:
+    """Holds without parallax and with a wrong prior rotation, too.
 
-    An outlier that happens to lie on its epipolar ray cannot be told: 16 of 360 degrees at 8 px, fewer further off.
+    An outlier on its epipolar ray cannot be detected: 16 of 360 degrees at 8 px, fewer at larger errors.
     """
     R_prior = None if prior_error_deg is None else turned(MOTIONS[name], prior_error_deg)
     good, missed = [], []
@@ -265,8 +265,8 @@ def test_two_views_tell_outliers_and_lose_no_good_track(name: str, share: float,
     assert np.mean(missed) < 0.1
 
 
-def test_a_known_rotation_takes_no_more_than_two_tracks_for_a_direction() -> None:
-    """With the rotation at hand the direction is found among 45 % outliers from a handful of pairs."""
+def test_known_rotation_needs_two_tracks_for_the_direction() -> None:
+    """With known rotation, 12 pairs of tracks give the direction among 45 % outliers."""
     before, after, bad = two_views(T_TRUE, 5, 0.45)
     few = make_problem(settings=ConsensusSettings(samples=12))
     kept = bearing_consensus(few, before, after, np.eye(3), T_TRUE[:3, :3])
@@ -275,7 +275,7 @@ def test_a_known_rotation_takes_no_more_than_two_tracks_for_a_direction() -> Non
     assert kept[bad].mean() < 0.1
 
 
-def test_two_views_give_the_same_bits_again() -> None:
+def test_two_views_are_deterministic() -> None:
     before, after, _ = two_views(T_TRUE, 6, 0.3, noise=0.6)
     for R_prior in (None, T_TRUE[:3, :3], turned(T_TRUE, 5.0)):
         a, b = (agreeing(before, after, R_prior) for _ in range(2))
@@ -285,34 +285,34 @@ def test_two_views_give_the_same_bits_again() -> None:
 
 
 @pytest.mark.parametrize("n", [0, 1, 7])
-def test_two_views_of_too_few_tracks_say_nothing(n: int) -> None:
+def test_two_views_of_too_few_tracks_give_no_consensus(n: int) -> None:
     before, after, _ = two_views(T_TRUE, 7, 0.0)
     assert agreeing(before[:n], after[:n], None) is None
 
 
-def test_scattered_pixels_in_two_views_say_nothing() -> None:
+def test_scattered_pixels_in_two_views_give_no_consensus() -> None:
     rng = np.random.default_rng(8)
     before, after = rng.uniform([0, 0], [1242, 375], (2, 200, 2))
     assert agreeing(before, after, None) is None
     assert agreeing(before, after, np.eye(3)) is None
 
 
-def test_two_views_of_one_and_the_same_pixel_do_not_fail() -> None:
+def test_two_views_of_identical_pixels_do_not_fail() -> None:
     same = np.tile([[300.0, 200.0]], (20, 1))
     kept = agreeing(same, same, None)
     assert kept is None or kept.all()
 
 
-@pytest.mark.parametrize("told", [False, True])
-def test_a_predicted_rotation_frees_two_views_from_a_turning_truck(told: bool) -> None:
-    """The truck wins the vote of two views, too, unless the rotation is known.
+@pytest.mark.parametrize("with_prior", [False, True])
+def test_prior_rotation_rejects_turning_truck_in_two_views(with_prior: bool) -> None:
+    """The truck wins the two-view consensus unless a rotation is predicted.
 
-    The camera stands, so that its direction of translation is free, and part of the truck lies on epipolar rays then.
+    The camera is stationary, so its direction of translation is arbitrary and part of the truck is on epipolar rays.
     """
     p, after, truck = turning_truck()
-    kept = agreeing(project(CAMERA, p)[:, :2], after, np.eye(3) if told else None)
+    kept = agreeing(project(CAMERA, p)[:, :2], after, np.eye(3) if with_prior else None)
     assert kept is not None
-    if told:
+    if with_prior:
         assert kept[~truck].mean() > 0.95
         assert kept[truck].mean() < 0.5
     else:
@@ -320,11 +320,11 @@ def test_a_predicted_rotation_frees_two_views_from_a_turning_truck(told: bool) -
         assert kept[truck].mean() > 0.9
 
 
-# --- both in turn ---------------------------------------------------------------------------------------------------
+# --- depth and two views ----------------------------------------------------------------------------------------------
 
 
-def test_depth_votes_where_there_is_enough_and_the_images_alone_where_not() -> None:
-    """With depth, tracks without it all stay; without, the two views drop what moves against the rest."""
+def test_static_tracks_use_depth_or_fall_back_to_two_views() -> None:
+    """With enough depth, tracks without depth are all kept; otherwise two views reject moving tracks."""
     before, after, bad = two_views(T_TRUE, 9, 0.3)
     p = scene(300, 9)
     deep = np.arange(300) % 2 == 0
@@ -340,4 +340,4 @@ def test_depth_votes_where_there_is_enough_and_the_images_alone_where_not() -> N
     assert kept[~bad].mean() > 0.97
     kept, motion = static_tracks(make_problem(), before[:5], p[:5], few[:5], after[:5], np.eye(4), None, None)
     assert motion is None
-    assert kept.all()  # too few to say anything: nothing is dropped
+    assert kept.all()  # too few for a consensus: nothing is dropped

@@ -1,4 +1,4 @@
-"""Patches, alignment, the search along the row and the detector, each against a slow or exact twin."""
+"""Patches, alignment, stereo search and the detector, each against a slow or exact reference."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from vio.records import BoolArray, Image, IntArray, TrackPrior
 
 
 def waves(u: FloatArray, v: FloatArray, seed: int = 0) -> FloatArray:
-    """A random texture, known at every real-valued pixel; wavelengths 6 to 50 px."""
+    """A random texture, defined at every real-valued pixel; wavelengths 6 to 50 px."""
     rng = np.random.default_rng(seed)
     wavelength, angle, phase = np.exp(rng.uniform(np.log(6), np.log(50), 30)), *rng.uniform(0, 2 * np.pi, (2, 30))
     total = np.zeros(np.broadcast_shapes(u.shape, v.shape))
@@ -52,7 +52,7 @@ POINTS = np.random.default_rng(5).uniform([40, 40], [260, 160], (60, 2))
 
 
 def test_warped_patches_equal_a_loop() -> None:
-    """Coordinates are rounded to 1/32 pixel, so the loop reads at rounded ones."""
+    """Coordinates are rounded to 1/32 pixel, so the loop uses rounded ones."""
     warp = shift_warps(POINTS[:5])
     warp[:, :, :2] += np.random.default_rng(3).normal(0, 0.1, (5, 2, 2))
     patches = warped_patches(PLAIN.astype(np.float32), warp, 2).reshape(5, 5, 5)
@@ -74,14 +74,14 @@ def test_patches_cut_at_rounded_points_hold_exact_pixels() -> None:
     np.testing.assert_allclose(centre, (1 - b) * rows[0] + b * rows[1], atol=1e-3)
 
 
-def test_inside_refuses_what_is_not_a_number() -> None:
+def test_inside_rejects_nan() -> None:
     points = np.array([[10.0, 10.0], [np.nan, 10.0], [-1.0, 10.0], [299.0, 199.0]])
     np.testing.assert_array_equal(inside(PLAIN, points, 0.0), [True, False, False, True])
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.6, 30.0)])
 def test_affine_alignment_finds_a_known_warp(gain: float, offset: float) -> None:
-    """The second picture is turned, scaled, shifted and of another exposure."""
+    """The second image is rotated, scaled, shifted and differs in exposure."""
     linear = np.array([[1.04, 0.03, -4.0], [-0.02, 0.97, 3.0], [0.0, 0.0, 1.0]])
     other = np.clip(np.rint(gain * picture(linear).astype(np.float64) + offset), 0, 255).astype(np.uint8)
     expected = POINTS @ np.linalg.inv(linear)[:2, :2].T + np.linalg.inv(linear)[:2, 2]
@@ -97,11 +97,11 @@ def test_affine_alignment_finds_a_known_warp(gain: float, offset: float) -> None
 def fitted(
     source: Image, target: Image, radius: int, start: FloatArray, steps: int, rows: FloatArray | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Templates cut at POINTS of one picture, aligned with another."""
+    """Templates cut at POINTS of one image, aligned with another."""
     centres = rounded(POINTS)
     store = templates(cut_patches(source.astype(np.float32), centres, radius))
     warp, score = align(store, np.arange(60), target.astype(np.float32), shift_warps(start), steps, rows)
-    # Take the rounding of the centres back, so that the warps start at the points themselves.
+    # Undo the rounding of the centres, so that the warps start at the points themselves.
     warp[:, :, 2] += (warp[:, :, :2] @ (POINTS - centres)[:, :, None])[:, :, 0]
     return warp, score
 
@@ -115,8 +115,8 @@ def test_alignment_with_expected_rows_leaves_the_rows_straight() -> None:
     np.testing.assert_allclose(warp[:, 1, :2], np.tile([0.0, 1.0], (60, 1)), atol=1e-12)
 
 
-def test_an_edge_that_leaves_the_row_open_stays_on_its_row() -> None:
-    """On a slanted edge the patch determines only the shift across; the expected row settles the rest."""
+def test_expected_row_resolves_the_aperture_problem() -> None:
+    """On a slanted edge the patch determines only the shift across it; the expected row determines the rest."""
     v, u = np.mgrid[0:200, 0:300].astype(np.float64)
     edge = 128 + 80 * np.tanh((u - 0.5 * v - 60 + 12) / 2)
     moved = 128 + 80 * np.tanh((u - 0.5 * v - 60) / 2)
@@ -135,7 +135,7 @@ def test_an_edge_that_leaves_the_row_open_stays_on_its_row() -> None:
     assert np.abs(held[:, 0, 2] - on_edge[:, 0] - 12).max() < 0.25
 
 
-def test_row_correlation_equals_numpys() -> None:
+def test_row_correlation_equals_numpy() -> None:
     other = picture(np.eye(3), seed=1)
     centres = np.array([[50, 60], [120, 100]])
     score = row_correlation(PLAIN, other, centres, np.array([40, 110]), 9, 3)
@@ -155,7 +155,7 @@ def test_row_correlation_beyond_the_image_is_minus_one() -> None:
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.08])
-def test_the_search_finds_known_disparities(slope: float) -> None:
+def test_search_finds_known_disparities(slope: float) -> None:
     """On a surface whose disparity grows down the image, like a road."""
     right = picture(np.array([[1.0, slope, 13.3], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
     true = slope * POINTS[:, 1] + 13.3
@@ -166,20 +166,20 @@ def test_the_search_finds_known_disparities(slope: float) -> None:
     assert error.max() < 1.5
 
 
-def test_disparity_outside_the_range_is_refused() -> None:
+def test_disparity_outside_the_range_is_rejected() -> None:
     for shift in (-6.0, 80.0):
         right = picture(np.array([[1.0, 0.0, shift], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]))
         _, valid = match_rows(half_image(PLAIN), half_image(right), POINTS, 48.0, 0.6, 0.03)
-        assert valid.mean() < 0.35  # chance likeness, which the fine fit refuses
+        assert valid.mean() < 0.35  # chance matches, which the fine alignment rejects
 
 
-def test_matching_nothing_gives_nothing() -> None:
+def test_matching_no_points_gives_no_disparities() -> None:
     disparity, valid = match_rows(half_image(PLAIN), half_image(PLAIN), np.zeros((0, 2)), 48.0, 0.6, 0.03)
     assert disparity.shape == valid.shape == (0,)
 
 
-def test_the_row_field_learns_what_rectification_left_over() -> None:
-    """Rows that differ by a relative roll and a shift, with noise and one tenth of wrong matches."""
+def test_row_field_estimates_rectification_error() -> None:
+    """Rows differ by a relative roll and a shift, with noise and 10 % wrong matches."""
     rng = np.random.default_rng(4)
     field = RowField(640, 360)
     for _ in range(10):
@@ -193,7 +193,7 @@ def test_the_row_field_learns_what_rectification_left_over() -> None:
     assert np.abs(field.rows(grid) - grid[:, 1] - expected).max() < 0.1
 
 
-def test_an_untaught_row_field_changes_nothing() -> None:
+def test_initial_row_field_is_zero() -> None:
     np.testing.assert_array_equal(RowField(300, 200).rows(POINTS), POINTS[:, 1])
 
 
@@ -231,8 +231,8 @@ def test_new_corners_go_where_tracks_are_missing() -> None:
     assert np.mean(new[:, 0] > 150) > 0.9
 
 
-def test_corners_lie_where_the_image_has_them() -> None:
-    """White squares on black: the corners found at half resolution are the squares', to about a pixel."""
+def test_corners_are_found_at_corners_of_squares() -> None:
+    """White squares on black: the corners found at half resolution are those of the squares, to about a pixel."""
     image = np.zeros((200, 300), dtype=np.uint8)
     for v in range(30, 170, 50):
         for u in range(30, 270, 60):
@@ -252,7 +252,7 @@ def test_corners_lie_where_the_image_has_them() -> None:
     assert np.median(gap) < 2.0
 
 
-def test_no_corner_lies_where_the_mask_forbids_it() -> None:
+def test_mask_excludes_corners() -> None:
     allowed = np.ones(HALF.shape, dtype=np.bool_)
     allowed[:, :75] = False
     found = detect_corners(HALF, np.zeros((0, 2)), 200, GridSettings(), KltSettings(), allowed)
@@ -260,7 +260,7 @@ def test_no_corner_lies_where_the_mask_forbids_it() -> None:
     assert found[:, 0].min() >= 149.0
 
 
-def test_a_weak_corner_beside_a_strong_one_is_not_taken() -> None:
+def test_weak_corner_next_to_a_strong_one_is_dropped() -> None:
     image = np.full((200, 300), 60, dtype=np.uint8)
     image[60:80, 60:80] = 250
     image[60:80, 100:120] = 75
@@ -272,13 +272,13 @@ def test_a_weak_corner_beside_a_strong_one_is_not_taken() -> None:
     assert np.mean(np.abs(loose - [110, 70]).max(axis=1) < 16) > 0.3
 
 
-def test_nothing_wanted_or_a_tiny_image_gives_no_corners() -> None:
+def test_no_corners_if_none_wanted_or_image_tiny() -> None:
     assert detect_corners(HALF, POINTS, 0, GridSettings(), KltSettings()).shape == (0, 2)
     assert detect_corners(HALF[:10, :10], np.zeros((0, 2)), 10, GridSettings(), KltSettings()).shape == (0, 2)
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 360), (752, 480), (1242, 375)])
-def test_one_set_of_defaults_scales_with_the_image(width: int, height: int) -> None:
+def test_defaults_scale_with_the_image(width: int, height: int) -> None:
     grid = GridSettings()
     rows, columns = grid_shape(width, height, grid)
     assert rows * columns * grid.cell_features == pytest.approx(grid.target_features, rel=0.15)
@@ -294,8 +294,8 @@ def noisy(level: float, sigma: float, seed: int) -> Image:
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 6.0])
-def test_the_gradient_of_noise_is_told_from_the_image_alone(sigma: float) -> None:
-    """Against the Sobel derivative itself, on noise alone; a slope and straight edges add nothing."""
+def test_noise_gradient_is_estimated_from_the_image(sigma: float) -> None:
+    """Compared with the Sobel derivative of pure noise; gradients and straight edges have no effect."""
     image = noisy(100, sigma, 1).astype(np.float64)
     du = image[:, 2:] - image[:, :-2]
     sobel = (du[:-2] + 2 * du[1:-1] + du[2:]) / 8
@@ -305,17 +305,17 @@ def test_the_gradient_of_noise_is_told_from_the_image_alone(sigma: float) -> Non
     assert noise_gradient(sloped) == pytest.approx(noise_gradient(noisy(100, sigma, 1)), rel=0.1)
 
 
-def test_noise_in_the_dark_gives_hardly_a_corner() -> None:
-    """The threshold sinks with the noise, but stays above what noise makes of itself."""
+def test_noise_in_the_dark_gives_few_corners() -> None:
+    """The threshold decreases with the noise, but stays above the gradient of the noise."""
     for sigma in (0.5, 1.5, 3.0):
         half = half_image(noisy(8, sigma, 2))
         assert len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings(), KltSettings())) <= 3
         loose = KltSettings(min_gradient_over_noise=1.0)
         found = len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings(), loose))
-        assert found > (30 if sigma > 1 else 3)  # the setting is what keeps them away
+        assert found > (30 if sigma > 1 else 3)  # control: without the setting there are corners
 
 
-# --- records, anchors, predictions ----------------------------------------------------------------------------------
+# --- records, anchors, predictions ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,7 +330,7 @@ class Outer:
     inner: Inner
 
 
-def test_rows_of_records_are_taken_and_joined_also_in_records_within() -> None:
+def test_take_and_joined_work_on_nested_records() -> None:
     record = Outer(np.arange(4), np.arange(8.0).reshape(4, 2), Inner(np.array([True, False, True, False])))
     odd = take(record, np.array([3, 1]))
     assert odd.names.tolist() == [3, 1]
@@ -353,10 +353,10 @@ def test_anchors_keep_their_slots_when_the_bank_grows() -> None:
     bank.keep_only(first)
     again = bank.put(image, POINTS[20:22])
     assert not set(first) & set(again)
-    assert set(again) <= set(more) | {3}  # what is free is used again
+    assert set(again) <= set(more) | {3}  # free slots are reused
 
 
-def test_points_that_end_up_behind_the_camera_keep_their_pixels() -> None:
+def test_points_behind_the_camera_keep_their_pixels() -> None:
     camera = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
     p_prev = np.array([[0.1, 0.2, 5.0], [0.1, 0.2, 1.0], [-1.0, 0.5, 9.0]])
     T_curr_prev = se3_exp([0.02, -0.01, -2.0, 0.0, 0.05, 0.01])
@@ -368,13 +368,13 @@ def test_points_that_end_up_behind_the_camera_keep_their_pixels() -> None:
     np.testing.assert_array_equal(found[1], left[1])
 
 
-def test_the_told_pixels_are_those_of_the_ids_that_a_prior_names() -> None:
+def test_prior_pixels_are_matched_by_id() -> None:
     prior = TrackPrior(np.array([3, 7, 9]), np.arange(12.0).reshape(3, 4))
-    rows, told = prior_pixels(np.array([9, 1, 3]), prior)
-    assert dict(zip(rows.tolist(), told.tolist(), strict=True)) == {0: [8.0, 9.0], 2: [0.0, 1.0]}
+    rows, predicted = prior_pixels(np.array([9, 1, 3]), prior)
+    assert dict(zip(rows.tolist(), predicted.tolist(), strict=True)) == {0: [8.0, 9.0], 2: [0.0, 1.0]}
 
 
-def test_points_spread_as_a_loop_that_fills_the_emptiest_cell_would() -> None:
+def test_spread_evenly_equals_a_greedy_loop() -> None:
     rng = np.random.default_rng(12)
     points, occupied = rng.uniform([0, 0], [400, 300], (120, 2)), rng.uniform([0, 0], [400, 300], (10, 2))
     grid = GridSettings(target_features=60, cell_features=3, min_distance=0.0)

@@ -1,4 +1,4 @@
-"""Replaying recorded observations, and choosing a front end by name."""
+"""Replay of recorded observations, and selection of a front end by name."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ def test_recorded_observations_come_back_unchanged() -> None:
         assert frontend.process(frame(index)).observations is RECORD[index]
 
 
-def test_counts_say_what_is_new_and_what_goes_on() -> None:
+def test_counts_new_and_continued_features() -> None:
     frontend = PrecomputedFrontend(RECORD.get)
     counts = [(o.tracked, o.matched, o.detected) for o in (frontend.process(frame(k)) for k in range(3))]
     assert counts == [(0, 3, 3), (2, 3, 2), (0, 0, 0)]
 
 
-def test_a_frame_without_record_is_named() -> None:
+def test_error_names_a_frame_without_observations() -> None:
     with pytest.raises(DataError, match="frame 7 has no precomputed observations"):
         PrecomputedFrontend(RECORD.get).process(frame(7))
 
 
 class FakeDataset:
-    """A dataset that holds features only, or images only."""
+    """A dataset with features only, or with images only."""
 
     def __init__(self, has_images: bool) -> None:
         self._has_images = has_images
@@ -67,27 +67,27 @@ class FakeDataset:
         return RECORD.get(index)
 
 
-def test_builders_make_what_they_are_called() -> None:
+def test_builders_create_the_named_front_end() -> None:
     kinds = {"klt": KltFrontend, "precomputed": PrecomputedFrontend}
     for name, kind in kinds.items():
         assert name in BUILDERS
         assert isinstance(build_frontend(name, CAMERA, FrontendSettings(), FakeDataset(True)), kind)
 
 
-def test_auto_follows_what_the_recording_holds() -> None:
+def test_auto_selects_by_content_of_the_recording() -> None:
     assert isinstance(build_frontend("auto", CAMERA, FrontendSettings(), FakeDataset(True)), KltFrontend)
     without = build_frontend("auto", CAMERA, FrontendSettings(), FakeDataset(False))
     assert isinstance(without, PrecomputedFrontend)
     assert without.process(frame(0)).observations is RECORD[0]
 
 
-def test_an_unknown_name_lists_the_known_ones() -> None:
+def test_error_for_unknown_name_lists_known_ones() -> None:
     dataset = cast(Dataset, cast(Any, SimpleNamespace()))
     with pytest.raises(ConfigError, match=r"'orbit'.*auto, klt, orb, sift, kornia, precomputed"):
         build_frontend("orbit", CAMERA, FrontendSettings(), dataset)
 
 
-def test_settings_need_no_opencv() -> None:
+def test_settings_do_not_import_opencv() -> None:
     """The command line lists settings in half a second; OpenCV alone takes longer to import."""
     import subprocess
     import sys

@@ -1,4 +1,4 @@
-"""What a prediction does to the front ends: a good one bridges jumps, a bad one of any kind does no harm."""
+"""Effect of a prior on the front ends: a good one bridges jumps, a bad one of any kind does no harm."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ OFF_PX = 30.0
 SETTINGS = FrontendSettings(grid=GridSettings(target_features=150), match=MatchSettings(max_keypoints=400))
 NAMES = ["klt", "orb", "sift"]
 
-Spoil = Callable[[TrackPrior, np.random.Generator], TrackPrior]
+Corruption = Callable[[TrackPrior, np.random.Generator], TrackPrior]
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def clip() -> Clip:
 
 
 def true_prior(clip: Clip, seen: Observations, now: int, rng: np.random.Generator) -> TrackPrior:
-    """Where the features of the frame before will be, up to the noise of a filter, and the true rotation."""
+    """True pixels of the previous frame's features with the noise of a filter, and the true rotation."""
     before, (left, right) = (views(clip.simulation, int(clip.simulation.taken_ns[k])) for k in (now - 1, now))
     to_left, _ = correspondence(clip.simulation.world, before[0], left, seen.z[:, :2])
     to_right, _ = correspondence(clip.simulation.world, before[0], right, seen.z[:, :2])
@@ -77,7 +77,7 @@ def half_shifted(prior: TrackPrior, rng: np.random.Generator) -> TrackPrior:
     return moved(prior, np.array([[OFF_PX, 0.0]]) * (rng.uniform(size=(len(prior.ids), 1)) < 0.5))
 
 
-SPOILS: dict[str, Spoil] = {
+CORRUPTIONS: dict[str, Corruption] = {
     "right": lambda prior, _: prior,
     "right rotation alone": lambda prior, _: nothing_but_rotation(prior),
     "all off to one side": lambda prior, _: moved(prior, np.array([[OFF_PX, 0.0]])),
@@ -121,12 +121,12 @@ def quality(clip: Clip, outputs: list[FrontendOutput]) -> Quality:
     return Quality(float(np.median(error)), float(np.mean(error > 1)), kept / could, rows)
 
 
-def run(clip: Clip, name: str, spoil: Spoil | None) -> Quality:
+def run(clip: Clip, name: str, corrupt: Corruption | None) -> Quality:
     recording = SimulatedRecording(clip.simulation)
     frontend = build_frontend(name, rectified_camera(clip.simulation.rig), SETTINGS, recording)
     rng, outputs = np.random.default_rng(3), [frontend.process(clip.frames[0])]
     for k in range(1, FRAMES):
-        prior = None if spoil is None else spoil(true_prior(clip, outputs[-1].observations, k, rng), rng)
+        prior = None if corrupt is None else corrupt(true_prior(clip, outputs[-1].observations, k, rng), rng)
         outputs.append(frontend.process(clip.frames[k], prior))
     return quality(clip, outputs)
 
@@ -137,22 +137,20 @@ def alone(clip: Clip) -> dict[str, Quality]:
     return {name: run(clip, name, None) for name in NAMES}
 
 
-@pytest.mark.parametrize("kind", SPOILS)
+@pytest.mark.parametrize("kind", CORRUPTIONS)
 @pytest.mark.parametrize("name", NAMES)
-def test_a_prior_of_any_kind_leaves_the_tracks_as_good_as_none(
-    name: str, kind: str, clip: Clip, alone: dict[str, Quality]
-) -> None:
-    """Within 0.01 px in the median, 1 % of outliers, 2 % of the tracks and 4 % of the stereo rows."""
-    plain, told = alone[name], run(clip, name, SPOILS[kind])
-    assert told.median_px < plain.median_px + 0.01
-    assert told.outliers < plain.outliers + 0.01
-    assert told.survived > plain.survived - 0.02
-    assert told.stereo > 0.96 * plain.stereo
+def test_prior_of_any_kind_does_not_degrade_tracks(name: str, kind: str, clip: Clip, alone: dict[str, Quality]) -> None:
+    """Within 0.01 px in the median, 1 % of outliers, 2 % of the tracks and 4 % of the stereo matches."""
+    plain, with_prior = alone[name], run(clip, name, CORRUPTIONS[kind])
+    assert with_prior.median_px < plain.median_px + 0.01
+    assert with_prior.outliers < plain.outliers + 0.01
+    assert with_prior.survived > plain.survived - 0.02
+    assert with_prior.stereo > 0.96 * plain.stereo
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_prior_bridges_a_gap_that_is_too_wide_without(name: str, clip: Clip) -> None:
-    """Five frames in a row are lost; Lucas-Kanade has one level, and descriptors are looked for nearby only."""
+def test_prior_bridges_a_gap_too_wide_for_tracking_alone(name: str, clip: Clip) -> None:
+    """Five consecutive frames are lost; Lucas-Kanade has one level, and the search radius of descriptors is small."""
     simulation = replace(
         clip.simulation, taken_ns=clip.simulation.taken_ns[::6], stamps_ns=clip.simulation.stamps_ns[::6]
     )
@@ -161,16 +159,16 @@ def test_a_prior_bridges_a_gap_that_is_too_wide_without(name: str, clip: Clip) -
         SETTINGS, klt=replace(SETTINGS.klt, pyramid_levels=0), match=replace(SETTINGS.match, search_radius=0.02)
     )
     kept = []
-    for told in (False, True):
+    for with_prior in (False, True):
         frontend = build_frontend(name, rectified_camera(simulation.rig), settings, SimulatedRecording(simulation))
         seen = frontend.process(apart.frames[0]).observations
-        prior = true_prior(apart, seen, 1, np.random.default_rng(4)) if told else None
+        prior = true_prior(apart, seen, 1, np.random.default_rng(4)) if with_prior else None
         kept.append(frontend.process(apart.frames[1], prior).tracked / len(seen))
     assert kept[1] > 1.5 * kept[0]
     assert kept[1] > 0.25
 
 
-def test_only_the_usable_part_of_a_prior_is_used() -> None:
+def test_invalid_parts_of_a_prior_are_ignored() -> None:
     z = np.arange(16.0).reshape(4, 4)
     z[1, 0], z[2, 3] = np.nan, np.inf  # the right pixel is not needed
     kept = usable_prior(TrackPrior(np.array([7, 3, 5, 7]), z, np.eye(3)))
@@ -183,13 +181,13 @@ def test_only_the_usable_part_of_a_prior_is_used() -> None:
     assert usable_prior(nothing) is None
 
 
-def test_the_expected_motion_stands_for_predicted_pixels_near_it() -> None:
+def test_predicted_motion_reuses_an_expected_motion_that_fits() -> None:
     p = scene(300, 30)
     near = se3_exp([0.01, 0.0, -0.02, 0.0, 0.0005, 0.0]) @ T_TRUE
     uv = pixels(T_TRUE, p, 31, noise=0.0)
     assert predicted_motion(CAMERA, p, uv, near) is near
     hard_turn = se3_exp([0.1, 0.0, -0.3, 0.0, 0.2, 0.05])
-    for T in (T_TRUE, hard_turn):  # from far away it is a start near the truth, to be refined on the tracks
+    for T in (T_TRUE, hard_turn):  # from far away, the result is a start near the truth
         far = predicted_motion(CAMERA, p, pixels(T, p, 31, noise=0.0), np.eye(4))
         assert far is not None
         assert np.median(pixel_errors(CAMERA, far, p, pixels(T, p, 31, noise=0.0))) < 2.0
@@ -199,8 +197,8 @@ def test_the_expected_motion_stands_for_predicted_pixels_near_it() -> None:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.65, 0.75])
-def test_a_prior_wins_against_a_truck_of_any_size_that_leaves_it_enough_points(share: float) -> None:
-    """With a needed support of 30 %, a third of the truck's own points is enough."""
+def test_prior_overrides_truck_of_any_size_with_enough_support(share: float) -> None:
+    """With a required support of 30 %, a third of the truck's points is enough."""
     settings = ConsensusSettings(prior_min_support=0.3)
     wall, truck = scene(200, 32, (15.0, 40.0)), scene(200, 33, (7.0, 8.0))
     still, passing = round(200 * (1 - share)), round(200 * share)

@@ -1,4 +1,4 @@
-"""The KLT front end on rendered images whose every pixel is known: errors, effects, edges, ids, order, equal bits."""
+"""The KLT front end on rendered images with known ground truth: errors, effects, occlusion, ids, determinism."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from frontend import FrontendSettings, build_frontend
 from frontend.settings import GridSettings
-from tools.frontend_accuracy import Tally, accuracy_scenario, figures, judge
+from tools.frontend_accuracy import Tally, accuracy_scenario, evaluate, figures
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import se3_from_parts
 from vio.protocols import Frontend
@@ -28,12 +28,12 @@ from vio.sim.world import MovingBox, World, room
 FEATURES = 150
 FRAMES = 16
 SIZE_PX = 376
-BARE_SURFACES = (0, 2)  # the walls +x and +y come first among a room's surfaces
+BARE_SURFACES = (0, 2)  # the walls +x and +y are the first surfaces of a room
 ON_THE_IMAGE = [name for name in EFFECTS if name not in ("dropped", "duplicated", "time-offset")]
 
 
 class Recorder:
-    """A front end that keeps what another one says."""
+    """A front end that records the outputs of another one."""
 
     def __init__(self, frontend: Frontend) -> None:
         self._frontend = frontend
@@ -57,7 +57,7 @@ def run(simulation: Simulation, frames: list[StereoFrame]) -> Case:
     recording = SimulatedRecording(simulation)
     settings = FrontendSettings(grid=GridSettings(target_features=FEATURES))
     recorder = Recorder(build_frontend("klt", rectified_camera(simulation.rig), settings, recording))
-    tally = judge(simulation, frames, recorder)
+    tally = evaluate(simulation, frames, recorder)
     return Case(simulation, frames, recorder.outputs, tally, figures(tally))
 
 
@@ -67,7 +67,7 @@ def rendered(simulation: Simulation) -> list[StereoFrame]:
 
 
 def latest(simulation: Simulation) -> Simulation:
-    """The last frames alone."""
+    """The last frames only."""
     return replace(simulation, taken_ns=simulation.taken_ns[-FRAMES:], stamps_ns=simulation.stamps_ns[-FRAMES:])
 
 
@@ -78,7 +78,7 @@ def world() -> World:
 
 @pytest.fixture(scope="module")
 def case(world: World) -> Callable[[str | None], Case]:
-    """The last frames of a two-second flight, which is then at full speed, under an effect; each made once."""
+    """The last frames of a two-second flight, at full speed, under an effect; each is rendered once."""
     made: dict[str | None, Case] = {}
 
     def build(effect: str | None) -> Case:
@@ -93,7 +93,7 @@ def case(world: World) -> Callable[[str | None], Case]:
     return build
 
 
-# --- accuracy -------------------------------------------------------------------------------------------------------
+# --- accuracy ---------------------------------------------------------------------------------------------------------
 
 
 def test_tracks_and_disparities_in_the_room_are_accurate(case: Callable[[str | None], Case]) -> None:
@@ -112,19 +112,19 @@ def test_tracks_and_disparities_in_the_room_are_accurate(case: Callable[[str | N
     assert row["median_px"] < 0.03
 
 
-def test_tracks_in_the_room_live_long_and_corners_are_found_again(case: Callable[[str | None], Case]) -> None:
+def test_tracks_in_the_room_are_long_and_corners_repeatable(case: Callable[[str | None], Case]) -> None:
     measured = case(None).figures
     assert measured["recall"] > 0.97
     assert measured["life_mean"] > 0.5 * FRAMES
-    assert measured["corner_recall"] > 0.25  # the strongest 150 corners lie closer than tracks may
+    assert measured["corner_recall"] > 0.25  # the strongest 150 corners are closer together than tracks may be
 
 
 @pytest.mark.parametrize("effect", ON_THE_IMAGE)
 def test_errors_stay_small_under_every_effect(effect: str, case: Callable[[str | None], Case]) -> None:
-    """Noise doubles the error; darkness, a signal of 8 gray levels, makes it six times as large; tracks stay right."""
+    """Noise doubles the error; darkness, with a signal of 8 gray levels, makes it six times as large."""
     measured = case(effect).figures
     if effect == "dark" and measured["step"] is None:
-        return  # no corner stands out: nothing is said, so nothing is wrong
+        return  # no corners, so no errors
     assert measured["step"]["median_px"] < {"noise": 0.2, "dark": 0.5}.get(effect, 0.1)
     assert measured["disparity"]["median_px"] < {"noise": 0.12, "dark": 0.4}.get(effect, 0.1)
     for name, share in (("step", 0.02), ("disparity", 0.1 if effect == "dark" else 0.04)):
@@ -144,8 +144,8 @@ def test_darkness_gives_few_tracks(case: Callable[[str | None], Case]) -> None:
     assert case("dark").figures["features_median"] < 0.5 * case(None).figures["features_median"]
 
 
-def test_a_bare_wall_carries_no_tracks() -> None:
-    """Noise on an even surface is no corner: what is found there lies near an outline."""
+def test_bare_wall_has_no_tracks() -> None:
+    """Noise on an untextured surface gives no corners: all features are near an outline."""
     facing = plan(accuracy_scenario("bare-wall", frames=100, width=SIZE_PX))  # ends before a bare wall
     tracked = run(last := latest(facing), rendered(last))
     recording = SimulatedRecording(last)
@@ -162,11 +162,11 @@ def test_a_bare_wall_carries_no_tracks() -> None:
     assert on_wall <= 0.01 * features
 
 
-# --- frames that are late, lost or repeated -------------------------------------------------------------------------
+# --- dropped and duplicated frames ------------------------------------------------------------------------------------
 
 
 def with_times(simulation: Simulation, source: list[int]) -> Simulation:
-    """The simulation with the content of other frames; stamps are those of the last of them."""
+    """The simulation with the frames `source`; with duplicates, stamps continue at the frame rate."""
     taken = simulation.taken_ns[source]
     stamps = simulation.stamps_ns[: len(source)] if len(set(source)) < len(source) else taken
     return replace(simulation, taken_ns=taken, stamps_ns=stamps)
@@ -182,7 +182,7 @@ def test_tracks_bridge_dropped_frames(case: Callable[[str | None], Case]) -> Non
     assert dropped.figures["step"]["outliers"] < 0.02
 
 
-def test_tracks_stand_still_in_duplicated_frames(case: Callable[[str | None], Case]) -> None:
+def test_tracks_do_not_move_in_duplicated_frames(case: Callable[[str | None], Case]) -> None:
     plain = case(None)
     source = [0, 1, 2, 2, 3, 4, 5, 5, 5, 6, 7, 8]
     simulation = with_times(plain.simulation, source)
@@ -201,11 +201,11 @@ def test_tracks_stand_still_in_duplicated_frames(case: Callable[[str | None], Ca
             assert moved.max() < 0.5
 
 
-# --- edges ----------------------------------------------------------------------------------------------------------
+# --- occlusion --------------------------------------------------------------------------------------------------------
 
 
-def test_no_track_lives_on_beyond_an_edge() -> None:
-    """Poles in front of the wall hide one track after the other while the camera passes by, rising and falling."""
+def test_tracks_end_at_occlusions() -> None:
+    """Poles in front of the wall occlude tracks while the camera passes by."""
     y = np.linspace(-0.9, 0.9, 19)
     R = look_rotation(np.tile([1.0, 0.0, 0.0], (len(y), 1)))
     T = se3_from_parts(R, np.stack([-0.4 + 0.2 * y, y, 1.4 + 0.2 * np.sin(5 * y)], axis=1))
@@ -221,13 +221,13 @@ def test_no_track_lives_on_beyond_an_edge() -> None:
 
 
 def _pole(y: float) -> MovingBox:
-    """A box like a pole, which stands still; by moving boxes a test can put one where it likes."""
+    """A stationary box in the shape of a pole; a moving box can be placed anywhere."""
     T = se3_from_parts(np.eye(3), np.array([1.6, y, 1.4]))
     return MovingBox(np.array([0.15, 0.15, 1.8]), lambda time_ns: T)
 
 
 def _hidden(case: Case) -> int:
-    """Features whose point something else hides in the next frame."""
+    """Count the features whose point is occluded in the next frame."""
     count = 0
     for k, output in enumerate(case.outputs[:-1]):
         times = case.simulation.taken_ns[k : k + 2].tolist()
@@ -238,7 +238,7 @@ def _hidden(case: Case) -> int:
     return count
 
 
-# --- contract -------------------------------------------------------------------------------------------------------
+# --- contract ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("effect", [None, *ON_THE_IMAGE])
@@ -257,7 +257,7 @@ def test_ids_are_never_reused_and_disparities_are_positive(
         assert (stereo[:, 0] - stereo[:, 2] > 0).all()
 
 
-def test_equal_images_give_equal_bits(case: Callable[[str | None], Case]) -> None:
+def test_equal_images_give_identical_output(case: Callable[[str | None], Case]) -> None:
     once = case("noise")
     again = run(once.simulation, rendered(once.simulation))
     for a, b in zip(once.outputs, again.outputs, strict=True):

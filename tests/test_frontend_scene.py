@@ -1,4 +1,4 @@
-"""A textured wall seen by a moving stereo camera, for the front end's tests: every pixel's truth is a formula."""
+"""A textured wall seen by a moving stereo camera, with analytic ground truth for every pixel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NOISE = 1.5  # gray levels
 
 @dataclass(frozen=True, slots=True)
 class Wall:
-    """The plane `normal . p = offset` in the world frame, painted with a sum of cosines over world x and y."""
+    """The plane `normal . p = offset` in the world frame, textured with a sum of cosines over world x and y."""
 
     normal: FloatArray  # (3,)
     offset: float
@@ -39,7 +39,7 @@ class Wall:
         return 128.0 + 40.0 * total / np.sqrt((amplitude**2).sum() / 2)
 
     def hit(self, T_world_cam: FloatArray, pixels: FloatArray, camera: StereoCamera = CAMERA) -> FloatArray:
-        """Points (..., 3) in the world where the rays of left pixels (..., 2) meet the wall."""
+        """Points (..., 3) in the world where the rays of left pixels (..., 2) intersect the wall."""
         rays = np.stack(
             [
                 (pixels[..., 0] - camera.cu) / camera.fu,
@@ -57,7 +57,7 @@ SLANTED = Wall(normal=np.array([0.1, -0.35, 1.0]), offset=4.0, seed=3)
 
 
 def truth(wall: Wall, T_world_cam: FloatArray, pixels: FloatArray, T_world_other: FloatArray) -> FloatArray:
-    """Stereo pixels (N, 4) at the other pose of what the left image shows at pixels (N, 2)."""
+    """Stereo pixels (N, 4) at another pose of the points at left pixels (N, 2)."""
     return project(CAMERA, transform_points(se3_inverse(T_world_other), wall.hit(T_world_cam, pixels)))
 
 
@@ -83,19 +83,19 @@ def right_of(T_world_cam: FloatArray) -> FloatArray:
 
 
 def stereo_frame(index: int, T_world_cam: FloatArray, wall: Wall = SLANTED) -> StereoFrame:
-    """The pair seen at one pose."""
+    """The stereo pair at one pose."""
     left = eight_bit(view(wall, T_world_cam), 2 * index)
     right = eight_bit(view(wall, right_of(T_world_cam)), 2 * index + 1)
     return StereoFrame(index, index * 50_000_000, left, right)
 
 
 def flight(frames: int) -> list[FloatArray]:
-    """Poses of a camera that goes sideways and forward while it turns a little."""
+    """Poses of a camera that moves sideways and forward and turns slightly."""
     step = np.array([0.03, -0.01, 0.05, 0.003, -0.006, 0.004])
     return [se3_exp(k * step) for k in range(frames)]
 
 
-def test_what_the_left_image_shows_is_what_the_right_one_shows_at_the_true_pixel() -> None:
+def test_left_and_right_images_agree_at_true_pixels() -> None:
     pose = flight(3)[2]
     left, right = view(SLANTED, pose), view(SLANTED, right_of(pose))
     pixels = np.stack(np.meshgrid(np.arange(60.0, 420.0, 7), np.arange(10.0, 290.0, 7)), axis=-1).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""The KLT front end on a clip of TartanAir v2, whose flow and depth are known for every pixel."""
+"""The KLT front end on a clip of TartanAir v2, with ground-truth flow and depth for every pixel."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, StereoFrame
 
-# Pixel centres of the clip's 640x640 images are at whole numbers here, so the axis, the middle of the image, is at
-# 319.5: with it, flow that is computed from depth and poses agrees with the flow of the files to their rounding.
+# Pixel centres are at integer coordinates, so the principal point of the 640x640 images is at 319.5: with it, flow
+# computed from depth and poses agrees with the flow of the files up to rounding.
 CAMERA = StereoCamera(320.0, 320.0, 319.5, 319.5, 0.25, 640, 640)
-FLOW_STEP_PX = 1 / 64  # of the files' 16-bit numbers, whose zero is 32768
-SEEN = 0  # in a flow file's third channel; other values: hidden or outside in the next image
+FLOW_STEP_PX = 1 / 64  # of the 16-bit values in the files, with an offset of 32768
+VISIBLE = 0  # in the third channel of a flow file; other values: occluded or outside the next image
 
-# The clip's poses are those of a body with x forward, y right, z down.
+# The poses of the clip are those of a body with x forward, y right, z down.
 R_BODY_CAM = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
@@ -32,7 +32,7 @@ class Clip:
     frames: list[StereoFrame]
     depth: list[FloatArray]  # (H, W) metres along the optical axis, left camera
     flow: list[FloatArray]  # (H, W, 2) px to the next left image
-    seen: list[BoolArray]  # (H, W) the pixel's point is seen in the next left image
+    seen: list[BoolArray]  # (H, W) the point is visible in the next left image
     T_world_cam: FloatArray  # (F, 4, 4)
 
 
@@ -51,7 +51,7 @@ def clip(data_dir: Path) -> Clip:
     poses = np.loadtxt(folder / "pose_lcam_front.txt")
     T = se3_from_parts(rotation_from_quat_xyzw(poses[:, 3:]) @ R_BODY_CAM, poses[:, :3])
     flow = [(image[..., :2].astype(float) - 32768) * FLOW_STEP_PX for image in encoded]
-    return Clip(frames, depth, flow, [image[..., 2] == SEEN for image in encoded], T)
+    return Clip(frames, depth, flow, [image[..., 2] == VISIBLE for image in encoded], T)
 
 
 def _png(path: Path) -> Any:
@@ -61,14 +61,14 @@ def _png(path: Path) -> Any:
 @pytest.fixture(scope="module")
 def outputs(clip: Clip) -> list[FrontendOutput]:
     class Nothing:
-        """Only the precomputed front end asks its dataset for anything."""
+        """A dataset without content: only the precomputed front end uses it."""
 
     frontend = build_frontend("klt", CAMERA, FrontendSettings(), Nothing())  # type: ignore[arg-type]
     return [frontend.process(frame) for frame in clip.frames]
 
 
 def moved(clip: Clip, k: int, uv: FloatArray, depth: FloatArray) -> FloatArray:
-    """Pixels (N, 2) in the next left image of pixels (N, 2) with depths (N,) in this one, by the poses."""
+    """Pixels (N, 2) in the next left image of pixels (N, 2) with depths (N,) in this one, from the poses."""
     rays = np.concatenate([(uv - [CAMERA.cu, CAMERA.cv]) / CAMERA.fu, np.ones((len(uv), 1))], axis=1)
     T = se3_inverse(clip.T_world_cam[k + 1]) @ clip.T_world_cam[k]
     p = transform_points(T, rays * depth[:, None])
@@ -85,29 +85,28 @@ def at(dense: FloatArray, uv: FloatArray) -> FloatArray:
 def smooth(clip: Clip, k: int, uv: FloatArray) -> BoolArray:
     """Mask (N,) of pixels whose 7x7 surroundings differ by less than 5 % in depth.
 
-    Elsewhere a patch shows two surfaces, and which of them the pixel under its middle belongs to is chance.
+    Elsewhere a patch contains two surfaces, and the surface of its centre pixel is ambiguous.
     """
     near, far = (f(clip.depth[k], np.ones((7, 7), np.uint8)) for f in (cv2.erode, cv2.dilate))
     column, row = np.rint(uv).astype(int).T
     return np.asarray(far[row, column] < 1.05 * near[row, column], dtype=np.bool_)
 
 
-def test_flow_and_depth_agree_through_the_poses_to_the_rounding_of_the_files(clip: Clip) -> None:
-    """So the encodings, the camera and the poses are understood: the largest rounding error is 0.011 px."""
+def test_flow_and_depth_agree_with_the_poses(clip: Clip) -> None:
+    """Validates the encodings, the camera and the poses: the largest rounding error is 0.011 px."""
     v, u = np.mgrid[0:640:3, 0:640:3].reshape(2, -1)
     for k, flow in enumerate(clip.flow):
         uv = np.stack([u, v], axis=1).astype(float)
         error = np.linalg.norm(moved(clip, k, uv, clip.depth[k][v, u]) - uv - flow[v, u], axis=1)
         error = error[clip.seen[k][v, u]]
         assert np.percentile(error, 99.9) < FLOW_STEP_PX * 2**-0.5 * 1.1
-        assert np.median(np.linalg.norm(flow, axis=2)) > 3  # something moves
+        assert np.median(np.linalg.norm(flow, axis=2)) > 3  # the scene is not static
 
 
 def test_temporal_tracks_follow_the_true_flow(clip: Clip, outputs: list[FrontendOutput]) -> None:
-    """Measured: 0.154 px in the middle, 95 % below 0.40, none of a thousand beyond 1 px; with edges, 7 % beyond.
+    """Measured: median 0.154 px, 95 % below 0.40, none of a thousand above 1 px; at depth edges, 7 % above 1 px.
 
-    That is three times the error on our own rendered images: these ones shimmer, as game engines' do, and their
-    surfaces shine.
+    This is three times the error on our own rendered images: the game engine adds aliasing and specular surfaces.
     """
     errors, everywhere = [], []
     for k, (a, b) in enumerate(pairwise(outputs)):
@@ -126,7 +125,7 @@ def test_temporal_tracks_follow_the_true_flow(clip: Clip, outputs: list[Frontend
 
 
 def disparity_errors(clip: Clip, outputs: list[FrontendOutput]) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Errors (N,) in each frame, found minus true, on smooth surfaces and everywhere."""
+    """Errors (N,) in each frame, measured minus true, on smooth surfaces and everywhere."""
     errors, everywhere = [], []
     for k, output in enumerate(outputs):
         z = output.observations.z[output.observations.has_right]
@@ -139,7 +138,7 @@ def disparity_errors(clip: Clip, outputs: list[FrontendOutput]) -> tuple[list[Fl
 
 
 def test_disparities_follow_the_true_depth(clip: Clip, outputs: list[FrontendOutput]) -> None:
-    """Measured: 0.120 px in the middle (0.097 of it is the clip's own), 95 % below 0.33; with edges, 7 % over 1 px."""
+    """Measured: median 0.120 px (0.097 of it is a bias of the clip), 95 % below 0.33; at edges, 7 % above 1 px."""
     errors, everywhere = disparity_errors(clip, outputs)
     count, median, most, outliers = _figures(errors)
     assert count > 1200
@@ -149,8 +148,8 @@ def test_disparities_follow_the_true_depth(clip: Clip, outputs: list[FrontendOut
     assert _figures(everywhere)[3] < 0.12
 
 
-def test_the_bias_of_disparities_is_the_clips_own(clip: Clip, outputs: list[FrontendOutput]) -> None:
-    """The right images lie 0.08 to 0.12 px left of where depth puts them, as a fit to all smooth pixels finds."""
+def test_disparity_bias_is_that_of_the_clip(clip: Clip, outputs: list[FrontendOutput]) -> None:
+    """The right images are shifted left by 0.08 to 0.12 px against depth, as a fit to all smooth pixels shows."""
     errors, _ = disparity_errors(clip, outputs)
     found = [float(np.median(error)) for error in errors]
     fitted = [_dense_shift(clip, k) for k in range(len(clip.frames))]
@@ -159,14 +158,14 @@ def test_the_bias_of_disparities_is_the_clips_own(clip: Clip, outputs: list[Fron
     assert abs(np.mean(found) - np.mean(fitted)) < 0.03
 
 
-def test_matches_lie_in_one_row(outputs: list[FrontendOutput]) -> None:
+def test_matches_are_on_one_row(outputs: list[FrontendOutput]) -> None:
     rows = np.concatenate([o.observations.z[o.observations.has_right] @ [0.0, 1.0, 0.0, -1.0] for o in outputs])
     assert abs(np.median(rows)) < 0.05
     assert np.median(np.abs(rows)) < 0.15
 
 
 def _dense_shift(clip: Clip, k: int) -> float:
-    """Disparity that all smooth pixels show beyond the true one: one least-squares step, no features, no windows."""
+    """Mean disparity bias of all smooth pixels: one least-squares step, without features or windows."""
     v, u = np.mgrid[0:640, 0:640].astype(np.float32)
     disparity = (CAMERA.fu * CAMERA.baseline_m / clip.depth[k]).astype(np.float32)
     left, right = clip.frames[k].left, clip.frames[k].right
@@ -182,6 +181,6 @@ def _dense_shift(clip: Clip, k: int) -> float:
 
 
 def _figures(parts: list[FloatArray]) -> tuple[int, float, float, float]:
-    """Count, median, 95 % and the share beyond 1 px."""
+    """Count, median, 95 % and the share above 1 px."""
     error = np.abs(np.concatenate(parts))
     return len(error), float(np.median(error)), float(np.percentile(error, 95)), float(np.mean(error > 1))

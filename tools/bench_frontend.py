@@ -3,10 +3,10 @@
     python tools/bench_frontend.py [--names klt orb sift] [--clips room street kitti_0039] [--repeat 3] [--edges]
         [--json FILE]
 
-Rendered clips and TartanAir have a truth for every pixel. On KITTI the features of one frame are triangulated, moved
-by one rigid motion fitted to the pair, and compared with the pixels tracked there; and, apart, by the true motion.
-Real clips are read from the folder named by VIO_DATA. One thread; times are medians with quartiles over all frames but
-the first of all repetitions. On a shared machine compare figures of one call only.
+Rendered clips and TartanAir have ground truth for every pixel. On KITTI the features of one frame are triangulated,
+moved by one rigid motion fitted to the pair, and compared with the tracked pixels; and separately by the true motion.
+Real clips are read from the folder in VIO_DATA. One thread; times are medians with quartiles over all frames but the
+first, over all repetitions. On a shared machine, compare figures of one call only.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from vio.geometry.distortion import StereoRig, rectified_camera
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import BoolArray, FrontendOutput, Observations, Recording, StereoFrame
-from vio.sim.effects import SensorEffects, develop
+from vio.sim.effects import SensorEffects, apply_effects
 from vio.sim.motion import MotionSpline, car_loop, hand_held
 from vio.sim.oracle import OracleFrontend, OracleSettings
 from vio.sim.render import correspondence
@@ -44,24 +44,24 @@ from vio.sim.sequence import SimulatedRecording, simulate, views
 from vio.sim.world import World, room, street
 from vio.threads import one_blas_thread
 
-Truth = Callable[[int, FloatArray], tuple[FloatArray, BoolArray]]  # frame, left pixels (N, 2): true pixels, seen there
+Truth = Callable[[int, FloatArray], tuple[FloatArray, BoolArray]]  # frame, left pixels (N, 2): true pixels, visible
 
 
 @dataclass(frozen=True)
 class Clip:
-    """Frames with what is known about them."""
+    """Frames with their ground truth."""
 
     name: str
     camera: StereoCamera
     frames: list[StereoFrame]
-    in_next: Truth | None  # where the left image of the next frame shows the same point
-    in_right: Truth | None  # where the right image shows it
+    in_next: Truth | None  # true pixels in the next left image
+    in_right: Truth | None  # true pixels in the right image
     poses: FloatArray | None = None  # (F, 4, 4) T_world_cam0, ground truth
-    judged: tuple[int, ...] | None = None  # transitions k -> k + 1 that count for temporal figures; None: all
+    evaluated: tuple[int, ...] | None = None  # transitions k -> k + 1 used for temporal figures; None: all
     simulation: SimulatedRecording | None = None
 
 
-# --- rendered clips -------------------------------------------------------------------------------------------------
+# --- rendered clips ---------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -101,27 +101,27 @@ def _truths(recording: SimulatedRecording) -> tuple[Truth, Truth]:
     return in_next, in_right
 
 
-def _developed(
+def _with_effects(
     name: str,
     recording: SimulatedRecording,
     radiance: list[tuple[Any, Any]],
     effects_of: Callable[[int], SensorEffects],
-    judged: tuple[int, ...] | None = None,
+    evaluated: tuple[int, ...] | None = None,
 ) -> Clip:
     frames = []
     for k, pair in enumerate(radiance):
         time_ns = int(recording.simulation.taken_ns[k])
         left, right = (
-            develop(image, effects_of(k), time_ns=time_ns, frame_index=k, camera=i, seed=5)
+            apply_effects(image, effects_of(k), time_ns=time_ns, frame_index=k, camera=i, seed=5)
             for i, image in enumerate(pair)
         )
         frames.append(StereoFrame(k, time_ns, left, right))
     camera = rectified_camera(recording.simulation.rig)
-    return Clip(name, camera, frames, *_truths(recording), judged=judged, simulation=recording)
+    return Clip(name, camera, frames, *_truths(recording), evaluated=evaluated, simulation=recording)
 
 
 def rendered_clips(wanted: set[str], count: int) -> Iterator[Clip]:
-    """Render the clips whose names are wanted; those of one scene share their perfect images."""
+    """Render the wanted clips; clips of one scene share their noise-free images."""
     plain = SensorEffects(read_noise=1.5)
     period = 5  # frames between steps of the exposure
     steps = tuple(range(period - 1, count - 1, period))
@@ -140,9 +140,9 @@ def rendered_clips(wanted: set[str], count: int) -> Iterator[Clip]:
         times = recording.simulation.taken_ns
         if wanted & room_effects.keys():
             radiance = [recording.radiance(int(t)) for t in times]
-            for name, (effects_of, judged) in room_effects.items():
+            for name, (effects_of, evaluated) in room_effects.items():
                 if name in wanted:
-                    yield _developed(name, recording, radiance, effects_of, judged)
+                    yield _with_effects(name, recording, radiance, effects_of, evaluated)
         if "room_blur_5px" in wanted:
             speed = [
                 np.median(np.linalg.norm(recording.flow(0, int(a), int(b)), axis=2))
@@ -151,14 +151,14 @@ def rendered_clips(wanted: set[str], count: int) -> Iterator[Clip]:
             shutter_ms = 5.0 / float(np.mean(speed)) * 1e3 / scene.rate_hz
             blurred = _rendered(scene, count, exposure_ms=shutter_ms)
             radiance = [blurred.radiance(int(t)) for t in times]
-            yield _developed("room_blur_5px", blurred, radiance, lambda k: plain)
+            yield _with_effects("room_blur_5px", blurred, radiance, lambda k: plain)
     if "street" in wanted:
         recording = _rendered(_street_scene(), count)
         radiance = [recording.radiance(int(t)) for t in recording.simulation.taken_ns]
-        yield _developed("street", recording, radiance, lambda k: plain)
+        yield _with_effects("street", recording, radiance, lambda k: plain)
 
 
-# --- real clips -----------------------------------------------------------------------------------------------------
+# --- real clips -------------------------------------------------------------------------------------------------------
 
 
 def kitti_clip(folder: Path, name: str, count: int | None) -> Clip:
@@ -196,7 +196,7 @@ def tartanair_clip(folder: Path) -> Clip:
         return cv2.remap(np.ascontiguousarray(dense), at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR)[0]
 
     def smooth(k: int, uv: FloatArray) -> BoolArray:
-        """Mask (N,) of pixels whose 7x7 surroundings differ by less than 5 % in depth: elsewhere truth is luck."""
+        """Mask (N,) of pixels whose 7x7 surroundings differ by less than 5 % in depth: elsewhere truth is ambiguous."""
         nearest, farthest = (f(depth[k], np.ones((7, 7), np.uint8)) for f in (cv2.erode, cv2.dilate))
         row, column = (np.clip(np.rint(uv[:, i]).astype(int), 0, 639) for i in (1, 0))
         return np.asarray(farthest[row, column] < 1.05 * nearest[row, column])
@@ -233,26 +233,26 @@ def data_folder() -> Path:
 
 
 def clips(wanted: set[str], count: int, real_count: int | None = None) -> Iterator[Clip]:
-    """Make the clips by name; real ones whose folder is absent are left out with a warning."""
+    """Make the clips by name; real clips without a folder are skipped with a warning."""
     yield from rendered_clips(wanted, count)
     data = data_folder()
     for name in REAL:
         if name in wanted:
             if not (data / name).is_dir():
-                logging.getLogger(__name__).warning("no %s in %s (VIO_DATA): left out", name, data)
+                logging.getLogger(__name__).warning("no %s in %s (VIO_DATA): skipped", name, data)
                 continue
             yield (
                 tartanair_clip(data / name) if name == "tartanair2_clip" else kitti_clip(data / name, name, real_count)
             )
 
 
-# --- measuring ------------------------------------------------------------------------------------------------------
+# --- measuring --------------------------------------------------------------------------------------------------------
 
-Builder = Callable[[Clip], Any]  # a fresh front end for a clip
+Builder = Callable[[Clip], Any]  # a new front end for a clip
 
 
 def run(clip: Clip, build: Builder) -> list[tuple[FrontendOutput, float]]:
-    """Outputs of a fresh front end with the milliseconds that each frame took."""
+    """Outputs of a new front end, with the milliseconds per frame."""
     frontend = build(clip)
     results = []
     for frame in clip.frames:
@@ -263,7 +263,7 @@ def run(clip: Clip, build: Builder) -> list[tuple[FrontendOutput, float]]:
 
 
 def temporal_errors(clip: Clip, seen: list[Observations], k: int) -> tuple[FloatArray, BoolArray, BoolArray]:
-    """Errors (N,) px of the features of frame k in the next, whether each was found there, whether it could be (N,)."""
+    """Errors (N,) px of the features of frame k in the next one, and masks (N,) of those tracked and those visible."""
     assert clip.in_next is not None
     there, visible = clip.in_next(k, seen[k].z[:, :2])
     visible &= _within(clip, there)
@@ -274,18 +274,18 @@ def temporal_errors(clip: Clip, seen: list[Observations], k: int) -> tuple[Float
 
 
 def disparity_errors(clip: Clip, seen: list[Observations], k: int) -> tuple[FloatArray, BoolArray]:
-    """Signed errors (N,) px of the disparities of frame k, and the mask (N,) of those that can be judged."""
+    """Signed errors (N,) px of the disparities of frame k, and the mask (N,) of those with ground truth."""
     assert clip.in_right is not None
     there, visible = clip.in_right(k, seen[k].z[:, :2])
     return there[:, 0] - seen[k].z[:, 2], visible & seen[k].has_right
 
 
-EDGE_PX = (4.0, 8.0)  # the second is the reach of klt's patch
+EDGE_PX = (4.0, 8.0)  # the second is about the half side of klt's patch
 _EDGE_STEP = 1.05  # ratio of depths between neighbouring pixels of two surfaces
 
 
 def edge_distance(clip: Clip, k: int, uv: FloatArray) -> FloatArray:
-    """Distances (N,) px of left pixels (N, 2) from the nearest step of depth between two surfaces."""
+    """Distances (N,) px of left pixels (N, 2) from the nearest depth step between two surfaces."""
     assert clip.simulation is not None
     depth, surface = clip.simulation.depth(0, int(clip.simulation.simulation.taken_ns[k]))
     square = np.ones((2, 2), np.uint8)
@@ -301,12 +301,12 @@ def edge_distance(clip: Clip, k: int, uv: FloatArray) -> FloatArray:
 
 
 def edge_figures(clip: Clip, seen: list[Observations]) -> dict[str, Any]:
-    """Share of the features, and of their errors above 1 px, that lie near a step of depth, by distance in px."""
+    """Share of the features, and of their errors above 1 px, that are near a depth step, by distance in px."""
     rows: dict[str, list[FloatArray]] = {"temporal": [], "disparity": []}
     for k in range(len(seen)):
         distance = edge_distance(clip, k, seen[k].z[:, :2])
-        error, judged = disparity_errors(clip, seen, k)
-        rows["disparity"].append(np.stack([np.abs(error), distance], axis=1)[judged])
+        error, evaluated = disparity_errors(clip, seen, k)
+        rows["disparity"].append(np.stack([np.abs(error), distance], axis=1)[evaluated])
         if k + 1 < len(seen):
             error, found, visible = temporal_errors(clip, seen, k)
             rows["temporal"].append(np.stack([error, distance], axis=1)[found & visible])
@@ -339,14 +339,14 @@ def accuracy(clip: Clip, outputs: list[FrontendOutput]) -> dict[str, Any]:
     }
     if clip.in_next is not None and clip.in_right is not None:
         temporal, shown, kept = [], 0, 0
-        for k in range(len(seen) - 1) if clip.judged is None else clip.judged:
+        for k in range(len(seen) - 1) if clip.evaluated is None else clip.evaluated:
             error, found, visible = temporal_errors(clip, seen, k)
             temporal.append(error[found & visible])
             shown, kept = shown + int(visible.sum()), kept + int((found & visible).sum())
         figures["temporal_px"] = _summary(np.concatenate(temporal))
         figures["survived"] = kept / max(shown, 1)
-        judged = [disparity_errors(clip, seen, k) for k in range(len(seen))]
-        figures["disparity_px"] = _summary(np.concatenate([error[mask] for error, mask in judged]))
+        evaluated = [disparity_errors(clip, seen, k) for k in range(len(seen))]
+        figures["disparity_px"] = _summary(np.concatenate([error[mask] for error, mask in evaluated]))
     elif clip.poses is not None:
         figures |= _rigid_figures(clip, seen)
     return figures
@@ -362,7 +362,7 @@ def _within(clip: Clip, uv: FloatArray) -> BoolArray:
 
 
 def _rows(ids: Any, later: Any) -> tuple[BoolArray, Any]:
-    """Whether each id is among the later ones, and its row there (arbitrary where not)."""
+    """Mask of the ids that are among the later ones, and their rows there (arbitrary where not)."""
     order = np.argsort(later)
     if len(later) == 0:
         return np.zeros(len(ids), dtype=np.bool_), np.zeros(len(ids), dtype=np.int64)
@@ -370,7 +370,7 @@ def _rows(ids: Any, later: Any) -> tuple[BoolArray, Any]:
     return later[row] == ids, row
 
 
-_FIT_PX = 1.0  # distance from where the fitted motion puts a feature, beyond which it counts little
+_FIT_PX = 1.0  # reprojection error under the fitted motion above which a feature has little weight
 
 
 def _rigid_figures(clip: Clip, seen: list[Observations]) -> dict[str, Any]:
@@ -397,7 +397,7 @@ def _rigid_figures(clip: Clip, seen: list[Observations]) -> dict[str, Any]:
 
 
 def _summary(error: FloatArray) -> dict[str, float]:
-    """Median and 95 % of the size of errors (N,), the median error with its sign, and the share beyond 1 px."""
+    """Median and 95 % of absolute errors (N,), the signed median, and the share above 1 px."""
     if len(error) == 0:
         return {"count": 0}
     size = np.abs(error)
@@ -411,7 +411,7 @@ def _summary(error: FloatArray) -> dict[str, float]:
 
 
 def timing(runs: list[list[tuple[FrontendOutput, float]]]) -> dict[str, list[float]]:
-    """Quartiles [25, 50, 75 %] in milliseconds of every stage and of the whole frame, first frames left out."""
+    """Quartiles [25, 50, 75 %] in milliseconds of every stage and of the whole frame, without first frames."""
     frames = [frame for results in runs for frame in results[1:]]
     stages = dict.fromkeys(stage for output, _ in frames for stage in output.stages_ms)
     columns = {stage: [output.stages_ms.get(stage, 0.0) for output, _ in frames] for stage in stages}
@@ -445,7 +445,7 @@ KORNIA = {
 
 
 def kornia_options(name: str, weights: Path) -> dict[str, str | Path]:
-    """Settings of `frontend.learned` of a variant of kornia, with files in the folder of weights; none of others."""
+    """Settings of `frontend.learned` of a variant of kornia, with files in the folder of weights; else empty."""
     options = KORNIA.get(name, {})
     return {key: weights / value if key.endswith("_weights") else value for key, value in options.items()}
 
@@ -454,7 +454,7 @@ NAMES = ("klt", "orb", "sift", "oracle", *KORNIA)
 
 
 def builders(names: list[str], overrides: list[str]) -> dict[str, Builder]:
-    """How to build each front end for a clip, with settings overridden by `key=value` below `frontend.`."""
+    """Builders of the front ends for a clip, with settings overridden by `key=value` below `frontend.`."""
 
     def builder(name: str) -> Builder:
         if name == "oracle":
@@ -473,7 +473,7 @@ def _oracle(clip: Clip) -> Any:
 
 
 class _ClipDataset:
-    """A clip as the dataset that builders ask for."""
+    """A clip in the form of a dataset, for the builders."""
 
     def __init__(self, clip: Clip) -> None:
         times = np.array([frame.time_ns for frame in clip.frames])
@@ -488,7 +488,7 @@ class _ClipDataset:
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
-    """The results as one Markdown table a clip."""
+    """Format the results as one Markdown table per clip."""
     lines = []
     for clip_name, by_name in results.items():
         real = any("reprojection_fitted_px" in figures for figures in by_name.values())
@@ -496,7 +496,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
         second = "under the true poses" if real else "disparity px: median, 95 %, bias, > 1 px"
         lines += [
             f"\n{clip_name}",
-            f"| | {first} | {second} | stereo rows: least, median | track length: median, mean | ms |",
+            f"| | {first} | {second} | stereo matches: least, median | track length: median, mean | ms |",
             "|---|---|---|---|---|---|",
         ]
         for name, f in by_name.items():
@@ -521,7 +521,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
                 lines.append(
                     f"{name}: of {near['errors']} {kind} errors above 1 px, "
                     + ", ".join(f"{100 * share:.0f} % within {r} px" for r, share in near["errors_near"].items())
-                    + " of a step of depth; of all features "
+                    + " of a depth step; of all features "
                     + ", ".join(f"{100 * share:.0f} %" for share in near["features_near"].values())
                     + "; wrong elsewhere "
                     + ", ".join(f"{100 * share:.2f} %" for share in near["wrong_elsewhere"].values())
@@ -536,7 +536,7 @@ def _cell(summary: dict[str, float], *keys: str) -> str:
 
 
 def main() -> int:
-    """Run the benchmark; print tables, and write JSON where asked."""
+    """Run the benchmark; print tables, and write JSON if requested."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--names", nargs="+", default=["klt", "orb", "sift", "oracle"], choices=NAMES)
     parser.add_argument("--clips", nargs="+", default=[*RENDERED, *REAL], choices=[*RENDERED, *REAL])
@@ -546,7 +546,7 @@ def main() -> int:
     parser.add_argument(
         "--set", action="append", default=[], help="setting below `frontend.`, such as klt.window_px=21"
     )
-    parser.add_argument("--edges", action="store_true", help="also say which errors lie at steps of depth (rendered)")
+    parser.add_argument("--edges", action="store_true", help="also report the errors near depth steps (rendered)")
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     cv2.setNumThreads(1)
@@ -565,7 +565,7 @@ def main() -> int:
 
 
 def measure(clip: Clip, build: dict[str, Builder], repeat: int, *, edges: bool) -> dict[str, Any]:
-    """Figures of each front end on one clip; repetitions take turns, so that a busy machine hits all alike."""
+    """Figures of each front end on one clip; repetitions alternate, so that load on the machine affects all equally."""
     runs: dict[str, list[list[tuple[FrontendOutput, float]]]] = {name: [] for name in build}
     for _ in range(repeat):
         for name in build:

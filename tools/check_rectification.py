@@ -1,10 +1,10 @@
 """Check rectification: rows of matched points on real recordings, and tracking accuracy on rendered images.
 
     python tools/check_rectification.py rows FOLDER...      # |vl - vr| of matched points
-    python tools/check_rectification.py tracking            # rectified images against raw ones, truth exact
-    python tools/check_rectification.py resampling          # what interpolation costs
+    python tools/check_rectification.py tracking            # rectified against raw images, with exact ground truth
+    python tools/check_rectification.py resampling          # error and time of the interpolation
 
-All print a table, or JSON with --json. The figures in docs/rectification.md come from here.
+All print a table, or JSON with --json. The figures in docs/rectification.md are from this tool.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ from vio.geometry.distortion import StereoRig, project_point, rig_from_rectified
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import Rectification, rectify, rectify_pixels
 from vio.records import BoolArray, Image, StereoFrame
-from vio.sim.effects import SensorEffects, develop
-from vio.sim.motion import MotionSpline, evaluate, hand_held, turned
+from vio.sim.effects import SensorEffects, apply_effects
+from vio.sim.motion import MotionSpline, evaluate, hand_held, rotate_body_axes
 from vio.sim.render import View, camera_rays, correspondence, inside_image, render
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_like_rig
 from vio.sim.world import World, room
@@ -44,23 +44,23 @@ _WINDOW_PX = 21
 
 @dataclass(frozen=True, slots=True)
 class RowResidual:
-    """How well rows of matched points agree; pixels of the rectified images."""
+    """Row differences of matched points; pixels of the rectified images."""
 
     recording: str
-    points: str  # how the points of a match were placed
+    points: str  # how the points were located
     pairs: int
     matches: int
     median_px: float  # of |vl - vr|
     p95_px: float
     bias_px: float  # median of vl - vr
-    turn_deg: tuple[float, float, float]  # rotation of the right camera that would lower the residuals most
-    median_after_turn_px: float  # of |vl - vr| under that rotation: what is left to the matching
+    turn_deg: tuple[float, float, float]  # rotation of the right camera that minimises the residuals
+    median_after_turn_px: float  # of |vl - vr| under that rotation: the matching error
 
 
 def match_sift(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
-    """Matched pixels (N, 2), (N, 2): mutual nearest SIFT descriptors, on one common fundamental matrix.
+    """Matched pixels (N, 2), (N, 2): mutual nearest SIFT descriptors, inliers of one common fundamental matrix.
 
-    The matrix is a free one, estimated from these matches alone: nothing here knows that rows should agree.
+    The matrix is estimated from these matches alone, without the assumption that rows agree.
     Reference: Lowe, Distinctive image features from scale-invariant keypoints (2004).
     """
     sift = cv2.SIFT.create(nfeatures=1500)
@@ -96,7 +96,7 @@ def _flow(a: Image, b: Image, points: FloatArray, guess: FloatArray, *, levels: 
 
 
 def row_residuals(source: str, interpolation: Interpolation) -> list[RowResidual]:
-    """Measure a recording, with the points where SIFT puts them and after refining them."""
+    """Measure a recording, with SIFT points and with refined points."""
     dataset = open_dataset(source, DatasetSettings(interpolation=interpolation))
     camera = dataset.recording.camera
     matched: dict[str, list[FloatArray]] = {"SIFT": [], "refined": []}
@@ -126,10 +126,10 @@ def row_residuals(source: str, interpolation: Interpolation) -> list[RowResidual
 
 
 def _best_turn(xy: FloatArray, dv: FloatArray, fv: float) -> tuple[FloatArray, FloatArray]:
-    """Small rotation (3,) of the right camera, in radians, that explains row residuals (N,), and what then remains.
+    """Small rotation (3,) of the right camera, in radians, that fits row residuals (N,), and the remaining residuals.
 
-    A ray [x, y, 1] turned by phi moves by phi x ray, its row by fv (-(1 + y^2) phi_x + x y phi_y + x phi_z).
-    Iteratively reweighted least squares, so that false matches count little.
+    A ray [x, y, 1] rotated by phi moves by phi x ray, its row by fv (-(1 + y^2) phi_x + x y phi_y + x phi_z).
+    Iteratively reweighted least squares, so that false matches have little weight.
     """
     x, y = xy[:, 0], xy[:, 1]
     A = fv * np.stack([-(1 + y * y), x * y, x], axis=1)
@@ -140,7 +140,7 @@ def _best_turn(xy: FloatArray, dv: FloatArray, fv: float) -> tuple[FloatArray, F
     return phi, dv - A @ phi
 
 
-# --- rectified images against raw ones ------------------------------------------------------------------------------
+# --- rectified images against raw images ------------------------------------------------------------------------------
 
 _RAW, _IDEAL = "raw, points undistorted", "rendered rectified (no resampling)"
 _METHODS: tuple[str, ...] = (_RAW, *(f"rectified, {name}" for name in get_args(Interpolation)), _IDEAL)
@@ -160,8 +160,8 @@ class TrackingError:
     tracker: str
     images: str
     step: str  # stereo, or the time between two left images
-    points: int  # the same ones for all kinds of images
-    lost_percent: float  # of all visible points: given up by the tracker
+    points: int  # the same for all kinds of images
+    lost_percent: float  # of all visible points: lost by the tracker
     median_px: float
     p95_px: float
     rows_median_px: float  # of the vertical part of the error
@@ -169,7 +169,7 @@ class TrackingError:
 
 @dataclass(frozen=True, slots=True)
 class ResamplingError:
-    """What interpolation does to an image, and what it costs."""
+    """Error and time of an interpolation method."""
 
     interpolation: str
     rms_gray: float  # difference from the rectified image rendered directly, without noise
@@ -178,7 +178,7 @@ class ResamplingError:
 
 @dataclass(frozen=True, slots=True)
 class _Scene:
-    """A flight through a rendered room, seen by EuRoC's real cameras and by the rectified ones they turn into."""
+    """A flight through a rendered room, seen by EuRoC's raw cameras and by the rectified cameras."""
 
     world: World
     motion: MotionSpline
@@ -194,7 +194,7 @@ def make_scene(seed: int = 3) -> _Scene:
     done = rectify(raw)
     names: tuple[Interpolation, ...] = get_args(Interpolation)
     rectifiers = {f"rectified, {name}": make_rectifier(raw, name, Path("euroc_like_rig")) for name in names}
-    motion = turned(hand_held(seed=seed, duration_s=14.0), R_FLU_EUROC_IMU)
+    motion = rotate_body_axes(hand_held(seed=seed, duration_s=14.0), R_FLU_EUROC_IMU)
     return _Scene(room(seed), motion, raw, rig_from_rectified(done.camera, done.T_rect0_imu), rectifiers, done)
 
 
@@ -212,13 +212,13 @@ def _pictures(scene: _Scene, time_ns: int, noise: float) -> dict[str, tuple[Imag
         for camera, view in enumerate(_views(scene, rig, time_ns)):
             radiance = render(scene.world, camera_rays(view.camera), view.T_world_cam, time_ns)
             number = time_ns // 1_000_000
-            pair.append(develop(radiance, effects, time_ns=time_ns, frame_index=number, camera=camera, seed=7))
+            pair.append(apply_effects(radiance, effects, time_ns=time_ns, frame_index=number, camera=camera, seed=7))
         out[name] = pair[0], pair[1]
     return out | {name: rectifier(*out[_RAW]) for name, rectifier in scene.rectifiers.items()}
 
 
 def _track(first: Image, second: Image, start: FloatArray, guess: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Lucas-Kanade forth and back: pixels (N, 2) and a mask of those that returned."""
+    """Forward-backward Lucas-Kanade: pixels (N, 2) and a mask of consistent ones."""
     there, found = _flow(first, second, start, guess, levels=2)
     back, found_back = _flow(second, first, there, start, levels=2)
     return there, found & found_back & (np.linalg.norm(back - start, axis=1) < _BACK_PX)
@@ -227,7 +227,7 @@ def _track(first: Image, second: Image, start: FloatArray, guess: FloatArray) ->
 def _align(
     first: Image, second: Image, start: FloatArray, guess: FloatArray, *, same_row: bool
 ) -> tuple[FloatArray, BoolArray]:
-    """The front end's own last step from where Lucas-Kanade ended: pixels (N, 2) and a mask of good fits."""
+    """The front end's alignment, from the result of Lucas-Kanade: pixels (N, 2) and a mask of good fits."""
     prepared = templates(cut_patches(first.astype(np.float32), start, _RADIUS))
     rows = start[:, 1] if same_row else None
     warps, score = align(prepared, np.arange(len(start)), second.astype(np.float32), shift_warps(guess), 12, rows)
@@ -298,7 +298,7 @@ def _summary(key: tuple[str, str, str], e: FloatArray, lost: int, tried: int) ->
 
 
 def resampling_errors(*, moments: int, seed: int = 3) -> list[ResamplingError]:
-    """Compare resampled images with the rectified ones rendered directly, away from the border."""
+    """Compare resampled with directly rendered rectified images, away from the border."""
     scene = make_scene(seed)
     square: dict[str, list[float]] = {name: [] for name in scene.rectifiers}
     spent_ms: dict[str, list[float]] = {name: [] for name in scene.rectifiers}
@@ -319,7 +319,7 @@ def resampling_errors(*, moments: int, seed: int = 3) -> list[ResamplingError]:
     ]
 
 
-# --- command line ---------------------------------------------------------------------------------------------------
+# --- command line -----------------------------------------------------------------------------------------------------
 
 
 def _print_table(rows: Sequence[RowResidual | TrackingError | ResamplingError]) -> None:

@@ -1,10 +1,10 @@
-"""Hold a front end against rendered images whose every pixel is known; print a table, or JSON.
+"""Measure the accuracy of a front end on rendered images with known ground truth; print a table, or JSON.
 
     python tools/frontend_accuracy.py [--frontend klt] [--set frontend.klt.window_px=21] [--json FILE]
 
-Renders the room as seen along a hand-held flight by a rectified 752x480 rig like EuRoC's: 300 frames, then 100 under
-each effect. Errors are distances to the exact map: from where a feature was in the frame before (`step`), from where it
-began (`since birth`), and from its left pixel to the right image (`disparity`).
+Renders a room along a hand-held flight with a rectified 752x480 rig like EuRoC's: 300 frames, then 100 under each
+effect. Errors are relative to the exact correspondence: of the pixel in the previous frame (`step`), of the first pixel
+of the track (`since birth`), and of the left pixel in the right image (`disparity`).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from vio.geometry.lie import FloatArray
 from vio.protocols import Frontend
 from vio.records import FrontendOutput, Image, IntArray, Observations, StereoFrame
 from vio.sim.render import View, cast, correspondence, inside_image, observe, surface_points
-from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, plan, usual_workers
+from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, default_workers, plan
 from vio.sim.sequence import SimulatedRecording, Simulation, views
 from vio.sim.world import Surfaces, surfaces_at
 from vio.threads import one_blas_thread
@@ -48,52 +48,54 @@ SHOWN_EFFECTS = (
 )
 
 _OUTLIER_PX = 1.0
-_CROSSED_PX = 1.5  # a track this far off, at another depth than its point, has changed surface
+_CROSSED_PX = 1.5  # error above which a track at another depth than its point has moved to another surface
 _OTHER_DEPTH = 0.02  # relative
-_RIM_PX = 3.0  # a feature this near to a nearer surface may be a point of that one's outline
-_CROSSED_FRAMES = 3  # for longer, a track on the wrong side of an edge counts as kept
-_MARGIN_PX = 12.0  # a point nearer to the image's border may be given up
-_CORNERS = 150  # strongest corners of an image, for the recall of repeatable ones
+_RIM_PX = 3.0  # a feature this close to a nearer surface may be a point of its outline
+_CROSSED_FRAMES = 3  # a track on the wrong surface for more frames counts as kept
+_MARGIN_PX = 12.0  # points closer to the image border are not required to be tracked
+_CORNERS = 150  # strongest corners of an image, for the recall of repeatable corners
 _CORNER_GAP_PX = 24.0
-_AGAIN_PX = 1.5  # a corner found this near to its true place is the same
-_HELD_PX = 3.0  # a track this near to a corner holds it
+_AGAIN_PX = 1.5  # distance from the true pixel up to which a corner is repeated
+_HELD_PX = 3.0  # distance up to which a track covers a corner
 
 
 @dataclass
 class Tally:
-    """Everything counted while a front end works; arrays of one entry per observation, gathered frame by frame."""
+    """Errors and counts of a front end; arrays have one entry per observation, one array per frame."""
 
-    step: list[FloatArray] = field(default_factory=list)  # (N, 2) px, found minus true
+    step: list[FloatArray] = field(default_factory=list)  # (N, 2) px, measured minus true
     since_birth: list[FloatArray] = field(default_factory=list)  # (N, 2) px
     age: list[IntArray] = field(default_factory=list)  # (N,) frames since birth, beside `since_birth`
     disparity: list[FloatArray] = field(default_factory=list)  # (N,) px
     row: list[FloatArray] = field(default_factory=list)  # (N,) px, right row minus true
     order: list[FloatArray] = field(default_factory=list)  # (N,) ul - ur
     held: list[int] = field(default_factory=list)  # features in each frame
-    matched: list[int] = field(default_factory=list)  # features with a right pixel in each frame
-    lived: dict[int, int] = field(default_factory=dict)  # frames that each feature was seen in
-    crossed: dict[int, int] = field(default_factory=dict)  # longest time that each feature spent beyond an edge
-    could_go_on: int = 0  # features whose point is still visible in the next frame
-    went_on: int = 0  # of these, found there within _OUTLIER_PX
-    kept: int = 0  # of these, found there at all
+    matched: list[int] = field(default_factory=list)  # features with a right match in each frame
+    lived: dict[int, int] = field(default_factory=dict)  # number of frames of each feature
+    crossed: dict[int, int] = field(
+        default_factory=dict
+    )  # largest number of consecutive frames of each feature on another surface
+    could_go_on: int = 0  # features whose point is visible in the next frame
+    went_on: int = 0  # of these, tracked there within _OUTLIER_PX
+    kept: int = 0  # of these, tracked there at any error
     corners: int = 0  # repeatable corners
-    corners_held: int = 0  # of these, held by one track in both images
-    reused: int = 0  # ids that came back after they had gone
+    corners_held: int = 0  # of these, covered by one track in both images
+    reused: int = 0  # ids that reappeared after they were lost
     ms: list[float] = field(default_factory=list)
 
 
 @dataclass
 class _Birth:
-    """Where on the scene each feature began, and which nearer surface its pixel's surroundings belong to."""
+    """Scene point of each feature's first observation, and of the nearest surface around its pixel."""
 
     frame: dict[int, int] = field(default_factory=dict)
     surface: dict[int, tuple[int, int]] = field(default_factory=dict)  # own, rim
-    place: dict[int, FloatArray] = field(default_factory=dict)  # (2, 2) m on own, on rim
+    place: dict[int, FloatArray] = field(default_factory=dict)  # (2, 2) m on the own surface, on the rim
     offset: dict[int, FloatArray] = field(default_factory=dict)  # (2,) px from the rim's point to the feature
 
 
-def judge(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Frontend) -> Tally:
-    """Run a front end over rendered frames and compare everything it says with the truth."""
+def evaluate(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Frontend) -> Tally:
+    """Run a front end over rendered frames and compare its outputs with the ground truth."""
     tally, birth, beyond = Tally(), _Birth(), dict[int, int]()
     before: Observations | None = None
     image_before: Image | None = None
@@ -105,13 +107,13 @@ def judge(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Front
         now = now.take(~now.stale)
         _count(tally, output, now, before)
         left, right = views(simulation, int(simulation.taken_ns[frame.index]))
-        _judge_stereo(tally, simulation, now, left, right)
-        _judge_life(tally, birth, beyond, simulation, now, left, frame.index)
+        _evaluate_stereo(tally, simulation, now, left, right)
+        _evaluate_life(tally, birth, beyond, simulation, now, left, frame.index)
         if before is not None and image_before is not None and frame.left is not None:
             last = views(simulation, int(simulation.taken_ns[before.frame_index]))[0]
-            _judge_step(tally, simulation, before, now, last, left)
+            _evaluate_step(tally, simulation, before, now, last, left)
             if frame.index % 5 == 0:
-                _judge_corners(tally, simulation, (before, image_before, last), (now, frame.left, left))
+                _evaluate_corners(tally, simulation, (before, image_before, last), (now, frame.left, left))
         before, image_before = now, frame.left
     return tally
 
@@ -125,7 +127,7 @@ def _count(tally: Tally, output: FrontendOutput, now: Observations, before: Obse
         tally.lived[name] = tally.lived.get(name, 0) + 1
 
 
-def _judge_stereo(tally: Tally, simulation: Simulation, now: Observations, left: View, right: View) -> None:
+def _evaluate_stereo(tally: Tally, simulation: Simulation, now: Observations, left: View, right: View) -> None:
     seen = now.take(now.has_right)
     true, visible = correspondence(simulation.world, left, right, seen.z[:, :2])
     error = seen.z[:, 2:] - true
@@ -134,7 +136,7 @@ def _judge_stereo(tally: Tally, simulation: Simulation, now: Observations, left:
     tally.order.append(seen.z[:, 0] - seen.z[:, 2])
 
 
-def _judge_step(
+def _evaluate_step(
     tally: Tally, simulation: Simulation, before: Observations, now: Observations, last: View, left: View
 ) -> None:
     true, visible = correspondence(simulation.world, last, left, before.z[:, :2])
@@ -147,7 +149,7 @@ def _judge_step(
     tally.went_on += int((open_to[i] & (np.linalg.norm(error, axis=1) <= _OUTLIER_PX)).sum())
 
 
-def _judge_life(
+def _evaluate_life(
     tally: Tally,
     birth: _Birth,
     beyond: dict[int, int],
@@ -156,10 +158,10 @@ def _judge_life(
     left: View,
     frame_index: int,
 ) -> None:
-    """Compare each feature with the point of the scene that it began on.
+    """Compare each feature with the scene point of its first observation.
 
-    A corner on an outline may belong to the surface behind by a fraction of a pixel and yet be a point of the outline:
-    features that began within a few pixels of a nearer surface may follow either.
+    A corner on an outline may be on the background by a fraction of a pixel and yet be a point of the outline: features
+    detected within a few pixels of a nearer surface may follow either surface.
     """
     names = now.ids.tolist()
     if not names:
@@ -183,7 +185,7 @@ def _judge_life(
     tally.age.append(age[old])
     distance = np.linalg.norm(p_world - left.T_world_cam[:3, 3], axis=1)
     elsewhere = np.abs(hits.distance - distance) > _OTHER_DEPTH * distance
-    # Just behind an outline a point is hidden although its feature is hardly off: that is no crossing yet.
+    # Just behind an outline a point is occluded although its feature has a small error: that is not a crossing yet.
     away = elsewhere & ((np.linalg.norm(error, axis=1) > _CROSSED_PX) | ~visible)
     away &= np.linalg.norm(rim_error, axis=1) > _CROSSED_PX
     for name, crossed in zip(names, away.tolist(), strict=True):
@@ -193,7 +195,7 @@ def _judge_life(
 
 
 def _begin(birth: _Birth, names: list[int], surfaces: Surfaces, left: View, uv: FloatArray, frame_index: int) -> None:
-    """Remember what features (N,) at pixels (N, 2) stand on, and the nearest surface around each."""
+    """Store the scene points of features (N,) at pixels (N, 2), and of the nearest surface around each."""
     if not names:
         return
     ring = np.concatenate(
@@ -213,13 +215,13 @@ def _begin(birth: _Birth, names: list[int], surfaces: Surfaces, left: View, uv: 
         birth.offset[name] = -ring[rim]
 
 
-def _judge_corners(
+def _evaluate_corners(
     tally: Tally,
     simulation: Simulation,
     before: tuple[Observations, Image, View],
     now: tuple[Observations, Image, View],
 ) -> None:
-    """Count strong corners that both images show at the same point, and those that one track holds in both."""
+    """Count strong corners that are repeated in both images, and those that one track covers in both."""
     corners, again = _corners(before[1]), _corners(now[1])
     if len(corners) == 0 or len(again) == 0:
         return
@@ -244,11 +246,11 @@ def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
     return out
 
 
-# --- figures --------------------------------------------------------------------------------------------------------
+# --- figures ----------------------------------------------------------------------------------------------------------
 
 
 def figures(tally: Tally) -> dict[str, Any]:
-    """Reduce a tally to plain numbers; errors in pixels, shares from 0 to 1, None where nothing was seen."""
+    """Reduce a tally to plain numbers; errors in pixels, shares from 0 to 1, None without observations."""
     lives = np.array(list(tally.lived.values()) or [0])
     tracked = int((lives > 1).sum())
     crossed = np.array(list(tally.crossed.values()), dtype=int)
@@ -286,7 +288,7 @@ def _joined(parts: Sequence[FloatArray], columns: int) -> FloatArray:
 
 
 def _errors(error: FloatArray) -> dict[str, Any] | None:
-    """Median, 95 % and outlier share of the size of signed errors (N,) or (N, 2), and their signed median."""
+    """Median, 95 % and outlier share of the absolute errors (N,) or (N, 2), and their signed median."""
     if len(error) == 0:
         return None
     size = np.abs(error) if error.ndim == 1 else np.linalg.norm(error, axis=1)
@@ -312,11 +314,11 @@ def measure(scenario: Scenario, config: Config, *, workers: int) -> dict[str, An
     with ParallelRecording(scenario, workers=workers, simulation=simulation) as parallel, one_blas_thread():
         recording: SimulatedRecording = parallel if workers > 1 else SimulatedRecording(simulation)
         frontend = build_frontend(config.frontend.name, rectified_camera(simulation.rig), config.frontend, recording)
-        return figures(judge(simulation, (recording.frame(k) for k in range(len(recording))), frontend))
+        return figures(evaluate(simulation, (recording.frame(k) for k in range(len(recording))), frontend))
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
-    """Lay the figures out as markdown."""
+    """Format the figures as a Markdown table."""
     head = (
         "| conditions | frames | features, stereo | step: median, 95 %, > 1 px | bias u, v "
         "| since birth: median, 95 %, > 1 px | disparity: median, 95 %, > 1 px, bias "
@@ -363,7 +365,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--effect-frames", type=int, default=100, help="under each effect (default 100)")
     parser.add_argument("--width", type=int, metavar="PX", help="image width (default 752)")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--workers", type=int, default=usual_workers(300), help="rendering processes")
+    parser.add_argument("--workers", type=int, default=default_workers(300), help="rendering processes")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write all figures")
     args = parser.parse_args(argv)
     effects = [name for name in args.effects.split(",") if name]
