@@ -1,4 +1,4 @@
-"""`vio calibrate` from end to end: on tracks with an IMU or velocities, and on images that need rectifying."""
+"""`vio calibrate` end to end: tracks with an IMU or velocities, and images that need rectification."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _faults(facts: dict[str, Any]) -> list[str]:
 
 
 def _flight(path: Path, T_cam0_imu: FloatArray, offset_s: float) -> Path:
-    """Tracks and IMU samples of a shaking flight, whose clocks differ and whose extrinsics are said to be something."""
+    """Write tracks and IMU samples of a shaking flight with a clock offset and given extrinsics."""
     flight, rng, end_ns = Shaking(FRAMES), np.random.default_rng(0), (FRAMES - 1) * STEP_NS
     seen = [flight.observe(k, 0.3, rng, 80) for k in range(FRAMES)]
     samples = [s for s in _samples(flight, MsckfSettings(), offset_s, rng) if 0 <= s.time_ns <= end_ns]
@@ -51,20 +51,18 @@ def _flight(path: Path, T_cam0_imu: FloatArray, offset_s: float) -> Path:
     return path
 
 
-def test_an_imu_is_calibrated_from_tracks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_calibrates_an_imu_from_tracks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     facts = _calibrate(capsys, _flight(tmp_path / "flight.npz", T_CAM0_IMU, 0.0), tmp_path / "out")
     assert facts["findings"] == []
     assert rotation_angle_deg(np.array(facts["imu"]["R_cam0_imu"]).T @ T_CAM0_IMU[:3, :3]) < 0.05
     assert abs(facts["imu"]["time_offset_s"]) < 0.3e-3
-    lever, sigma = (np.array(facts["lever_arm"][key]) for key in ("t_cam0_imu", "sigma_m"))
-    assert np.all(np.abs(lever - T_CAM0_IMU[:3, 3]) < 3 * sigma)
+    lever_arm, sigma = (np.array(facts["lever_arm"][key]) for key in ("t_cam0_imu", "sigma_m"))
+    assert np.all(np.abs(lever_arm - T_CAM0_IMU[:3, 3]) < 3 * sigma)
     assert np.all(sigma < 0.03)
     assert rotation_angle_deg(facts["stereo"]["R_cam1_cam0"]) < 0.02
 
 
-def test_inverted_extrinsics_and_late_clocks_are_told_to_people(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_prints_inverted_extrinsics_and_clock_offset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = _flight(tmp_path / "flight.npz", se3_inverse(T_CAM0_IMU), 0.02)
     assert main(["calibrate", str(source), "--out", str(tmp_path / "out"), "--pairs", "2"]) == 0
     out = capsys.readouterr().out
@@ -87,34 +85,34 @@ def test_inverted_extrinsics_and_late_clocks_are_told_to_people(
     ],
     ids=["right", "translation", "both"],
 )
-def test_velocities_tell_inverted_extrinsics(
+def test_reports_inverted_extrinsics_by_velocities(
     T_cam0_imu: FloatArray, faults: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The drive's velocities hold for the step that follows, so they are half a step early; the yaw alone turns."""
+    """The drive's velocities are those of the following step, so they are half a step early; only yaw rotates."""
     arrays = ece276a_arrays(make_drive(60, pixel_sigma=0.3, yaw_rate=1.0))
     arrays["features"], arrays["cam_T_imu"] = arrays["features"][:, ::4], T_cam0_imu
     facts = _calibrate(capsys, make_npz(tmp_path / "drive.npz", arrays), tmp_path / "out")
     assert _faults(facts) == faults
     assert facts["imu"]["time_offset_s"] == pytest.approx(-0.05, abs=0.004)
     assert facts["imu"]["weak"].startswith("rotation about one axis")
-    assert "holds velocities, no accelerometer" in facts["lever_arm"]["verdict"]
+    assert "contains velocities, no accelerometer" in facts["lever_arm"]["verdict"]
 
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An EuRoC folder of distorted images, three seconds."""
+    """Render an EuRoC folder of distorted images, three seconds."""
     out = tmp_path_factory.mktemp("rendered") / "room"
     size = ["--rig", "euroc", "--width", "200", "--rate", "15", "--duration", "3", "--effects", "clean"]
     assert main(["render", "--out", str(out), *size, "--workers", "1"]) == 0
     return out
 
 
-def test_images_that_need_rectifying_are_calibrated(
+def test_calibrates_images_that_need_rectification(
     rendered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     facts = _calibrate(capsys, rendered, tmp_path / "out")
     assert facts["findings"] == []
-    assert "stretches of 1 s" in facts["lever_arm"]["verdict"]
+    assert "windows of 1 s" in facts["lever_arm"]["verdict"]
     given = [yaml.safe_load((rendered / "mav0" / f"cam{k}" / "sensor.yaml").read_text()[10:]) for k in (0, 1)]
     T_imu_cam = [np.reshape(sheet["T_BS"]["data"], (4, 4)) for sheet in given]
     chain = yaml.safe_load((tmp_path / "out" / "camchain-imucam.yaml").read_text())
@@ -127,7 +125,7 @@ def test_images_that_need_rectifying_are_calibrated(
     assert chain["cam0"]["timeshift_cam_imu"] == pytest.approx(facts["imu"]["time_offset_s"])
 
 
-def test_cameras_that_cannot_be_rectified_are_measured_all_the_same(
+def test_measures_cameras_that_cannot_be_rectified(
     rendered: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     swapped = tmp_path / "swapped"
@@ -139,11 +137,11 @@ def test_cameras_that_cannot_be_rectified_are_measured_all_the_same(
     facts = _calibrate(capsys, swapped, tmp_path / "out", pairs=5)
     assert _faults(facts) == ["cameras swapped"]
     assert "the reader refuses this calibration" in facts["notes"][0]
-    assert "must be mended first" in facts["imu"]["verdict"]
+    assert "must be corrected first" in facts["imu"]["verdict"]
 
 
 @pytest.mark.parametrize("option", [("--pairs", "0"), ("--frames", "1")])
-def test_numbers_that_measure_nothing_are_refused(
+def test_rejects_numbers_that_are_too_small(
     option: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["calibrate", str(tmp_path), *option]) == 1

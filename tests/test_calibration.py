@@ -1,4 +1,4 @@
-"""Estimates against exact synthetic motion; verdicts where the data leaves a value open; faults found by name."""
+"""Estimates against exact synthetic motion; unobservable values; faults of given calibrations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vio.calibration.egomotion import CameraMotion, camera_motion
 from vio.calibration.findings import NotObservable
 from vio.calibration.gyro import align_gyro
 from vio.calibration.inertial import ImuAlignment, rates_of
-from vio.calibration.levers import LeverArm, lever_arm
+from vio.calibration.lever_arm import LeverArm, estimate_lever_arm
 from vio.calibration.stereo import (
     RayMatches,
     StereoEstimate,
@@ -82,7 +82,7 @@ def test_exact_rays_have_no_epipolar_angle() -> None:
     assert np.median(np.abs(turned)) == pytest.approx(0.01, rel=0.1), "a pitch of 10 mrad moves every ray off by that"
 
 
-def test_stereo_extrinsics_come_out_with_honest_deviations(estimate: StereoEstimate) -> None:
+def test_stereo_extrinsics_have_consistent_standard_deviations(estimate: StereoEstimate) -> None:
     turn = float(rotation_angle_deg(estimate.R_cam1_cam0 @ T_CAM0_CAM1[:3, :3]))
     swing = np.degrees(np.linalg.norm(np.cross(estimate.direction, _direction(T_CAM0_CAM1))))
     assert turn < max(0.05, 4 * estimate.rotation_sigma_deg)
@@ -101,7 +101,7 @@ def test_stereo_extrinsics_come_out_with_honest_deviations(estimate: StereoEstim
     ],
     ids=["few", "two pairs", "far away"],
 )
-def test_what_the_matches_leave_open_is_no_number(matches: RayMatches, because: str) -> None:
+def test_unobservable_extrinsics_give_a_reason(matches: RayMatches, because: str) -> None:
     found = refine_stereo(matches, T_CAM0_CAM1[:3, :3].T, _direction(T_CAM0_CAM1))
     assert isinstance(found, NotObservable)
     assert "not observable because" in str(found)
@@ -125,7 +125,7 @@ def _changed(turn_deg: tuple[float, float, float] = (0, 0, 0), sign: float = 1.0
     ],
     ids=["right", "pitch", "yaw", "roll", "translation", "inverse", "direction"],
 )
-def test_a_wrong_stereo_calibration_is_named(
+def test_reports_a_wrong_stereo_calibration(
     estimate: StereoEstimate, matches: RayMatches, given: FloatArray, faults: list[str]
 ) -> None:
     findings = judge_stereo(estimate, given, matches)
@@ -134,7 +134,7 @@ def test_a_wrong_stereo_calibration_is_named(
         assert "off by 1.0" in findings[0].detail or "off by 0.9" in findings[0].detail
 
 
-def test_exchanged_images_are_named(matches: RayMatches) -> None:
+def test_reports_exchanged_images(matches: RayMatches) -> None:
     swapped = RayMatches(matches.pair, matches.ray1, matches.ray0)
     inverse = se3_inverse(T_CAM0_CAM1)
     found = refine_stereo(swapped, inverse[:3, :3].T, _direction(inverse))
@@ -144,7 +144,7 @@ def test_exchanged_images_are_named(matches: RayMatches) -> None:
     assert judge_exchange(matches, swapped, T_CAM0_CAM1) == ()
 
 
-def test_stretches_of_video_are_averaged_or_refused(estimate: StereoEstimate) -> None:
+def test_stretches_of_video_are_averaged_or_rejected(estimate: StereoEstimate) -> None:
     def stretch(yaw_deg: float) -> tuple[FloatArray, FloatArray]:
         return so3_exp(np.radians([0, yaw_deg, 0])) @ T_CAM0_CAM1[:3, :3].T, _direction(T_CAM0_CAM1)
 
@@ -153,11 +153,11 @@ def test_stretches_of_video_are_averaged_or_refused(estimate: StereoEstimate) ->
     assert joined.stretches == 3
     assert float(rotation_angle_deg(joined.R_cam1_cam0 @ T_CAM0_CAM1[:3, :3])) < 1e-6
     assert joined.rotation_sigma_deg == pytest.approx(0.02 / np.sqrt(3), rel=1e-3)
-    assert combine_stereo(estimate, [stretch(0.0)] * 2) is None, "two stretches have no spread to speak of"
+    assert combine_stereo(estimate, [stretch(0.0)] * 2) is None, "two stretches are too few for a spread"
     assert combine_stereo(estimate, [stretch(y) for y in (2.0, -2.0, 0.0)]) is None
 
 
-def test_rows_are_described_over_the_image() -> None:
+def test_row_residuals_are_resolved_over_the_image() -> None:
     rng = np.random.default_rng(1)
     ul, v = rng.uniform(100, 640, 4000), rng.uniform(0, 480, 4000)
     slope = 0.001 * (ul - 320)
@@ -179,7 +179,7 @@ RATE_HZ = 20.0
 
 
 def _seen(spline: MotionSpline, *, noise: float = 1.0) -> CameraMotion:
-    """The camera's exact twists with noise like that of stereo tracks."""
+    """Return the camera's exact twists with noise like that of stereo tracks."""
     times_ns = np.arange(spline.start_ns + 200_000_000, spline.end_ns - 200_000_000, int(1e9 / RATE_HZ))
     state = evaluate(spline, times_ns)
     T_world_cam = state.T_world_imu @ se3_inverse(T_CAM0_IMU)
@@ -209,7 +209,7 @@ def samples(spline: MotionSpline) -> tuple[ImuSample, ...]:
 
 
 @pytest.mark.parametrize("shift_ms", [0.0, 10.0, -35.0])
-def test_gyro_and_camera_give_rotation_offset_and_lever(
+def test_estimates_rotation_offset_and_lever_arm(
     spline: MotionSpline, samples: tuple[ImuSample, ...], shift_ms: float
 ) -> None:
     late = tuple(replace(s, time_ns=s.time_ns + int(shift_ms * 1e6)) for s in samples)
@@ -219,19 +219,19 @@ def test_gyro_and_camera_give_rotation_offset_and_lever(
     assert found.weak is None
     assert float(rotation_angle_deg(found.R_cam0_imu @ T_CAM0_IMU[:3, :3].T)) < 0.1
     assert 1e3 * found.time_offset_s == pytest.approx(shift_ms, abs=0.5)
-    lever = lever_arm(motion, rates, found)
-    assert isinstance(lever, LeverArm)
-    np.testing.assert_allclose(lever.t_cam0_imu, T_CAM0_IMU[:3, 3], atol=0.01)
-    assert (np.abs(lever.t_cam0_imu - T_CAM0_IMU[:3, 3]) < 5 * lever.sigma_m + 1e-3).all()
-    faults = [f.fault for f in judge_imu(found, lever, T_CAM0_IMU)]
+    lever_arm = estimate_lever_arm(motion, rates, found)
+    assert isinstance(lever_arm, LeverArm)
+    np.testing.assert_allclose(lever_arm.t_cam0_imu, T_CAM0_IMU[:3, 3], atol=0.01)
+    assert (np.abs(lever_arm.t_cam0_imu - T_CAM0_IMU[:3, 3]) < 5 * lever_arm.sigma_m + 1e-3).all()
+    faults = [f.fault for f in judge_imu(found, lever_arm, T_CAM0_IMU)]
     assert faults == ([] if shift_ms == 0 else ["clocks apart"])
 
 
-def test_a_wrong_imu_calibration_is_named(spline: MotionSpline, samples: tuple[ImuSample, ...]) -> None:
+def test_reports_a_wrong_imu_calibration(spline: MotionSpline, samples: tuple[ImuSample, ...]) -> None:
     motion, rates = _seen(spline), rates_of(samples)
     found = align_gyro(motion, rates)
     assert isinstance(found, ImuAlignment)
-    lever = lever_arm(motion, rates, found)
+    lever_arm = estimate_lever_arm(motion, rates, found)
     R, t = T_CAM0_IMU[:3, :3], T_CAM0_IMU[:3, 3]
     for given, fault in (
         (se3_from_parts(so3_exp(np.radians([0, 1, 0])) @ R, t), "IMU-camera rotation wrong"),
@@ -240,18 +240,18 @@ def test_a_wrong_imu_calibration_is_named(spline: MotionSpline, samples: tuple[I
         (se3_from_parts(R, -R.T @ t), "IMU-camera translation inverted"),
         (se3_from_parts(R, t + np.array([0, 0.2, 0.3])), "IMU-camera translation wrong"),
     ):
-        assert [f.fault for f in judge_imu(found, lever, given)] == [fault]
+        assert [f.fault for f in judge_imu(found, lever_arm, given)] == [fault]
 
 
-def test_a_camera_that_does_not_turn_aligns_nothing(samples: tuple[ImuSample, ...], spline: MotionSpline) -> None:
+def test_alignment_is_unobservable_without_rotation(samples: tuple[ImuSample, ...], spline: MotionSpline) -> None:
     motion = _seen(spline)
     straight = replace(motion, twists=motion.twists * [1, 1, 1, 0, 0, 0])
     found = align_gyro(straight, rates_of(samples))
     assert isinstance(found, NotObservable)
-    assert str(found).endswith("not observable because the camera does not turn")
+    assert str(found).endswith("not observable because the camera does not rotate")
 
 
-def test_one_axis_of_turning_leaves_the_rotation_about_it_open() -> None:
+def test_rotation_about_one_axis_leaves_the_alignment_about_it_unobservable() -> None:
     rng = np.random.default_rng(0)
     times_ns = np.arange(0, 20_000_000_000, 50_000_000)
     rate = 0.5 * np.sin(1.3 * 1e-9 * times_ns)
@@ -270,11 +270,11 @@ def test_one_axis_of_turning_leaves_the_rotation_about_it_open() -> None:
     assert isinstance(found, ImuAlignment)
     assert found.weak is not None
     assert "rotation about one axis" in found.weak
-    lever = lever_arm(motion, rates_of(samples), found)
-    assert isinstance(lever, NotObservable)
+    lever_arm = estimate_lever_arm(motion, rates_of(samples), found)
+    assert isinstance(lever_arm, NotObservable)
 
 
-def test_no_tracks_no_motion_and_no_sensor_no_rates() -> None:
+def test_rejects_missing_tracks_and_missing_samples() -> None:
     none = feature_tracks({}, 5)
     found = camera_motion(StereoCamera(400, 400, 320, 240, 0.1), none, np.arange(5) * 1_000_000_000)
     assert isinstance(found, NotObservable)

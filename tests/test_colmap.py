@@ -1,4 +1,4 @@
-"""Models as pycolmap reads them, refinement of simulated runs, and the commands that stand on both."""
+"""Models read back by pycolmap, refinement of simulated runs, and the commands `check`, `refine` and `export`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def simulation() -> Simulation:
 
 
 def _make_run(simulation: Simulation, folder: Path, *, stop: int | None = None, lost_after: int | None = None) -> Path:
-    """A run's folder from exact geometry with noise, without rendering."""
+    """Make a run's folder from exact geometry with noise, without rendering."""
     settings = OracleSettings(max_features=120, sigma_px=SIGMA_PX, outlier_fraction=0.02, max_track_length=lost_after)
     dataset = SimulatedRecording(simulation)
     config = replace(Config(), backend="vislam", motion="none")
@@ -93,7 +93,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
 # --- keyframes, points, poses ---------------------------------------------------------------------------------------
 
 
-def test_keyframes_span_the_run_and_obey_their_limit(saved: TrackedPath) -> None:
+def test_keyframes_span_the_run_and_respect_their_limit(saved: TrackedPath) -> None:
     every = choose_keyframes(saved)
     few = choose_keyframes(saved, most=8)
     assert 2 < len(few) <= 8 < len(every)
@@ -117,7 +117,7 @@ def test_points_of_exact_pixels_are_exact(saved: TrackedPath) -> None:
     assert np.abs(residual).max() < 1e-5
 
 
-def test_a_pose_comes_back_from_points(saved: TrackedPath) -> None:
+def test_recovers_a_pose_from_points(saved: TrackedPath) -> None:
     rng = np.random.default_rng(0)
     p_world = rng.uniform([-3, -2, 3], [3, 2, 9], (60, 3))
     T_world_cam0 = se3_exp([0.2, -0.1, 0.3, 0.05, -0.1, 0.02])
@@ -152,7 +152,7 @@ def test_covariances_of_positions_and_points_match_sampling(saved: TrackedPath) 
 # --- models ---------------------------------------------------------------------------------------------------------
 
 
-def test_a_model_projects_as_our_camera_does_but_for_half_a_pixel(saved: TrackedPath, tmp_path: Path) -> None:
+def test_a_model_projects_as_our_camera_with_an_offset_of_half_a_pixel(saved: TrackedPath, tmp_path: Path) -> None:
     keyframes = choose_keyframes(saved, most=8)
     T = saved.trajectory.T_world_body[keyframes]
     tracks = build_tracks(saved, keyframes, T)
@@ -186,7 +186,7 @@ def test_a_model_projects_as_our_camera_does_but_for_half_a_pixel(saved: Tracked
 
 
 @pytest.mark.parametrize("stamped", [False, True])
-def test_a_model_is_read_as_a_trajectory(saved: TrackedPath, tmp_path: Path, stamped: bool) -> None:
+def test_reads_a_model_as_a_trajectory(saved: TrackedPath, tmp_path: Path, stamped: bool) -> None:
     keyframes = choose_keyframes(saved, most=6)
     T = saved.trajectory.T_world_body[keyframes]
     tracks = build_tracks(saved, keyframes, T)
@@ -211,7 +211,7 @@ def test_a_model_is_read_as_a_trajectory(saved: TrackedPath, tmp_path: Path, sta
 # --- refinement -----------------------------------------------------------------------------------------------------
 
 
-def test_refine_lowers_the_error_and_leaves_the_run_as_it_was(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refine_lowers_the_error_and_does_not_change_the_run(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = _contents(folder)
     first = _json(capsys, "refine", str(folder))
     after = _contents(folder)
@@ -221,25 +221,25 @@ def test_refine_lowers_the_error_and_leaves_the_run_as_it_was(folder: Path, caps
     assert first["ate_m"] < 0.9 * first["ate_before_m"]
     assert first["sigma_px"] == pytest.approx(SIGMA_PX, rel=0.2)
     again = _json(capsys, "refine", str(folder))
-    assert again["ate_m"] == first["ate_m"], "one thread repeats to the bit"
+    assert again["ate_m"] == first["ate_m"], "one thread is bit-identical"
     assert _contents(folder)["refined/trajectory.tum"] == after["refined/trajectory.tum"]
     scores = _json(capsys, "eval", str(folder / "refined"), str(folder))
     assert 0 < float(str(scores["ate_m"])) < 2 * first["ate_before_m"]
 
 
-def test_priors_need_a_filter_that_repeats_itself(
+def test_priors_need_a_filter_that_reproduces_the_run(
     folder: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     held = _json(capsys, "refine", str(folder), "--priors", "filter", "--keyframes", "12")
     assert held["priors"] == "filter"
     free = _json(capsys, "refine", str(folder), "--keyframes", "12")
-    assert float(str(held["moved_rms_m"])) < float(str(free["moved_rms_m"])), "priors hold on to the filter"
+    assert float(str(held["moved_rms_m"])) < float(str(free["moved_rms_m"])), "priors keep the poses near the filter's"
     config = (folder / "config.yaml").read_text()
     assert "pixel_sigma_px: 0.75" in config
     (folder / "config.yaml").write_text(config.replace("pixel_sigma_px: 0.75", "pixel_sigma_px: 2.5"))
     other = _json(capsys, "refine", str(folder), "--priors", "filter", "--keyframes", "12")
     assert other["priors"] == "none"
-    assert "does not repeat" in caplog.text
+    assert "does not reproduce" in caplog.text
 
 
 def test_an_interrupted_refinement_leaves_nothing(
@@ -250,19 +250,19 @@ def test_an_interrupted_refinement_leaves_nothing(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vio.run_folder.landmarks_ply", interrupted)  # in the midst of writing
+    monkeypatch.setattr("vio.run_folder.landmarks_ply", interrupted)  # while writing
     assert main(["refine", str(folder)]) == 130
     capsys.readouterr()
     assert _contents(folder) == before
     assert sorted(p.name for p in folder.parent.iterdir()) == ["run"]
 
 
-def test_what_cannot_be_refined_is_said(
+def test_refine_reports_unusable_runs(
     simulation: Simulation, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "no run folder" in _error(capsys, "refine", str(tmp_path))
     short = _make_run(simulation, tmp_path / "short", stop=1)
-    assert "a run of 1 frames has no two views" in _error(capsys, "refine", str(short))
+    assert "a run of 1 frames has fewer than two views" in _error(capsys, "refine", str(short))
     blink = _make_run(simulation, tmp_path / "blink", stop=20, lost_after=1)
     message = _error(capsys, "refine", str(blink))
     assert "not observable because no feature is seen consistently in 2 keyframes" in message
@@ -296,10 +296,10 @@ def test_export_without_images_is_a_reference_for_eval(folder: Path, capsys: pyt
     assert float(str(refined["mean_reprojection_error_px"])) < float(str(facts["mean_reprojection_error_px"]))
 
 
-def test_export_wants_images_and_says_so(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_export_reports_missing_images(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "name the recording with --source" in _error(capsys, "export", "colmap", str(folder))
     assert not (folder / "colmap").exists()
-    assert "make it with `vio refine" in _error(capsys, "export", "colmap", str(folder), "--refined")
+    assert "create it with `vio refine" in _error(capsys, "export", "colmap", str(folder), "--refined")
 
 
 # --- rendered images ------------------------------------------------------------------------------------------------
@@ -307,7 +307,7 @@ def test_export_wants_images_and_says_so(folder: Path, capsys: pytest.CaptureFix
 
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A KITTI folder of 14 rendered frames, and a run on it with exact tracks."""
+    """Make a KITTI folder of 14 rendered frames, and a run on it with exact tracks."""
     place = tmp_path_factory.mktemp("rendered")
     motion = hand_held(duration_s=5.0, seed=2)
     plan = simulate(room(1, texel_m=0.006), small_rig(320, 200), motion, rate_hz=3.0, effects=CLEAN, seed=1)
@@ -339,7 +339,7 @@ def test_export_writes_images_and_colours(
     assert np.corrcoef(mine[:, 0], theirs[:, 0])[0, 1] > 0.9, "COLMAP finds the same colours at the same places"
 
 
-def test_check_agrees_with_a_good_run_and_gives_the_scale(
+def test_check_agrees_with_a_correct_run_and_estimates_the_scale(
     rendered: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     report = _json(capsys, "check", str(rendered[1]), "--mapper", "incremental", "--keyframes", "9")
@@ -351,7 +351,7 @@ def test_check_agrees_with_a_good_run_and_gives_the_scale(
     assert sorted(p.name for p in (rendered[1] / "check").iterdir()) == ["check.json", "check.png", "incremental"]
 
 
-def test_images_without_texture_give_a_verdict_not_a_number(
+def test_images_without_texture_are_not_observable(
     rendered: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     blank = tmp_path / "blank"
@@ -369,7 +369,7 @@ def test_images_without_texture_give_a_verdict_not_a_number(
     assert facts["findings"] == []
 
 
-def test_calibrate_measures_rectified_images_and_finds_swapped_ones(
+def test_calibrate_measures_rectified_images_and_reports_swapped_ones(
     rendered: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "cal"
@@ -391,7 +391,7 @@ def test_calibrate_measures_rectified_images_and_finds_swapped_ones(
 # --- comparison -----------------------------------------------------------------------------------------------------
 
 
-def test_a_comparison_finds_scale_and_the_place_of_a_jump(saved: TrackedPath) -> None:
+def test_comparison_estimates_the_scale_and_locates_a_jump(saved: TrackedPath) -> None:
     rows = choose_keyframes(saved, most=30)
     rng = np.random.default_rng(2)
     T = saved.trajectory.T_world_body[rows].copy()
@@ -409,7 +409,7 @@ def test_a_comparison_finds_scale_and_the_place_of_a_jump(saved: TrackedPath) ->
     assert found.segments[0].difference_m == pytest.approx(0.05, rel=0.2)
 
 
-def test_both_are_compared_with_ground_truth_where_there_is_one(saved: TrackedPath) -> None:
+def test_comparison_evaluates_both_against_ground_truth(saved: TrackedPath) -> None:
     rows = choose_keyframes(saved, most=30)
     longer = saved.trajectory.T_world_body[rows].copy()
     longer[:, :3, 3] *= 1.02
@@ -434,13 +434,13 @@ def test_pure_rotation_has_no_scale(saved: TrackedPath) -> None:
     assert "does not move" in found.why_no_scale
 
 
-def test_a_run_without_right_matches_says_why(saved: TrackedPath) -> None:
-    blind = replace(saved, tracks=replace(saved.tracks, has_right=np.zeros_like(saved.tracks.has_right)))
+def test_rejects_a_run_without_right_matches(saved: TrackedPath) -> None:
+    without_right = replace(saved, tracks=replace(saved.tracks, has_right=np.zeros_like(saved.tracks.has_right)))
     with pytest.raises(EstimationError, match="not observable because no feature has a right match"):
-        choose_keyframes(blind)
+        choose_keyframes(without_right)
 
 
-def test_a_kitti_folder_of_noise_is_not_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_noise_images_are_not_calibrated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = make_kitti(tmp_path / "kitti")
     facts = _json(capsys, "calibrate", str(source), "--out", str(tmp_path / "cal"), "--pairs", "3", "--frames", "4")
     assert "not observable because" in facts["stereo"]["verdict"]  # type: ignore[index]

@@ -1,4 +1,4 @@
-"""The watch over a run: silent on sane runs, one line per event on others."""
+"""Run monitoring: no output on plausible runs, one line per event on others."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ def _lines(reports: list[UpdateReport]) -> list[str]:
     return [line for k, report in enumerate(reports) for line in health.frame(k, report, _estimate(k))]
 
 
-def test_a_sane_run_is_silent() -> None:
-    assert _lines([GOOD] * 50 + [EMPTY] * 10 + [GOOD] * 50) == []  # half a second without features is nothing
+def test_a_plausible_run_gives_no_warning() -> None:
+    assert _lines([GOOD] * 50 + [EMPTY] * 10 + [GOOD] * 50) == []  # half a second without features is tolerated
 
 
-def test_missing_features_are_said_when_they_stay_away_and_when_they_come_back() -> None:
+def test_reports_when_features_are_missing_and_when_they_are_back() -> None:
     gone, back = _lines([GOOD] * 10 + [EMPTY] * 45 + [GOOD] * 10)
     assert "no usable feature since frame 9" in gone
-    assert "uncertain by 0.02 m" in gone
+    assert "standard deviation of its position is 0.02 m" in gone
     assert back == "frame 55: features again, after 2.3 s without"
 
 
-def test_new_landmarks_alone_do_not_end_a_blackout() -> None:
+def test_new_landmarks_alone_do_not_end_a_gap_without_features() -> None:
     fresh = replace(EMPTY, initialised=5)
     _, back = _lines([GOOD] * 10 + [EMPTY] * 30 + [fresh] * 10 + [GOOD])
     assert back == "frame 50: features again, after 2.1 s without"
 
 
-def test_two_blackouts_are_two_events() -> None:
+def test_two_gaps_without_features_are_two_events() -> None:
     assert len(_lines([GOOD] * 5 + [EMPTY] * 30 + [GOOD] * 5 + [EMPTY] * 30 + [GOOD])) == 4
 
 
-def test_rejecting_most_features_for_long_is_said_once() -> None:
+def test_reports_once_that_most_features_are_rejected() -> None:
     bad = replace(GOOD, used=10, gated=40)
     (line,) = _lines([GOOD] * 5 + [bad] * 60)
     assert line.startswith("frame 24: more features rejected than used for 20 frames")
@@ -55,17 +55,17 @@ def test_rejecting_most_features_for_long_is_said_once() -> None:
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "message"),
     [
         ({"x": 400.0}, "the estimate moves at"),
         ({"gyro_bias": np.array([0.0, 0.9, 0.0])}, "gyro bias is estimated as 0.9 rad/s"),
         ({"accel_bias": np.array([0.0, 0.0, -6.0])}, "accelerometer bias is estimated as 6 m/s^2"),
     ],
 )
-def test_a_state_no_vehicle_has_is_said_once(more: dict[str, object], said: str) -> None:
+def test_reports_an_implausible_state_once(more: dict[str, object], message: str) -> None:
     health = RunHealth()
     assert health.frame(0, GOOD, _estimate(0)) == ()
     (line,) = health.frame(1, GOOD, _estimate(1, **more))  # type: ignore[arg-type]
-    assert said in line
+    assert message in line
     assert "diverged" in line
     assert health.frame(2, GOOD, _estimate(2, **more)) == ()  # type: ignore[arg-type]

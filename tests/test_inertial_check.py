@@ -1,4 +1,4 @@
-"""The watch over the IMU: every fault gives its own finding, good data none."""
+"""IMU check: every fault gives its own finding, correct data none."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, t
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import ImuSample, Observations, observations
 from vio.sim.imu import ImuNoise, simulate_imu
-from vio.sim.motion import MotionSpline, car_loop, evaluate, fit_spline, hand_held, turned
+from vio.sim.motion import MotionSpline, car_loop, evaluate, fit_spline, hand_held, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_rectified_rig, small_rig
 from vio.trajectory_io import read_trajectory
 from vio.watch.clocks import judge_clocks
@@ -29,12 +29,12 @@ _FRAME_NS = 50_000_000
 
 @dataclass(frozen=True)
 class Watched:
-    """A recording as the check sees it."""
+    """A recording as input of the check."""
 
     camera: StereoCamera
     T_cam0_imu: FloatArray
     samples: list[ImuSample]
-    gravity: list[FloatArray]  # (3,) each sample's part that is due to gravity
+    gravity: list[FloatArray]  # (3,) each sample's component due to gravity
     frames: list[Observations]
 
 
@@ -84,7 +84,7 @@ def _recording(name: str, seed: int = 0, mount: str = "euroc") -> Watched:
     if name == "car":
         motion = car_loop(duration_s=25, start_m=25, seed=seed)
     if mount == "euroc":
-        motion = turned(motion, R_FLU_EUROC_IMU)
+        motion = rotate_body_axes(motion, R_FLU_EUROC_IMU)
     imu = simulate_imu(motion, noise=ImuNoise(), seed=seed)
     times = np.arange(motion.start_ns, motion.end_ns, _FRAME_NS)
     T_cam0_imu = se3_inverse(rig.T_imu_cam0)
@@ -153,14 +153,14 @@ def _shifted(it: Watched, seconds: float) -> list[ImuSample]:
     return [replace(s, time_ns=s.time_ns + round(seconds * 1e9)) for s in it.samples]
 
 
-# Good data
+# Correct data
 
 
 @pytest.mark.parametrize("mount", ["euroc", "forward"])
 @pytest.mark.parametrize(
     ("name", "seed"), [("room", 0), ("room", 1), ("slow", 2), ("late", 3), ("still", 4), ("car", 5)]
 )
-def test_good_recording_gives_no_finding(name: str, seed: int, mount: str) -> None:
+def test_correct_recording_gives_no_finding(name: str, seed: int, mount: str) -> None:
     assert _watch(_recording(name, seed, mount)) == []
 
 
@@ -198,7 +198,7 @@ def test_poor_sensor_gives_no_finding() -> None:
 # Units, signs, axes
 
 _CYCLE = np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]])
-_SPOILED: dict[str, tuple[Callable[[Watched], list[ImuSample]], list[str], str]] = {
+_CORRUPTED: dict[str, tuple[Callable[[Watched], list[ImuSample]], list[str], str]] = {
     "g": (lambda it: _accel(it, lambda a: a / 9.80665), ["accelerometer units"], "in g: multiply by 9.81"),
     "mg": (lambda it: _accel(it, lambda a: a / 9.80665e-3), ["accelerometer units"], "mg"),
     "odd": (lambda it: _accel(it, lambda a: a * 5), ["accelerometer units"], "the unit or scale is unknown"),
@@ -222,11 +222,11 @@ _SPOILED: dict[str, tuple[Callable[[Watched], list[ImuSample]], list[str], str]]
 
 
 @pytest.mark.parametrize(("seed", "mount"), [(0, "euroc"), (1, "forward")])
-@pytest.mark.parametrize("name", _SPOILED)
-def test_spoiled_samples_give_exactly_their_finding(name: str, seed: int, mount: str) -> None:
-    spoil, faults, words = _SPOILED[name]
+@pytest.mark.parametrize("name", _CORRUPTED)
+def test_corrupted_samples_give_exactly_their_finding(name: str, seed: int, mount: str) -> None:
+    corrupt, faults, words = _CORRUPTED[name]
     it = _recording("room", seed, mount)
-    found = _watch(it, samples=spoil(it))
+    found = _watch(it, samples=corrupt(it))
     assert _faults(found) == faults
     assert words in found[0].explanation + found[0].seen
     assert all("\n" not in f.message and f.seen in f.message and f.explanation in f.message for f in found)
@@ -244,25 +244,25 @@ def test_biased_accelerations_without_gravity_are_not_taken_for_g() -> None:
 
 @pytest.mark.parametrize("name", ["degrees", "left-handed", "inverted accelerometer", "no gravity"])
 def test_slow_motion_is_enough(name: str) -> None:
-    spoil, faults, _ = _SPOILED[name]
+    corrupt, faults, _ = _CORRUPTED[name]
     it = _recording("slow", 2)
-    assert _faults(_watch(it, samples=spoil(it))) == faults
+    assert _faults(_watch(it, samples=corrupt(it))) == faults
 
 
-def test_degrees_are_told_after_two_seconds_when_the_run_ends() -> None:
+def test_reports_degrees_when_the_run_ends_after_two_seconds() -> None:
     it = _recording("room")
     assert _faults(_watch(it, samples=_gyro(it, np.degrees), frames=it.frames[:40])) == ["gyro units"]
 
 
-def test_nothing_is_claimed_of_motion_at_rest() -> None:
+def test_standstill_gives_no_finding_about_motion() -> None:
     it = _recording("still", 4)
-    rest = [f for f in it.frames if f.time_ns < 9_900_000_000]
-    for spoil in ("degrees", "left-handed", "cycled gyro"):
-        assert _watch(it, samples=_SPOILED[spoil][0](it), frames=rest) == []
-    assert _faults(_watch(it, samples=_SPOILED["g"][0](it), frames=rest)) == ["accelerometer units"]
-    hint = _watch(it, samples=_SPOILED["inverted accelerometer"][0](it), frames=rest)
+    standstill = [f for f in it.frames if f.time_ns < 9_900_000_000]
+    for corrupt in ("degrees", "left-handed", "cycled gyro"):
+        assert _watch(it, samples=_CORRUPTED[corrupt][0](it), frames=standstill) == []
+    assert _faults(_watch(it, samples=_CORRUPTED["g"][0](it), frames=standstill)) == ["accelerometer units"]
+    hint = _watch(it, samples=_CORRUPTED["inverted accelerometer"][0](it), frames=standstill)
     assert _faults(hint) == ["upside down"]
-    assert "too small to tell" in hint[0].explanation
+    assert "too small to decide" in hint[0].explanation
     assert not hint[0].certain
 
 
@@ -270,8 +270,8 @@ def test_nothing_is_claimed_of_motion_at_rest() -> None:
 
 
 @pytest.mark.parametrize("mount", ["euroc", "forward"])
-def test_extrinsics_are_told_from_gyro_and_accelerometer(mount: str) -> None:
-    """The inverse of either mount only exchanges axes, as a wrongly wired gyro does; the accelerometer tells."""
+def test_distinguishes_wrong_extrinsics_from_a_wrong_gyro(mount: str) -> None:
+    """The inverse of either mount only exchanges axes, as a miswired gyro does; the accelerometer decides."""
     it = _recording("room", 0, mount)
     T = it.T_cam0_imu
     assert _faults(_watch(it, T_cam0_imu=se3_inverse(T))) == ["extrinsics inverted"]
@@ -280,10 +280,10 @@ def test_extrinsics_are_told_from_gyro_and_accelerometer(mount: str) -> None:
     assert str(np.round(T[0, 1], 1)) in identity[0].explanation
     turned_by = _watch(it, T_cam0_imu=T @ se3_exp([0, 0, 0, 0.3, 0.4, -0.1]))
     assert _faults(turned_by) == ["extrinsics rotation"]
-    assert "lies 29 deg" in turned_by[0].seen
+    assert "is 29 deg" in turned_by[0].seen
 
 
-def test_a_mirrored_frame_that_no_exchange_of_axes_explains_is_told() -> None:
+def test_reports_a_mirrored_frame_that_no_exchange_of_axes_explains() -> None:
     it = _recording("room")
     across = np.array([0.5, 0.3, 0.8]) / np.linalg.norm([0.5, 0.3, 0.8])
     found = _watch(it, samples=_gyro(it, lambda w: w - 2 * across * (across @ w)))
@@ -291,12 +291,12 @@ def test_a_mirrored_frame_that_no_exchange_of_axes_explains_is_told() -> None:
     assert "a mirrored frame fits" in found[0].seen
 
 
-def test_small_errors_of_extrinsics_are_left_to_calibration() -> None:
+def test_small_errors_of_extrinsics_give_no_finding() -> None:
     it = _recording("room")
     assert _watch(it, T_cam0_imu=it.T_cam0_imu @ se3_exp([0.01, 0.02, 0, 0.03, 0.03, -0.03])) == []
 
 
-def test_degrees_and_inverted_extrinsics_are_both_told() -> None:
+def test_reports_both_degrees_and_inverted_extrinsics() -> None:
     it = _recording("room")
     found = _watch(it, samples=_gyro(it, np.degrees), T_cam0_imu=se3_inverse(it.T_cam0_imu))
     assert _faults(found) == ["extrinsics inverted", "gyro units"]
@@ -305,7 +305,7 @@ def test_degrees_and_inverted_extrinsics_are_both_told() -> None:
 # Clocks
 
 
-def test_offset_of_the_clocks_is_measured() -> None:
+def test_estimates_the_clock_offset() -> None:
     it = _recording("room")
     for seconds in (0.05, -1.3):
         found = _watch(it, samples=_shifted(it, seconds))
@@ -314,11 +314,11 @@ def test_offset_of_the_clocks_is_measured() -> None:
     assert _watch(it, samples=_shifted(it, 0.005)) == []
 
 
-def test_no_sample_among_the_frames_is_said_before_a_filter_gives_up() -> None:
+def test_reports_missing_samples_before_a_filter_fails() -> None:
     it = _recording("room")
     check = InertialCheck(it.camera, it.T_cam0_imu)
-    said = [k for k, seen in enumerate(it.frames[:20]) if check.frame(seen)]
-    assert said == [9]
+    reported = [k for k, seen in enumerate(it.frames[:20]) if check.frame(seen)]
+    assert reported == [9]
     assert check.finish() == ()
     check = InertialCheck(it.camera, it.T_cam0_imu)
     for sample in it.samples[:100]:
@@ -329,7 +329,7 @@ def test_no_sample_among_the_frames_is_said_before_a_filter_gives_up() -> None:
     assert "epochs" in found[0].explanation
 
 
-def test_part_of_the_frames_without_samples_is_counted() -> None:
+def test_reports_the_share_of_frames_without_samples() -> None:
     it = _recording("room")
     found = _watch(it, samples=[s for s in it.samples if s.time_ns < 15_000_000_000])
     assert _faults(found) == ["clocks overlap in part"]
@@ -346,13 +346,13 @@ _IMU_NS = _EPOCH + np.arange(4000) * 5_000_000
     [
         (_IMU_NS // 1000, "clocks without overlap", "1e+3 the IMU's stamps cover the frames"),
         (_IMU_NS // 10**6, "clocks without overlap", "milliseconds"),
-        (_IMU_NS - _EPOCH, "clocks without overlap", "other epochs"),
+        (_IMU_NS - _EPOCH, "clocks without overlap", "different epochs"),
         (_IMU_NS[:0], "clocks without overlap", "epoch"),
         (_IMU_NS[:1000], "clocks overlap in part", "cut short"),
         ((_IMU_NS - _EPOCH) // 1000 + _EPOCH, "clocks overlap in part", ""),
     ],
 )
-def test_clocks_are_judged_by_their_stamps(imu_ns: np.ndarray, fault: str, words: str) -> None:
+def test_finds_clock_faults_by_the_stamps(imu_ns: np.ndarray, fault: str, words: str) -> None:
     (finding,) = judge_clocks(_CAMERA_NS, imu_ns)
     assert finding.fault == fault
     assert words in finding.explanation
@@ -365,10 +365,10 @@ def test_clocks_that_agree_give_no_finding() -> None:
     assert judge_clocks(_CAMERA_NS[:0], _IMU_NS) == ()
 
 
-# The samples by themselves
+# Samples alone
 
 
-def test_saturation_is_told_and_no_scale_made_of_it() -> None:
+def test_reports_saturation_and_no_wrong_scale() -> None:
     it = _recording("room")
     found = _watch(it, samples=_gyro(it, lambda w: np.clip(w, -0.45, 0.45)))
     assert _faults(found) == ["saturation"]
@@ -385,7 +385,7 @@ def test_coarse_and_held_samples_are_not_saturated() -> None:
     assert _watch(it, samples=held) == []
 
 
-def test_silence_is_told_once() -> None:
+def test_reports_a_gap_once() -> None:
     it = _recording("room")
     kept = [s for s in it.samples if not 3 <= s.time_ns * 1e-9 % 8 < 3.2]
     found = _watch(it, samples=kept)
@@ -393,19 +393,19 @@ def test_silence_is_told_once() -> None:
     assert "0.205 s" in found[0].seen
 
 
-# The watch itself
+# The check itself
 
 
-def test_watch_ends_and_can_be_asked_again() -> None:
+def test_check_ends_and_can_be_reset() -> None:
     it = _recording("late", 3)
     check = InertialCheck(it.camera, it.T_cam0_imu)
 
-    def feed(spoil: float, shift_ns: int) -> list[InertialFinding]:
+    def feed(corrupt: float, shift_ns: int) -> list[InertialFinding]:
         found: list[InertialFinding] = []
         samples = iter(it.samples)
         for seen in it.frames:
             for sample in samples:
-                check.imu(replace(sample, gyro=spoil * sample.gyro, time_ns=sample.time_ns + shift_ns))
+                check.imu(replace(sample, gyro=corrupt * sample.gyro, time_ns=sample.time_ns + shift_ns))
                 if sample.time_ns >= seen.time_ns:
                     break
             found += check.frame(replace(seen, time_ns=seen.time_ns + shift_ns))
@@ -415,12 +415,12 @@ def test_watch_ends_and_can_be_asked_again() -> None:
     assert feed(1.0, 0) == []
     assert feed(1.0, length) == []
     assert check.done
-    assert feed(-1.0, 2 * length) == []  # nobody looks any more
-    check.again()
+    assert feed(-1.0, 2 * length) == []  # the comparison has ended
+    check.reset()
     assert not check.done
     assert _faults(feed(-1.0, 3 * length)) == ["gyro sign"]
-    check.again()
-    assert feed(-1.0, 4 * length) == []  # said before
+    check.reset()
+    assert feed(-1.0, 4 * length) == []  # reported before
     assert check.finish() == ()
 
 
@@ -447,17 +447,17 @@ def test_memory_is_bounded() -> None:
         ("MH_03", ("g", "turned gyro", "inverted accelerometer")),
     ],
 )
-def test_real_imu_is_good_until_it_is_spoiled(data_dir: Path, flight: str, mistakes: tuple[str, ...]) -> None:
+def test_real_imu_gives_a_finding_only_when_corrupted(data_dir: Path, flight: str, mistakes: tuple[str, ...]) -> None:
     it = _real(data_dir / "euroc_real_imu" / flight, 30.0)
     T = it.T_cam0_imu
     assert _watch(it) == []
     assert _faults(_watch(it, T_cam0_imu=se3_inverse(T))) == ["extrinsics inverted"]
     for name in mistakes:
-        spoil, faults, _ = _SPOILED[name]
-        assert _faults(_watch(it, samples=spoil(it))) == faults, name
+        corrupt, faults, _ = _CORRUPTED[name]
+        assert _faults(_watch(it, samples=corrupt(it))) == faults, name
 
 
-def test_inverted_lever_arm_is_told_where_the_motion_shows_it(data_dir: Path) -> None:
+def test_reports_an_inverted_lever_arm_where_the_motion_determines_it(data_dir: Path) -> None:
     it = _real(data_dir / "euroc_real_imu" / "V1_02", 30.0)
     T = se3_from_parts(it.T_cam0_imu[:3, :3], -it.T_cam0_imu[:3, 3])
     found = _watch(it, T_cam0_imu=T)

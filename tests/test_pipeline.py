@@ -310,5 +310,5 @@ def test_a_recording_that_shows_nothing_is_said_so() -> None:
             return observations(index, index * STEP_NS, [], np.zeros((0, 4)))
 
     result = run(Dark(frames=4, velocity=False), Config())
-    assert result.warnings[-1] == "no feature in any of 4 frames: the trajectory says nothing of the motion"
+    assert result.warnings[-1] == "no feature in any of 4 frames: the trajectory contains no information on the motion"
     assert not any("no feature in any" in line for line in run(FakeDrive(frames=4), Config()).warnings)

@@ -1,6 +1,6 @@
-"""What a recording says about its own calibration: stereo extrinsics, IMU-camera rotation, lever arm, time offset.
+"""Calibration from a recording: stereo extrinsics, IMU-camera rotation, lever arm, time offset.
 
-Own geometry on rays, tracks and motion samples; numpy and scipy only, and no reader, so that readers may ask it.
-Every estimate comes with standard deviations from a jackknife over blocks of the recording, so that they cover errors
-that last, and is withheld where the motion or the scene leaves it open.
+The package works on rays, tracks and motion samples. It depends on numpy and scipy only, not on readers, so that
+readers may use it. Standard deviations come from a jackknife over blocks of the recording, so that they include
+correlated errors. Values that the motion or the scene leaves unobservable are not estimated.
 """

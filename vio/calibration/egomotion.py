@@ -1,4 +1,4 @@
-"""The left camera's motion from its stereo tracks alone, frame to frame: the yardstick for every motion sensor."""
+"""The left camera's motion from its stereo tracks alone, frame to frame: the reference for every motion sensor."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vio.records import FeatureTracks, IntArray
 
 _MIN_LINKS = 8  # tracks needed between two frames
 _MIN_DISPARITY_PX = 2.0
-_WIDTHS_PX = (30.0, 15.0, 8.0, 4.0, 2.0, 2.0)  # robust width per iteration, shrinking past the outliers
+_WIDTHS_PX = (30.0, 15.0, 8.0, 4.0, 2.0, 2.0)  # robust width per iteration, decreasing to exclude outliers
 _MIN_DEPTH_M = 0.5
 _DEGENERATE = 1e-9  # relative size of a normal matrix's smallest eigenvalue below which a motion is not determined
 _LEAST_TWISTS = 40  # frame intervals for a calibration
@@ -73,7 +73,7 @@ def stereo_twists(camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArra
 
 
 def _links(tracks: FeatureTracks) -> tuple[IntArray, IntArray]:
-    """Rows (L,) and (L,) of the same id in successive frames, both fresh and with a right match, ordered by frame."""
+    """Return rows (L,) and (L,) of the same id in successive frames, not stale and with a right match, by frame."""
     frames, usable = tracks.frames, tracks.has_right & ~tracks.stale
     order = np.lexsort((frames, tracks.ids))
     a, b = order[:-1], order[1:]
@@ -86,13 +86,13 @@ def _links(tracks: FeatureTracks) -> tuple[IntArray, IntArray]:
 def camera_motion(
     camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray, guess: FloatArray | None = None
 ) -> CameraMotion | NotObservable:
-    """Estimate the camera's motion for a calibration: no long interval, and enough of them or none.
+    """Estimate the camera's motion for a calibration; not observable if too few short intervals have one.
 
     Args:
         camera: rectified pair.
         tracks: stereo features.
         times_ns: (F,) frame times.
-        guess: (F - 1, 6) twists to start from; None: rest.
+        guess: (F - 1, 6) twists to start from; None: standstill.
     """
     start = np.zeros((len(times_ns) - 1, 6)) if guess is None else guess
     found = stereo_twists(camera, tracks, times_ns, start)
@@ -103,7 +103,7 @@ def camera_motion(
         gap = float(np.median(np.diff(times_ns))) * _NS if len(times_ns) > 1 else float("inf")
         return NotObservable(
             "IMU-camera calibration",
-            f"only {len(found.frames)} frame intervals give a motion of the camera ({_LEAST_TWISTS} are needed; frames "
+            f"only {len(found.frames)} frame intervals determine the camera's motion ({_LEAST_TWISTS} needed; frames "
             f"are {gap:.3g} s apart); too few images, too far apart, or too little texture",
         )
     return found

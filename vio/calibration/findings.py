@@ -1,4 +1,4 @@
-"""What a measurement ends in beside a number: why there is none, or what is wrong with the one that was given."""
+"""Results other than values: why a quantity is not observable, and faults of a given calibration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Fault: TypeAlias = Literal[
 
 @dataclass(frozen=True, slots=True)
 class NotObservable:
-    """Stands in place of an estimate and says why there is none."""
+    """Replaces an estimate and gives the reason why there is none."""
 
     what: str
     because: str
@@ -31,7 +31,7 @@ class NotObservable:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One fault of a given calibration, in words with figures."""
+    """One fault of a given calibration, with a description and figures."""
 
     fault: Fault
     detail: str

@@ -1,4 +1,4 @@
-"""How gyro and camera lie to each other, in angle and in time."""
+"""Rotation and time offset between gyro and camera."""
 
 from __future__ import annotations
 
@@ -15,38 +15,38 @@ from vio.robust import jackknife, robust_sigma
 _BLOCKS = 10  # of the jackknife
 _ROTATION_DEG = 1.0  # standard deviations beyond these are called weak …
 TIME_OFFSET_S = 0.005
-_LEAST_TURN_RADPS = 0.02  # spread of the rotation rate below which gyro and images tell each other nothing
+_MIN_RATE_RADPS = 0.02  # spread of the rotation rate below which the alignment is unobservable
 _LARGEST_OFFSET_S = 0.1
 _OFFSET_STEP_S = 0.004
-_VELOCITY_WEIGHT = 0.02  # rad/s per m/s: what one velocity's error is worth beside a rotation rate's
+_VELOCITY_WEIGHT = 0.02  # rad/s per m/s: weight of a velocity's error relative to a rotation rate's
 _NS = 1e-9
 
 
 def align_gyro(motion: CameraMotion, rates: Rates) -> ImuAlignment | NotObservable:
-    """Find rotation, time offset and gyro bias that make the gyro's turns those of the camera.
+    """Estimate rotation, time offset and gyro bias that align the gyro's rotations with those of the camera.
 
     Model, for each frame interval: `omega_cam dt = R_cam0_imu (integral of gyro over the shifted interval - b dt)`.
-    Velocities of a `velocity` recording take part as directions, since a car turns about one axis only.
+    Velocities of a `velocity` recording are used as directions, since a car rotates about one axis only.
     """
-    if float(np.linalg.norm(motion.twists[:, 3:].std(axis=0))) < _LEAST_TURN_RADPS:
-        return NotObservable("IMU-camera rotation and time offset", "the camera does not turn")
+    if float(np.linalg.norm(motion.twists[:, 3:].std(axis=0))) < _MIN_RATE_RADPS:
+        return NotObservable("IMU-camera rotation and time offset", "the camera does not rotate")
     problem = _GyroProblem(motion, rates)
     offset = problem.coarse_offset()
     keep = problem.covered
     solution = problem.fit(problem.start(offset), keep)
     sigma = problem.spread(solution, keep)
-    again = []
+    refits = []
     for block in np.array_split(np.flatnonzero(keep), _BLOCKS):
         part = keep.copy()
         part[block] = False
-        again.append(problem.fit(solution, part))
-    turns = np.array([so3_log(so3_exp(x[:3]) @ so3_exp(solution[:3]).T) for x in again])
-    errors = jackknife(np.concatenate([turns, np.array(again)[:, 3:]], axis=1))
+        refits.append(problem.fit(solution, part))
+    turns = np.array([so3_log(so3_exp(x[:3]) @ so3_exp(solution[:3]).T) for x in refits])
+    errors = jackknife(np.concatenate([turns, np.array(refits)[:, 3:]], axis=1))
     errors = np.maximum(errors, problem.formal_sigma(solution, keep, sigma))
     rotation_sigma = np.degrees(errors[:3])
     weak = None
     if rotation_sigma.max() > _ROTATION_DEG:
-        weak = "rotation about one axis (the motion turns too little about the others)"
+        weak = "rotation about one axis (too little rotation about the others)"
     if errors[3] > TIME_OFFSET_S:
         weak = f"{weak} and time offset" if weak else "time offset (the rotation rate hardly changes)"
     return ImuAlignment(
@@ -84,24 +84,24 @@ class _GyroProblem:
             self._velocities = motion.twists[:, :3], v_imu
 
     def gyro(self, offset: float) -> FloatArray:
-        """Mean rotation rate (K, 3) of each interval, imu frame."""
+        """Return the mean rotation rate (K, 3) of each interval, imu frame."""
         turned = [
             np.interp(at + offset, self._t, self._turned[:, k]) for k in range(3) for at in (self._end, self._begin)
         ]
         return np.stack([turned[2 * k] - turned[2 * k + 1] for k in range(3)], axis=1) / self._dt[:, None]
 
     def coarse_offset(self) -> float:
-        """The offset at which the two rotation rates' magnitudes go best together."""
-        seen = np.linalg.norm(self._omega, axis=1)[self.covered]
+        """Return the offset at which the magnitudes of the two rotation rates agree best."""
+        camera_rates = np.linalg.norm(self._omega, axis=1)[self.covered]
         offsets = np.arange(-_LARGEST_OFFSET_S, _LARGEST_OFFSET_S + 1e-9, _OFFSET_STEP_S)
         scores = []
         for offset in offsets:
-            felt = np.linalg.norm(self.gyro(offset), axis=1)[self.covered]
-            scores.append(float(np.median(np.abs(felt - seen))))
+            gyro_rates = np.linalg.norm(self.gyro(offset), axis=1)[self.covered]
+            scores.append(float(np.median(np.abs(gyro_rates - camera_rates))))
         return float(offsets[int(np.argmin(scores))])
 
     def start(self, offset: float) -> FloatArray:
-        """Parameters from the closed form at one offset. Reference: Wahba's problem by SVD (Markley 1988)."""
+        """Return the closed-form solution at one offset. Reference: Wahba's problem by SVD (Markley 1988)."""
         gyro, omega = self.gyro(offset)[self.covered], self._omega[self.covered]
         C = (omega - np.median(omega, axis=0)).T @ (gyro - np.median(gyro, axis=0))
         if self._velocities is not None:
@@ -110,7 +110,7 @@ class _GyroProblem:
         return np.concatenate([so3_log(nearest_rotation(C)), [offset], np.zeros(3)])
 
     def residuals(self, x: FloatArray) -> FloatArray:
-        """Differences (K, 3 or 6) of the rates, and of the velocities where they are known."""
+        """Return differences (K, 3 or 6) of the rates, and of the velocities where they are known."""
         R = so3_exp(x[:3])
         turning = self._omega - (self.gyro(float(x[3])) - x[4:]) @ R.T
         if self._velocities is None:
@@ -119,7 +119,7 @@ class _GyroProblem:
         return np.concatenate([turning, (v_cam - v_imu @ R.T) * _VELOCITY_WEIGHT], axis=1)
 
     def fit(self, x: FloatArray, keep: BoolArray) -> FloatArray:
-        """Robust least squares from `x` on some of the intervals."""
+        """Fit by robust least squares from `x` on some of the intervals."""
         start = x
         for _ in range(2):
             scale = self.spread(start, keep)
@@ -135,16 +135,16 @@ class _GyroProblem:
         return out
 
     def spread(self, x: FloatArray, keep: BoolArray) -> float:
-        """Robust standard deviation of one residual."""
+        """Return the robust standard deviation of one residual."""
         return max(robust_sigma(self.residuals(x)[keep]), 1e-6)
 
     def formal_sigma(self, x: FloatArray, keep: BoolArray, sigma: float) -> FloatArray:
-        """Standard deviations (7,) if residuals were independent; large where a direction is open."""
+        """Return standard deviations (7,) for independent residuals; large in unobservable directions."""
         J = np.empty((self.residuals(x)[keep].size, 7))
         for k, h in enumerate([1e-4] * 3 + [1e-3] + [1e-4] * 3):
             step = np.zeros(7)
             step[k] = h
-            if k < 3:  # a turn on the camera's side, as the jackknife measures it
+            if k < 3:  # a rotation on the camera's side, as in the jackknife
                 plus, minus = (
                     np.concatenate([so3_log(so3_exp(s * step[:3]) @ so3_exp(x[:3])), x[3:]]) for s in (1.0, -1.0)
                 )

@@ -1,4 +1,4 @@
-"""What gyro, lever arm and verdicts share: motion samples as arrays, and how the sensor lies to the camera."""
+"""Types shared by the inertial calibration: motion samples as arrays, and the sensor's alignment with the camera."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class Rates:
     times_ns: IntArray  # (S,)
     angular: FloatArray  # (S, 3) rad/s, imu frame
     linear: FloatArray  # (S, 3) specific force in m/s^2, or velocity in m/s
-    inertial: bool  # the former
+    inertial: bool  # whether `linear` is specific force
 
 
 def rates_of(samples: Sequence[MotionSample]) -> Rates:
-    """Motion samples of one kind as arrays.
+    """Return motion samples of one kind as arrays.
 
     Raises:
-        EstimationError: there is none.
+        EstimationError: there are no samples.
     """
     if not samples:
         raise EstimationError("the recording holds no motion sensor; only the cameras can be calibrated")
@@ -42,7 +42,7 @@ def rates_of(samples: Sequence[MotionSample]) -> Rates:
 
 @dataclass(frozen=True, slots=True)
 class ImuAlignment:
-    """How gyro and camera lie to each other."""
+    """Rotation, time offset and bias of the gyro relative to the camera."""
 
     R_cam0_imu: FloatArray  # (3, 3)
     rotation_sigma_deg: FloatArray  # (3,) about the axes of cam0
@@ -51,4 +51,4 @@ class ImuAlignment:
     gyro_bias: FloatArray  # (3,) rad/s
     residual_radps: float  # robust spread of the rotation rates' difference, each axis
     intervals: int
-    weak: str | None  # what the motion leaves open, in words
+    weak: str | None  # what the motion leaves unobservable, in words

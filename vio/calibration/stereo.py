@@ -1,4 +1,4 @@
-"""How the two cameras lie to each other, by rays of matched points; and how well the rows of rectified ones agree."""
+"""Relative pose of the two cameras from rays of matched points, and row residuals of rectified images."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from vio.records import BoolArray, IntArray
 from vio.robust import robust_sigma
 
 _BLOCKS = 10  # of a jackknife
-_WIDEST_DEG, _NARROWER_DEG = 1.0, 0.3  # epipolar angles of candidates, as the fit closes in
+_WIDEST_DEG, _NARROWER_DEG = 1.0, 0.3  # gates on epipolar angles in successive fits
 _LEAST_MATCHES = 150
 _LEAST_PAIRS = 3
-_STEREO_ROTATION_DEG = 0.2  # standard deviations beyond these withhold a value …
+_STEREO_ROTATION_DEG = 0.2  # with larger standard deviations the value is not observable
 _STEREO_DIRECTION_DEG = 2.0
 _LEAST_STRETCHES = 3
 _LEAST_IN_CELL = 15  # matches that make a cell's median
@@ -28,7 +28,7 @@ _Pose: TypeAlias = tuple[FloatArray, FloatArray]  # R_cam1_cam0 (3, 3), unit dir
 
 @dataclass(frozen=True, slots=True)
 class RayMatches:
-    """The same points seen by both cameras of a rig."""
+    """Points matched between the two cameras of a rig."""
 
     pair: IntArray  # (N,) number of the stereo pair
     ray0: FloatArray  # (N, 3) unit rays in cam0
@@ -40,7 +40,7 @@ class RayMatches:
 
 
 def join_matches(parts: Sequence[RayMatches]) -> RayMatches:
-    """All matches of several pairs as one table."""
+    """Return the matches of several pairs as one table."""
     none = np.zeros((0, 3))
     return RayMatches(
         np.concatenate([np.zeros(0, dtype=np.int64), *(m.pair for m in parts)]),
@@ -60,11 +60,11 @@ class StereoEstimate:
     matches: int  # inliers
     pairs: int
     residual_deg: float  # robust spread of the epipolar angle over single pairs
-    stretches: int | None = None  # stretches of video behind the values; None: single pairs alone
+    stretches: int | None = None  # stretches of video that the values are a mean of; None: single pairs alone
 
 
 def epipolar_angles(R_cam1_cam0: FloatArray, direction: FloatArray, matches: RayMatches) -> FloatArray:
-    """Signed angles (N,) in radians between the rays of cam1 and the epipolar planes of those of cam0."""
+    """Return signed angles (N,) in radians between the rays of cam1 and the epipolar planes of those of cam0."""
     turned = matches.ray0 @ R_cam1_cam0.T
     normal = np.cross(R_cam1_cam0 @ direction, turned)
     length = np.linalg.norm(normal, axis=1)
@@ -72,7 +72,7 @@ def epipolar_angles(R_cam1_cam0: FloatArray, direction: FloatArray, matches: Ray
 
 
 def epipolar_spread(R_cam1_cam0: FloatArray, direction: FloatArray, matches: RayMatches) -> float:
-    """Median size of the epipolar angles, radians."""
+    """Return the median magnitude of the epipolar angles, radians."""
     return float(np.median(np.abs(epipolar_angles(R_cam1_cam0, direction, matches))))
 
 
@@ -98,13 +98,13 @@ def refine_stereo(
             return few
         R, d = _fit_stereo(inliers, R, d, max(spread, 1e-6))
     spread = robust_sigma(epipolar_angles(R, d, inliers))
-    again = [_fit_stereo(inliers.take(~block), R, d, max(spread, 1e-6)) for block in _blocks(inliers.pair)]
-    rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in _deviations(R, d, again))
+    refits = [_fit_stereo(inliers.take(~block), R, d, max(spread, 1e-6)) for block in _blocks(inliers.pair)]
+    rotation_sigma, direction_sigma = (_jackknife_norm(v) for v in _deviations(R, d, refits))
     if rotation_sigma > np.radians(_STEREO_ROTATION_DEG) or direction_sigma > np.radians(_STEREO_DIRECTION_DEG):
         return NotObservable(
             "left-right extrinsics",
-            f"the matches leave {np.degrees(rotation_sigma):.2f} deg of rotation and {np.degrees(direction_sigma):.1f} "
-            "deg of direction open; all points may be far away or on one plane",
+            f"the standard deviations are {np.degrees(rotation_sigma):.2f} deg of rotation and "
+            f"{np.degrees(direction_sigma):.1f} deg of direction; all points may be far away or on one plane",
         )
     return StereoEstimate(
         R_cam1_cam0=R,
@@ -118,7 +118,7 @@ def refine_stereo(
 
 
 def too_few(matches: RayMatches) -> NotObservable | None:
-    """Say why left-right extrinsics cannot be had from so few matches; None: there are enough."""
+    """Return why left-right extrinsics are not observable with so few matches; None: there are enough."""
     pairs = len(np.unique(matches.pair))
     if len(matches.pair) >= _LEAST_MATCHES and pairs >= _LEAST_PAIRS:
         return None
@@ -143,33 +143,33 @@ def _fit_stereo(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float
 
 
 def _tangents(d: FloatArray) -> FloatArray:
-    """Two unit vectors (3, 2) perpendicular to a direction and to each other."""
+    """Return two unit vectors (3, 2) perpendicular to a direction and to each other."""
     out: FloatArray = np.linalg.svd(d[None, :])[2][1:].T
     return out
 
 
 def _blocks(labels: IntArray) -> list[BoolArray]:
-    """Masks (N,) of the rows of each of up to ten blocks of labels."""
+    """Return masks (N,) of the rows of each of up to ten blocks of labels."""
     names = np.unique(labels)
     parts = np.array_split(names, min(_BLOCKS, len(names)))
     return [np.isin(labels, part) for part in parts]
 
 
 def _deviations(R: FloatArray, d: FloatArray, others: Sequence[_Pose]) -> tuple[FloatArray, FloatArray]:
-    """Turns (n, 3) and swings (n, 3), radians, by which other rotations and directions differ from one."""
+    """Return rotation vectors (n, 3), radians, by which other rotations and directions differ from one."""
     return np.array([so3_log(Rk @ R.T) for Rk, _ in others]), np.array([np.cross(d, dk) for _, dk in others])
 
 
 def _jackknife_norm(values: FloatArray) -> float:
-    """Standard error of a vector (its length) from its leave-one-block-out values (n, d)."""
+    """Return the standard error of a vector (its length) from its leave-one-block-out values (n, d)."""
     return float(np.sqrt((len(values) - 1) * np.mean(np.sum((values - values.mean(axis=0)) ** 2, axis=1))))
 
 
 def combine_stereo(pairs: StereoEstimate, stretches: Sequence[_Pose]) -> StereoEstimate | None:
-    """The mean of rotation and direction over stretches of video, with their standard errors; None: too uncertain.
+    """Average rotation and direction over stretches of video, with standard errors; None: too uncertain.
 
     Args:
-        pairs: what single pairs say, for its counts.
+        pairs: the estimate from single pairs, for its counts.
         stretches: at least three of `R_cam1_cam0` (3, 3) and direction (3,).
     """
     if len(stretches) < _LEAST_STRETCHES:
@@ -195,17 +195,17 @@ def combine_stereo(pairs: StereoEstimate, stretches: Sequence[_Pose]) -> StereoE
 
 @dataclass(frozen=True, slots=True)
 class RowResiduals:
-    """How well the rows of a rectified pair agree."""
+    """Row differences of a rectified pair."""
 
     median_px: float  # of vl - vr
     spread_px: float  # robust standard deviation
-    grid_px: FloatArray  # (3, 3) medians over the image, rows from the top; NaN where too few matches lie
+    grid_px: FloatArray  # (3, 3) medians over the image, rows from the top; NaN where there are too few matches
     positive_disparity: float  # share of matches with ul > ur
     matches: int
 
 
 def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | NotObservable:
-    """Describe the row differences of matches (N, 4) `[ul vl ur vr]` in rectified pixels of an image so large."""
+    """Describe the row differences of matches (N, 4) `[ul vl ur vr]` in rectified pixels, over the image."""
     if len(z) < _LEAST_MATCHES:
         return NotObservable("row alignment", f"only {len(z)} matches were found")
     off = z[:, 1] - z[:, 3]

@@ -1,4 +1,4 @@
-"""What is wrong with a given calibration, by name and with figures, where a measurement shows it."""
+"""Faults of a given calibration, found by comparison with the measured one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from vio.calibration.findings import Finding, NotObservable
 from vio.calibration.gyro import TIME_OFFSET_S
 from vio.calibration.inertial import ImuAlignment, Rates
-from vio.calibration.levers import LeverArm, judge_levers
+from vio.calibration.lever_arm import LeverArm, judge_lever_arms
 from vio.calibration.stereo import RayMatches, StereoEstimate, epipolar_spread, too_few
 from vio.evaluation import rotation_angle_deg
 from vio.geometry.lie import FloatArray, so3_log
@@ -18,13 +18,13 @@ from vio.records import FeatureTracks, IntArray
 
 _CLEARLY_WORSE = 2.0  # spread of the given calibration's epipolar angles over that of the measured one
 _EXCHANGED_DEG = 0.2  # largest epipolar angle of a calibration that fits
-_OPPOSITE_DEG = 20.0  # a direction so close to the negative of another is its negative
+_OPPOSITE_DEG = 20.0  # a direction so close to the negative of another is taken as inverted
 _NAMED_SIGMAS = 5.0  # a difference must exceed so many standard deviations …
 _NAMED_ROTATION_DEG = 0.3  # … and these limits, to be called a fault
 _NAMED_DIRECTION_DEG = 1.0
 _NAMED_IMU_ROTATION_DEG = 0.5
-_INVERSE_DEG = 5.0  # an inverse that fits so well is the explanation
-_NAMED_LEVER_M = 0.03
+_INVERSE_DEG = 5.0  # an inverse that fits so well is taken as the explanation
+_NAMED_LEVER_ARM_M = 0.03
 _NAMED_OFFSET_S = 0.002
 
 
@@ -34,9 +34,9 @@ _NAMED_OFFSET_S = 0.002
 def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: RayMatches) -> tuple[Finding, ...]:
     """Compare measured left-right extrinsics with given ones (4, 4).
 
-    Which camera is the left one is measured, too: cam1 must lie on the positive x side of cam0. From single
-    pairs, a difference is a fault only where the given extrinsics explain the matches clearly worse: a slightly wrong
-    lens model passes for a few tenths of a degree of yaw.
+    The order of the cameras is measured, too: cam1 must be on the positive x side of cam0. From single pairs, a
+    difference is a fault only if the given extrinsics explain the matches clearly worse: a slightly wrong lens model
+    looks like a few tenths of a degree of yaw.
     """
     R_given, given = T_cam0_cam1[:3, :3].T, _unit(T_cam0_cam1[:3, 3])
     swapped = _judge_order(estimate, R_given, given)
@@ -78,7 +78,7 @@ def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: Ray
 
 
 def _judge_order(estimate: StereoEstimate, R_given: FloatArray, given: FloatArray) -> Finding | None:
-    """Say whether cam1 is the left camera, in the images or in the calibration (rotation (3, 3), direction (3,))."""
+    """Check whether cam1 is the left camera, in the images or in the calibration (rotation (3, 3), direction (3,))."""
     if estimate.direction[0] < -0.5:
         return Finding(
             "cameras swapped",
@@ -109,11 +109,11 @@ def _swing_limit_deg(estimate: StereoEstimate) -> float:
 
 
 def judge_exchange(matches: RayMatches, exchanged: RayMatches, T_cam0_cam1: FloatArray) -> tuple[Finding, ...]:
-    """Say whether the given calibration (4, 4) fits the images much better with the two cameras' images exchanged.
+    """Check whether the given calibration (4, 4) fits the images much better with the two cameras' images exchanged.
 
     Args:
         matches: rays by the cameras as the recording has them.
-        exchanged: the same matches, each image taken for the other camera's.
+        exchanged: the same matches, with the images of the two cameras exchanged.
         T_cam0_cam1: given pose of cam1 in cam0.
     """
     if too_few(matches) is not None or too_few(exchanged) is not None:
@@ -125,8 +125,8 @@ def judge_exchange(matches: RayMatches, exchanged: RayMatches, T_cam0_cam1: Floa
     return (
         Finding(
             "cameras swapped",
-            f"with the images of cam0 and cam1 exchanged the calibration fits them to {other_way:.3f} deg, as they are "
-            f"to {as_given:.3f} deg; exchange the two image folders",
+            f"the calibration fits the images to {other_way:.3f} deg with cam0 and cam1 exchanged, and to "
+            f"{as_given:.3f} deg as given; exchange the two image folders",
         ),
     )
 
@@ -134,11 +134,13 @@ def judge_exchange(matches: RayMatches, exchanged: RayMatches, T_cam0_cam1: Floa
 # --- inertial sensor ------------------------------------------------------------------------------------------------
 
 
-def judge_imu(alignment: ImuAlignment, lever: LeverArm | NotObservable, T_cam0_imu: FloatArray) -> tuple[Finding, ...]:
+def judge_imu(
+    alignment: ImuAlignment, lever_arm: LeverArm | NotObservable, T_cam0_imu: FloatArray
+) -> tuple[Finding, ...]:
     """Compare measured IMU-camera extrinsics and clocks with a given transform (4, 4)."""
     found = [*_judge_rotation(alignment, T_cam0_imu[:3, :3])]
-    if isinstance(lever, LeverArm):
-        found += _judge_translation(lever, T_cam0_imu)
+    if isinstance(lever_arm, LeverArm):
+        found += _judge_translation(lever_arm, T_cam0_imu)
     limit_s = max(_NAMED_OFFSET_S, _NAMED_SIGMAS * alignment.time_offset_sigma_s)
     if alignment.time_offset_sigma_s < TIME_OFFSET_S and abs(alignment.time_offset_s) > limit_s:
         found.append(
@@ -169,35 +171,36 @@ def _judge_rotation(alignment: ImuAlignment, R: FloatArray) -> Iterator[Finding]
     )
 
 
-def _judge_translation(lever: LeverArm, T_cam0_imu: FloatArray) -> Iterator[Finding]:
-    """Compare the measured translation with a given one, and with what it may have been mistaken for."""
+def _judge_translation(lever_arm: LeverArm, T_cam0_imu: FloatArray) -> Iterator[Finding]:
+    """Compare the measured translation with a given one, and with its likely confusions."""
     R, t = T_cam0_imu[:3, :3], T_cam0_imu[:3, 3]
-    off_m = float(np.linalg.norm(lever.t_cam0_imu - t))
-    if off_m <= max(_NAMED_LEVER_M, _NAMED_SIGMAS * float(np.linalg.norm(lever.sigma_m))):
+    off_m = float(np.linalg.norm(lever_arm.t_cam0_imu - t))
+    if off_m <= max(_NAMED_LEVER_ARM_M, _NAMED_SIGMAS * float(np.linalg.norm(lever_arm.sigma_m))):
         return
     others = {
         "its negative": -t,
         "as the camera's position in the IMU frame it": -R @ t,
         "the inverse transform": -R.T @ t,
     }
-    nearest = min(others, key=lambda name: float(np.linalg.norm(lever.t_cam0_imu - others[name])))
-    near_m = float(np.linalg.norm(lever.t_cam0_imu - others[nearest]))
+    nearest = min(others, key=lambda name: float(np.linalg.norm(lever_arm.t_cam0_imu - others[name])))
+    near_m = float(np.linalg.norm(lever_arm.t_cam0_imu - others[nearest]))
     if near_m < 0.5 * off_m:
         yield Finding(
             "IMU-camera translation inverted",
-            f"measured {_triple(lever.t_cam0_imu)} m, given {_triple(t)} m; {nearest} fits to {near_m:.3f} m",
+            f"measured {_triple(lever_arm.t_cam0_imu)} m, given {_triple(t)} m; {nearest} fits to {near_m:.3f} m",
         )
         return
     yield Finding(
         "IMU-camera translation wrong",
-        f"measured {_triple(lever.t_cam0_imu)} m (standard deviations {_triple(lever.sigma_m)}), given {_triple(t)} m",
+        f"measured {_triple(lever_arm.t_cam0_imu)} m (standard deviations {_triple(lever_arm.sigma_m)}), "
+        f"given {_triple(t)} m",
     )
 
 
-def judge_velocity_lever(
+def judge_velocity_lever_arm(
     camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray, rates: Rates, T_cam0_imu: FloatArray
 ) -> tuple[Finding, ...]:
-    """Say whether the translation of a recording with velocities is the camera's position in the IMU frame.
+    """Check whether the translation of a recording with velocities is the camera's position in the IMU frame.
 
     Args:
         camera: rectified pair.
@@ -210,16 +213,16 @@ def judge_velocity_lever(
     both = np.concatenate([rates.linear, rates.angular], axis=1)
     at, clock = times_ns - times_ns[0], rates.times_ns - times_ns[0]
     velocities = np.stack([np.interp(at, clock, both[:, k]) for k in range(6)], axis=1)
-    verdict = judge_levers(camera, tracks, times_ns, velocities, R, (-R.T @ t, t))
+    verdict = judge_lever_arms(camera, tracks, times_ns, velocities, R, (-R.T @ t, t))
     if verdict.better != 1:
         return ()
     x, y, z = -R @ t
     return (
         Finding(
             "IMU-camera translation inverted",
-            f"velocities and features place the camera at {verdict.place:+.2f} +- {verdict.place_sigma:.2f} between "
-            f"the position that the transform says (-1) and the one that its translation is in the IMU frame (+1); the "
-            f"translation must be -R t = ({x:.3f}, {y:.3f}, {z:.3f}) m",
+            f"velocities and features give the camera's position as {verdict.place:+.2f} +- {verdict.place_sigma:.2f} "
+            f"between that of the transform (-1) and its translation taken as a position in the IMU frame (+1); "
+            f"the translation must be -R t = ({x:.3f}, {y:.3f}, {z:.3f}) m",
         ),
     )
 

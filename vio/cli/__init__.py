@@ -1,6 +1,6 @@
 """The command `vio`: subcommands, one file each; nothing heavy is imported before a command runs.
 
-Exit status: 0 fine, 1 an expected error told in one line, 2 wrong usage, 130 interrupted.
+Exit status: 0 success, 1 an expected error, reported in one line, 2 wrong usage, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a letter must not end the program
+        if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character must not end the program
             stream.reconfigure(errors="replace")
     args = build_parser().parse_args(argv)
     logging.basicConfig(
@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("interrupted; nothing was written", file=sys.stderr)
         return 130
     except BrokenPipeError:
-        # The reader of our output went away (`vio config --show | head`): not an error of ours.
+        # The reader of the output closed the pipe (`vio config --show | head`): not an error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:

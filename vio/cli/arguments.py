@@ -32,7 +32,7 @@ def lengths(text: str) -> tuple[float, ...]:
 
 
 def config_from(args: argparse.Namespace) -> Config:
-    """Build the configuration that the arguments ask for."""
+    """Build the configuration from the arguments."""
     from vio.config import load_config
 
     overrides = list(args.set)

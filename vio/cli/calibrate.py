@@ -1,4 +1,4 @@
-"""`vio calibrate`: what a recording says about its calibration."""
+"""`vio calibrate`: measure and check a recording's calibration."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def add_parser(commands: Any) -> None:
         "calibrate",
         help="measure and check a calibration",
         description="Measure from a recording itself: left-right rotation and baseline direction (the length is taken "
-        "as given), IMU-camera rotation, time offset and lever arm where the motion shows them; compare with the "
-        "calibration given and name what is wrong. Writes a Kalibr-style and EuRoC-style YAML. Intrinsics are taken "
+        "as given), IMU-camera rotation, time offset and lever arm where the motion makes them observable; compare "
+        "with the given calibration and report its faults. Writes a Kalibr-style and EuRoC-style YAML. Intrinsics are taken "
         "as given.",
     )
     parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
@@ -46,7 +46,7 @@ def execute(args: argparse.Namespace) -> int:
     import json
 
     from vio.atomic import atomic_folder
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.cli.running import free_folder
     from vio.colmap import quiet
@@ -67,11 +67,11 @@ def execute(args: argparse.Namespace) -> int:
     with atomic_folder(out, replace=True, marker=MARKER) as folder:
         write_calibration(folder, report)
         (folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
-    return answer(facts, [*_rows(report), ("results", str(out))], as_json=args.json, name_width=22)
+    return print_result(facts, [*_rows(report), ("results", str(out))], as_json=args.json, name_width=22)
 
 
 def _frontend(dataset: Dataset) -> Frontend:
-    """The usual front end."""
+    """Return the default front end."""
     from frontend import build_frontend
     from frontend.settings import FrontendSettings
 
@@ -84,14 +84,14 @@ def _facts(report: CalibrationReport) -> dict[str, Any]:
         "stereo": _plain(report.stereo),
         "rows": _plain(report.rows),
         "imu": _plain(report.imu.alignment),
-        "lever_arm": _plain(report.imu.lever),
+        "lever_arm": _plain(report.imu.lever_arm),
         "findings": [{"fault": f.fault, "detail": f.detail} for f in report.findings],
         "notes": list(report.notes),
     }
 
 
 def _plain(record: Any) -> dict[str, Any]:
-    """A result as JSON takes it."""
+    """Return a result as plain JSON types."""
     from dataclasses import asdict
 
     import numpy as np
@@ -104,7 +104,7 @@ def _plain(record: Any) -> dict[str, Any]:
 
 
 def _finite(values: Any) -> Any:
-    """Nested lists of numbers with None for what is not finite: JSON knows no NaN."""
+    """Return nested lists of numbers with None for non-finite values: JSON has no NaN."""
     import math
 
     if isinstance(values, list):
@@ -175,9 +175,9 @@ def _imu_rows(imu: ImuReport) -> list[tuple[str, str]]:
             ("IMU minus camera clock", f"{1e3 * a.time_offset_s:+.2f} ms, sigma {1e3 * a.time_offset_sigma_s:.2f} ms"),
         ]
         if a.weak is not None:
-            rows.append(("  not observable", f"the motion leaves open the {a.weak}"))
-    if isinstance(imu.lever, NotObservable):
-        return [*rows, ("lever arm", str(imu.lever))]
-    x, y, z = imu.lever.t_cam0_imu
-    p, q, r = imu.lever.sigma_m
+            rows.append(("  not observable", f"the motion leaves unobservable the {a.weak}"))
+    if isinstance(imu.lever_arm, NotObservable):
+        return [*rows, ("lever arm", str(imu.lever_arm))]
+    x, y, z = imu.lever_arm.t_cam0_imu
+    p, q, r = imu.lever_arm.sigma_m
     return [*rows, ("IMU in cam0", f"{x:+.4f} {y:+.4f} {z:+.4f} m, sigma {p:.4f} {q:.4f} {r:.4f}")]

@@ -1,4 +1,4 @@
-"""`vio check`: a second opinion on a run, by COLMAP from its images."""
+"""`vio check`: comparison of a run with COLMAP's reconstruction from its images."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vio.colmap.reconstruction import Mapper
-    from vio.offline.check import Opinion
+    from vio.offline.check import MapperResult
 
 MARKER = "check.json"
 KEYFRAMES = 40
@@ -20,17 +20,23 @@ def add_parser(commands: Any) -> None:
         "check",
         help="check a run without ground truth",
         description="Reconstruct keyframes of a run (of `vio run --save-observations`) from their images alone with "
-        "COLMAP's incremental and global mapper, the stereo rig known, and compare: ATE after SE(3) alignment, scale, "
-        "where the two disagree. Writes RUN/check with a report, a picture and both models. Takes minutes.",
+        "COLMAP's incremental and global mapper, with a known stereo rig, and compare: ATE after SE(3) alignment, "
+        "scale, and segments that disagree. Writes RUN/check with a report, a plot and both models. Takes minutes.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
     parser.add_argument(
         "--mapper", choices=("both", "incremental", "global"), default="both", help="COLMAP's mapper (default both)"
     )
     parser.add_argument(
-        "--keyframes", type=int, default=KEYFRAMES, metavar="N", help=f"at most so many (default {KEYFRAMES})"
+        "--keyframes",
+        type=int,
+        default=KEYFRAMES,
+        metavar="N",
+        help=f"largest number of keyframes (default {KEYFRAMES})",
     )
-    parser.add_argument("--source", metavar="SOURCE", help="where the recording is now (default: as the run names it)")
+    parser.add_argument(
+        "--source", metavar="SOURCE", help="current path of the recording (default: as stored in the run)"
+    )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="default 1: repeatable")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(execute=execute)
@@ -41,7 +47,7 @@ def execute(args: argparse.Namespace) -> int:
     import json
 
     from vio.atomic import atomic_folder
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.colmap import quiet
     from vio.errors import ConfigError
@@ -55,29 +61,29 @@ def execute(args: argparse.Namespace) -> int:
     mappers: tuple[Mapper, ...] = ("incremental", "global") if args.mapper == "both" else (args.mapper,)
     out = args.run / "check"
     with ProgressBar(f"check {args.run.name}") as bar, atomic_folder(out, replace=True, marker=MARKER) as folder:
-        opinions = check_run(
+        results = check_run(
             run, folder, mappers, most=args.keyframes, source=args.source, threads=args.threads, progress=bar.update
         )
         report = {
             "out": str(out),
             "of": str(args.run),
-            "keyframes": opinions[0].total,
-            "mappers": {opinion.mapper: _facts(opinion) for opinion in opinions},
+            "keyframes": results[0].total,
+            "mappers": {result.mapper: _facts(result) for result in results},
         }
         (folder / MARKER).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
-    rows = [(opinion.mapper, f"{key:<10} {value}") for opinion in opinions for key, value in _rows(opinion)]
-    return answer(report, [*rows, ("picture", str(out / "check.png"))], as_json=args.json, name_width=12)
+    rows = [(result.mapper, f"{key:<10} {value}") for result in results for key, value in _rows(result)]
+    return print_result(report, [*rows, ("plot", str(out / "check.png"))], as_json=args.json, name_width=12)
 
 
-def _facts(opinion: Opinion) -> dict[str, Any]:
+def _facts(result: MapperResult) -> dict[str, Any]:
     from dataclasses import asdict
 
-    if opinion.found is None:
-        return {"verdict": opinion.verdict, "registered": 0}
-    model, comparison = opinion.found
+    if result.found is None:
+        return {"verdict": result.verdict, "registered": 0}
+    model, comparison = result.found
     facts = {key: value for key, value in asdict(comparison).items() if key != "aligned"}
     return {
-        "verdict": opinion.verdict,
+        "verdict": result.verdict,
         "registered": len(model.keyframes),
         "points": model.points,
         "mean_reprojection_error_px": model.mean_reprojection_error_px,
@@ -88,17 +94,19 @@ def _facts(opinion: Opinion) -> dict[str, Any]:
     }
 
 
-def _rows(opinion: Opinion) -> list[tuple[str, str]]:
-    if opinion.found is None:
-        return [("verdict", opinion.verdict)]
-    model, comparison = opinion.found
+def _rows(result: MapperResult) -> list[tuple[str, str]]:
+    if result.found is None:
+        return [("verdict", result.verdict)]
+    model, comparison = result.found
     rows = [
-        ("keyframes", f"{len(model.keyframes)} of {opinion.total} connected, {model.points} points"),
+        ("keyframes", f"{len(model.keyframes)} of {result.total} connected, {model.points} points"),
         ("ATE", f"{comparison.ate_m:.4f} m to the run after SE(3) alignment, {comparison.ate_deg:.3f} deg"),
     ]
     if comparison.scale is not None and comparison.scale_sigma is not None:
         percent, sigma = 100 * (comparison.scale - 1), 100 * comparison.scale_sigma
-        rows.append(("scale", f"{percent:+.3f} +- {sigma:.3f} % (COLMAP over run, both by the known baseline)"))
+        rows.append(
+            ("scale", f"{percent:+.3f} +- {sigma:.3f} % (COLMAP relative to the run, both by the known baseline)")
+        )
     for segment in comparison.segments:
         rows.append(
             (
@@ -115,5 +123,5 @@ def _rows(opinion: Opinion) -> list[tuple[str, str]]:
                 f"these keyframes; COLMAP's scale {100 * ((comparison.reference_scale or 1) - 1):+.3f} %",
             )
         )
-    rows.append(("verdict", opinion.verdict))
+    rows.append(("verdict", result.verdict))
     return rows

@@ -1,4 +1,4 @@
-"""`vio demo`: renders its own stereo recording, runs images to trajectory, and names the picture."""
+"""`vio demo`: render a stereo recording, process it, and print errors and the path of the plot."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "demo",
         help="render a small recording and process it",
-        description="Render a stereo recording with known truth, process it from the images, and say how well it went.",
+        description="Render a stereo recording with ground truth, process it from the images, and print the errors.",
     )
     parser.add_argument("--out", type=Path, default=Path("demo"), metavar="DIR", help="folder (default demo)")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
@@ -21,7 +21,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.cli.running import check_out, process, rows_of
     from vio.config import load_config
@@ -31,4 +31,4 @@ def execute(args: argparse.Namespace) -> int:
     with ProgressBar("rendering the street") as bar:
         recording = write_demo_recording(args.out / "street", bar.update)
     metrics = process(str(recording), load_config(), out=args.out / "run")
-    return answer(metrics, rows_of(metrics), as_json=args.json)
+    return print_result(metrics, rows_of(metrics), as_json=args.json)

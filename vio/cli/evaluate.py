@@ -1,4 +1,4 @@
-"""`vio eval`: one trajectory against another."""
+"""`vio eval`: comparison of a trajectory with a reference."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def add_parser(commands: Any) -> None:
         "eval",
         help="compare a trajectory with a reference",
         description="Compare a trajectory, or a run's folder, with a reference: ATE, RPE and KITTI drift. Files in "
-        "TUM, KITTI or EuRoC form, or a COLMAP model; a reference in KITTI form, or a model whose images are "
+        "TUM, KITTI or EuRoC format, or a COLMAP model; a reference in KITTI format, or a model whose images are "
         "numbered, is associated by frame number, others by time.",
     )
     parser.add_argument("estimate", type=Path, metavar="EST", help="a trajectory file or a run's folder")
@@ -42,7 +42,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.evaluation import KITTI_LENGTHS_M, evaluate
 
     estimate, T_cam0_imu = _read(args.estimate)
@@ -65,11 +65,11 @@ def execute(args: argparse.Namespace) -> int:
     scores = result.as_dict()
     figures = ((key, value) for key, value in scores.items() if not isinstance(value, (list, dict)))
     rows = ((k, "–" if v is None else v if isinstance(v, str) else f"{v:.6g}") for k, v in figures)
-    return answer(scores, rows, as_json=args.json, name_width=22)
+    return print_result(scores, rows, as_json=args.json, name_width=22)
 
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
-    """Read a trajectory file, a run's folder or a COLMAP model, with the extrinsics where it has them."""
+    """Read a trajectory file, a run's folder or a COLMAP model, with the extrinsics if it has them."""
     from vio.run_folder import MARKER, read_run
 
     if path.is_dir() and not (path / MARKER).is_file():

@@ -1,4 +1,4 @@
-"""`vio export`: a run in the form of other programs."""
+"""`vio export`: conversion of a run to the formats of other programs."""
 
 from __future__ import annotations
 
@@ -21,9 +21,11 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("form", choices=("colmap",), metavar="FORM", help="colmap (with transforms.json)")
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default RUN/colmap)")
-    parser.add_argument("--refined", action="store_true", help="take the poses of `vio refine`")
-    parser.add_argument("--keyframes", type=int, metavar="N", help="at most so many keyframes (default: as needed)")
-    parser.add_argument("--source", metavar="SOURCE", help="where the recording is now (default: as the run names it)")
+    parser.add_argument("--refined", action="store_true", help="use the poses of `vio refine`")
+    parser.add_argument("--keyframes", type=int, metavar="N", help="largest number of keyframes (default: as needed)")
+    parser.add_argument(
+        "--source", metavar="SOURCE", help="current path of the recording (default: as stored in the run)"
+    )
     parser.add_argument("--no-images", action="store_true", help="do not write the rectified images")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(execute=execute)
@@ -35,7 +37,7 @@ def execute(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from vio.atomic import atomic_folder
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.colmap import quiet
     from vio.errors import ConfigError
@@ -72,4 +74,4 @@ def execute(args: argparse.Namespace) -> int:
         ("points", f"{done.points}"),
         ("residual", f"{done.mean_reprojection_error_px:.3f} px mean reprojection error, as COLMAP computes it"),
     )
-    return answer(facts, rows, as_json=args.json)
+    return print_result(facts, rows, as_json=args.json)

@@ -1,4 +1,4 @@
-"""What commands print: one JSON object for machines, or a table for people."""
+"""Output of the commands: one JSON object, or a table."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 
-def answer(facts: Mapping[str, Any], rows: Iterable[tuple[str, str]], *, as_json: bool, name_width: int = 10) -> int:
-    """Print all facts as JSON, or rows of names and values as a table; return the exit status."""
+def print_result(
+    facts: Mapping[str, Any], rows: Iterable[tuple[str, str]], *, as_json: bool, name_width: int = 10
+) -> int:
+    """Print all results as JSON, or rows of names and values as a table; return the exit status."""
     if as_json:
         print(json.dumps(facts))
     else:

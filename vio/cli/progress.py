@@ -9,30 +9,30 @@ from tqdm import tqdm
 
 
 class ProgressBar:
-    """tqdm's bar for work that says how far it is, and perhaps only then how far it has to go."""
+    """A tqdm bar for work whose total may become known only during it."""
 
     def __init__(self, label: str, total: int | None = None, *, unit: str = "steps") -> None:
-        """Start at nothing done.
+        """Start at zero.
 
         Args:
             label: what is being done.
-            total: how many steps there are, where that is known already.
-            unit: what a step is.
+            total: number of steps, if known.
+            unit: name of the steps.
         """
         hidden = not sys.stderr.isatty()
         self._bar = tqdm(desc=label, total=total, unit=f" {unit}", dynamic_ncols=True, file=sys.stderr, disable=hidden)
 
     def update(self, done: int, total: int | None = None) -> None:
-        """Say how many steps are done, and of how many if that is news."""
+        """Set the number of steps done, and optionally the total."""
         self._bar.total = self._bar.total if total is None else total
         self._bar.update(done - self._bar.n)
 
     def advance(self) -> None:
-        """Say that one more step is done."""
+        """Advance by one step."""
         self._bar.update()
 
     def close(self) -> None:
-        """Leave the bar as it stands, and the cursor below it."""
+        """Keep the bar as it is, and move the cursor below it."""
         self._bar.close()
 
     def __enter__(self) -> ProgressBar:

@@ -1,4 +1,4 @@
-"""`vio rectify`: a folder of raw stereo images in, one of rectified images out."""
+"""`vio rectify`: write the rectified images of a folder of raw stereo images."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ def add_parser(commands: Any) -> None:
         help="write a rectified folder",
         description="Rectify the images of an EuRoC folder (written as an EuRoC folder with pinhole cameras, the same "
         "IMU and ground truth) or of an unrectified KITTI raw drive (written as a KITTI odometry folder). `vio run` "
-        "needs no such folder, it rectifies as it reads; other programs may.",
+        "does not need this, since it rectifies while reading; other programs may.",
     )
     parser.add_argument("source", metavar="SOURCE", help="an EuRoC folder or a KITTI raw drive, or kind:path")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, whole or not at all")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)")
     parser.add_argument(
         "--interpolation",
         choices=("linear", "cubic", "lanczos4"),
         default="linear",
-        help="between pixels (default linear, as vio run does it)",
+        help="interpolation between pixels (default linear, as in vio run)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(execute=execute)
@@ -36,12 +36,12 @@ def execute(args: argparse.Namespace) -> int:
     import logging
 
     from vio.atomic import atomic_folder
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.datasets import DatasetSettings, open_dataset
     from vio.datasets.euroc import write_rectified_euroc
     from vio.datasets.kitti_raw import write_rectified_kitti
-    from vio.datasets.rectified import RectifiedDataset, refuse_rectified
+    from vio.datasets.rectified import RectifiedDataset, check_not_rectified
     from vio.errors import DataError
     from vio.text_files import write_text
 
@@ -55,7 +55,7 @@ def execute(args: argparse.Namespace) -> int:
             f"{recording.path} is of kind {recording.kind}, which is rectified already: there is nothing to do; the "
             f"kinds that may need it are {', '.join(writers)}"
         )
-    refuse_rectified(dataset)
+    check_not_rectified(dataset)
     camera = recording.camera
     facts = {
         "kind": recording.kind,
@@ -78,4 +78,4 @@ def execute(args: argparse.Namespace) -> int:
         ("focal", f"{camera.fu:.4f} px"),
         ("baseline", f"{camera.baseline_m:.6f} m"),
     )
-    return answer({"out": str(args.out), **facts}, rows, as_json=args.json)
+    return print_result({"out": str(args.out), **facts}, rows, as_json=args.json)

@@ -19,16 +19,16 @@ def add_parser(commands: Any) -> None:
         "refine",
         help="bundle-adjust a run",
         description="Bundle-adjust the keyframes of a run (of `vio run --save-observations`) with the run's own "
-        "tracks, the stereo rig held fixed, and write the refined trajectory and map to RUN/refined, which `vio eval` "
+        "tracks and a fixed stereo rig, and write the refined trajectory and map to RUN/refined, which `vio eval` "
         "and `vio export` read like a run.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
-    parser.add_argument("--keyframes", type=int, metavar="N", help="at most so many keyframes (default: as needed)")
+    parser.add_argument("--keyframes", type=int, metavar="N", help="largest number of keyframes (default: as needed)")
     parser.add_argument(
         "--priors",
         choices=("none", "filter"),
         default="none",
-        help="hold the camera positions to the filter's, by its covariance (replays the filter; default none)",
+        help="use the filter's camera positions and covariances as priors (replays the filter; default none)",
     )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="of the solver (default 1: repeatable)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -39,7 +39,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import time
 
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.colmap import quiet
     from vio.errors import ConfigError
@@ -70,7 +70,7 @@ def execute(args: argparse.Namespace) -> int:
         }
         _write(args.run / FOLDER, run, done, metrics)
         bar.update(STEPS + 1, STEPS + 1)
-    return answer(metrics, _rows(metrics), as_json=args.json)
+    return print_result(metrics, _rows(metrics), as_json=args.json)
 
 
 def _facts(run: SavedRun, done: Refinement) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def _facts(run: SavedRun, done: Refinement) -> dict[str, Any]:
 
 
 def _write(out: Path, run: SavedRun, done: Refinement, metrics: dict[str, Any]) -> None:
-    """Write what `vio eval` and `vio export` read like a run's folder."""
+    """Write a folder that `vio eval` and `vio export` read like a run's."""
     import json
 
     from vio.atomic import atomic_folder

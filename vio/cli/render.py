@@ -1,4 +1,4 @@
-"""`vio render`: a named scene and a trajectory in, a EuRoC or KITTI folder with known truth out."""
+"""`vio render`: render a scene along a trajectory to an EuRoC or KITTI folder with ground truth."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ def add_parser(commands: Any) -> None:
     """Add the subcommand."""
     parser = commands.add_parser(
         "render",
-        help="render a recording with known truth",
-        description="Render a stereo-inertial recording with ground truth, along a ready or a recorded trajectory, and "
+        help="render a recording with ground truth",
+        description="Render a stereo-inertial recording with ground truth along a built-in or recorded trajectory, and "
         "write it as an EuRoC or KITTI folder that any odometry system can read.",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write, whole or not at all")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)")
     parser.add_argument(
         "--scene",
         choices=("room", "street", "corridor"),
         default="room",
-        help="what is seen (default room; one is built around a recorded trajectory)",
+        help="the scene (default room; it is built around a recorded trajectory)",
     )
     parser.add_argument(
         "--trajectory",
@@ -34,9 +34,11 @@ def add_parser(commands: Any) -> None:
         help="handheld (default), car, a TUM file of the IMU's poses, or the folder of a recorded flight with "
         "groundtruth_tum.txt and, used where they exist, image_timestamps_ns.txt and imu0.csv",
     )
-    parser.add_argument("--frame-times", type=Path, metavar="F", help="frames of a recorded trajectory: ns, one a line")
     parser.add_argument(
-        "--imu", metavar="F", help="simulated, none, or EuRoC's csv of a recorded one (default: the flight's own)"
+        "--frame-times", type=Path, metavar="F", help="frame times of a recorded trajectory: ns, one per line"
+    )
+    parser.add_argument(
+        "--imu", metavar="F", help="simulated, none, or EuRoC's csv of a recorded IMU (default: that of the flight)"
     )
     parser.add_argument(
         "--velocity",
@@ -46,11 +48,11 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--rig",
         choices=("euroc", "euroc-rectified", "kitti", "fisheye", "small"),
-        help="cameras and where they sit on the IMU (default: euroc-rectified for handheld, kitti for car, euroc, "
+        help="cameras and their extrinsics to the IMU (default: euroc-rectified for handheld, kitti for car, euroc, "
         "which is unrectified, for a recorded trajectory)",
     )
-    parser.add_argument("--width", type=int, metavar="PX", help="image width, the field of view kept")
-    parser.add_argument("--rate", type=float, metavar="HZ", help="frames a second (default 20; 10 for car)")
+    parser.add_argument("--width", type=int, metavar="PX", help="image width, with the same field of view")
+    parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second (default 20; 10 for car)")
     parser.add_argument("--duration", type=float, metavar="S", help="length (default 30 s, or the whole flight)")
     parser.add_argument("--effects", metavar="NAME,…", default="", help=f"of {_EFFECTS}")
     parser.add_argument(
@@ -60,7 +62,7 @@ def add_parser(commands: Any) -> None:
         metavar="a.b=c",
         help="one value of effects, faults or imu_noise, such as effects.blur_exposure_ms=20; may be repeated",
     )
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="everything random follows from it")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers")
     parser.add_argument("--format", choices=("euroc", "kitti"), help="of the folder (default kitti for that rig)")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default up to 2); the images are the same")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
@@ -71,11 +73,11 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import time
 
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.errors import ConfigError
     from vio.sim.export import export_euroc, export_kitti
-    from vio.sim.scenarios import ParallelRecording, plan, usual_workers
+    from vio.sim.scenarios import ParallelRecording, default_workers, plan
     from vio.sim.sequence import SimulatedRecording
     from vio.threads import one_blas_thread
 
@@ -85,7 +87,7 @@ def execute(args: argparse.Namespace) -> int:
     start = time.perf_counter()
     simulation = plan(scenario)
     frames = len(simulation.stamps_ns)
-    workers = usual_workers(frames) if args.workers is None else args.workers
+    workers = default_workers(frames) if args.workers is None else args.workers
 
     def write(recording: SimulatedRecording) -> None:
         with ProgressBar(f"rendering the {scenario.scene}") as bar:
@@ -122,7 +124,7 @@ def execute(args: argparse.Namespace) -> int:
         "pairs_per_s": round(frames / seconds, 2),
         "bytes": sum(path.stat().st_size for path in args.out.rglob("*") if path.is_file()),
     }
-    return answer(summary, _rows(summary), as_json=args.json)
+    return print_result(summary, _rows(summary), as_json=args.json)
 
 
 def _rows(summary: dict[str, Any]) -> tuple[tuple[str, str], ...]:
@@ -136,7 +138,7 @@ def _rows(summary: dict[str, Any]) -> tuple[tuple[str, str], ...]:
 
 
 def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
-    """Turn the arguments into a scenario and the form of the folder.
+    """Convert the arguments to a scenario and the format of the folder.
 
     Raises:
         VioError: arguments contradict each other, or name what does not exist.
@@ -163,11 +165,11 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
     rig: Any = args.rig or ("euroc" if isinstance(trajectory, Path) else "kitti" if car else "euroc-rectified")
     form = args.format or ("kitti" if rig == "kitti" else "euroc")
     if form == "euroc" and imu == "none":
-        raise ConfigError("an EuRoC folder needs an IMU; give --imu simulated or a record, or --format kitti")
+        raise ConfigError("an EuRoC folder needs an IMU; give --imu simulated or a recorded one, or --format kitti")
     if form == "euroc" and args.velocity not in (None, "none"):
-        raise ConfigError("an EuRoC folder has no place for body velocities; give --format kitti")
+        raise ConfigError("an EuRoC folder cannot contain body velocities; give --format kitti")
     if form == "kitti" and args.imu not in (None, "none"):
-        raise ConfigError("a KITTI folder has no place for an IMU; give --format euroc")
+        raise ConfigError("a KITTI folder cannot contain an IMU; give --format euroc")
     if form == "kitti":
         imu = "none"
     scenario = Scenario(
@@ -187,7 +189,7 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
 
 
 def _conditions(args: argparse.Namespace) -> Conditions:
-    """The named effects, then single values."""
+    """Return the named effects with single values replaced."""
     from vio.config import merge_override
     from vio.sim.scenarios import conditions_of
 

@@ -1,4 +1,4 @@
-"""`vio run`: a recording in, a folder of results out."""
+"""`vio run`: process a recording, and write a folder of results."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ def add_parser(commands: Any) -> None:
     parser = commands.add_parser(
         "run",
         help="process a recording",
-        description="Process a recording and write a folder of results. The kind of SOURCE is seen from its content; "
-        "'kind:path' forces it (kitti, kitti_raw, euroc, ece276a, utias, log).",
+        description="Process a recording and write a folder of results. The kind of SOURCE is detected from its "
+        "content; 'kind:path' sets it (kitti, kitti_raw, euroc, ece276a, utias, log).",
     )
     parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
     add_config_arguments(parser)
-    parser.add_argument("--reference", type=Path, metavar="F", help="ground truth (TUM, KITTI or EuRoC form)")
+    parser.add_argument("--reference", type=Path, metavar="F", help="ground truth (TUM, KITTI or EuRoC format)")
     parser.add_argument("--start", type=int, default=0, metavar="N", help="first frame (default 0)")
     parser.add_argument("--stop", type=int, metavar="N", help="frame after the last one")
     parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
-    parser.add_argument("--save-observations", action="store_true", help="also write what the front end saw")
+    parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(execute=execute)
@@ -32,7 +32,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.running import process, rows_of
 
     metrics = process(
@@ -46,4 +46,4 @@ def execute(args: argparse.Namespace) -> int:
         save_observations=args.save_observations,
         progress=not args.quiet,
     )
-    return answer(metrics, rows_of(metrics), as_json=args.json)
+    return print_result(metrics, rows_of(metrics), as_json=args.json)

@@ -1,4 +1,4 @@
-"""What `vio run` and `vio demo` share: process a source, show progress, say how it went."""
+"""Shared by `vio run` and `vio demo`: process a source, show progress, tabulate the metrics."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vio.atomic import refuse_to_lose
+from vio.atomic import check_replaceable
 from vio.cli.progress import ProgressBar
 from vio.config import Config
 from vio.datasets import open_dataset
@@ -33,7 +33,7 @@ class ProgressViewer:
         self._bar.advance()
 
     def close(self) -> None:
-        """Leave the bar as it stands."""
+        """Close the bar."""
         self._bar.close()
 
 
@@ -67,14 +67,14 @@ def process(
 
 
 def check_out(folder: Path) -> Path:
-    """Refuse a folder that holds something else before the work begins, not after.
+    """Reject a folder with other contents before the processing starts.
 
     Raises:
         VioError: the folder is not an earlier run's, or the path is a file.
     """
     if folder.exists() and not folder.is_dir():
         raise VioError(f"{folder}: is a file; --out takes a folder")
-    refuse_to_lose(folder, replace=True, marker=MARKER, own=FILES)
+    check_replaceable(folder, replace=True, marker=MARKER, own=FILES)
     return folder
 
 
@@ -88,7 +88,7 @@ def free_folder(source: Path, root: Path = Path("runs")) -> Path:
 
 
 def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return a run's metrics in a few lines for people."""
+    """Return a run's metrics as a few table rows."""
     stages = ", ".join(f"{name} {ms:.1f}" for name, ms in metrics["stages_ms"].items())
     rows = [
         ("frames", f"{metrics['frames']}, path {metrics['path_length_m']:.2f} m"),
@@ -107,5 +107,5 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         score = metrics["landmark_error"]
         rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
     rows.append(("results", metrics["out"]))
-    rows.append(("picture", str(Path(metrics["out"]) / "trajectory.png")))
+    rows.append(("plot", str(Path(metrics["out"]) / "trajectory.png")))
     return rows

@@ -1,8 +1,8 @@
-"""COLMAP: models written and read, bundle adjustment, reconstruction. The only package that knows pycolmap.
+"""Interface to COLMAP: model files, bundle adjustment, reconstruction. The only package that imports pycolmap.
 
-Two conventions of COLMAP end here. Its pixels put the *corner* of the top-left pixel at (0, 0), ours its centre: half a
-pixel is added on the way in and taken off on the way out. Its poses map the world to the camera (`cam_from_world`, our
-`T_cam_world`), ours the other way.
+Two conventions of COLMAP are converted here. Its pixels put the *corner* of the top-left pixel at (0, 0), ours its
+centre: half a pixel is added on input and subtracted on output. Its poses map the world to the camera
+(`cam_from_world`, our `T_cam_world`), ours are the inverse.
 """
 
 from __future__ import annotations
@@ -23,6 +23,6 @@ SIFT_FEATURES = 1500  # per image
 
 
 def quiet() -> None:
-    """Keep COLMAP's own log to errors."""
+    """Restrict COLMAP's own log to errors."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
     pycolmap.logging.verbose_level = -1

@@ -1,4 +1,4 @@
-"""Bundle adjustment of keyframes and points under the stereo rig, and of the rig under keyframes in motion."""
+"""Bundle adjustment of keyframes and points with fixed stereo extrinsics, or of the extrinsics from video."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 
 from vio.colmap.model import LEFT, RIGHT, build_model, frame_id, image_id, matrix, numbered, rig_geometry
-from vio.colmap.solver import solve, solver_options, whole_model
+from vio.colmap.solver import adjustment_config, solve, solver_options
 from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
@@ -19,11 +19,11 @@ from vio.robust import robust_sigma
 
 @dataclass(frozen=True, slots=True)
 class Adjustment:
-    """What a bundle adjustment made of keyframes and points."""
+    """The result of a bundle adjustment."""
 
     T_world_cam0: FloatArray  # (K, 4, 4)
-    tracks: PointTracks  # with moved points, without outliers
-    rms_before_px: float  # over all rows that the robust limit kept, each coordinate
+    tracks: PointTracks  # with adjusted points, without outliers
+    rms_before_px: float  # over all inlier rows, per coordinate
     rms_after_px: float
     rows_dropped: int
     sigma_px: float  # robust spread of a coordinate's residual after the first round
@@ -31,7 +31,7 @@ class Adjustment:
 
 @dataclass(frozen=True, slots=True)
 class PositionPriors:
-    """Where the keyframes' left cameras are believed to be."""
+    """Prior positions of the keyframes' left cameras."""
 
     positions: FloatArray  # (K, 3) world, metres
     covariances: FloatArray  # (K, 3, 3) m^2
@@ -47,17 +47,17 @@ def adjust(
     threads: int = 1,
     progress: Callable[[], None] = lambda: None,
 ) -> Adjustment:
-    """Bundle-adjust keyframes and points under the stereo rig, intrinsics and extrinsics held fixed.
+    """Bundle-adjust keyframes and points, with fixed intrinsics and stereo extrinsics.
 
-    Two rounds: all rows under a robust loss, then again from the start without the rows that it calls outliers. The
-    first keyframe stays where it is.
+    Two rounds: all rows with a robust loss, then from the initial values again without the outliers of the first. The
+    pose of the first keyframe is fixed.
 
     Args:
         camera: the rectified pair.
-        T_world_cam0: (K, 4, 4) where to start.
+        T_world_cam0: (K, 4, 4) initial poses.
         tracks: points and rows.
-        priors: a Gaussian on each camera position, weighted against the pixels' own spread.
-        gate_sigma: rows off by more than so many robust standard deviations leave the second round.
+        priors: a Gaussian on each camera position, weighted against the pixels' standard deviation.
+        gate_sigma: rows beyond so many robust standard deviations are excluded from the second round.
         threads: of the solver; one makes the result repeatable.
         progress: called after each of the two rounds.
 
@@ -102,10 +102,10 @@ def _solve(
     *,
     sigma_px: float = 1.0,
 ) -> tuple[FloatArray, FloatArray]:
-    """Poses (K, 4, 4) and points (M, 3) of one bundle adjustment."""
+    """Return poses (K, 4, 4) and points (M, 3) of one bundle adjustment."""
     count = len(T_world_cam0)
     model = build_model(camera, T_world_cam0, tracks, numbered(count))
-    config = whole_model(model)
+    config = adjustment_config(model)
     config.set_constant_sensor_from_rig_pose(model.camera(RIGHT).sensor_id)
     config.set_constant_rig_from_world_pose(frame_id(0))
     options = solver_options(loss_px, threads)
@@ -124,10 +124,10 @@ def _solve(
 def adjust_rig_in_motion(
     camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks, *, gate_sigma: float = 5.0
 ) -> tuple[FloatArray, FloatArray]:
-    """Bundle-adjust the pose of cam1 in cam0 together with keyframes and points, over tracks in time.
+    """Bundle-adjust the pose of cam1 in cam0 together with keyframes and points of a video.
 
-    Motion shows what a single pair leaves to the lens model: a turn of one camera about the vertical shifts all
-    disparities, which the way between two frames contradicts.
+    Motion makes observable what a single pair cannot separate from the lens model: a yaw of one camera shifts all
+    disparities, which contradicts the motion between frames.
 
     Returns `R_cam1_cam0` (3, 3) and the unit direction (3,) from cam0 to cam1 in cam0, of the rectified pair.
 
@@ -142,7 +142,7 @@ def adjust_rig_in_motion(
             raise EstimationError("not observable because no track is consistent over the keyframes")
         count = len(T_world_cam0)
         model = build_model(camera, T_world_cam0, kept, numbered(count))
-        config = whole_model(model)
+        config = adjustment_config(model)
         config.set_constant_rig_from_world_pose(frame_id(0))
         options = solver_options(loss_px, 1)
         options.refine_sensor_from_rig = True
@@ -156,7 +156,7 @@ def adjust_rig_in_motion(
 
 
 def _pose_priors(model: pycolmap.Reconstruction, priors: PositionPriors, sigma_px: float) -> list[pycolmap.PosePrior]:
-    """One prior for each keyframe's left image; covariances scaled so that pixels may keep unit weight."""
+    """Return a prior for each keyframe's left image; covariances are scaled to pixels of unit weight."""
     out = []
     for k, (position, covariance) in enumerate(zip(priors.positions, priors.covariances, strict=True)):
         out.append(

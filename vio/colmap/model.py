@@ -26,13 +26,13 @@ _GRAY = 128  # of points without an image
 
 @dataclass(frozen=True, slots=True)
 class ModelImages:
-    """The keyframes of a model as files."""
+    """Image files of a model's keyframes."""
 
     left: tuple[str, ...]  # K names relative to the folder of images
     right: tuple[str, ...]
 
     def below(self, folder: str) -> ModelImages:
-        """The same files seen from the parent of a folder that holds them."""
+        """Return the same names with a parent folder as prefix."""
         left, right = (tuple(f"{folder}/{name}" for name in side) for side in (self.left, self.right))
         return ModelImages(left, right)
 
@@ -49,7 +49,7 @@ def numbered(count: int) -> ModelImages:
 
 
 def pinhole(camera_id: int, size: tuple[int, int], params: Sequence[float]) -> pycolmap.Camera:
-    """A camera with an image of (width, height) pixels and `params` fu, fv, cu, cv in COLMAP's pixels."""
+    """Return a camera with an image of (width, height) pixels and `params` fu, fv, cu, cv in COLMAP's pixels."""
     return pycolmap.Camera(
         camera_id=camera_id,
         model="PINHOLE",
@@ -63,7 +63,7 @@ def pinhole(camera_id: int, size: tuple[int, int], params: Sequence[float]) -> p
 def rig_model(
     size: tuple[int, int], params: Sequence[float], cam1_from_cam0: pycolmap.Rigid3d
 ) -> pycolmap.Reconstruction:
-    """An empty model of two equal cameras, as `pinhole` makes them, in one rig, whose reference is the left one."""
+    """Return an empty model of two equal cameras, as `pinhole` makes them, in a rig whose reference is the left one."""
     model = pycolmap.Reconstruction()
     for camera_id in (LEFT, RIGHT):
         model.add_camera(pinhole(camera_id, size, params))
@@ -75,12 +75,12 @@ def rig_model(
 
 
 def rig_geometry(model: pycolmap.Reconstruction) -> tuple[FloatArray, FloatArray]:
-    """Rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, as a model has them."""
+    """Return rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, of a model."""
     return without_scale(matrix(model.rig(RIG).sensor_from_rig(model.camera(RIGHT).sensor_id)))
 
 
 def without_scale(T_cam1_cam0: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, of a transform (4, 4)."""
+    """Return rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, of a transform (4, 4)."""
     R = T_cam1_cam0[:3, :3]
     direction = -R.T @ T_cam1_cam0[:3, 3]
     return R, direction / np.linalg.norm(direction)
@@ -131,10 +131,10 @@ def _add_points(
     """Add the points with their tracks.
 
     Args:
-        model: holds the frames already.
+        model: already contains the frames.
         tracks: the points.
-        begins: (K,) first row of each keyframe: its left image's pixels are its rows, in order.
-        right_index: (R,) place of each row among the pixels of its keyframe's right image; -1: it is not there.
+        begins: (K,) first row of each keyframe; the pixels of its left image are its rows, in order.
+        right_index: (R,) index of each row among the pixels of its keyframe's right image; -1: no right pixel.
         colours: (M, 3); None: gray.
     """
     by_point = np.argsort(tracks.point, kind="stable")
@@ -151,17 +151,17 @@ def _add_points(
 
 
 def image_id(keyframe: int, camera_id: int) -> int:
-    """The number of a keyframe's image by one camera in a model."""
+    """Return the id of a keyframe's image by one camera in a model."""
     return 2 * keyframe + camera_id
 
 
 def frame_id(keyframe: int) -> int:
-    """The number of a keyframe in a model."""
+    """Return the id of a keyframe in a model."""
     return keyframe + 1
 
 
 def rectified_rig(camera: StereoCamera) -> pycolmap.Rigid3d:
-    """The rig of a rectified pair."""
+    """Return the rig of a rectified pair."""
     return pycolmap.Rigid3d(pycolmap.Rotation3d(), -np.array([camera.baseline_m, 0.0, 0.0]))
 
 
@@ -176,11 +176,11 @@ def add_frame(
     """Add a keyframe with both images.
 
     Args:
-        model: with its cameras and rig.
+        model: already contains cameras and rig.
         keyframe: its index.
         T_cam0_world: (4, 4).
         names: image files of all keyframes.
-        left: (N, 2) pixels in the left image, ours.
+        left: (N, 2) pixels in the left image, in our convention.
         right: (M, 2) in the right one.
     """
     images = [
@@ -211,7 +211,7 @@ def _rigid(T: FloatArray) -> pycolmap.Rigid3d:
 
 
 def matrix(T: pycolmap.Rigid3d | None) -> FloatArray:
-    """Give a transform of COLMAP's as (4, 4)."""
+    """Convert a transform of COLMAP to (4, 4)."""
     assert T is not None
     out = np.eye(4)
     out[:3] = T.matrix()
@@ -219,11 +219,11 @@ def matrix(T: pycolmap.Rigid3d | None) -> FloatArray:
 
 
 def mean_reprojection_error_px(model: pycolmap.Reconstruction) -> float:
-    """Mean over the points of the mean length of their residuals: COLMAP's own figure."""
+    """Return COLMAP's mean reprojection error: the mean over points of their mean residual length."""
     model.update_point_3d_errors()
     return float(model.compute_mean_reprojection_error())
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in COLMAP's binary form; the folder must exist."""
+    """Write a model in COLMAP's binary format; the folder must exist."""
     model.write_binary(folder)

@@ -1,4 +1,4 @@
-"""The same keyframes and points in nerfstudio's form."""
+"""Export of keyframes and points in nerfstudio's format."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from vio.mapping.points import PointTracks
 
 
 def nerfstudio_transforms(camera: StereoCamera, T_world_cam0: FloatArray, names: ModelImages) -> str:
-    """Return the text of nerfstudio's `transforms.json`; file names as given, the point cloud beside it.
+    """Return the text of nerfstudio's `transforms.json`; the point cloud is `points.ply` in the same folder.
 
-    Poses are camera to world with x right, y up, z back (OpenGL); the world is the run's own, metric.
+    Poses are camera to world with x right, y up, z back (OpenGL); the world frame is that of the run, metric.
     """
     T_cam0_cam1 = np.eye(4)
     T_cam0_cam1[0, 3] = camera.baseline_m

@@ -1,4 +1,4 @@
-"""Single stereo pairs: SIFT matches, their relative pose by RANSAC, and the rig adjusted over all of them."""
+"""Single stereo pairs: SIFT matches, relative pose by RANSAC, and bundle adjustment of the rig over all pairs."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from vio.colmap.model import (
     rig_model,
     without_scale,
 )
-from vio.colmap.solver import solve, solver_options, whole_model
+from vio.colmap.solver import adjustment_config, solve, solver_options
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image
 
 _RATIO = 0.8  # of the distances to the best and the second best descriptor
-_VIRTUAL_PX = 500.0  # focal length of the camera that rays are turned into pixels with
-_VIRTUAL_SIZE = (1000, 1000)  # COLMAP wants one; nothing depends on it
+_VIRTUAL_PX = 500.0  # focal length of the camera that projects rays to pixels
+_VIRTUAL_SIZE = (1000, 1000)  # required by COLMAP; without effect
 _VIRTUAL_PARAMS = (_VIRTUAL_PX, _VIRTUAL_PX, 0.0, 0.0)
 _ESSENTIAL_PX = 1.0
 
 
 def sift_matches(left: Image, right: Image, *, threads: int = 1) -> tuple[FloatArray, FloatArray]:
-    """Pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), outliers among them."""
+    """Return pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), including outliers."""
     options = pycolmap.FeatureExtractionOptions(num_threads=threads)
     options.sift.max_num_features = SIFT_FEATURES
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     (keys0, features0), (keys1, features1) = (_features(extractor, image) for image in (left, right))
     if len(keys0) < 2 or len(keys1) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    likeness = features0 @ features1.T
+    similarity = features0 @ features1.T
     norm0, norm1 = np.sum(features0**2, axis=1), np.sum(features1**2, axis=1)
-    distance = norm0[:, None] + norm1[None, :] - 2 * likeness
+    distance = norm0[:, None] + norm1[None, :] - 2 * similarity
     best1, best0 = np.argmin(distance, axis=1), np.argmin(distance, axis=0)
     two = np.partition(distance, 1, axis=1)[:, :2]
     good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _RATIO**2 * two[:, 1])
@@ -51,7 +51,7 @@ def sift_matches(left: Image, right: Image, *, threads: int = 1) -> tuple[FloatA
 
 
 def _features(extractor: pycolmap.FeatureExtractor, image: Image) -> tuple[FloatArray, npt.NDArray[np.float32]]:
-    """COLMAP's pixels (N, 2) of the features of an image, and their descriptors (N, 128)."""
+    """Return COLMAP's pixels (N, 2) of an image's features, and their descriptors (N, 128)."""
     keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(image))
     if not len(keypoints):
         return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
@@ -60,7 +60,7 @@ def _features(extractor: pycolmap.FeatureExtractor, image: Image) -> tuple[Float
 
 
 def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:
-    """Rotation `R_cam1_cam0` (3, 3) and unit direction (3,) of cam1 in cam0, by RANSAC over the matches of all pairs.
+    """Estimate `R_cam1_cam0` (3, 3) and the unit direction (3,) of cam1 in cam0, by RANSAC over all matches.
 
     None: no consensus.
     """
@@ -78,8 +78,8 @@ def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:
 def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Bundle-adjust the pose of cam1 in a rig over the matches (inliers) of all pairs; same form as the input.
 
-    Each pair is a frame of one rig with its own points; only the rig's inner transform and the points move, and the
-    scale, which two cameras leave open, is taken out again.
+    Each pair is a frame of one rig with its own points. Only the rig's extrinsics and the points are free; the result
+    is without scale, which two cameras do not determine.
 
     Raises:
         EstimationError: the solver failed.
@@ -99,7 +99,7 @@ def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArr
                 [pycolmap.TrackElement(image_id(k, LEFT), at), pycolmap.TrackElement(image_id(k, RIGHT), at)]
             )
             model.add_point3D(points[row], track, np.zeros(3, dtype=np.uint8))
-    config = whole_model(model)
+    config = adjustment_config(model)
     for k in range(len(names)):
         config.set_constant_rig_from_world_pose(frame_id(k))
     options = solver_options(0.5, 1)
@@ -110,7 +110,7 @@ def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArr
 
 
 def _virtual_pixels(matches: RayMatches) -> tuple[FloatArray, FloatArray]:
-    """COLMAP's pixels (N, 2) of the rays of both cameras, as pinhole cameras without distortion would have them."""
+    """Return COLMAP's pixels (N, 2) of the rays of both cameras in pinhole cameras without distortion."""
     left, right = (_VIRTUAL_PX * ray[:, :2] / ray[:, 2:] for ray in (matches.ray0, matches.ray1))
     return left, right
 
@@ -118,7 +118,7 @@ def _virtual_pixels(matches: RayMatches) -> tuple[FloatArray, FloatArray]:
 def _two_view_points(
     matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Points (N, 3) in cam0 in units of the baseline, nearest to both rays, and a mask of those ahead of both."""
+    """Return points (N, 3) in cam0, in units of the baseline, nearest to both rays, and a mask of those ahead."""
     a, b = matches.ray0, matches.ray1 @ R_cam1_cam0
     cosine = np.sum(a * b, axis=1)
     along_a, along_b = a @ direction, b @ direction

@@ -1,4 +1,4 @@
-"""Keyframes reconstructed from their images alone, by COLMAP's features, matches and mappers."""
+"""Reconstruction of keyframes from their images alone, by COLMAP's features, matches and mappers."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray
 
 Mapper: TypeAlias = Literal["incremental", "global"]
-_NEXT = (1, 2, 3, 5, 8, 16)  # keyframes ahead that the left camera is matched with
-_CROSS_NEXT = (1,)  # keyframes ahead of the left camera that the right one is matched with
+_NEXT = (1, 2, 3, 5, 8, 16)  # index offsets of later keyframes that left images are matched with
+_CROSS_NEXT = (1,)  # likewise between right images and later left ones
 _LEAST_REGISTERED = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Reconstructed:
-    """What COLMAP made of images alone."""
+    """A reconstruction by COLMAP."""
 
     mapper: Mapper
-    T_world_cam0: FloatArray  # (R, 4, 4) of the registered keyframes, in COLMAP's own world, metric by the rig
+    T_world_cam0: FloatArray  # (R, 4, 4) of the registered keyframes, in COLMAP's world frame, metric by the rig
     keyframes: IntArray  # (R,) their indices, increasing
     points: int
     mean_reprojection_error_px: float
@@ -36,8 +36,8 @@ def match_images(database: Path, images: Path, names: ModelImages, camera: Stere
     """Find SIFT features in image files and match them within and between keyframes, into a new COLMAP database.
 
     Args:
-        database: the file to make.
-        images: folder that the names are relative to; left images must lie in one folder, right ones in another.
+        database: the file to create.
+        images: folder that the names are relative to; left images must be in one folder, right ones in another.
         names: the keyframes' images.
         camera: the rectified pair, intrinsics and baseline of the rig.
         threads: for all steps; one makes the result repeatable.
@@ -93,14 +93,14 @@ def _pairs(names: ModelImages) -> list[tuple[str, str]]:
 def reconstruct(
     database: Path, images: Path, names: ModelImages, mapper: Mapper, out: Path, *, threads: int = 1
 ) -> Reconstructed | None:
-    """Reconstruct keyframes from a database of matches, rig and intrinsics held fixed; None: nothing came of it.
+    """Reconstruct keyframes from a database of matches, with fixed rig and intrinsics; None: not successful.
 
     Args:
-        database: made by `match_images`; left as it is.
+        database: made by `match_images`; not modified.
         images: folder that the names are relative to.
         names: the keyframes' images.
-        mapper: COLMAP's incremental mapper, or its global one.
-        out: folder for the model, made if missing.
+        mapper: COLMAP's incremental or global mapper.
+        out: folder for the model, created if missing.
         threads: for all steps.
     """
     pycolmap.set_random_seed(SEED)

@@ -1,4 +1,4 @@
-"""How COLMAP's bundle adjuster is asked, and what becomes of its failure."""
+"""Options and execution of COLMAP's bundle adjuster."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from vio.colmap.model import LEFT, RIGHT
 from vio.errors import EstimationError
 
 
-def whole_model(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
-    """All images of a model, intrinsics held fixed."""
+def adjustment_config(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConfig:
+    """Return a configuration with all images of a model and fixed intrinsics."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in model.images:
         config.add_image(image_id)
@@ -19,7 +19,7 @@ def whole_model(model: pycolmap.Reconstruction) -> pycolmap.BundleAdjustmentConf
 
 
 def solver_options(loss_px: float, threads: int) -> pycolmap.BundleAdjustmentOptions:
-    """Options with a soft-L1 loss of a width in pixels; intrinsics and rig held fixed."""
+    """Return options with a soft-L1 loss of a width in pixels, and fixed intrinsics and rig."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
     options.refine_sensor_from_rig = False
@@ -36,7 +36,7 @@ def solve(adjuster: pycolmap.BundleAdjuster) -> None:
     """Run a bundle adjuster.
 
     Raises:
-        EstimationError: its result is of no use.
+        EstimationError: its result is not usable.
     """
     summary = adjuster.solve()
     if not summary.is_solution_usable():

@@ -1,4 +1,4 @@
-"""Two trajectories over the same keyframes: how far apart, at which scale, and where they disagree."""
+"""Comparison of two trajectories over the same keyframes: distance, scale, and segments that disagree."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from vio.mapping.keyframes import TrackedPath
 from vio.records import BoolArray, IntArray, Trajectory
 from vio.robust import robust_sigma
 
-_SCALE_SIGMA = 0.02  # a scale less certain than this is not stated
-_LEAST_MOTIONS = 8  # keyframes needed to say which motions stand out
+_SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
+_LEAST_MOTIONS = 8  # keyframes needed to detect outlying motions
 _OUTLYING = 6.0  # robust standard deviations
 
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """A trajectory that others are measured by."""
+    """A reference trajectory."""
 
     trajectory: Trajectory  # of the left camera or the IMU
     T_cam0_imu: FloatArray  # (4, 4)
@@ -28,7 +28,7 @@ class GroundTruth:
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A stretch between keyframes over which two trajectories move differently."""
+    """A range of keyframes over which the motions of two trajectories differ."""
 
     first_frame: int
     last_frame: int
@@ -38,7 +38,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """A second opinion on a run's keyframes."""
+    """Comparison of a run's keyframes with other poses of the same frames."""
 
     total: int  # keyframes compared
     frames: IntArray  # (R,) frame numbers
@@ -59,20 +59,20 @@ class Comparison:
 def compare_keyframes(
     run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray, truth: GroundTruth | None = None
 ) -> Comparison:
-    """Compare poses of the left camera from elsewhere with those of a run.
+    """Compare poses of the left camera from another source with those of a run.
 
     Args:
         run: the run.
         rows: (R,) rows of its trajectory.
-        T_other_cam0: (R, 4, 4) poses from elsewhere at these rows, in any world.
-        truth: what both are compared with besides.
+        T_other_cam0: (R, 4, 4) poses from the other source at these rows, in any world frame.
+        truth: ground truth to compare both with.
 
     Reference: Umeyama (1991) for the alignment, as in `vio.evaluation`.
     """
     own = run.trajectory.T_world_body[rows]
     aligned = apply_alignment(align_poses(T_other_cam0, own, "se3"), T_other_cam0)
     difference_m = np.linalg.norm(aligned[:, :3, 3] - own[:, :3, 3], axis=1)
-    # Rotations are compared apart: a straight path leaves the roll of an alignment by positions open.
+    # Rotations are aligned separately: on a straight path an alignment by positions leaves the roll unobservable.
     turn = nearest_rotation(np.einsum("nij,nkj->ik", own[:, :3, :3], T_other_cam0[:, :3, :3]))
     difference_deg = rotation_angle_deg(np.swapaxes(own[:, :3, :3], 1, 2) @ turn @ T_other_cam0[:, :3, :3])
     scale, sigma, why = _scale_ratio(T_other_cam0, own, float(np.sqrt(np.mean(difference_m**2))))
@@ -96,7 +96,7 @@ def compare_keyframes(
 
 
 def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[float | None, float | None, str | None]:
-    """Length of the other trajectory over one's own with its standard error, or why there is none."""
+    """Return the other trajectory's scale relative to the run with its standard error, or why there is none."""
     p = T_own[:, :3, 3]
     extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
     if len(p) < 3:
@@ -113,7 +113,7 @@ def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[
 
 
 def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray) -> tuple[Segment, ...]:
-    """Stretches where motions between neighbouring keyframes differ far more than they usually do."""
+    """Return segments where motions between neighbouring keyframes differ by outliers."""
     if len(frames) < _LEAST_MOTIONS:
         return ()
     motion_own = se3_inverse(T_own[:-1]) @ T_own[1:]
@@ -136,7 +136,7 @@ def _stands_out(values: FloatArray) -> BoolArray:
 def _against(
     truth: GroundTruth, run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray
 ) -> tuple[float | None, float | None, float | None]:
-    """ATE of the other poses, their scale, and ATE of the run's; None where they cannot be compared."""
+    """Return ATE and scale of the other poses, and ATE of the run; None where they cannot be compared."""
     own = replace(
         run.trajectory,
         T_world_body=run.trajectory.T_world_body[rows],

@@ -1,4 +1,4 @@
-"""A trajectory with the features seen along it, and the frames of it that are keyframes."""
+"""A trajectory with its observations, and keyframe selection."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray, Observations, Trajectory
 
 _MIN_DISPARITY_PX = 0.5
-_ALL_FRAMES = 300  # a shorter run is adjusted whole
-_SCENE_SHARE = 0.08  # of the median depth: a new keyframe is due after moving so far …
-_TURN_DEG = 6.0  # … or turning so far
-_SPARSER = 1.15  # factor on both, from one attempt to the next
+_ALL_FRAMES = 300  # in a shorter run, every frame is a keyframe
+_SCENE_SHARE = 0.08  # of the median depth: translation to a new keyframe …
+_TURN_DEG = 6.0  # … or rotation to it
+_SPARSER = 1.15  # factor on both limits, from one attempt to the next
 _LEAST_STRETCH = 20  # frames
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedPath:
-    """Where the left camera was, frame by frame, and what it saw there."""
+    """The left camera's trajectory, and its observations of every frame."""
 
-    where: Path  # what the user knows it by: the run's folder, or the recording
+    where: Path  # the run's folder, or the recording, for messages
     camera: StereoCamera  # rectified pair
     trajectory: Trajectory  # of cam0, one pose a frame, with frame numbers
     tracks: FeatureTracks  # of all frames of the recording, by frame number
@@ -38,23 +38,23 @@ class TrackedPath:
         return self.trajectory.frame_indices
 
     def fresh(self, row: int) -> Observations:
-        """The observations at one row of the trajectory, without those known to be old."""
+        """Return the observations at one row of the trajectory, without stale ones."""
         seen = self.tracks.at(int(self.frames[row]), 0)
         return seen.take(~seen.stale)
 
 
 def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
-    """Rows (K,) of the trajectory that become keyframes: first and last, and whenever the view has changed enough.
+    """Return the rows (K,) of the trajectory that become keyframes: first, last, and after enough motion.
 
-    Enough is a share of the scene's median depth or a few degrees. Where that gives more than `most`, both limits grow.
-    Without `most`, a short run gives all of its frames.
+    Enough is a share of the scene's median depth or a few degrees. Both limits are increased until there are at most
+    `most`. Without `most`, all frames of a short run are keyframes.
 
     Raises:
         DataError: the run is shorter than two frames.
     """
     T = run.trajectory.T_world_body
     if len(T) < 2:
-        raise DataError(f"{run.where}: a run of {len(T)} frames has no two views; process more of the recording")
+        raise DataError(f"{run.where}: a run of {len(T)} frames has fewer than two views; process more frames")
     step_m = _SCENE_SHARE * _median_depth_m(run)
     if len(T) <= (_ALL_FRAMES if most is None else most):
         return np.arange(len(T))
@@ -88,13 +88,13 @@ def _median_depth_m(run: TrackedPath) -> float:
 def tracked_stretches(
     where: Path, camera: StereoCamera, tracks: FeatureTracks, motion: CameraMotion, *, longest: int, most: int
 ) -> list[TrackedPath]:
-    """Pieces of a recording, with poses chained from frame to frame.
+    """Return pieces of a recording, with poses concatenated from frame to frame.
 
     Args:
         where: the recording.
         camera: rectified pair.
         tracks: stereo features of the recording.
-        motion: of the camera, where it is known.
+        motion: of the camera, where it was estimated.
         longest: frames of a piece.
         most: pieces, spread over the recording.
     """

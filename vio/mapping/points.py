@@ -1,4 +1,4 @@
-"""Points of the map: from tracks across keyframes, triangulated over all views."""
+"""Map points: tracks across keyframes, triangulated from all views."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _POINT_STEPS = 8
 
 @dataclass(frozen=True, slots=True)
 class PointTracks:
-    """Points of the map and where the keyframes see them."""
+    """Map points and their observations in the keyframes."""
 
     ids: IntArray  # (M,) feature ids
     p_world: FloatArray  # (M, 3) metres
-    point: IntArray  # (R,) index of the point that a row shows
+    point: IntArray  # (R,) index of the point that a row observes
     keyframe: IntArray  # (R,) index of the keyframe of a row; rows are ordered by keyframe
     z: FloatArray  # (R, 4) rectified pixels
     has_right: BoolArray  # (R,)
@@ -38,11 +38,11 @@ def build_tracks(
         run: the run.
         keyframes: (K,) rows of the trajectory.
         T_world_cam0: (K, 4, 4) poses of the keyframes.
-        gate_px: a row whose reprojection is off by more (in any coordinate) is an outlier and left out.
-        least_views: keyframes that must see a point.
+        gate_px: a row with a larger reprojection error (in any coordinate) is an outlier.
+        least_views: keyframes that must observe a point.
 
     Raises:
-        EstimationError: no track survives.
+        EstimationError: no track is consistent.
     """
     fresh = [run.fresh(int(k)) for k in keyframes]
     ids = np.concatenate([o.ids for o in fresh])
@@ -71,7 +71,7 @@ def build_tracks(
 
 
 def keep_rows(tracks: PointTracks, rows: BoolArray, *, least_views: int = 2) -> PointTracks:
-    """Return the rows (R,) named by a mask, without points that have then too few views or no stereo row."""
+    """Return the rows selected by a mask (R,), without points that then have too few views or no stereo row."""
     count = len(tracks.ids)
     views = np.bincount(tracks.point[rows], minlength=count)
     stereo = np.bincount(tracks.point[rows & tracks.has_right], minlength=count)
@@ -89,7 +89,7 @@ def keep_rows(tracks: PointTracks, rows: BoolArray, *, least_views: int = 2) -> 
 
 
 def reprojection(camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks) -> tuple[FloatArray, BoolArray]:
-    """Residuals (R, 4) `z - prediction` in pixels, zero for absent right pixels, and a mask (R,) of points ahead."""
+    """Return residuals (R, 4) in pixels, zero for missing right pixels, and a mask (R,) of points ahead."""
     T_cam0_world = se3_inverse(T_world_cam0)
     q, ahead = _in_camera(T_cam0_world, tracks)
     residual = tracks.z - project(camera, q)
@@ -107,9 +107,9 @@ def _in_camera(T_cam0_world: FloatArray, tracks: PointTracks) -> tuple[FloatArra
 def triangulate_tracks(
     camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks, *, width_px: float = 1.0
 ) -> tuple[FloatArray, BoolArray]:
-    """Points (M, 3) of all views by robust Gauss-Newton, and a mask (M,) of those determined.
+    """Triangulate points (M, 3) from all views by robust Gauss-Newton; also return a mask (M,) of those determined.
 
-    Starts from the stereo pair with the largest disparity; a Geman-McClure weight of `width_px` bounds outliers.
+    Starts from the stereo pair with the largest disparity; a Geman-McClure weight of `width_px` limits outliers.
     """
     count = len(tracks.ids)
     disparity = np.where(tracks.has_right, tracks.z[:, 0] - tracks.z[:, 2], -np.inf)
@@ -146,7 +146,7 @@ def triangulate_tracks(
 
 
 def landmarks_of(camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks, sigma_px: float) -> Landmarks:
-    """The points as landmarks; covariances for fixed poses and `sigma_px` a pixel coordinate."""
+    """Return the points as landmarks, with covariances for fixed poses and `sigma_px` per pixel coordinate."""
     T_cam0_world = se3_inverse(T_world_cam0)
     q, _ = _in_camera(T_cam0_world, tracks)
     H = z_D_p_cam(camera, q) @ T_cam0_world[tracks.keyframe, :3, :3]

@@ -1,4 +1,4 @@
-"""Poses of the left camera from points, and how far two sets of poses may lie or do lie apart."""
+"""Poses of the left camera from points, covariances of its positions, and the distance of two trajectories."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vio.records import BoolArray, Estimate, IntArray, Trajectory
 
 _POSE_STEPS = 12
 _LEAST_ROWS = 6
-_LEAST_SIGMA_M = 1e-4  # of a prior: the first pose of a filter is certain by definition
+_LEAST_SIGMA_M = 1e-4  # of a prior: the first pose of a filter has no uncertainty by definition
 
 
 def align_to_points(
@@ -27,7 +27,7 @@ def align_to_points(
     *,
     width_px: float = 1.0,
 ) -> FloatArray | None:
-    """Pose (4, 4) of one frame from known points (P, 3) and their pixels (P, 4); None: too few of them fit.
+    """Estimate one frame's pose (4, 4) from known points (P, 3) and pixels (P, 4); None: too few of them fit.
 
     Robust Gauss-Newton from `T_world_cam0`.
     """
@@ -60,10 +60,10 @@ def align_to_points(
 def fill_between(
     run: TrackedPath, keyframes: IntArray, T_world_keyframes: FloatArray, tracks: PointTracks
 ) -> tuple[FloatArray, int]:
-    """Poses (N, 4, 4) of every frame once the keyframes have moved, and how many came from points.
+    """Return poses (N, 4, 4) of all frames after the keyframes were adjusted, and how many come from points.
 
-    A frame between keyframes is aligned to the refined points that it sees; where too few are seen it keeps its
-    motion relative to the keyframe before it.
+    A frame between keyframes is aligned to the refined points that it observes; with too few of them it keeps its
+    motion relative to the previous keyframe.
     """
     old = run.trajectory.T_world_body
     before = np.clip(np.searchsorted(keyframes, np.arange(len(old)), side="right") - 1, 0, None)
@@ -81,7 +81,7 @@ def fill_between(
 
 
 def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) -> FloatArray:
-    """Covariances (K, 3, 3) of the left camera's position in the world, from those of `xi` (docs/conventions.md).
+    """Return covariances (K, 3, 3) of the left camera's position in the world, from `xi` (docs/conventions.md).
 
     `T_imu_world = exp(xi) T_hat` moves a point c fixed in the body by `R_world_imu (-rho + c x phi)`.
     """
@@ -95,7 +95,7 @@ def position_covariances(estimates: Sequence[Estimate], T_cam0_imu: FloatArray) 
 
 
 def position_difference_m(one: Trajectory, other: Trajectory) -> float:
-    """Root mean square distance of paired positions after SE(3) alignment."""
+    """Return the root mean square distance of paired positions after SE(3) alignment."""
     alignment = align_poses(one.T_world_body, other.T_world_body, "se3")
     aligned = apply_alignment(alignment, one.T_world_body)
     return float(np.sqrt(np.mean(np.sum((aligned[:, :3, 3] - other.positions) ** 2, axis=1))))

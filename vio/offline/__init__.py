@@ -1,5 +1,5 @@
-"""What is done beside and after a run: calibration measured, a run checked, refined and exported, with COLMAP's help.
+"""Offline processing: calibration from a recording; check, refinement and export of a run, with COLMAP.
 
-The commands of the same names parse, call these functions and print. Everything here may know readers, mapping and
-COLMAP; nothing but the command line knows these.
+The commands of the same names parse arguments, call these functions and print. This package may depend on readers,
+mapping and COLMAP; only the command line depends on it.
 """

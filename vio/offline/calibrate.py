@@ -1,4 +1,4 @@
-"""A recording's calibration measured from the recording itself, and compared with the one that it comes with."""
+"""Measurement of a recording's calibration from the recording itself, and comparison with the given one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vio.calibration.egomotion import CameraMotion, camera_motion
 from vio.calibration.findings import Finding, NotObservable
 from vio.calibration.gyro import align_gyro
 from vio.calibration.inertial import ImuAlignment, rates_of
-from vio.calibration.levers import LeverArm, lever_arm
+from vio.calibration.lever_arm import LeverArm, estimate_lever_arm
 from vio.calibration.stereo import (
     RayMatches,
     RowResiduals,
@@ -24,7 +24,7 @@ from vio.calibration.stereo import (
     row_residuals,
     too_few,
 )
-from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo, judge_velocity_lever
+from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo, judge_velocity_lever_arm
 from vio.colmap.adjustment import adjust_rig_in_motion
 from vio.colmap.pairs import adjust_rig, relative_pose, sift_matches
 from vio.datasets.images import load_gray
@@ -42,20 +42,20 @@ from vio.records import BoolArray, FeatureTracks, MotionSample, Recording
 log = logging.getLogger(__name__)
 
 _STRETCH, _STRETCHES, _STRETCH_KEYFRAMES = 36, 6, 20  # frames, pieces, keyframes of each, for the rig in motion
-_STRETCH_GATE_PX = 8.0  # wide: a wrong rig puts every point off
-_FRAMES_PER_PAIR = 5  # a frame of a feature file holds fewer matches than a pair of images
-_CROOKED_PX = 2.0  # rows further apart than this are matched wrongly or not at all
-_HOPELESS = ("cameras swapped", "baseline translation inverted")  # features mean nothing then
+_STRETCH_GATE_PX = 8.0  # wide: wrong extrinsics displace every point
+_FRAMES_PER_PAIR = 5  # a frame of a feature file contains fewer matches than a pair of images
+_MAX_ROW_OFFSET_PX = 2.0  # with larger row differences, features are matched wrongly or not at all
+_UNUSABLE = ("cameras swapped", "baseline translation inverted")  # features are unusable then
 
-_ROWS, _IMU, _LEVER = "row alignment", "IMU-camera rotation and time offset", "lever arm"
+_ROWS, _IMU, _LEVER_ARM = "row alignment", "IMU-camera rotation and time offset", "lever arm"
 
 
 @dataclass(frozen=True, slots=True)
 class ImuReport:
-    """What the motion sensor's place and clock turned out to be."""
+    """Estimated extrinsics and clock offset of the motion sensor."""
 
     alignment: ImuAlignment | NotObservable
-    lever: LeverArm | NotObservable
+    lever_arm: LeverArm | NotObservable
     findings: tuple[Finding, ...] = ()
 
 
@@ -72,16 +72,16 @@ class CalibrationReport:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """All faults that were found."""
+        """All faults found."""
         return (*self.stereo_findings, *self.imu.findings)
 
 
 @dataclass(frozen=True, slots=True)
 class _Matches:
-    """Matches of left and right images, and what they say as they stand."""
+    """Matches of left and right images."""
 
     rays: RayMatches  # of the raw cameras
-    exchanged: RayMatches | None  # each image taken for the other camera's; None: the cameras are equal
+    exchanged: RayMatches | None  # with the cameras exchanged; None: the cameras are equal
     z: FloatArray  # (N, 4) rectified pixels [ul vl ur vr]; empty where images cannot be rectified
 
 
@@ -93,7 +93,7 @@ def measure(
     frames: int,
     progress: Callable[[int, int], None],
 ) -> CalibrationReport:
-    """Measure what a recording shows of its calibration, left and right first: all else stands on it.
+    """Measure a recording's calibration: first left and right, which everything else depends on.
 
     Args:
         source: the recording.
@@ -119,11 +119,11 @@ def measure(
         findings = judge_stereo(stereo, given, agreeing)
     if source.dataset is None:
         rows = NotObservable(_ROWS, "the images cannot be rectified")
-        why = "the left-right calibration must be mended first: it decides where features are and how far away"
+        why = "the left-right calibration must be corrected first: it determines the positions and depths of features"
         return CalibrationReport(source, stereo, rows, _no_imu(why), findings, notes)
     described = row_residuals(matches.z, *source.image_size(matches.z))
-    if _hopeless(described, findings):
-        why = f"{findings[0].fault if findings else 'image rows do not match'}: mend that first, then measure again"
+    if _unusable(described, findings):
+        why = f"{findings[0].fault if findings else 'image rows do not match'}: correct that first, then measure again"
         return CalibrationReport(source, stereo, described, _no_imu(why), findings, notes)
     recording = source.dataset.recording
     tracks, samples = tracked or track(source.dataset, build_frontend, frames, progress)
@@ -135,17 +135,17 @@ def measure(
     return CalibrationReport(source, stereo, described, imu, findings, notes)
 
 
-def _hopeless(rows: RowResiduals | NotObservable, findings: tuple[Finding, ...]) -> bool:
-    """Whether features in both images cannot be trusted to be of one point."""
-    crooked = isinstance(rows, RowResiduals) and abs(rows.median_px) + rows.spread_px > _CROOKED_PX
-    return crooked or any(f.fault in _HOPELESS for f in findings)
+def _unusable(rows: RowResiduals | NotObservable, findings: tuple[Finding, ...]) -> bool:
+    """Return whether features of the two images may not be of the same point."""
+    misaligned = isinstance(rows, RowResiduals) and abs(rows.median_px) + rows.spread_px > _MAX_ROW_OFFSET_PX
+    return misaligned or any(f.fault in _UNUSABLE for f in findings)
 
 
 # --- left and right -------------------------------------------------------------------------------------------------
 
 
 def _match_images(source: CalibrationSource, pairs: int, progress: Callable[[int, int], None]) -> _Matches:
-    """SIFT matches of spread pairs of images."""
+    """Return SIFT matches of spread pairs of images."""
     assert source.rig is not None
     rig, rotations = source.rig, source.rectifying()
     rays: list[RayMatches] = []
@@ -173,7 +173,7 @@ def _match_images(source: CalibrationSource, pairs: int, progress: Callable[[int
 
 
 def _rays(rig: StereoRig, uv0: FloatArray, uv1: FloatArray, pair: int) -> tuple[RayMatches, BoolArray]:
-    """Rays of matched pixels (N, 2) of both cameras, and a mask (N,) of the matches that have them."""
+    """Return rays of matched pixels (N, 2) of both cameras, and a mask (N,) of the matches that have them."""
     ray0, valid0 = unproject_pixel(rig.cam0, uv0)
     ray1, valid1 = unproject_pixel(rig.cam1, uv1)
     valid = valid0 & valid1 & (ray0[:, 2] > 0.1) & (ray1[:, 2] > 0.1)
@@ -181,7 +181,7 @@ def _rays(rig: StereoRig, uv0: FloatArray, uv1: FloatArray, pair: int) -> tuple[
 
 
 def _match_tracks(recording: Recording, tracks: FeatureTracks, pairs: int) -> _Matches:
-    """The stereo rows of spread frames of a feature file."""
+    """Return the stereo rows of spread frames of a feature file."""
     frames, fresh = tracks.frames, tracks.has_right & ~tracks.stale
     filled = np.unique(frames[fresh])
     spread = np.unique(np.linspace(0, len(filled) - 1, _FRAMES_PER_PAIR * pairs).astype(int))
@@ -193,7 +193,7 @@ def _match_tracks(recording: Recording, tracks: FeatureTracks, pairs: int) -> _M
 
 
 def _measure_stereo(matches: RayMatches) -> tuple[StereoEstimate | NotObservable, RayMatches]:
-    """RANSAC, refinement on epipolar angles, bundle adjustment of the rig; with the matches that agree."""
+    """Estimate by RANSAC, refinement on epipolar angles and bundle adjustment of the rig; also return the inliers."""
     if few := too_few(matches):
         return few, matches
     start = relative_pose(matches)
@@ -211,7 +211,7 @@ def _measure_stereo(matches: RayMatches) -> tuple[StereoEstimate | NotObservable
 def _stereo_in_motion(
     source: CalibrationSource, stereo: StereoEstimate, tracks: FeatureTracks, motion: CameraMotion
 ) -> StereoEstimate:
-    """The left-right extrinsics by bundle adjustment over stretches of video; as they were where that fails."""
+    """Estimate left-right extrinsics by bundle adjustment over stretches of video; unchanged where that fails."""
     assert source.dataset is not None
     width, height = source.image_size(tracks.z)
     camera = replace(source.dataset.recording.camera, width=int(width) + 1, height=int(height) + 1)
@@ -237,7 +237,7 @@ def _stereo_in_motion(
 
 
 def _no_imu(why: str) -> ImuReport:
-    return ImuReport(NotObservable(_IMU, why), NotObservable(_LEVER, why))
+    return ImuReport(NotObservable(_IMU, why), NotObservable(_LEVER_ARM, why))
 
 
 def _measure_imu(
@@ -247,19 +247,19 @@ def _measure_imu(
     motion: CameraMotion | NotObservable,
 ) -> ImuReport:
     if not samples:
-        return _no_imu("the recording holds no motion sensor")
+        return _no_imu("the recording contains no motion sensor")
     if isinstance(motion, NotObservable):
-        return ImuReport(motion, NotObservable(_LEVER, motion.because))
+        return ImuReport(motion, NotObservable(_LEVER_ARM, motion.because))
     rates = rates_of(samples)
     alignment = align_gyro(motion, rates)
     if isinstance(alignment, NotObservable):
-        return ImuReport(alignment, NotObservable(_LEVER, alignment.because))
-    lever = lever_arm(motion, rates, alignment)
+        return ImuReport(alignment, NotObservable(_LEVER_ARM, alignment.because))
+    lever_arm = estimate_lever_arm(motion, rates, alignment)
     given = recording.T_cam0_imu
     if given is None:
-        return ImuReport(alignment, lever)
-    findings = judge_imu(alignment, lever, given)
+        return ImuReport(alignment, lever_arm)
+    findings = judge_imu(alignment, lever_arm, given)
     if not rates.inertial:
         times_ns = recording.frame_times_ns
-        findings = (*findings, *judge_velocity_lever(recording.camera, tracks, times_ns, rates, given))
-    return ImuReport(alignment, lever, findings)
+        findings = (*findings, *judge_velocity_lever_arm(recording.camera, tracks, times_ns, rates, given))
+    return ImuReport(alignment, lever_arm, findings)

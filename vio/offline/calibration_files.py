@@ -1,4 +1,4 @@
-"""A measured calibration as files: Kalibr's camchain and EuRoC's sensor.yaml."""
+"""Files of a measured calibration: Kalibr's camchain and EuRoC's sensor.yaml."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from vio.calibration.inertial import ImuAlignment
-from vio.calibration.levers import LeverArm
+from vio.calibration.lever_arm import LeverArm
 from vio.calibration.stereo import StereoEstimate
 from vio.datasets.euroc_files import camera_yaml, median_rate_hz
 from vio.datasets.rectified import RectifiedDataset
@@ -19,13 +19,13 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.offline.calibrate import CalibrationReport
 
 _KALIBR_MODELS = {"pinhole": "none", "radtan": "radtan", "equidistant": "equidistant"}
-_USUAL_RATE_HZ = 20.0  # where there are no times to tell it from
+_USUAL_RATE_HZ = 20.0  # where there are no time stamps to derive it from
 
 
 def write_calibration(folder: Path, report: CalibrationReport) -> None:
-    """Write the measured calibration, given values in place of what could not be observed, in both forms.
+    """Write the measured calibration in both formats, with the given values where it is not observable.
 
-    Nothing is written of features without an image size. The folder must exist.
+    Nothing is written for features without an image size. The folder must exist.
     """
     rig = report.source.rig
     if rig is None:
@@ -47,7 +47,7 @@ def write_calibration(folder: Path, report: CalibrationReport) -> None:
 
 
 def _measured_stereo(report: CalibrationReport, rig: StereoRig) -> FloatArray:
-    """`T_cam0_cam1` (4, 4) as measured, with the given length of the baseline."""
+    """Return `T_cam0_cam1` (4, 4) as measured, with the given length of the baseline."""
     if not isinstance(report.stereo, StereoEstimate):
         return rig.T_cam0_cam1
     length = float(np.linalg.norm(rig.T_cam0_cam1[:3, 3]))
@@ -55,24 +55,24 @@ def _measured_stereo(report: CalibrationReport, rig: StereoRig) -> FloatArray:
 
 
 def _measured_imu(report: CalibrationReport, rig: StereoRig) -> tuple[FloatArray, float]:
-    """`T_cam0_imu` (4, 4) of the raw left camera, and by how many seconds the IMU's clock is ahead of the camera's."""
+    """Return `T_cam0_imu` (4, 4) of the raw left camera, and the IMU's clock minus the camera's in seconds."""
     T_cam0_imu, offset_s = se3_inverse(rig.T_imu_cam0), 0.0
-    alignment, lever, dataset = report.imu.alignment, report.imu.lever, report.source.dataset
-    R_rect_cam0 = np.eye(3)  # the motion was seen by the rectified camera
+    alignment, lever_arm, dataset = report.imu.alignment, report.imu.lever_arm, report.source.dataset
+    R_rect_cam0 = np.eye(3)  # the motion was measured with the rectified camera
     if isinstance(dataset, RectifiedDataset):
         R_rect_cam0 = (dataset.rectifier.T_rect0_imu @ rig.T_imu_cam0)[:3, :3]
     if isinstance(alignment, ImuAlignment) and alignment.weak is None:
         T_cam0_imu = se3_from_parts(R_rect_cam0.T @ alignment.R_cam0_imu, T_cam0_imu[:3, 3])
         offset_s = alignment.time_offset_s
-    if isinstance(lever, LeverArm):
-        T_cam0_imu = se3_from_parts(T_cam0_imu[:3, :3], R_rect_cam0.T @ lever.t_cam0_imu)
+    if isinstance(lever_arm, LeverArm):
+        T_cam0_imu = se3_from_parts(T_cam0_imu[:3, :3], R_rect_cam0.T @ lever_arm.t_cam0_imu)
     return T_cam0_imu, offset_s
 
 
 def _kalibr(
     cameras: Mapping[str, CameraModel], poses: Mapping[str, FloatArray], T_cam0_cam1: FloatArray, offset_s: float
 ) -> str:
-    """Kalibr's camchain: `T_cam_imu` maps the IMU to the camera, `t_imu = t_cam + timeshift_cam_imu`.
+    """Return Kalibr's camchain: `T_cam_imu` maps the IMU to the camera, `t_imu = t_cam + timeshift_cam_imu`.
 
     Args:
         cameras: by name.

@@ -1,4 +1,4 @@
-"""A second opinion on a saved run: COLMAP's reconstruction from the images alone, compared with it."""
+"""Comparison of a saved run with COLMAP's reconstruction from the images alone."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ _COLOURS: dict[Mapper, str] = {"incremental": "#d9822b", "global": "#3a9d5d"}
 
 
 @dataclass(frozen=True, slots=True)
-class Opinion:
-    """What one of COLMAP's mappers makes of a run's keyframes."""
+class MapperResult:
+    """The reconstruction of a run's keyframes by one of COLMAP's mappers, and its comparison with the run."""
 
     mapper: Mapper
     total: int  # keyframes given
@@ -30,7 +30,7 @@ class Opinion:
 
     @property
     def verdict(self) -> str:
-        """In a few words."""
+        """A short summary."""
         if self.found is None:
             return (
                 "not observable because COLMAP could not connect the keyframes; too few images, no overlap between "
@@ -41,7 +41,7 @@ class Opinion:
         left_out = f"; {missing} of {self.total} keyframes could not be connected" if missing else ""
         if comparison.scale is None:
             return f"poses compared, scale not observable because {comparison.why_no_scale}{left_out}"
-        where = f"disagrees in {len(comparison.segments)} segments" if comparison.segments else "agrees all along"
+        where = f"disagrees in {len(comparison.segments)} segments" if comparison.segments else "agrees throughout"
         return f"{where}{left_out}"
 
 
@@ -54,22 +54,22 @@ def check_run(
     source: str | None,
     threads: int,
     progress: Callable[[int, int], None],
-) -> tuple[Opinion, ...]:
-    """Reconstruct keyframes of a run from their images by some mappers, the stereo rig known, and compare.
+) -> tuple[MapperResult, ...]:
+    """Reconstruct keyframes of a run from their images with a known stereo rig, and compare.
 
-    Leaves a folder of each mapper's name with its model, and the picture `check.png`.
+    Writes a folder of each mapper's name with its model, and the plot `check.png`.
 
     Args:
         run: the run.
-        folder: where; it is there and empty.
+        folder: an existing, empty folder.
         mappers: COLMAP's.
-        most: keyframes.
-        source: the recording, where it is not at the place that the run names.
+        most: largest number of keyframes.
+        source: the recording, if it is not at the path stored in the run.
         threads: for all steps; one makes the result repeatable.
         progress: called with (done, total).
 
     Raises:
-        VioError: the run has too few views, or its images are not to be had.
+        VioError: the run has too few views, or its images are not available.
     """
     path, steps = run.tracked, 2 + len(mappers)
     keyframes = choose_keyframes(path, most=most)
@@ -79,23 +79,23 @@ def check_run(
     progress(1, steps)
     match_images(database, images, names, path.camera, threads=threads)
     progress(2, steps)
-    opinions: list[Opinion] = []
+    results: list[MapperResult] = []
     for mapper in mappers:
         model = reconstruct(database, images, names, mapper, folder / mapper, threads=threads)
         found = None
         if model is not None:
             rows = keyframes[model.keyframes]
             found = model, compare_keyframes(path, rows, model.T_world_cam0, run.truth)
-        opinions.append(Opinion(mapper, len(keyframes), found))
-        progress(2 + len(opinions), steps)
-    _draw(folder / "check.png", path.trajectory, opinions)
+        results.append(MapperResult(mapper, len(keyframes), found))
+        progress(2 + len(results), steps)
+    _draw(folder / "check.png", path.trajectory, results)
     shutil.rmtree(images)
     database.unlink()
-    return tuple(opinions)
+    return tuple(results)
 
 
-def _draw(path: Path, trajectory: Trajectory, opinions: Sequence[Opinion]) -> None:
-    """Both trajectories seen from above, and their distance along the way."""
+def _draw(path: Path, trajectory: Trajectory, results: Sequence[MapperResult]) -> None:
+    """Plot the trajectories from above, and their distance along the path."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 5), dpi=110, layout="constrained")
@@ -103,13 +103,13 @@ def _draw(path: Path, trajectory: Trajectory, opinions: Sequence[Opinion]) -> No
     p = trajectory.positions
     axes = np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2][:2]
     above.plot(*((p - p[0]) @ axes.T).T, color="#1f5fbf", label="run")
-    for opinion in opinions:
-        if opinion.found is None:
+    for result in results:
+        if result.found is None:
             continue
-        comparison, colour = opinion.found[1], _COLOURS[opinion.mapper]
+        comparison, colour = result.found[1], _COLOURS[result.mapper]
         q = (comparison.aligned[:, :3, 3] - p[0]) @ axes.T
-        above.plot(*q.T, ".", color=colour, label=f"COLMAP, {opinion.mapper}")
-        along.plot(comparison.frames, 1e3 * comparison.difference_m, ".-", color=colour, label=opinion.mapper)
+        above.plot(*q.T, ".", color=colour, label=f"COLMAP, {result.mapper}")
+        along.plot(comparison.frames, 1e3 * comparison.difference_m, ".-", color=colour, label=result.mapper)
         for segment in comparison.segments:
             along.axvspan(segment.first_frame, segment.last_frame, color=colour, alpha=0.2)
     above.set_aspect("equal", "datalim")

@@ -1,4 +1,4 @@
-"""A run in the form of other programs: a metric COLMAP model, and nerfstudio's transforms beside it."""
+"""Export of a run: a metric COLMAP model and nerfstudio's transforms."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vio.saved_run import SavedRun
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What was written."""
+    """Counts of the written data."""
 
     keyframes: int
     images: int
@@ -44,18 +44,18 @@ def export_colmap(
     source: str | None,
     progress: Callable[[int, int], None],
 ) -> Exported:
-    """Write `sparse/0`, `images`, `transforms.json` and `points.ply` into a folder that is there and empty.
+    """Write `sparse/0`, `images`, `transforms.json` and `points.ply` into an existing, empty folder.
 
     Args:
         run: the run.
-        folder: where.
-        most: keyframes; None: as many as are needed.
+        folder: the output folder.
+        most: largest number of keyframes; None: as many as needed.
         images: whether to write the rectified images, which give the points their colours.
-        source: the recording, where it is not at the place that the run names.
+        source: the recording, if it is not at the path stored in the run.
         progress: called with (done, total) after each keyframe's images.
 
     Raises:
-        VioError: the run has too few views or no consistent track, or its images are not to be had.
+        VioError: the run has too few views or no consistent track, or its images are not available.
     """
     keyframes = choose_keyframes(run.tracked, most=most)
     T_world_cam0 = run.tracked.trajectory.T_world_body[keyframes]
@@ -103,7 +103,7 @@ def _write_images(
 
 
 def _sample_gray(image: Image, uv: FloatArray) -> FloatArray:
-    """Gray values (N,) of the pixels nearest to (N, 2)."""
+    """Return the gray values (N,) of the pixels nearest to (N, 2)."""
     u = np.clip(np.rint(uv[:, 0]).astype(int), 0, image.shape[1] - 1)
     v = np.clip(np.rint(uv[:, 1]).astype(int), 0, image.shape[0] - 1)
     out: FloatArray = image[v, u].astype(np.float64)

@@ -23,14 +23,14 @@ def write_images(
 
     Args:
         run: the run.
-        source: the recording, where it is not at the place that the run names.
+        source: the recording, if it is not at the path stored in the run.
         keyframes: (K,) rows of the trajectory, increasing.
-        names: their files, relative to the folder.
-        folder: made if missing.
-        each: is given each keyframe's index and its left image.
+        names: file names relative to the folder.
+        folder: created if missing.
+        each: called with each keyframe's index and left image.
 
     Raises:
-        DataError: the images are not to be had.
+        DataError: the images are not available.
     """
     for name in (names.left[0], names.right[0]):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Bundle adjustment over a saved run's keyframes, and the run's other frames after it."""
+"""Bundle adjustment over a saved run's keyframes, and alignment of its other frames to the result."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Refinement:
     keyframes: IntArray  # (K,) rows of the trajectory
     aligned: int  # frames between keyframes that were aligned to the refined points
     with_priors: bool
-    moved_rms_m: float  # from the run, after SE(3) alignment
+    moved_rms_m: float  # RMS displacement from the run, after SE(3) alignment
     ate_before_m: float | None  # against the reference in the recording; None without one
     ate_m: float | None  # likewise, after refinement
 
@@ -48,8 +48,8 @@ def refine_run(
 
     Args:
         run: the run.
-        most: keyframes; None: as many as are needed.
-        priors: hold the camera positions to the filter's by its covariance, where the filter still repeats the run.
+        most: largest number of keyframes; None: as many as needed.
+        priors: use the filter's camera positions and covariances as priors, if the filter reproduces the run.
         threads: of the solver; one makes the result repeatable.
         progress: called with the number of steps done.
 
@@ -84,7 +84,7 @@ def refine_run(
 
 
 def _scores(run: SavedRun, refined: Trajectory) -> tuple[float | None, float | None]:
-    """ATE before and after, against the reference in the recording; None without one."""
+    """Return ATE before and after, against the reference in the recording; None without one."""
     truth = run.truth
     if truth is None:
         return None, None
@@ -100,23 +100,21 @@ def _scores(run: SavedRun, refined: Trajectory) -> tuple[float | None, float | N
 
 
 def _priors(run: SavedRun, keyframes: IntArray) -> PositionPriors | None:
-    """Replay the filter on its saved observations for the covariance of each pose; None where it has changed since."""
+    """Replay the filter on its saved observations for the poses' covariances; None if it does not reproduce the run."""
     where, frames = run.tracked.where, run.tracked.frames
-    again = process(
+    replayed = process(
         run.dataset, _estimator_settings(where / "config.yaml"), start=int(frames[0]), stop=int(frames[-1]) + 1
     )
-    poses = again.trajectory.in_cam0(again.T_cam0_body).T_world_body
+    poses = replayed.trajectory.in_cam0(replayed.T_cam0_body).T_world_body
     if len(poses) != len(frames) or np.abs(poses - run.tracked.trajectory.T_world_body).max() > 1e-6:
-        log.warning(
-            "the filter does not repeat %s any more (other version or settings); refining without priors", where
-        )
+        log.warning("the filter does not reproduce %s (other version or settings); refining without priors", where)
         return None
-    chosen = [again.estimates[int(k)] for k in keyframes]
+    chosen = [replayed.estimates[int(k)] for k in keyframes]
     return PositionPriors(poses[keyframes, :3, 3], position_covariances(chosen, run.T_cam0_imu))
 
 
 def _estimator_settings(path: Path) -> Config:
-    """The settings that a run was made with, but those of its front end, whose work is done."""
+    """Return the settings of a run without those of front end and reader, which the replay does not need."""
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:

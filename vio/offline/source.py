@@ -1,4 +1,4 @@
-"""A recording with its calibration as given, before anything is believed of it."""
+"""A recording with its calibration as given, without any correction."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from vio.records import FeatureTracks, MotionSample, Observations, StereoFrame, 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSource:
-    """What there is to measure a calibration from."""
+    """The data to measure a calibration from."""
 
     path: Path
     rig: StereoRig | None  # as calibrated; None: features without an image size
     raw_pairs: tuple[tuple[Path, Path], ...]  # image files, unrectified where the cameras are; empty: features only
-    dataset: Dataset | None  # None: the calibration is such that images cannot be rectified
+    dataset: Dataset | None  # None: images cannot be rectified with this calibration
     refused: str | None  # why not
 
     @property
@@ -48,7 +48,7 @@ class CalibrationSource:
         return rectifying_rotations(self.dataset.rectifier.rig)[:2]
 
     def image_size(self, z: FloatArray) -> tuple[float, float]:
-        """Width and height in pixels; where unknown, those that rectified pixels (N, 4) fill."""
+        """Return width and height in pixels; where unknown, the extent of rectified pixels (N, 4)."""
         camera = None if self.dataset is None else self.dataset.recording.camera
         if camera is not None and camera.width is not None and camera.height is not None:
             return float(camera.width), float(camera.height)
@@ -60,7 +60,7 @@ def open_source(text: str) -> CalibrationSource:
 
     Raises:
         DataError: no known recording, or it cannot be read.
-        CalibrationError: the calibration cannot be right, and the recording is none of EuRoC's.
+        CalibrationError: the calibration is invalid, and the recording is not in EuRoC format.
     """
     try:
         dataset = open_dataset(text, DatasetSettings(extrinsics="literal"))
@@ -80,7 +80,7 @@ def open_source(text: str) -> CalibrationSource:
 
 
 def _raw_euroc(path: Path, refused: str) -> CalibrationSource | None:
-    """An EuRoC folder whose cameras cannot be rectified: its rig and images as they stand; None: it is none."""
+    """Return rig and raw images of an EuRoC folder whose cameras cannot be rectified; None: another format."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     if not all((mav / name / "sensor.yaml").is_file() and (mav / name / "data").is_dir() for name in ("cam0", "cam1")):
         return None
@@ -99,8 +99,8 @@ def track(
 
     Args:
         dataset: the recording.
-        build_frontend: makes the front end where the recording holds images.
-        frames: at most so many are tracked.
+        build_frontend: makes the front end if the recording contains images.
+        frames: largest number of frames to track.
         progress: called with (done, total) after each of them.
 
     Raises:

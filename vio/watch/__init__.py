@@ -1,4 +1,4 @@
-"""What looks on at a run and changes nothing: is the IMU what it claims to be, and is the estimate still sane?
+"""Monitoring of a run without influence on it: plausibility of the IMU data and of the estimate.
 
-Nothing here knows a reader, a front end or a filter.
+This package does not depend on readers, front ends or filters.
 """

@@ -1,4 +1,4 @@
-"""Exchanged and inverted axes: which there are, and how they are written."""
+"""Exchanged and inverted axes: all signed permutations, and their text form."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vio.geometry.lie import FloatArray
 
 
 def signed_permutations() -> Iterator[FloatArray]:
-    """All 48 maps that exchange and invert axes; those that change least come first."""
+    """Yield all 48 maps that exchange and invert axes; those that change least come first."""
     every = [
         np.eye(3)[list(order)] * np.array(signs)[:, None]
         for order in permutations(range(3))
@@ -22,15 +22,15 @@ def signed_permutations() -> Iterator[FloatArray]:
 
 
 def axes_text(P: FloatArray) -> str:
-    """How true readings of x y z appear in the record, e.g. `[+y -x +z]`."""
+    """Return how true readings of x y z appear in the recording, e.g. `[+y -x +z]`."""
     return "[" + " ".join(f"{'+' if row.sum() > 0 else '-'}{'xyz'[int(np.argmax(np.abs(row)))]}" for row in P) + "]"
 
 
 def matrix_text(R: FloatArray) -> str:
-    """A matrix (3, 3) in one line."""
+    """Return a matrix (3, 3) in one line."""
     return "[" + ", ".join(triple_text(row) for row in R) + "]"
 
 
 def triple_text(v: npt.NDArray[np.floating]) -> str:
-    """Three numbers in one line."""
+    """Return three numbers in one line."""
     return f"[{v[0]:.3f}, {v[1]:.3f}, {v[2]:.3f}]"

@@ -1,4 +1,4 @@
-"""Whether the IMU's stamps cover those of the frames, by the stamps alone."""
+"""Overlap of the IMU's time stamps with those of the frames, by the stamps alone."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from vio.records import IntArray
 from vio.watch.finding import InertialFinding
 
 _COVERED = 0.97  # share of the frames that must have samples …
-_UNCOVERED_S = 1.0  # … unless so little time is without
+_UNCOVERED_S = 1.0  # … unless the uncovered time is shorter
 _LATE_S = 0.1  # a frame has a sample if the last one is no older
-_NO_IMU_FRAMES, _NO_IMU_S = 10, 0.4  # without any sample, it is said after so many frames and so much time
+_NO_IMU_FRAMES, _NO_IMU_S = 10, 0.4  # missing samples are reported after so many frames and so much time
 _NS = 1e-9
 
 
 def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[InertialFinding, ...]:
-    """Say whether the IMU's stamps cover those of the frames, and what would explain it if they do not.
+    """Check whether the IMU's stamps cover those of the frames, and explain it if they do not.
 
     Args:
         frame_times_ns: (F,) increasing.
@@ -37,7 +37,7 @@ def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[Iner
 
 
 class Coverage:
-    """Counts, as a run goes on, the frames that have IMU samples."""
+    """Count the frames that have IMU samples during a run."""
 
     def __init__(self) -> None:
         self._first_ns: int | None = None
@@ -52,17 +52,17 @@ class Coverage:
         self._covered += last_imu_ns is not None and (time_ns - last_imu_ns) * _NS <= _LATE_S
 
     def so_far(self, imu: tuple[int, int] | None, step_ns: float) -> list[InertialFinding]:
-        """Say early that no frame has samples.
+        """Report early that no frame has samples.
 
         Args:
-            imu: first and last stamp of the samples, ns; None: there is none.
-            step_ns: their usual distance.
+            imu: first and last stamp of the samples, ns; None: no samples.
+            step_ns: their usual interval.
         """
         long = self._frames >= _NO_IMU_FRAMES and self._seconds >= _NO_IMU_S
         return [_no_overlap(self._span, imu, step_ns)] if long and self._covered == 0 else []
 
     def at_end(self, imu: tuple[int, int] | None, step_ns: float) -> list[InertialFinding]:
-        """Say that no frame, or only a part of them, had samples; arguments as those of `so_far`."""
+        """Report that none or only a part of the frames had samples; arguments as for `so_far`."""
         if not self._frames or self._covered >= _COVERED * self._frames:
             return []
         if self._covered == 0:
@@ -91,7 +91,7 @@ def _no_overlap(frames: tuple[int, int], imu: tuple[int, int] | None, step_ns: f
             "the IMU's stamps may count from another epoch or in another unit (ns, us, ms, s); give both one clock, "
             "or use --motion none",
         )
-    seen = f"{seen}, IMU samples from {imu[0]} to {imu[1]} ns, no time in common"
+    seen = f"{seen}, IMU samples from {imu[0]} to {imu[1]} ns, without overlap"
     unit = _unit_of_clock(frames, imu, step_ns)
     if unit is not None:
         return InertialFinding("clocks without overlap", seen, unit)
@@ -102,8 +102,8 @@ def _no_overlap(frames: tuple[int, int], imu: tuple[int, int] | None, step_ns: f
     return InertialFinding(
         "clocks without overlap",
         seen,
-        f"{same}the clocks may count from other epochs (the IMU starts {offset_s:+.3f} s from the frames), or the "
-        "files belong to other recordings; move the IMU's stamps onto the camera's clock",
+        f"{same}the clocks may have different epochs (the IMU starts {offset_s:+.3f} s from the frames), or the "
+        "files belong to other recordings; convert the IMU's stamps to the camera's clock",
     )
 
 
@@ -118,7 +118,7 @@ def _part_overlap(frames: tuple[int, int], imu: tuple[int, int], step_ns: float,
 
 
 def _unit_of_clock(frames: tuple[int, int], imu: tuple[int, int], step_ns: float) -> str | None:
-    """Name the power of 1000 that brings the IMU's stamps onto the frames', where there is one."""
+    """Return the explanation by a power of 1000 that maps the IMU's stamps to the frames'; None: there is none."""
     names = {3: "microseconds", 6: "milliseconds", 9: "seconds"}
     for power in (3, 6, 9, -3, -6, -9):
         factor = 10.0**power

@@ -1,28 +1,28 @@
-"""What one look at a run has to judge an IMU by, before anything is judged."""
+"""The data that one evaluation of a run judges an IMU by."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 from vio.geometry.lie import FloatArray
-from vio.watch.force import ForceFit
-from vio.watch.turning import Turning
+from vio.watch.force_fit import ForceFit
+from vio.watch.gyro_fit import GyroFit
 
-FIRST_LOOK = 60  # intervals before the first look; fewer are there only when a run ends
+FIRST_EVALUATION = 60  # intervals before the first evaluation; there are fewer only at the end of a short run
 
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """The fits of gyro and accelerometer to the images, and the state of the watch."""
+    """The fits of gyro and accelerometer to the images, and the state of the check."""
 
     R_cam0_imu: FloatArray  # (3, 3) as given
-    turning: Turning
-    force: ForceFit | None  # None: too few windows are tracked throughout, or the readings have no unit
-    told: bool  # `force` will not come to know more: what it leaves open is judged without it
-    clipped: bool  # readings at the end of the range were found, which make turns look smaller
-    last: bool  # no later look will follow
+    gyro_fit: GyroFit
+    force: ForceFit | None  # None: too few windows without tracking loss, or the readings have no unit
+    force_final: bool  # `force` will not improve: what it leaves undecided is judged without it
+    clipped: bool  # readings at the end of the range were found, which make rotations appear smaller
+    last: bool  # no later evaluation will follow
 
     @property
     def brief(self) -> bool:
-        """Whether this is less than any look during a run has."""
-        return self.turning.count < FIRST_LOOK
+        """Whether there are fewer intervals than in any evaluation during a run."""
+        return self.gyro_fit.count < FIRST_EVALUATION

@@ -1,4 +1,4 @@
-"""What may be wrong with an IMU, its clock or its extrinsics, and how it is said."""
+"""Faults of an IMU, its clock or its extrinsics, and their messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ InertialFault: TypeAlias = Literal[
     "IMU gap",
 ]
 
-# A second finding of a group would say the same thing in other words.
+# A second finding of a group would repeat the first.
 _GROUPS: dict[InertialFault, str] = {
     "clocks without overlap": "overlap",
     "clocks overlap in part": "overlap",
@@ -45,11 +45,11 @@ _GROUPS: dict[InertialFault, str] = {
 
 @dataclass(frozen=True, slots=True)
 class InertialFinding:
-    """One thing that is wrong with the IMU, its clock or its extrinsics."""
+    """One fault of the IMU, its clock or its extrinsics."""
 
     fault: InertialFault
-    seen: str  # what the data show, with figures
-    explanation: str  # what would explain it, and what to do
+    seen: str  # the observation, with figures
+    explanation: str  # the likely cause, and what to do
     certain: bool = True  # False: a hint; correct data can look like this
 
     @property
@@ -59,5 +59,5 @@ class InertialFinding:
 
     @property
     def group(self) -> str:
-        """What it is about; of each group, one finding is enough."""
+        """The group of related faults; only one finding of each is reported."""
         return _GROUPS.get(self.fault, self.fault)

@@ -1,4 +1,4 @@
-"""Watch a run for divergence: what an estimator that has lost its way looks like from outside, said once per event."""
+"""Monitor a run for divergence by the estimator's outputs; each event is reported once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.records import Estimate, UpdateReport
 
-_BLIND_S = 1.0  # without a usable feature for longer, the pose is a prediction only
+_NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
 _REJECTING_FRAMES = 20
 _MAX_SPEED_MPS = 100.0
 _MAX_GYRO_BIAS_RADPS = 0.5
@@ -15,58 +15,58 @@ _MAX_ACCEL_BIAS_MPS2 = 3.0
 
 
 class RunHealth:
-    """Reads each frame's report and estimate; tells in one line what a user should know, when it begins and ends."""
+    """Monitor each frame's report and estimate; return one line when an event begins or ends."""
 
     def __init__(self) -> None:
         self._last: tuple[int, FloatArray] | None = None  # time and position of the frame before
-        self._fed: tuple[int, int] | None = None  # index and time of the last frame whose features moved the state
-        self._blind = False
+        self._last_used: tuple[int, int] | None = None  # index and time of the last frame with used features
+        self._without_features = False
         self._rejecting = 0
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
 
     def frame(self, index: int, report: UpdateReport, estimate: Estimate) -> tuple[str, ...]:
-        """Return the lines that this frame gives rise to.
+        """Return the warnings of this frame.
 
         Args:
             index: frame number.
             report: what the update did.
-            estimate: the belief after it.
+            estimate: the state estimate after it.
         """
         lines = [*self._features(index, report, estimate), *self._rejections(index, report)]
         lines += self._implausible(index, estimate)
         return tuple(lines)
 
     def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[str]:
-        """Say when features have been missing for long, and when they come back."""
+        """Report when features have been missing for long, and when they are back."""
         time_ns = estimate.time_ns
-        starts = report.initialised > 0 and not self._blind
-        if report.used > 0 or starts or self._fed is None:
-            ended = self._blind
-            away_s = 0.0 if self._fed is None else (time_ns - self._fed[1]) * 1e-9
-            self._fed, self._blind = (index, time_ns), False
+        starts = report.initialised > 0 and not self._without_features
+        if report.used > 0 or starts or self._last_used is None:
+            ended = self._without_features
+            away_s = 0.0 if self._last_used is None else (time_ns - self._last_used[1]) * 1e-9
+            self._last_used, self._without_features = (index, time_ns), False
             return [f"frame {index}: features again, after {away_s:.1f} s without"] if ended else []
-        seconds = (time_ns - self._fed[1]) * 1e-9
-        if self._blind or seconds < _BLIND_S:
+        seconds = (time_ns - self._last_used[1]) * 1e-9
+        if self._without_features or seconds < _NO_FEATURES_S:
             return []
-        self._blind = True
+        self._without_features = True
         sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
         return [
-            f"frame {index}: no usable feature since frame {self._fed[0]} ({seconds:.1f} s); the pose is a prediction, "
-            f"its position uncertain by {sigma:.2f} m"
+            f"frame {index}: no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); the pose is a "
+            f"prediction, the standard deviation of its position is {sigma:.2f} m"
         ]
 
     def _rejections(self, index: int, report: UpdateReport) -> list[str]:
-        """Say when more features are rejected than used for many frames in a row."""
+        """Report when more features are rejected than used for many frames in a row."""
         self._rejecting = self._rejecting + 1 if report.gated > report.used else 0
         if self._rejecting != _REJECTING_FRAMES:
             return []
         return [
             f"frame {index}: more features rejected than used for {_REJECTING_FRAMES} frames: wrong matches, moving "
-            "objects in the majority, or a pose that has left the truth"
+            "objects in the majority, or a pose that has diverged"
         ]
 
     def _implausible(self, index: int, estimate: Estimate) -> list[str]:
-        """Say once when the state is not that of a vehicle."""
+        """Report once when the state is implausible for a vehicle."""
         lines = []
         position = estimate.T_world_imu[:3, 3].copy()
         if self._last is not None and estimate.time_ns > self._last[0]:
@@ -83,7 +83,7 @@ class RunHealth:
         return lines
 
     def _once(self, what: str, value: float, limit: float, line: str) -> list[str]:
-        if value <= limit or what in self._said:
+        if value <= limit or what in self._reported:
             return []
-        self._said.add(what)
+        self._reported.add(what)
         return [f"{line}: the filter has diverged; check calibration, units and clocks"]

@@ -1,4 +1,4 @@
-"""The left camera's motion beside the IMU's readings: twists from frame to frame, a batch at a time, and one clock."""
+"""The left camera's twists from frame to frame, in batches, and the IMU's readings on the same clock."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vio.records import BoolArray, IntArray, Observations, feature_tracks
 from vio.watch.samples import GAP_S, MEMORY_S
 
 BATCH = 20  # frames whose motion is computed at once
-_TRACKS = 80  # of a frame that the camera's motion is computed from
+_TRACKS = 80  # tracks of a frame that the camera's motion is computed from
 _LEAST_LINKS = 15  # tracks between two frames
 _LONGEST_INTERVAL_S = 0.25
-_SAME_S = 1e-6  # one interval's end and the next one's begin: closer is joined
+_SAME_S = 1e-6  # intervals whose end and start differ by less are contiguous
 _NS = 1e-9
 
 
@@ -34,7 +34,7 @@ class Intervals:
 
 
 class CameraTwists:
-    """Gives the left camera's twists from frame to frame, from a thinned set of tracks, a batch at a time."""
+    """Compute the left camera's twists from frame to frame, from a subset of the tracks, in batches."""
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
@@ -43,23 +43,23 @@ class CameraTwists:
         self._links: list[int] = []
 
     def frame(self, seen: Observations) -> Intervals | None:
-        """Take one frame; every `BATCH` frames the motions since the last batch come back."""
+        """Add one frame; every `BATCH` frames, return the motions since the last batch."""
         rows = np.flatnonzero(seen.has_right & ~seen.stale)
         if len(rows) > _TRACKS:
-            # The same random choice of ids in every frame, so that tracks go on.
-            lot = (seen.ids[rows] * np.int64(2654435761)) & np.int64(0xFFFFFFFF)
-            rows = np.sort(rows[np.argpartition(lot, _TRACKS)[:_TRACKS]])
+            # The same random choice of ids in every frame, so that tracks continue.
+            hashed = (seen.ids[rows] * np.int64(2654435761)) & np.int64(0xFFFFFFFF)
+            rows = np.sort(rows[np.argpartition(hashed, _TRACKS)[:_TRACKS]])
         kept = seen.take(rows)
         if self._kept:
             last = self._kept[-1]
             _, a, b = np.intersect1d(last.ids, kept.ids, assume_unique=True, return_indices=True)
             self._links.append(len(a))
-            self._guess.append(self._turning(last, kept, kept.z[b, :2] - last.z[a, :2]))
+            self._guess.append(self._initial_rotation(last, kept, kept.z[b, :2] - last.z[a, :2]))
         self._kept.append(kept)
         return self.flush() if len(self._kept) > BATCH else None
 
-    def _turning(self, last: Observations, kept: Observations, flow: FloatArray) -> FloatArray:
-        """The twist that a pure turn would have, to start from: flow du = -fu wy dt, dv = fv wx dt."""
+    def _initial_rotation(self, last: Observations, kept: Observations, flow: FloatArray) -> FloatArray:
+        """Return the initial twist of a pure rotation: flow du = -fu wy dt, dv = fv wx dt."""
         out = np.zeros(6)
         dt = (kept.time_ns - last.time_ns) * _NS
         if len(flow) and dt > 0:
@@ -88,7 +88,7 @@ class RecentMotion:
         self._parts: list[Intervals] = []
 
     def add(self, motion: Intervals) -> None:
-        """Take the next intervals, and forget what is too old beside them."""
+        """Add the next intervals, and drop old ones."""
         if not len(motion):
             return
         self._parts.append(motion)
@@ -96,7 +96,7 @@ class RecentMotion:
             del self._parts[0]
 
     def joined(self) -> Intervals | None:
-        """All of them; None: there is none."""
+        """Return all intervals; None: there are none."""
         if not self._parts:
             return None
         return Intervals(
@@ -119,11 +119,11 @@ class Record:
 
     @property
     def joined(self) -> BoolArray:
-        """Whether each interval (K,) begins where the one before it ends."""
+        """Whether each interval (K,) starts where the previous one ends."""
         return np.concatenate([[False], np.abs(self.begin[1:] - self.end[:-1]) < _SAME_S])
 
     def means(self, offsets: npt.NDArray[np.floating]) -> tuple[FloatArray, BoolArray]:
-        """Mean readings (M, K, 6) over the intervals shifted by offsets (M,), and where (M, K) samples cover them."""
+        """Return mean readings (M, K, 6) over the intervals shifted by offsets (M,), and a mask (M, K) of coverage."""
         edges = [edge[None, :] + offsets[:, None] for edge in (self.begin, self.end)]
         low, high = (
             np.stack([np.interp(at.ravel(), self.t, self.integral[:, k]).reshape(at.shape) for k in range(6)], axis=-1)
@@ -136,7 +136,7 @@ class Record:
 
 
 def record_of(intervals: Intervals, times_ns: IntArray, values: FloatArray) -> Record:
-    """Bring intervals and readings (S, 6) [gyro; accel] at times (S,) onto one clock."""
+    """Convert intervals and readings (S, 6) [gyro; accel] at times (S,) to one clock."""
     origin = int(intervals.begin_ns[0])
     t, begin, end = (
         np.asarray((x - origin) * _NS, dtype=np.float64) for x in (times_ns, intervals.begin_ns, intervals.end_ns)

@@ -1,4 +1,4 @@
-"""All that looks on at a run, in one: is the estimate sane and, with raw IMU, can its readings be right?"""
+"""All monitors of a run in one: plausibility of the estimate and, with raw IMU data, of the readings."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ log = logging.getLogger(__name__)
 
 
 class RunWatch:
-    """Is shown everything that happens in a run, in time order; logs what it finds, and keeps it in `lines`."""
+    """Monitor all events of a run in time order; log warnings, and keep them in `lines`."""
 
     def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, *, imu: bool) -> None:
-        """Prepare.
+        """Create the monitors.
 
         Args:
             camera: rectified pair.
             T_cam0_body: (4, 4) as the run uses it.
-            imu: whether raw IMU samples carry the run.
+            imu: whether the run propagates with raw IMU samples.
         """
         self._health = RunHealth()
         self._inertial: InertialCheck | None = None
@@ -38,29 +38,31 @@ class RunWatch:
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
-        """See one motion sample."""
+        """Add one motion sample."""
         if self._inertial is not None and isinstance(sample, ImuSample):
             self._inertial.imu(sample)
 
     def observations(self, seen: Observations) -> None:
-        """See what the front end gave, before any selection."""
+        """Add the front end's observations, before feature selection."""
         self._frames += 1
         self._features += len(seen)
         if self._inertial is not None:
-            self._say(finding.message for finding in self._inertial.frame(seen))
+            self._report(finding.message for finding in self._inertial.frame(seen))
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
-        """See what the back end made of a frame."""
-        self._say(self._health.frame(index, report, estimate))
+        """Add the back end's report and estimate of a frame."""
+        self._report(self._health.frame(index, report, estimate))
 
     def close(self) -> None:
-        """See the end of the run, also of one that failed."""
+        """Finish at the end of the run, also of a failed one."""
         if self._frames and not self._features:
-            self._say([f"no feature in any of {self._frames} frames: the trajectory says nothing of the motion"])
+            self._report(
+                [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
+            )
         if self._inertial is not None:
-            self._say(finding.message for finding in self._inertial.finish())
+            self._report(finding.message for finding in self._inertial.finish())
 
-    def _say(self, lines: Iterable[str]) -> None:
+    def _report(self, lines: Iterable[str]) -> None:
         for line in lines:
             log.warning("%s", line)
             self.lines.append(line)

@@ -1,4 +1,4 @@
-"""The IMU's readings of the last minute, and what is wrong with them by themselves: silence, clipping, size."""
+"""The IMU's readings of the last minute, and the faults that they show by themselves: gaps, clipping, magnitude."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from vio.robust import robust_sigma
 from vio.watch.finding import InertialFinding
 
 GAP_S = 0.1  # readings further apart are a gap …
-_GAP_STEPS = 8.0  # … if that is so many times their usual distance
-MEMORY_S = 60.0  # older readings and motions are forgotten
+_GAP_STEPS = 8.0  # … if that is so many times their usual interval
+MEMORY_S = 60.0  # older readings and motions are dropped
 
 _LEAST_RUN = 5  # equal readings at the extreme in a row
-_LEAST_CHANCE = 1e-8  # of such a run by coarse steps alone
-_LEAST_LEVELS = 20  # different readings around it
+_LEAST_CHANCE = 1e-8  # probability of such a run by quantisation alone
+_LEAST_LEVELS = 20  # different readings on the axis
 
-_SMOOTH_S = 0.2  # readings are averaged over this much before their size is looked at
+_SMOOTH_S = 0.2  # readings are averaged over this time before their magnitude is judged
 _LEAST_SIZE_S = 1.0
 _GRAVITY = 9.80665
 _NS = 1e-9
@@ -39,7 +39,7 @@ class Samples:
 
     @property
     def span_ns(self) -> tuple[int, int] | None:
-        """Stamps of the first and the last reading ever taken; None: there is none."""
+        """Stamps of the first and the last reading ever added; None: there are none."""
         return None if self._first_ns is None or self.last_ns is None else (self._first_ns, self.last_ns)
 
     @property
@@ -49,16 +49,16 @@ class Samples:
             self._step_s = float(np.median(np.diff([s.time_ns for s in self._new]))) * _NS
         return self._step_s or 0.0
 
-    def take(self, sample: ImuSample) -> None:
-        """Take one reading."""
+    def add(self, sample: ImuSample) -> None:
+        """Add one reading."""
         if self.last_ns is not None and sample.time_ns <= self.last_ns:
-            return  # readers refuse clocks that run backwards; a repeated reading says nothing new
+            return  # readers reject decreasing stamps; a repeated reading adds no information
         self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
         self.last_ns = sample.time_ns
         self._new.append(sample)
 
-    def settle(self, *, keep: bool) -> list[InertialFinding]:
-        """Look at the readings since the last call, and keep them or let them go."""
+    def check_new(self, *, keep: bool) -> list[InertialFinding]:
+        """Check the readings since the last call for gaps and clipping, and keep or drop them."""
         if len(self._new) < 2:
             return []
         times = np.array([s.time_ns for s in self._new], dtype=np.int64)
@@ -77,26 +77,26 @@ class Samples:
         return found
 
     def table(self) -> tuple[IntArray, FloatArray]:
-        """Times (S,) and readings (S, 6) [gyro; accel]."""
+        """Return times (S,) and readings (S, 6) [gyro; accel]."""
         if not self._times:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
         return np.concatenate(self._times), np.concatenate(self._values)
 
 
 def _gap(times_ns: IntArray, steps: FloatArray, usual_s: float) -> Iterator[InertialFinding]:
-    """The longest silence before readings at times (S,), if it is one; steps (S or S - 1,) in seconds end there."""
+    """Yield the longest gap before readings at times (S,), if any; steps (S or S - 1,) in seconds end there."""
     if not len(steps) or steps.max() <= max(GAP_S, _GAP_STEPS * usual_s):
         return
     k = len(times_ns) - len(steps) + int(np.argmax(steps))
     yield InertialFinding(
         "IMU gap",
         f"no sample for {steps.max():.3f} s before {times_ns[k]} ns (samples are {1e3 * usual_s:.1f} ms apart)",
-        "samples were lost on the way; the pose between is a guess from the samples on both sides",
+        "samples were lost; the motion in between is interpolated from the samples on both sides",
     )
 
 
 def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFinding]:
-    """Runs of equal readings at the extreme of an axis that are no accident of coarse steps or held samples."""
+    """Yield runs of equal readings at the extreme of an axis that quantisation or held samples do not explain."""
     if len(values) < 4 * _LEAST_RUN:
         return
     equal = values[1:] == values[:-1]
@@ -105,7 +105,7 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
             at = values[:, axis] == extreme
             if at.sum() < _LEAST_RUN or at.all():
                 continue
-            # Neighbours elsewhere that are equal by chance: a run of n happens with probability held^(n-1).
+            # Equal neighbours elsewhere are due to chance: a run of n has the probability held^(n-1).
             held = float(np.mean(equal[~(at[1:] & at[:-1]), axis]))
             chance = np.log(_LEAST_CHANCE) / np.log(held) if held > 0 else 0.0
             run = _longest_run(at)
@@ -114,7 +114,7 @@ def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFind
             name, unit = ("gyro", "rad/s") if axis < 3 else ("accelerometer", "m/s^2")
             yield InertialFinding(
                 "saturation",
-                f"{int(at.sum())} samples of the {name}'s {'xyz'[axis % 3]} axis stand at {extreme:.4g} {unit}, {run} "
+                f"{int(at.sum())} samples of the {name}'s {'xyz'[axis % 3]} axis are at {extreme:.4g} {unit}, {run} "
                 f"in a row, near {times_ns[int(np.argmax(at))]} ns",
                 "the motion exceeds the sensor's range; choose a larger range, and expect drift there",
             )
@@ -128,15 +128,15 @@ def _longest_run(mask: BoolArray) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """How large the accelerometer's mean readings are, and what that means."""
+    """Magnitude of the accelerometer's mean readings, and the implied unit."""
 
     finding: InertialFinding | None
-    unit: float | None  # factor that makes the readings m/s^2; None: there is none, as gravity is gone
-    clear: bool = True  # False: biased readings without gravity can be of this size, too
+    unit: float | None  # factor that makes the readings m/s^2; None: unknown, since gravity was removed
+    clear: bool = True  # False: biased readings without gravity can have this magnitude, too
 
 
 def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
-    """Judge the accelerometer's unit by the size of its mean readings (S, 3) at times (S,)."""
+    """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
     t = np.asarray((times_ns - times_ns[0]) * _NS, dtype=np.float64)
     if t[-1] < _LEAST_SIZE_S:
         return Size(None, 1.0)
@@ -149,18 +149,18 @@ def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
 
 
 def _judge_median(median: float, spread: float) -> Size:
-    """Judge a median size and its spread, as a share of it."""
+    """Judge a median magnitude and its relative spread."""
     if 0.5 < median / _GRAVITY < 2.5:
         return Size(None, 1.0)
-    seen = f"the accelerometer's median size is {median:.4g} where gravity alone makes 9.8 m/s^2"
+    seen = f"the accelerometer's median magnitude is {median:.4g} where gravity alone gives 9.8 m/s^2"
     units = {
         1.0: "in g: multiply by 9.81",
         1000.0: "in mg (multiply by 0.00981) or in cm/s^2 (divide by 100)",
         9807.0: "in mm/s^2: divide by 1000",
     }
-    for gravity, words in units.items():
+    for gravity, explanation in units.items():
         if 0.6 < median / gravity < 1.6 and spread < 0.3:
-            finding = InertialFinding("accelerometer units", seen, f"the readings are {words}")
+            finding = InertialFinding("accelerometer units", seen, f"the readings are {explanation}")
             clear = gravity > 1.0 or (abs(median - 1.0) < 0.1 and spread < 0.06)
             return Size(finding, _GRAVITY / gravity, clear)
     if median < 0.5 * _GRAVITY and (spread >= 0.3 or median < 0.5):
@@ -174,10 +174,10 @@ def _judge_median(median: float, spread: float) -> Size:
 
 
 def gravity_removed(seen: str) -> InertialFinding:
-    """The finding that readings lack gravity, given what shows it."""
+    """Return the finding that readings lack gravity, given the observation."""
     return InertialFinding(
         "gravity removed",
         seen,
         "gravity has been taken out ('linear acceleration'), or the sensor is dead; a filter needs the raw specific "
-        "force (+9.8 m/s^2 upwards at rest)",
+        "force (+9.8 m/s^2 upwards at standstill)",
     )

@@ -1,4 +1,4 @@
-"""Where the IMU lies: measured by its accelerometer, or chosen between two places by velocities."""
+"""The IMU's lever arm: estimated from its accelerometer, or chosen between two candidates by velocities."""
 
 from __future__ import annotations
 
@@ -16,61 +16,61 @@ from vio.records import FeatureTracks, IntArray
 from vio.robust import jackknife, robust_sigma
 
 _BLOCKS = 10  # of the jackknife over windows
-_LEVER_M = 0.02  # a standard deviation beyond it withholds the value
+_MAX_SIGMA_M = 0.02  # with a larger standard deviation the value is not observable
 _WINDOW_S = 1.0
 _LEAST_WINDOWS = 12
 _NS = 1e-9
 
 _MIN_INTERVALS = 40  # frame intervals needed to judge two lever arms
 _JUDGED_BLOCKS = 12  # of the jackknife over them
-_LEAST_SIGMA = 0.1  # a jackknife over few blocks is not believed below this
+_LEAST_SIGMA = 0.1  # lower bound: a jackknife over few blocks is unreliable below this
 _LOG_ODDS = 10.0  # log-likelihood ratio that decides between two lever arms
 _HUBER = 2.0  # standard deviations
 _REWEIGHTINGS = 4
-_RIDGE = 1e-9  # keeps the fit solvable where a recording never accelerates or never turns
+_RIDGE = 1e-9  # keeps the fit solvable where a recording never accelerates or never rotates
 
 
 @dataclass(frozen=True, slots=True)
 class LeverArm:
-    """Where the IMU lies in the left camera's frame."""
+    """The IMU's position in the left camera's frame."""
 
     t_cam0_imu: FloatArray  # (3,) metres
     sigma_m: FloatArray  # (3,)
     windows: int
 
 
-def lever_arm(motion: CameraMotion, rates: Rates, alignment: ImuAlignment) -> LeverArm | NotObservable:
-    """Find the IMU's position in the left camera's frame from accelerometer and camera motion.
+def estimate_lever_arm(motion: CameraMotion, rates: Rates, alignment: ImuAlignment) -> LeverArm | NotObservable:
+    """Estimate the IMU's position in the left camera's frame from accelerometer and camera motion.
 
-    Over windows of a second, the doubly integrated specific force must move the IMU as the camera's motion and the
-    lever arm say. Start velocity and gravity are free in every window, the accelerometer bias is common.
+    Over windows of one second, the doubly integrated specific force must agree with the camera's motion and the lever
+    arm. Start velocity and gravity are free in every window, the accelerometer bias is common.
     """
     what = "lever arm"
     if not rates.inertial:
-        return NotObservable(what, "the recording holds velocities, no accelerometer")
+        return NotObservable(what, "the recording contains velocities, no accelerometer")
     if alignment.weak is not None:
-        return NotObservable(what, f"the motion leaves open the {alignment.weak}")
+        return NotObservable(what, f"the motion leaves unobservable the {alignment.weak}")
     blocks = _windows(motion, rates, alignment)
     if len(blocks) < _LEAST_WINDOWS:
         return NotObservable(
-            what, f"only {len(blocks)} stretches of {_WINDOW_S:g} s are tracked throughout ({_LEAST_WINDOWS} needed)"
+            what, f"only {len(blocks)} windows of {_WINDOW_S:g} s are without tracking loss ({_LEAST_WINDOWS} needed)"
         )
     x = _solve_windows(blocks)
-    again = [
+    refits = [
         _solve_windows([b for k, b in enumerate(blocks) if k % _BLOCKS != left_out]) for left_out in range(_BLOCKS)
     ]
-    sigma = jackknife(again)[:3]
-    if sigma.max() > _LEVER_M:
+    sigma = jackknife(refits)[:3]
+    if sigma.max() > _MAX_SIGMA_M:
         axis = "xyz"[int(np.argmax(sigma))]
         return NotObservable(
             what,
-            f"the motion turns too little: it leaves {sigma.max():.3f} m open along {axis} of cam0",
+            f"the camera rotates too little: the standard deviation is {sigma.max():.3f} m along {axis} of cam0",
         )
     return LeverArm(x[:3], sigma, len(blocks))
 
 
 def _windows(motion: CameraMotion, rates: Rates, alignment: ImuAlignment) -> list[tuple[FloatArray, FloatArray]]:
-    """For each window, the design (3n, 6) and the right side (3n,) of `[t_cam0_imu; bias]`, nuisances projected out."""
+    """Return each window's Jacobian and right side w.r.t. `[t_cam0_imu; bias]`, with the nuisances projected out."""
     origin = int(motion.times_ns[0])
     t_imu = _seconds(rates.times_ns, origin) - alignment.time_offset_s
     t_frame = _seconds(motion.times_ns, origin)
@@ -126,7 +126,7 @@ def _window(
 def _integrals(
     t: FloatArray, t_imu: FloatArray, gyro: FloatArray, force: FloatArray, R_cam0_imu: FloatArray
 ) -> FloatArray:
-    """Double integrals (n, 3, 4) at t[1:] of the force (column 0) and of the rotation (columns 1 to 3), in cam0(t0)."""
+    """Return double integrals (n, 3, 4) at t[1:] of force (column 0) and rotation (columns 1 to 3), in cam0(t0)."""
     low, high = np.searchsorted(t_imu, [t[0], t[-1]])
     knots = np.unique(np.concatenate([t, t_imu[low:high]]))
     omega, f = (np.stack([np.interp(knots, t_imu, values[:, k]) for k in range(3)], axis=1) for values in (gyro, force))
@@ -145,7 +145,7 @@ def _integrals(
 
 
 def _solve_windows(blocks: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArray:
-    """Robust least squares over the windows, each weighted as a whole."""
+    """Solve robust least squares over the windows, each weighted as a whole."""
     weights: FloatArray = np.ones(len(blocks))
     x: FloatArray = np.zeros(6)
     for _ in range(6):
@@ -158,30 +158,30 @@ def _solve_windows(blocks: Sequence[tuple[FloatArray, FloatArray]]) -> FloatArra
 
 
 @dataclass(frozen=True, slots=True)
-class LeverVerdict:
+class LeverArmVerdict:
     """Which of two camera positions in the IMU frame agrees with velocities and features."""
 
-    better: int | None  # 0 or 1; None: the motion does not tell them apart
-    place: float  # where the data put the camera on the line between the two: -1 at the first, +1 at the second
+    better: int | None  # 0 or 1; None: the motion does not distinguish them
+    place: float  # estimated position of the camera on the line between the two: -1 at the first, +1 at the second
     place_sigma: float  # standard error of `place`; infinite where nothing could be measured
     intervals: int  # frame intervals used
 
 
-def judge_levers(
+def judge_lever_arms(
     camera: StereoCamera,
     tracks: FeatureTracks,
     times_ns: IntArray,
     velocities: FloatArray,
     R_cam0_imu: FloatArray,
-    levers: tuple[FloatArray, FloatArray],
-) -> LeverVerdict:
-    """Decide between two positions of cam0 in the IMU frame by the rigid-body law `v_cam = v_imu + omega x lever`.
+    lever_arms: tuple[FloatArray, FloatArray],
+) -> LeverArmVerdict:
+    """Decide between two positions l of cam0 in the IMU frame by `v_cam = v_imu + omega x l` of a rigid body.
 
     The camera's velocity and rotation rate come from the stereo tracks, v_imu from the file (its noise averages out).
-    What else can make the two velocities differ is fitted beside the lever arm, for each axis: a constant, a part in
-    proportion to speed (scale, misalignment), to acceleration (clock offset), and to yaw rate times squared speed
-    (the side slip of tyres, which else passes for half a metre of lever arm). The standard error is a jackknife over
-    blocks of the recording, so that it covers errors that last.
+    Other causes of a velocity difference are fitted together with the lever arm, for each axis: a constant, and terms
+    proportional to speed (scale, misalignment), to acceleration (clock offset), and to yaw rate times squared speed
+    (side slip of the tyres, which otherwise looks like half a metre of lever arm). The standard error is a jackknife
+    over blocks of the recording, so that it includes correlated errors.
 
     Args:
         camera: rectified pair.
@@ -189,16 +189,16 @@ def judge_levers(
         times_ns: (F,) frame times.
         velocities: (F, 6) [v; omega] of the body, imu frame, m/s and rad/s.
         R_cam0_imu: (3, 3).
-        levers: the two candidates, (3,) metres in the imu frame.
+        lever_arms: the two candidates, (3,) metres in the imu frame.
     """
     middle = (velocities[:-1] + velocities[1:]) / 2
     turned = np.concatenate([middle[:, :3] @ R_cam0_imu.T, middle[:, 3:] @ R_cam0_imu.T], axis=1)
     seen = stereo_twists(camera, tracks, times_ns, turned)
     count = len(seen.frames)
     if count < _MIN_INTERVALS:
-        return LeverVerdict(None, 0.0, float("inf"), count)
+        return LeverArmVerdict(None, 0.0, float("inf"), count)
     v_cam, omega = seen.twists[:, :3] @ R_cam0_imu, seen.twists[:, 3:] @ R_cam0_imu
-    centre, half = (levers[1] + levers[0]) / 2, (levers[1] - levers[0]) / 2
+    centre, half = (lever_arms[1] + lever_arms[0]) / 2, (lever_arms[1] - lever_arms[0]) / 2
     y = v_cam - middle[seen.frames, :3] - np.cross(omega, centre)
     speed = np.linalg.norm(v_cam, axis=1)
     yaw_rate = omega[:, np.argmax(omega.std(axis=0))]
@@ -207,10 +207,10 @@ def judge_levers(
     every = np.arange(count)
     place = _fit_place(y, signal, nuisance)
     left_out = [np.setdiff1d(every, block) for block in np.array_split(every, _JUDGED_BLOCKS)]
-    again = [_fit_place(y[keep], signal[keep], nuisance[keep]) for keep in left_out]
-    sigma = max(float(jackknife(again)), _LEAST_SIGMA)
+    refits = [_fit_place(y[keep], signal[keep], nuisance[keep]) for keep in left_out]
+    sigma = max(float(jackknife(refits)), _LEAST_SIGMA)
     better = int(place > 0) if 2 * abs(place) / sigma**2 > _LOG_ODDS else None
-    return LeverVerdict(better, place, sigma, count)
+    return LeverArmVerdict(better, place, sigma, count)
 
 
 def _fit_place(y: FloatArray, signal: FloatArray, nuisance: FloatArray) -> float:

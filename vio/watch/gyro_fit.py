@@ -1,4 +1,4 @@
-"""The gyro's turning against that of the images: the best linear map between them, at the best clock offset."""
+"""The gyro's rates against those of the camera: the best linear map between them, at the best clock offset."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from vio.robust import robust_sigma
 from vio.watch.finding import InertialFinding
 from vio.watch.motion import Record
 
-_LEAST_TURN_RADPS = 0.02  # a camera that turns less says nothing about a gyro
-_CLEAR_OF_NOISE = 5.0  # the turning must exceed the noise of the images' rates by this factor
-AGREES = 0.2  # share of the turning that the best linear map leaves unexplained: below, explanations are judged
-_EXCESS = 0.2  # misfit over the best linear map, as a share of the turning: 11 degrees, or 20 % of scale
-_CHANCE = 30.0  # over the intervals, times the unexplained share: squared excess that the map's freedom may bring
+_MIN_RATE_RADPS = 0.02  # a gyro is not judged where the camera rotates less
+_CLEAR_OF_NOISE = 5.0  # the camera's rates must exceed their noise by this factor
+AGREES = 0.2  # share of the rotation that the best linear map leaves unexplained: below, explanations are judged
+_EXCESS = 0.2  # misfit over the best linear map, as a share of the rotation: 11 degrees, or 20 % of scale
+_CHANCE = 30.0  # over the intervals, times the unexplained share: squared excess due to the map's free parameters
 _CLEARLY_WORSE = 2.0
 _NAMED_OFFSET_S = 0.02
 _NEAR_OFFSETS_S = np.arange(-0.1, 0.1001, 0.01)
@@ -25,7 +25,7 @@ FAR_OFFSETS_S = np.arange(-5.0, 5.001, 0.025)
 
 
 @dataclass(frozen=True, slots=True)
-class Turning:
+class GyroFit:
     """Second moments of the camera's and the gyro's rates at one clock offset, and the best linear map, (I1)."""
 
     offset_s: float
@@ -34,48 +34,48 @@ class Turning:
     S_gg: FloatArray  # (3, 3) gyro
     A: FloatArray  # (3, 3) camera rate = A gyro + b
     b: FloatArray  # (3,)
-    unexplained: float  # share of the camera's turning that the map leaves, 0 to 1
-    noise_radps: float  # of the images' rates, each axis, from their second differences
+    unexplained: float  # share of the camera's rotation that the map leaves unexplained, 0 to 1
+    noise_radps: float  # of the camera's rates, each axis, from their second differences
     count: int  # intervals with samples
     gyro: FloatArray  # (K, 3) mean rates of each interval, rad/s
     force: FloatArray  # (K, 3) mean specific forces, unit of the readings
     covered: BoolArray  # (K,) samples cover the interval
 
     @property
-    def turn_radps(self) -> FloatArray:
-        """How much the camera turns about its three principal axes (3,), largest first."""
+    def rms_rates_radps(self) -> FloatArray:
+        """RMS rates (3,) of the camera about its three principal axes, largest first."""
         out: FloatArray = np.sqrt(np.maximum(np.linalg.eigvalsh(self.S_cc)[::-1], 0))
         return out
 
     @property
     def axes(self) -> int:
-        """About how many axes the camera turns clearly."""
-        clear = max(_LEAST_TURN_RADPS, _CLEAR_OF_NOISE * self.noise_radps)
-        return int(np.sum(self.turn_radps > clear))
+        """Number of axes about which the camera clearly rotates."""
+        clear = max(_MIN_RATE_RADPS, _CLEAR_OF_NOISE * self.noise_radps)
+        return int(np.sum(self.rms_rates_radps > clear))
 
     def scale(self, C: FloatArray) -> float:
-        """The factor on an orthogonal map (3, 3) from gyro to camera that fits best."""
+        """Return the best factor on an orthogonal map (3, 3) from gyro to camera."""
         return float(np.sum(C * self.S_cg) / max(float(np.trace(self.S_gg)), 1e-300))
 
     def excess(self, C: FloatArray, scale: float) -> float:
-        """Misfit of `scale C` beyond that of the best linear map, as a share of the turning, (I2)."""
+        """Return the misfit of `scale C` beyond that of the best linear map, as a share of the rotation, (I2)."""
         total = float(np.trace(self.S_cc))
         misfit = total - 2 * scale * float(np.sum(C * self.S_cg)) + scale**2 * float(np.trace(self.S_gg))
         return float(np.sqrt(max(misfit / max(total, 1e-300) - self.unexplained, 0.0)))
 
     @property
     def tolerance(self) -> float:
-        """The excess up to which a map passes as right."""
+        """The excess up to which a map is accepted."""
         return max(_EXCESS, float(np.sqrt(_CHANCE / max(self.count, 1) * self.unexplained)))
 
     def fits(self, C: FloatArray) -> bool:
-        """Whether an orthogonal map (3, 3) from gyro to camera passes as right, by its best scale."""
+        """Return whether an orthogonal map (3, 3) from gyro to camera is accepted at its best scale."""
         scale = self.scale(C)
         return scale > 0 and self.excess(C, scale) < self.tolerance
 
 
-def fit_turning(record: Record, least: int) -> Turning | None:
-    """Fit the camera's rates by the gyro's at the clock offset that serves best; None: too little turning to tell."""
+def fit_gyro(record: Record, least: int) -> GyroFit | None:
+    """Fit the camera's rates by the gyro's at the best clock offset; None: too little rotation."""
     omega = record.twists[:, 3:]
     noise = robust_sigma(np.diff(omega, 2, axis=0)) / np.sqrt(6) if len(omega) > 4 else np.inf
     best = _at_offset(record, _NEAR_OFFSETS_S, least, noise)
@@ -90,8 +90,8 @@ def fit_turning(record: Record, least: int) -> Turning | None:
     return best if best.axes else None
 
 
-def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, noise: float) -> Turning | None:
-    """The linear map at the best of some clock offsets, refitted without outliers."""
+def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, noise: float) -> GyroFit | None:
+    """Fit the linear map at the best of some clock offsets, then robustly."""
     means, covered = record.means(offsets)
     omega, gyro = record.twists[:, 3:], means[..., :3]
     enough = covered.sum(axis=1) >= least
@@ -105,7 +105,7 @@ def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, no
         r = np.linalg.norm(omega - gyro[k] @ A.T - b, axis=1)
         width = max(2 * robust_sigma(r[covered[k]]), 1e-6)
         weight = covered[k] / (1 + (r / width) ** 2) ** 2
-    return Turning(
+    return GyroFit(
         offset_s=float(offsets[k]),
         S_cc=S_cc,
         S_cg=S_cg,
@@ -122,7 +122,7 @@ def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, no
 
 
 def _moments(omega: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[FloatArray, ...]:
-    """Centred moments cc, cg, gg (M, 3, 3), unexplained share (M,), A (M, 3, 3) and b (M, 3), for weights (M, K)."""
+    """Return centred moments cc, cg, gg (M, 3, 3), unexplained share (M,), A (M, 3, 3), b (M, 3) for weights (M, K)."""
     w = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
     mean_c, mean_g = w @ omega, np.einsum("mk,mki->mi", w, gyro)
     c, g = omega[None] - mean_c[:, None], gyro - mean_g[:, None]
@@ -136,17 +136,17 @@ def _moments(omega: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[F
     return S_cc, S_cg, S_gg, np.clip(share, 0.0, 1.0), A, mean_c - np.einsum("mij,mj->mi", A, mean_g)
 
 
-def judge_offset(turning: Turning, record: Record, least: int) -> InertialFinding | None:
-    """Name a clock offset that matters, where the turning shows it clearly."""
-    if abs(turning.offset_s) < _NAMED_OFFSET_S or turning.unexplained > AGREES:
+def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFinding | None:
+    """Report a relevant clock offset, where the rotation determines it clearly."""
+    if abs(gyro_fit.offset_s) < _NAMED_OFFSET_S or gyro_fit.unexplained > AGREES:
         return None
-    as_stamped = _at_offset(record, np.zeros(1), least, turning.noise_radps)
-    if as_stamped is not None and as_stamped.unexplained < _CLEARLY_WORSE * turning.unexplained + 0.003:
+    as_stamped = _at_offset(record, np.zeros(1), least, gyro_fit.noise_radps)
+    if as_stamped is not None and as_stamped.unexplained < _CLEARLY_WORSE * gyro_fit.unexplained + 0.003:
         return None
     left = "cannot be compared" if as_stamped is None else f"leaves {100 * as_stamped.unexplained:.1f} % unexplained"
     return InertialFinding(
         "clocks apart",
-        f"gyro and images turn together best when a frame stamped t is taken for t {turning.offset_s:+.3f} s of the "
-        f"IMU's clock ({100 * turning.unexplained:.1f} % of the turning unexplained; without the shift it {left})",
-        f"the IMU's clock is ahead of the camera's by {turning.offset_s:+.3f} s; subtract that from the IMU's stamps",
+        f"the rates of gyro and images agree best if a frame stamped t is at t {gyro_fit.offset_s:+.3f} s of the "
+        f"IMU's clock ({100 * gyro_fit.unexplained:.1f} % of the rotation unexplained; without the shift it {left})",
+        f"the IMU's clock is ahead of the camera's by {gyro_fit.offset_s:+.3f} s; subtract that from the IMU's stamps",
     )
