@@ -1,4 +1,4 @@
-"""The command line as a stranger uses it: the contract of its output, and every way to go wrong."""
+"""The command line: the contract of its output, and its error messages."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ def test_run_without_reference_prints_null(recording: Path, tmp_path: Path, caps
     assert metrics["motion"] == "none"
 
 
-def test_reference_of_cam0_leaks_no_lever_arm(
+def test_reference_of_cam0_is_compared_with_the_lever_arm(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The filter estimates the IMU, a KITTI reference describes cam0, a metre away: turning would show."""
+    """The filter estimates the IMU, a KITTI reference describes cam0, a metre away: rotation would show it."""
     out = str(tmp_path / "out")
     metrics = _json(capsys, "run", str(recording), "--reference", str(truth), "--out", out)
     assert metrics["evaluation"]["body"] == "cam0"
@@ -86,7 +86,7 @@ def test_reference_of_cam0_leaks_no_lever_arm(
     assert plain["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-4)
 
 
-def test_frames_of_a_part_meet_their_own_reference(
+def test_a_range_of_frames_is_compared_with_its_own_reference(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     args = ("run", str(recording), "--reference", str(truth), "--out", str(tmp_path / "out"))
@@ -96,7 +96,7 @@ def test_frames_of_a_part_meet_their_own_reference(
     assert metrics["ate_m"] < 0.05
 
 
-def test_a_shorter_reference_scores_the_frames_it_covers(
+def test_a_shorter_reference_evaluates_the_frames_it_covers(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     short = tmp_path / "short.txt"
@@ -105,7 +105,7 @@ def test_a_shorter_reference_scores_the_frames_it_covers(
     assert metrics["evaluation"]["matched"] == 15
 
 
-def test_saved_observations_replay_to_the_bit(
+def test_saved_observations_replay_bit_identically(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first, second, third = (tmp_path / name for name in ("first", "second", "third"))
@@ -129,7 +129,7 @@ def test_effective_configuration_reproduces_the_run(
     assert (first / "trajectory.tum").read_bytes() == (second / "trajectory.tum").read_bytes()
 
 
-def test_runs_without_out_number_themselves(
+def test_runs_without_out_are_numbered(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -137,7 +137,7 @@ def test_runs_without_out_number_themselves(
     assert outs == [str(Path("runs/drive")), str(Path("runs/drive-2"))]
 
 
-def test_an_earlier_run_is_replaced_but_nothing_that_was_put_beside_it(
+def test_replaces_an_earlier_run_but_no_other_files(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -155,7 +155,7 @@ def test_an_earlier_run_is_replaced_but_nothing_that_was_put_beside_it(
     assert (out / "metrics.json").read_bytes() == before
 
 
-def test_features_of_another_recording_are_refused(
+def test_rejects_features_of_another_recording(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = tmp_path / "first"
@@ -170,7 +170,7 @@ def test_features_of_another_recording_are_refused(
     assert not (tmp_path / "mixed").exists()
 
 
-def test_letters_that_the_terminal_lacks_end_nothing() -> None:
+def test_output_on_a_terminal_without_unicode() -> None:
     env = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
     for words in (["run", "--help"], ["config", "--show"]):
         done = subprocess.run([sys.executable, "-m", "vio", *words], capture_output=True, env=env, check=False)
@@ -179,7 +179,7 @@ def test_letters_that_the_terminal_lacks_end_nothing() -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
-def test_output_that_cannot_be_written_is_said_in_a_line() -> None:
+def test_reports_unwritable_output_in_one_line() -> None:
     with Path("/dev/full").open("w") as full:
         words = [sys.executable, "-m", "vio", "config", "--show"]
         done = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, check=False, text=True)
@@ -187,7 +187,7 @@ def test_output_that_cannot_be_written_is_said_in_a_line() -> None:
     assert done.stderr == "error: cannot write the output: No space left on device\n"
 
 
-def test_people_get_lines_and_the_picture_is_named(
+def test_prints_a_table_with_the_path_of_the_plot(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["run", str(recording), "--out", str(tmp_path / "out")]) == 0
@@ -226,7 +226,7 @@ def test_people_get_lines_and_the_picture_is_named(
         (["export", "colmap", "{tmp}/empty", "--keyframes", "1"], "--keyframes must be at least 2"),
     ],
 )
-def test_mistakes_cost_one_line_and_leave_nothing(
+def test_errors_are_one_line_and_write_nothing(
     argv: list[str], message: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "empty").mkdir()
@@ -240,7 +240,7 @@ def test_mistakes_cost_one_line_and_leave_nothing(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_truncated_image_is_named_and_skipped_up_to_a_limit(
+def test_reports_and_skips_truncated_images_up_to_a_limit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = make_kitti(tmp_path / "kitti", frames=6)
@@ -252,7 +252,7 @@ def test_truncated_image_is_named_and_skipped_up_to_a_limit(
     assert "000003.png" in _error(capsys, *run, "--set", "dataset.max_bad_frames=0")
 
 
-def test_interrupted_run_leaves_nothing(
+def test_interrupted_run_writes_nothing(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stop(*args: object, **kwargs: object) -> None:
@@ -264,15 +264,15 @@ def test_interrupted_run_leaves_nothing(
     assert not (tmp_path / "deep").exists()
 
 
-def test_debug_shows_where_an_expected_error_came_from(tmp_path: Path) -> None:
+def test_debug_raises_the_expected_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="does not exist"):
         main(["--debug", "run", str(tmp_path / "nothing")])
 
 
-def test_eval_takes_the_extrinsics_from_a_file(
+def test_eval_reads_the_extrinsics_from_a_file(
     recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A trajectory of the IMU against one of cam0: without the lever arm between them there is nothing to compare."""
+    """A trajectory of the IMU can be compared with one of cam0 only with the extrinsics between them."""
     _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))
     files = [str(tmp_path / "out" / "trajectory.tum"), str(truth)]
     assert "give the extrinsic T_cam0_imu" in _error(capsys, "eval", *files)
@@ -285,7 +285,7 @@ def test_eval_takes_the_extrinsics_from_a_file(
     )
 
 
-def test_wrong_usage_is_2() -> None:
+def test_wrong_usage_exits_with_status_2() -> None:
     for argv in (
         [],
         ["fly"],
@@ -308,7 +308,7 @@ def test_config_shows_every_setting_with_unit_and_default(capsys: pytest.Capture
     assert "one of: consistent, literal" in out
 
 
-def test_config_prints_what_a_run_would_use(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_config_prints_the_effective_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["config", "--set", "vislam.iterations=7"]) == 0
     path = tmp_path / "all.yaml"
     path.write_text(capsys.readouterr().out)
@@ -316,7 +316,7 @@ def test_config_prints_what_a_run_would_use(tmp_path: Path, capsys: pytest.Captu
     assert "iterations: 7" in capsys.readouterr().out
 
 
-def test_eval_aligns_as_asked(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_eval_aligns_as_requested(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from dataclasses import replace
 
     from vio.trajectory_io import write_tum
@@ -339,7 +339,7 @@ def test_eval_aligns_as_asked(recording: Path, tmp_path: Path, capsys: pytest.Ca
     assert "t_err_percent" in capsys.readouterr().out
 
 
-def test_every_file_we_write_opens_in_evo(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_evo_reads_every_trajectory_file(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from evo.tools import file_interface
 
     out = Path(_json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))["out"])
@@ -366,7 +366,7 @@ def test_the_module_runs_as_a_process(recording: Path, tmp_path: Path) -> None:
     assert json.loads(done.stdout)["frames"] == FRAMES
 
 
-def test_where_pycolmap_has_no_wheels_only_its_commands_are_missing(recording: Path, tmp_path: Path) -> None:
+def test_without_pycolmap_only_its_commands_fail(recording: Path, tmp_path: Path) -> None:
     code = "import sys; sys.modules['pycolmap'] = None; from vio.cli import main; sys.exit(main(sys.argv[1:]))"
     out = tmp_path / "out"
 

@@ -1,4 +1,4 @@
-"""The configuration: order of precedence, strictness, messages that name the remedy."""
+"""The configuration: precedence, strictness, messages with a remedy."""
 
 from __future__ import annotations
 
@@ -59,45 +59,45 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("vislam:\n  use_stale: 1\n", r"takes true or false, got 1"),
         ("vislam:\n  noise: litral\n", r"is one of consistent, literal, not 'litral'; did you mean 'literal'"),
         ("- 1\n- 2\n", r"is a mapping of settings, not a list"),
-        ("msckf:\n  clones: 5\nmsckf:\n  clones: 7\n", r"'msckf' is there twice"),
+        ("msckf:\n  clones: 5\nmsckf:\n  clones: 7\n", r"'msckf' is given twice"),
         ("vislam: [\n", r"not valid YAML"),
         ("motion:\n", r"motion is one of auto"),
     ],
 )
-def test_mistakes_in_the_file_are_named(tmp_path: Path, text: str, message: str) -> None:
+def test_reports_mistakes_in_the_file(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         load_config(_write(tmp_path, text))
 
 
 @pytest.mark.parametrize("override", ["vislam.iterations", "=3", "vislam.iterations=[", "vislam=3", "a.b.c=1"])
-def test_mistakes_in_an_override_are_named(override: str) -> None:
+def test_reports_mistakes_in_an_override(override: str) -> None:
     with pytest.raises(ConfigError, match="--set"):
         load_config(None, [override])
 
 
-def test_missing_file_is_named(tmp_path: Path) -> None:
+def test_reports_a_missing_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"none\.yaml.*check the path"):
         load_config(tmp_path / "none.yaml")
 
 
-def test_binary_file_is_named(tmp_path: Path) -> None:
+def test_reports_a_binary_file(tmp_path: Path) -> None:
     path = tmp_path / "image.yaml"
     path.write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(ConfigError, match=r"image\.yaml"):
         load_config(path)
 
 
-def test_every_setting_is_explained_and_quantities_have_units() -> None:
+def test_every_setting_has_a_description_and_quantities_have_units() -> None:
     rows = list(describe(Config()))
     assert len({row.key for row in rows}) == len(rows)
     for row in rows:
-        assert row.doc, f"{row.key} has no meaning"
+        assert row.doc, f"{row.key} has no description"
         for suffix in ("_px", "_mps", "_m", "_s", "_deg", "_radps", "_mps2", "_radps2"):
             if row.key.endswith(suffix):
                 assert row.unit, f"{row.key} has no unit"
 
 
-def test_shipped_files_are_valid_and_hold_deviations_only() -> None:
+def test_shipped_files_are_valid_and_contain_deviations_only() -> None:
     folder = Path(__file__).resolve().parent.parent / "configs"
     files = sorted(folder.glob("*.yaml"))
     assert files
@@ -111,8 +111,8 @@ def _numbers() -> list[SettingInfo]:
 
 
 @pytest.mark.parametrize("info", _numbers(), ids=lambda info: info.key)
-def test_every_number_has_a_range_and_leaving_it_is_refused_by_name(info: SettingInfo) -> None:
-    assert info.range, "say what values it may have"
+def test_every_number_has_a_range_and_other_values_are_rejected(info: SettingInfo) -> None:
+    assert info.range, "declare its allowed range"
     for word in info.range.split(" and "):
         name, bound = word.rsplit(" ", 1)
         outward = -1 if name in ("at least", "above") else 1
@@ -125,7 +125,7 @@ def test_every_number_has_a_range_and_leaving_it_is_refused_by_name(info: Settin
             load_config(None, [f"{info.key}={bound if isinstance(info.default, int) else float(bound)}"])
 
 
-def test_numbers_must_be_finite_and_ranges_hold_in_code_too() -> None:
+def test_rejects_infinite_numbers_and_checks_ranges_in_code() -> None:
     with pytest.raises(ConfigError, match=r"msckf\.max_distance must be finite"):
         load_config(None, ["msckf.max_distance=.inf"])
     with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3, got 2"):

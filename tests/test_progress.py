@@ -1,4 +1,4 @@
-"""The progress bar, drawn on a terminal that is a string."""
+"""The progress bar, drawn to a string that acts as a terminal."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class Terminal(io.StringIO):
 
 
 def _terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
-    """Take the place of stderr; in the test itself, as pytest sets its own after the fixtures."""
+    """Replace stderr; called in the test itself, since pytest sets its own after the fixtures."""
     out = Terminal()
     monkeypatch.setattr(sys, "stderr", out)
     return out
 
 
-def test_the_bar_counts_what_is_advanced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_advance_counts_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = _terminal(monkeypatch)
     with ProgressBar("drive", 40, unit="frames") as bar:
         for _ in range(40):
@@ -33,7 +33,7 @@ def test_the_bar_counts_what_is_advanced(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "frames/s" in last
 
 
-def test_a_total_may_come_later(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_total_may_be_given_later(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = _terminal(monkeypatch)
     with ProgressBar("check") as bar:
         bar.update(3)
@@ -43,7 +43,7 @@ def test_a_total_may_come_later(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "50%" in last
 
 
-def test_the_bar_is_left_when_the_work_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bar_is_closed_when_the_work_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     terminal = _terminal(monkeypatch)
 
     def work() -> None:
@@ -53,10 +53,10 @@ def test_the_bar_is_left_when_the_work_fails(monkeypatch: pytest.MonkeyPatch) ->
 
     with pytest.raises(ZeroDivisionError):
         work()
-    assert terminal.getvalue().endswith("\n"), "the error's line stands below the bar"
+    assert terminal.getvalue().endswith("\n"), "the error is printed below the bar"
 
 
-def test_nothing_is_drawn_where_stderr_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_draws_nothing_where_stderr_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     with ProgressBar("drive", 4) as bar:
         bar.update(2, 9)
         bar.advance()

@@ -1,4 +1,4 @@
-"""What a run has saved: where its images are, that its files belong together, and what is said where they do not."""
+"""Saved runs: path of the images, consistency of the files, and messages where they are inconsistent."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FRAMES = 6
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A feature file, its saved run, and the saved run of that run's observations."""
+    """Make a feature file, its saved run, and the saved run of that run's observations."""
     place = tmp_path_factory.mktemp("places")
     recording = make_npz(place / "drive.npz", ece276a_arrays(make_drive(FRAMES)))
     for source, out in ((recording, "first"), (place / "first" / "observations.npz", "second")):
@@ -37,44 +37,44 @@ def _without_the_last_pose(file: Path) -> None:
     file.write_text("".join(lines[:-1]))
 
 
-def test_a_run_of_a_runs_observations_names_the_recording_itself(places: Path) -> None:
+def test_a_replayed_run_names_the_original_recording(places: Path) -> None:
     first, second = (read_saved_run(places / name) for name in ("first", "second"))
     assert first.source == second.source == f"ece276a:{places / 'drive.npz'}"
     np.testing.assert_array_equal(second.tracked.trajectory.T_world_body, first.tracked.trajectory.T_world_body)
     assert first.truth is None
 
 
-def test_a_trajectory_of_another_run_is_told(places: Path, tmp_path: Path) -> None:
+def test_rejects_a_trajectory_of_another_run(places: Path, tmp_path: Path) -> None:
     folder = tmp_path / "spoiled"
     shutil.copytree(places / "first", folder)
     _without_the_last_pose(folder / "trajectory.tum")
-    with pytest.raises(DataError, match="are not of one whole run; repeat the run"):
+    with pytest.raises(DataError, match="are not of the same complete run; repeat the run"):
         read_saved_run(folder)
 
 
-def test_refined_poses_must_be_there_and_of_the_same_frames(run: SavedRun, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="holds no trajectory; make it with `vio refine"):
+def test_rejects_missing_refined_poses_and_those_of_other_frames(run: SavedRun, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="contains no trajectory; create it with `vio refine"):
         with_poses(run, tmp_path)
     shutil.copy(run.tracked.where / "trajectory.tum", tmp_path)
     same = with_poses(run, tmp_path)
     np.testing.assert_allclose(same.tracked.trajectory.T_world_body, run.tracked.trajectory.T_world_body)
     _without_the_last_pose(tmp_path / "trajectory.tum")
-    with pytest.raises(DataError, match=r"describes other frames than .*first; refine again"):
+    with pytest.raises(DataError, match=r"contains other frames than .*first; refine again"):
         with_poses(run, tmp_path)
 
 
-def test_images_are_asked_of_the_recording_that_has_them(run: SavedRun, tmp_path: Path) -> None:
+def test_rejects_recordings_without_the_images_of_the_run(run: SavedRun, tmp_path: Path) -> None:
     rows = np.array([0, 2])
-    with pytest.raises(DataError, match="holds no images; name the recording with --source or use --no-images"):
+    with pytest.raises(DataError, match="contains no images; name the recording with --source or use --no-images"):
         list(stereo_frames(run, None, rows))
-    with pytest.raises(DataError, match=r"are not to be had: .*does not exist.*; name the recording with --source"):
+    with pytest.raises(DataError, match=r"are not available: .*does not exist.*; name the recording with --source"):
         list(stereo_frames(run, str(tmp_path / "gone"), rows))
     kitti = make_kitti(tmp_path / "kitti", frames=FRAMES)
     with pytest.raises(DataError, match="has another calibration than the run"):
         list(stereo_frames(run, str(kitti), rows))
 
 
-def test_images_of_the_rows_come_in_order_and_a_broken_one_is_named(run: SavedRun, tmp_path: Path) -> None:
+def test_yields_images_in_order_and_reports_an_unreadable_one(run: SavedRun, tmp_path: Path) -> None:
     kitti = make_kitti(tmp_path / "kitti", frames=FRAMES)
     (kitti / "calib.txt").write_text(calib_text(0.0, 0.54))
     camera = replace(run.tracked.camera, fu=700.0, fv=700.0, cu=600.0, cv=180.0, baseline_m=0.54)

@@ -36,15 +36,15 @@ class Config(Section):
 
     motion: MotionName = setting(
         "auto",
-        "what carries the pose between frames: imu, velocity, none (images alone), or auto: the best that the "
-        "recording holds and the back end takes",
+        "motion input for propagation: imu, velocity, none (images alone), or auto: the best that the recording "
+        "contains and the back end supports",
     )
     backend: BackendName = setting(
         "msckf", "the estimator: msckf, the sliding-window filter, or vislam, the paper's filter"
     )
     lag_frames: int = setting(
         0,
-        "report each pose this many frames late, as the window then has it (msckf, up to its clones); 0: causal",
+        "output each pose this many frames late, smoothed by the window (msckf, up to its clones); 0: causal",
         at_least=0,
     )
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
@@ -94,7 +94,7 @@ def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: s
         values: deviations, nested by section.
         where: the source of the values, for messages.
         prefix: the path of the section, ending in a dot, for messages.
-        root: the whole that the section is a part of, for messages; None: the section itself.
+        root: the configuration that contains the section, for messages; None: the section itself.
 
     Raises:
         ConfigError: a key is unknown, or a value has the wrong type or is out of range.
@@ -131,7 +131,7 @@ def as_dict(section: Any) -> dict[str, Any]:
 
 
 def to_yaml(config: Config) -> str:
-    """Write the effective configuration as YAML; `load_config` reads it back to an equal one."""
+    """Return the effective configuration as YAML; `load_config` reads it back to an equal one."""
     return yaml.safe_dump(as_dict(config), sort_keys=False, allow_unicode=True)
 
 
@@ -162,14 +162,14 @@ def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """YAML in which a setting stands once; YAML itself lets the last of several win."""
+    """YAML loader that rejects duplicate keys, of which YAML itself would use the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Refuse a key that is there already."""
+        """Reject a duplicate key."""
         seen: set[str] = set()
         for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
             if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is there twice", key.start_mark)
+                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is given twice", key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
@@ -235,7 +235,7 @@ def _type_name(hint: Any) -> str:
 
 
 def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
-    """Name the setting that was probably meant: the same one in a sister section, a similar one here, or any namesake.
+    """Suggest a setting: the same name in a sibling section, a similar one here, or the same name anywhere.
 
     A name may be split over section and setting: `consensus_samples` is `consensus.samples`.
     """

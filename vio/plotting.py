@@ -1,4 +1,4 @@
-"""Pictures of a run, drawn with matplotlib but without its global state."""
+"""Plots of a run, drawn with matplotlib without its global state."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _ESTIMATE, _REFERENCE, _DEAD_RECKONING, _LANDMARKS = "#1f5fbf", "#111111", "#d98
 
 
 def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
-    """Draw the map seen from above and, beside it, what happened over time; write a PNG.
+    """Plot the map from above, and errors, feature counts and times over the frames; write a PNG.
 
     Args:
         path: the PNG to write.
         result: the run.
-        evaluation: the trajectory against the reference, or None without one.
-        dead_reckoning: dead reckoning against the reference, or None.
+        evaluation: the trajectory against the reference; None without one.
+        dead_reckoning: dead reckoning against the reference; None without one.
     """
     from matplotlib.figure import Figure
 
@@ -35,7 +35,7 @@ def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_
     _draw_time(figure.add_subplot(grid[2, 1]), seconds, result)
     figure.suptitle(_title(result, evaluation), fontsize=12)
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a name in other letters
+        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a name in another script
         figure.savefig(path)
 
 
@@ -49,7 +49,7 @@ def _title(result: RunResult, evaluation: Evaluation | None) -> str:
 
 
 def _draw_map(axes: Any, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
-    """Draw trajectories and landmarks in the plane in which the motion spreads most."""
+    """Draw trajectories and landmarks in the plane of the largest extent of the motion."""
     own = result.trajectory.in_cam0(result.T_cam0_body).positions
     if evaluation is None:
         T_ref_world, curves = np.eye(4), [("estimate", own, _ESTIMATE, "-", 1.8)]
@@ -81,14 +81,14 @@ def _draw_map(axes: Any, result: RunResult, evaluation: Evaluation | None, dead_
 
 
 def _plane(positions: FloatArray) -> tuple[int, int]:
-    """The two axes along which the positions spread most, in ascending order."""
+    """Return the two axes with the largest extent of the positions, in ascending order."""
     spread = np.ptp(positions, axis=0)
     first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
     return first, second
 
 
 def _view(positions: FloatArray, axes: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Limits that hold all trajectories and a margin of the surroundings."""
+    """Return plot limits that contain all trajectories and a margin."""
     chosen = positions[:, axes]
     low, high = chosen.min(axis=0), chosen.max(axis=0)
     margin = max(0.15 * float((high - low).max()), 1.0)
@@ -118,7 +118,7 @@ def _draw_error(
 
 
 def _binned(seconds: FloatArray, values: FloatArray, bins: int = 250) -> tuple[FloatArray, FloatArray]:
-    """Medians over equal groups of frames, so that a thousand frames still show as a curve."""
+    """Return medians over equal groups of frames, so that a thousand frames remain a readable curve."""
     groups = np.array_split(np.arange(len(seconds)), min(bins, len(seconds)))
     return np.array([seconds[g].mean() for g in groups]), np.array([np.median(values[g]) for g in groups])
 

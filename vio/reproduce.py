@@ -1,4 +1,4 @@
-"""The paper's experiment: the same features and velocities through every setting of its filter, side by side."""
+"""The paper's experiment: the same features and velocities with every variant of its filter."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from vio.selectors import SelectorSettings
 from vio.threads import one_blas_thread
 from vio.trajectory_io import read_trajectory
 
-# The paper's letters: W = diag(.5, .5, .5, .05, .05, .05) and V = 15 I, both taken as variances, no gate, landmarks
-# taken as known in the pose update, the input held from one frame to the next, repeated pixels taken as they are.
+# The paper's values: W = diag(.5, .5, .5, .05, .05, .05) and V = 15 I, both taken as variances, no gate, landmarks
+# assumed known in the pose update, zero-order hold of the input between frames, repeated pixels used unchanged.
 PAPER = VislamSettings(
     motion_model="input",
     noise="literal",
@@ -49,10 +49,12 @@ class Variant:
     backend: BackendName = "vislam"
 
 
-# The ids and pixels of the file as they stand, as every published solution takes them.
+# The ids and pixels of the file unchanged, as in every published solution.
 AS_FILED = DatasetSettings(repeated_tracks="literal")
-# The paper's filter with W read as standard deviations times the step, a gate, and landmarks that may be wrong.
-HONEST = replace(PAPER, noise="consistent", gate_probability=0.95, landmark_uncertainty=True, landmark_prior="stereo")
+# The paper's filter with W as standard deviations times the step, a gate, and landmark uncertainty.
+CONSISTENT = replace(
+    PAPER, noise="consistent", gate_probability=0.95, landmark_uncertainty=True, landmark_prior="stereo"
+)
 MOST_SEEN = SelectorSettings(name="visibility_whole")
 MOST_SEEN_SO_FAR = SelectorSettings(name="visibility")
 
@@ -62,9 +64,9 @@ VARIANTS = (
     Variant("paper, all features", PAPER, dataset=AS_FILED),
     Variant("paper, most seen 1/7", PAPER, MOST_SEEN, AS_FILED),
     Variant("paper, most seen 1/7 so far", PAPER, MOST_SEEN_SO_FAR, AS_FILED),
-    Variant("consistent W, gate, all", HONEST, dataset=AS_FILED),
-    Variant("consistent W, gate, most seen 1/7", HONEST, MOST_SEEN, AS_FILED),
-    Variant("consistent W, gate, all, renamed tracks", HONEST),
+    Variant("consistent W, gate, all", CONSISTENT, dataset=AS_FILED),
+    Variant("consistent W, gate, most seen 1/7", CONSISTENT, MOST_SEEN, AS_FILED),
+    Variant("consistent W, gate, all, renamed tracks", CONSISTENT),
     Variant("recommended, ids as filed", VislamSettings(), dataset=AS_FILED),
     Variant("recommended, most seen 1/7", VislamSettings(), MOST_SEEN),
     Variant("recommended, most seen 1/7 so far", VislamSettings(), MOST_SEEN_SO_FAR),
@@ -78,7 +80,7 @@ VARIANTS = (
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What one variant reached."""
+    """The results of one variant."""
 
     name: str
     used_per_frame: float
@@ -194,7 +196,7 @@ def _plot(
                 curves.append((variant.name, result.trajectory.positions[:, :2], colour))
             else:
                 label = f"{variant.name}, {score.as_dict()['ate_m']:.1f} m"
-                # A KITTI reference is written in the first camera's frame: x right, z forward.
+                # A KITTI reference is in the first camera's frame: x right, z forward.
                 curves.append((label, score.aligned.positions[:, _ground(score.reference)], colour))
                 if not axes.lines:
                     ground = score.reference.positions[:, _ground(score.reference)]
@@ -202,7 +204,7 @@ def _plot(
     for label, positions, colour in curves:
         axes.plot(*positions.T, color=colour, lw=1.5, label=label)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_title(f"{drive}: the paper's filter and what a gate and honest noise change", fontsize=11)
+    axes.set_title(f"{drive}: the paper's filter, and the effect of a gate and of consistent noise", fontsize=11)
     axes.set_xlabel("m")
     axes.set_ylabel("m")
     axes.grid(alpha=0.25)

@@ -1,4 +1,4 @@
-"""The folder that a run leaves behind: configuration, trajectory, map, per-frame log, metrics, picture."""
+"""The output folder of a run: configuration, trajectory, map, per-frame log, metrics, plot."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vio.trajectory_io import in_first_cam0, read_trajectory, write_kitti, write
 
 log = logging.getLogger(__name__)
 
-MARKER = "metrics.json"  # a folder that holds it, and nothing but FILES, is one of ours and may be replaced
+MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
 FILES = (
     MARKER,
     "config.yaml",
@@ -50,43 +50,43 @@ def write_run_folder(
     lengths_m: Sequence[float] = KITTI_LENGTHS_M,
     save_observations: bool = False,
 ) -> dict[str, Any]:
-    """Write all results of a run, appearing at once when complete, and return the metrics.
+    """Write all results of a run atomically, and return the metrics.
 
     Args:
         folder: replaced if it is an earlier run's folder.
         result: the run.
-        reference: ground truth, or None.
+        reference: ground truth; None without one.
         lengths_m: path lengths of the KITTI metric.
-        save_observations: also write `observations.npz`; the result must have kept them.
+        save_observations: also write `observations.npz`; the result must contain them.
 
     Raises:
-        VioError: the folder cannot be written, or holds something else.
+        VioError: the folder cannot be written, or contains something else.
     """
     evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
     metrics = metrics_of(result, evaluation, dead_reckoning, folder)
-    with atomic_folder(folder, replace=True, marker=MARKER, own=FILES) as inside:
-        (inside / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
-        write_tum(inside / "trajectory.tum", result.trajectory)
-        write_kitti(inside / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
+    with atomic_folder(folder, replace=True, marker=MARKER, own=FILES) as temporary:
+        (temporary / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
+        write_tum(temporary / "trajectory.tum", result.trajectory)
+        write_kitti(temporary / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
         if result.dead_reckoning is not None:
-            write_tum(inside / "dead_reckoning.tum", result.dead_reckoning)
-        (inside / "landmarks.ply").write_bytes(landmarks_ply(result.landmarks))
-        (inside / "frames.csv").write_text(frames_csv(result.frames), encoding="utf-8")
+            write_tum(temporary / "dead_reckoning.tum", result.dead_reckoning)
+        (temporary / "landmarks.ply").write_bytes(landmarks_ply(result.landmarks))
+        (temporary / "frames.csv").write_text(frames_csv(result.frames), encoding="utf-8")
         if save_observations:
-            _write_observations(inside / "observations.npz", result)
+            _write_observations(temporary / "observations.npz", result)
         from vio.plotting import plot_run
 
-        plot_run(inside / "trajectory.png", result, evaluation, dead_reckoning)
-        (inside / MARKER).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        plot_run(temporary / "trajectory.png", result, evaluation, dead_reckoning)
+        (temporary / MARKER).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     return metrics
 
 
 def score(
     result: RunResult, reference: Trajectory | None, *, lengths_m: Sequence[float] = KITTI_LENGTHS_M
 ) -> tuple[Evaluation | None, Evaluation | None]:
-    """Evaluate a run's trajectory and its dead reckoning; None where there is nothing to compare with.
+    """Evaluate a run's trajectory and its dead reckoning; None without a reference or dead reckoning.
 
-    A reference that cannot be compared (too short, no common time) is reported as a warning: the run stands.
+    A reference that cannot be compared (too short, no common time) gives a warning only.
     """
     if reference is None:
         return None, None
@@ -105,7 +105,7 @@ def score(
 def metrics_of(
     result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None, folder: Path
 ) -> dict[str, Any]:
-    """Collect what `--json` prints and metrics.json holds; null where there is no reference."""
+    """Collect the metrics for `--json` and metrics.json; null where there is no reference."""
     frames = result.frames
     work_ms = np.array([f.total_ms for f in frames])
     scores = None if evaluation is None else evaluation.as_dict()
@@ -141,7 +141,7 @@ def metrics_of(
 
 
 def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str, Any] | None:
-    """Compare the map with surveyed landmarks, after the alignment of the trajectory; None where there are none."""
+    """Compare the map with surveyed landmarks, after alignment of the trajectory; None: no such landmarks."""
     truth = result.recording.landmarks_reference
     if truth is None or evaluation is None:
         return None
@@ -158,10 +158,10 @@ def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str
 
 
 def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
-    """Read a trajectory file, or that of a run's folder with its extrinsics.
+    """Read a trajectory file, or the trajectory and extrinsics of a run's folder.
 
     Raises:
-        DataError: the path holds no trajectory.
+        DataError: the path contains no trajectory.
     """
     if not path.is_dir():
         return read_trajectory(path), None
@@ -170,10 +170,10 @@ def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
 
 
 def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
-    """Read what `metrics_of` wrote into a run's folder, and `T_cam0_imu` (4, 4) from it.
+    """Read the metrics of a run's folder, and `T_cam0_imu` (4, 4) from them.
 
     Raises:
-        DataError: the folder is no run's, or its metrics are damaged.
+        DataError: the folder is not a run's, or its metrics are damaged.
     """
     path = folder / MARKER
     if not path.is_file():
@@ -187,7 +187,7 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
 
 
 def landmarks_ply(landmarks: Landmarks) -> bytes:
-    """Return the map as a binary PLY: x y z in metres, and the standard deviation along the worst axis."""
+    """Return the map as a binary PLY: x y z in metres, and the largest standard deviation of any direction."""
     points = np.zeros(len(landmarks.ids), dtype=[(name, "<f4") for name in ("x", "y", "z", "sigma")])
     points["x"], points["y"], points["z"] = landmarks.p_world.T
     points["sigma"] = np.sqrt(np.maximum(np.linalg.eigvalsh(landmarks.covariance)[:, -1], 0.0))
@@ -201,7 +201,7 @@ def landmarks_ply(landmarks: Landmarks) -> bytes:
 
 
 def frames_csv(frames: tuple[FrameLog, ...]) -> str:
-    """Return the per-frame log as CSV text; the front end's own stages follow as columns of their own."""
+    """Return the per-frame log as CSV text; the front end's stages are the last columns."""
     stages = sorted({name for f in frames for name in f.stages_ms})
     text = io.StringIO()
     writer: csv.DictWriter[str] | None = None

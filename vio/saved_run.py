@@ -1,4 +1,4 @@
-"""A run's folder read back, with the observations that led to it and the images behind them."""
+"""Reader of a run's folder, with its observations and the images of its recording."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ OBSERVATIONS = "observations.npz"
 
 @dataclass(frozen=True, slots=True)
 class SavedRun:
-    """What a run's folder holds, with the observations that led to it."""
+    """Contents of a run's folder, with its observations."""
 
     tracked: TrackedPath  # the left camera's trajectory with its observations; `tracked.where` is the folder
-    source: str  # the recording as `kind:path`, the one that the images came from
+    source: str  # the recording of the images, as `kind:path`
     dataset: FeatureDataset  # observations of every frame, as a recording
     T_cam0_imu: FloatArray  # (4, 4)
     metrics: dict[str, Any]
 
     @property
     def truth(self) -> GroundTruth | None:
-        """The ground truth that lies in the recording; None: there is none."""
+        """The ground truth in the recording; None: there is none."""
         reference = self.dataset.recording.reference
         return None if reference is None else GroundTruth(reference, self.T_cam0_imu)
 
@@ -55,13 +55,13 @@ def read_saved_run(folder: Path) -> SavedRun:
     trajectory = read_trajectory(folder / "trajectory.tum")
     frames = trajectory.frame_indices
     if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
-        raise DataError(f"{folder}: trajectory.tum and {OBSERVATIONS} are not of one whole run; repeat the run")
+        raise DataError(f"{folder}: trajectory.tum and {OBSERVATIONS} are not of the same complete run; repeat the run")
     tracked = TrackedPath(folder, dataset.recording.camera, trajectory.in_cam0(T_cam0_imu), dataset.tracks)
     return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics)
 
 
 def _original_source(log: Path) -> str:
-    """The recording that holds the images, through any number of replayed logs."""
+    """Return the recording of the images, through any number of replayed logs."""
     source = str(read_npz(log)["source"])
     kind, _, path = source.partition(":")
     seen = {log.resolve()}
@@ -73,16 +73,16 @@ def _original_source(log: Path) -> str:
 
 
 def with_poses(run: SavedRun, folder: Path) -> SavedRun:
-    """The run with the poses of another folder, such as that of `vio refine`.
+    """Return the run with the poses of another folder, such as that of `vio refine`.
 
     Raises:
-        DataError: that folder does not exist or describes other frames.
+        DataError: that folder does not exist or contains other frames.
     """
     if not (folder / "trajectory.tum").is_file():
-        raise DataError(f"{folder} holds no trajectory; make it with `vio refine {run.tracked.where}`")
+        raise DataError(f"{folder} contains no trajectory; create it with `vio refine {run.tracked.where}`")
     trajectory = read_trajectory(folder / "trajectory.tum").in_cam0(run.T_cam0_imu)
     if trajectory.frame_indices is None or not np.array_equal(trajectory.frame_indices, run.tracked.frames):
-        raise DataError(f"{folder} describes other frames than {run.tracked.where}; refine again")
+        raise DataError(f"{folder} contains other frames than {run.tracked.where}; refine again")
     return replace(run, tracked=replace(run.tracked, trajectory=trajectory))
 
 
@@ -91,21 +91,23 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
 
     Args:
         run: the run.
-        source: the recording, where it is not at the place that the run names.
+        source: the recording, if it is not at the path stored in the run.
         rows: increasing.
 
     Raises:
-        DataError: the recording is gone, holds no images, has another camera, or a frame cannot be read.
+        DataError: the recording is missing, has no images or another camera, or a frame cannot be read.
     """
     try:
         dataset = open_dataset(source or run.source)
     except DataError as error:
         raise DataError(
-            f"the images of {run.tracked.where} are not to be had: {error}; name the recording with --source"
+            f"the images of {run.tracked.where} are not available: {error}; name the recording with --source"
         ) from error
     recording = dataset.recording
     if not recording.has_images:
-        raise DataError(f"{source or run.source} holds no images; name the recording with --source or use --no-images")
+        raise DataError(
+            f"{source or run.source} contains no images; name the recording with --source or use --no-images"
+        )
     ours, theirs = run.tracked.camera, recording.camera
     if not np.allclose(
         [ours.fu, ours.fv, ours.cu, ours.cv, ours.baseline_m],

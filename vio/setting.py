@@ -1,4 +1,4 @@
-"""How a configuration section declares one setting: default, unit, range and meaning in one place."""
+"""Declaration of a setting: default, unit, range and description in one place."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Range:
-    """Values that a number may have; None: no bound on that side."""
+    """Allowed range of a number; None: no bound on that side."""
 
     at_least: float | None = None
     above: float | None = None
@@ -21,7 +21,7 @@ class Range:
     below: float | None = None
 
     def holds(self, value: float) -> bool:
-        """Whether a finite number lies in the range."""
+        """Return whether a finite number is in the range."""
         return (
             (self.at_least is None or value >= self.at_least)
             and (self.above is None or value > self.above)
@@ -30,7 +30,7 @@ class Range:
         )
 
     def __str__(self) -> str:
-        """`at least 3`, `above 0 and below 1`, …; empty where there is no bound."""
+        """Return `at least 3`, `above 0 and below 1`, …; empty without bounds."""
         bounds = ((f.name.replace("_", " "), getattr(self, f.name)) for f in fields(self))
         return " and ".join(f"{name} {bound:g}" for name, bound in bounds if bound is not None)
 
@@ -45,19 +45,19 @@ def setting(
     at_most: float | None = None,
     below: float | None = None,
 ) -> T:
-    """Declare a dataclass field with a default, a one-line meaning, a unit and a range; `vio config --show` tells them.
+    """Declare a dataclass field with default, one-line description, unit and range, as shown by `vio config --show`.
 
-    A `Section` refuses numbers out of their range and numbers that are not finite.
+    A `Section` rejects numbers out of their range and numbers that are not finite.
     """
     allowed = Range(at_least, above, at_most, below)
     return field(default=default, metadata={"doc": doc, "unit": unit, "range": allowed})
 
 
 class Section:
-    """Base of the configuration's sections: frozen dataclasses of settings that are in range however they were made."""
+    """Base of the configuration's sections: frozen dataclasses whose settings are checked at construction."""
 
     __slots__ = ()
-    section: ClassVar[str] = ""  # its place in the configuration, as --set names it
+    section: ClassVar[str] = ""  # its path in the configuration, as used by --set
 
     def __post_init__(self) -> None:
         """Check every number.
