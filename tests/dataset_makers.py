@@ -1,4 +1,4 @@
-"""Small valid recordings written into a folder, for tests of the readers and of what stands on them."""
+"""Small valid recordings written to a folder, for tests of the readers and their users."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ FRAME_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """A vehicle on a winding road and what its cameras see."""
+    """A vehicle on a winding road and its features."""
 
     seconds: FloatArray  # (F,)
     T_world_imu: FloatArray  # (F, 4, 4)
-    velocities: FloatArray  # (F, 6) [v; omega] that carry each pose to the next
+    velocities: FloatArray  # (F, 6) [v; omega] from each pose to the next
     features: FloatArray  # (4, M, F), -1 where not seen
     points: FloatArray  # (M, 3) world
 
@@ -97,7 +97,7 @@ def make_npz(path: Path, arrays: Mapping[str, npt.NDArray[np.generic]]) -> Path:
 
 
 def utias_arrays(drive: Drive) -> dict[str, npt.NDArray[np.float64]]:
-    """The variables of a UTIAS file; velocities and poses go on for three frames longer than the features."""
+    """The variables of a UTIAS file; velocities and poses cover three frames more than the features."""
     longer = np.pad(drive.velocities, ((0, 3), (0, 0)), mode="edge")
     poses = np.concatenate([drive.T_world_imu, np.tile(drive.T_world_imu[-1:], (3, 1, 1))])
     return {
@@ -144,7 +144,7 @@ def make_kitti(
 ) -> Path:
     """Write a KITTI folder: self-contained with velocity and extrinsics, or official with poses two levels up.
 
-    Camera 2 stands 6 cm left of camera 0, as KITTI's does.
+    Camera 2 is 6 cm left of camera 0, as KITTI's does.
     """
     sequence = folder / "sequences" / "07" if official else folder
     drive = make_drive(max(frames, 2))
@@ -167,18 +167,18 @@ def make_kitti(
     return sequence
 
 
-# --- spoiling what was made ---------------------------------------------------------------------------------------
+# --- corrupting the arrays ------------------------------------------------------------------------------------------
 
 Arrays: TypeAlias = dict[str, np.ndarray]
 
 
 def without(*keys: str) -> Callable[[Arrays], Arrays]:
-    """Leave arrays out."""
+    """Remove arrays."""
     return lambda arrays: {k: v for k, v in arrays.items() if k not in keys}
 
 
 def changed(key: str, value: object) -> Callable[[Arrays], Arrays]:
-    """Put another array in the place of one."""
+    """Replace an array."""
     return lambda arrays: {**arrays, key: np.asarray(value)}
 
 

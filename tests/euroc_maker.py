@@ -1,4 +1,4 @@
-"""Small EuRoC folders and KITTI raw drives, for tests of their readers and of what stands on them."""
+"""Small EuRoC folders and KITTI raw drives, for tests of their readers and users."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def noise_image(rng: np.random.Generator, camera: CameraModel) -> np.ndarray:
 
 
 def write_imu(folder: Path, frames: int, T_body_imu: FloatArray | None = None) -> None:
-    """Write `imu0` with readings that tell their sample."""
+    """Write `imu0` with readings that identify their sample."""
     folder.mkdir(exist_ok=True)
     (folder / "sensor.yaml").write_text(IMU_YAML.format(rows=matrix(np.eye(4) if T_body_imu is None else T_body_imu)))
     rows = [f"{t},{k}.5,0.1,-0.2,9.81,{-k},0.25" for k, t in enumerate(imu_stamps(frames))]
@@ -184,7 +184,7 @@ def rigid_text(T: FloatArray) -> str:
 def make_kitti_raw(
     folder: Path, numbers: Sequence[int] = (100, 101, 102, 103), *, rectified: bool = False, above: bool = False
 ) -> Path:
-    """Write a drive; with `above`, its calibration stands in the folder above it, as KITTI lays it out."""
+    """Write a drive; with `above`, its calibration is in the parent folder, as in KITTI's layout."""
     drive = folder / "2011_09_26_drive_0039_extract" if above else folder
     rng = np.random.default_rng(0)
     small = replace(KITTI_RIG.cam0, width=RECT_SIZE[0], height=RECT_SIZE[1])

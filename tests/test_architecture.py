@@ -1,4 +1,4 @@
-"""Imports go one way, and nothing heavy is loaded before it is needed."""
+"""Layered imports, and lazy loading of heavy packages."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from tools.draw_structure import floors, read_rooms
 ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
 
-# Only the configuration, the pipeline builder and the command line know both packages.
-KNOW_BOTH = {"vio.config", "vio.pipeline", "vio.sim.oracle"}
-# Modules of the estimator: numbers in, numbers out.
+# Only the configuration, the pipeline builder and the command line import both packages.
+IMPORT_BOTH = {"vio.config", "vio.pipeline", "vio.sim.oracle"}
+# Modules of the estimator, free of images and files.
 ESTIMATOR = ("vio.filters", "vio.geometry", "vio.records", "vio.selectors", "vio.protocols", "vio.evaluation")
-# What a part must not know, lower parts first; the command line, which nothing may know, is held apart.
+# Imports forbidden to each package, lower layers first; the command line, forbidden to all, is tested separately.
 _ABOVE_READERS = (
     "vio.config",
     "vio.pipeline",
@@ -30,7 +30,7 @@ _ABOVE_READERS = (
     "vio.saved_run",
     "vio.offline",
 )
-MUST_NOT_KNOW = {
+MUST_NOT_IMPORT = {
     "vio.robust": ("vio.records", "vio.calibration"),
     "vio.calibration": ("vio.watch", "vio.datasets", *_ABOVE_READERS),
     "vio.watch": ("vio.datasets", *_ABOVE_READERS),
@@ -60,14 +60,14 @@ def _heads(file: Path, *, top_level_only: bool) -> set[str]:
     return {name.split(".")[0] for name in _imports(file, top_level_only=top_level_only)}
 
 
-def _within(name: str, part: str) -> bool:
-    return name == part or name.startswith(f"{part}.")
+def _within(name: str, package: str) -> bool:
+    return name == package or name.startswith(f"{package}.")
 
 
-def test_parts_that_must_not_know_others_exist() -> None:
+def test_packages_of_import_rules_exist() -> None:
     names = [_name(file) for file in FILES]
-    parts = {*MUST_NOT_KNOW, *(other for others in MUST_NOT_KNOW.values() for other in others)}
-    assert {part for part in parts if not any(_within(name, part) for name in names)} == set()
+    packages = {*MUST_NOT_IMPORT, *(other for others in MUST_NOT_IMPORT.values() for other in others)}
+    assert {package for package in packages if not any(_within(name, package) for name in names)} == set()
 
 
 @pytest.mark.parametrize("file", FILES, ids=_name)
@@ -77,23 +77,23 @@ def test_imports_go_one_way(file: Path) -> None:
     if name.startswith(ESTIMATOR):
         forbidden = {"cv2", "torch", "kornia", "matplotlib", "pycolmap", "frontend"}
         assert not forbidden & {i.split(".")[0] for i in everything}
-    if name.startswith("vio") and not name.startswith("vio.cli") and name not in KNOW_BOTH:
-        assert not any(i.split(".")[0] == "frontend" for i in everything), "only the pipeline knows the front end"
-    for part, others in MUST_NOT_KNOW.items():
-        if _within(name, part):
-            assert not {i for i in everything for other in others if _within(i, other)}, f"{part} lies below these"
+    if name.startswith("vio") and not name.startswith("vio.cli") and name not in IMPORT_BOTH:
+        assert not any(i.split(".")[0] == "frontend" for i in everything), "only the pipeline imports the front end"
+    for package, others in MUST_NOT_IMPORT.items():
+        if _within(name, package):
+            assert not {i for i in everything for other in others if _within(i, other)}, f"{package} is below these"
     if not name.startswith(("vio.cli", "vio.__main__")):
-        assert not any(i.startswith("vio.cli") for i in everything), "nothing knows the command line"
+        assert not any(i.startswith("vio.cli") for i in everything), "nothing imports the command line"
     assert "torch" not in _heads(file, top_level_only=True)
 
 
-def test_rooms_import_each_other_in_no_circle() -> None:
-    rooms = read_rooms(ROOT)
-    assert {"vio.filters", "vio.datasets", "frontend", "vio.pipeline"} <= set(rooms)
-    assert floors(rooms)[1] == []
+def test_packages_have_no_import_cycle() -> None:
+    packages = read_rooms(ROOT)
+    assert {"vio.filters", "vio.datasets", "frontend", "vio.pipeline"} <= set(packages)
+    assert floors(packages)[1] == []
 
 
-def test_a_circle_of_rooms_would_be_seen(tmp_path: Path) -> None:
+def test_detects_an_import_cycle(tmp_path: Path) -> None:
     (tmp_path / "frontend").mkdir()
     for name, text in (
         ("a", "def f():\n    from vio.b import g\n"),
@@ -118,9 +118,9 @@ def test_matplotlib_stays_out_of_import_time() -> None:
 
 
 def _loaded(code: str, suspects: set[str]) -> set[str]:
-    """Which of these modules a new interpreter has loaded once it ran this."""
-    tell = f"\nimport sys\nprint(*({suspects!r} & set(sys.modules)), file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", code + tell], capture_output=True, text=True, cwd=ROOT, check=True)
+    """Return which of these modules a new interpreter has loaded after running the code."""
+    report = f"\nimport sys\nprint(*({suspects!r} & set(sys.modules)), file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", code + report], capture_output=True, text=True, cwd=ROOT, check=True)
     return set(done.stderr.split())
 
 
@@ -142,18 +142,18 @@ for parser in commands.choices.values():
 @pytest.mark.parametrize(
     "code", ["import vio", HELP, HELP_OF_EACH], ids=["import vio", "vio --help", "vio COMMAND --help"]
 )
-def test_nothing_heavy_is_loaded_before_a_command_runs(code: str) -> None:
+def test_no_heavy_import_before_a_command_runs(code: str) -> None:
     assert not _loaded(code, HEAVY)
 
 
-def test_the_estimator_loads_little_of_scipy() -> None:
+def test_the_estimator_does_not_import_slow_parts_of_scipy() -> None:
     # `scipy.stats` and what it pulls in were 3.5 of the 6.1 seconds that importing the pipeline took.
     beyond = {"cv2", "torch", "kornia", "matplotlib", "pycolmap", "scipy.stats", "scipy.optimize", "scipy.io"}
     assert not _loaded("import vio.pipeline, vio.evaluation", beyond)
     assert _loaded("import vio.pipeline", {"scipy.linalg"}), "so that the test above can fail"
 
 
-def test_no_print_or_exit_below_the_command_line() -> None:
+def test_no_print_or_exit_outside_the_command_line() -> None:
     for file in FILES:
         if _name(file).startswith("vio.cli") or _name(file) == "vio.__main__":
             continue

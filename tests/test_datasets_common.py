@@ -1,4 +1,4 @@
-"""Clocks, transforms, the order of events, opening by kind or content, and the contract that all readers keep."""
+"""Clocks, transforms, the order of events, opening by kind or content, and the contract of all readers."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def make_source(kind: str, folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("kind", SOURCES)
-def test_every_reader_keeps_the_contract(kind: str, tmp_path: Path) -> None:
+def test_every_reader_satisfies_the_contract(kind: str, tmp_path: Path) -> None:
     dataset = open_dataset(make_source(kind, tmp_path))
     recording = dataset.recording
     assert recording.kind == kind.removesuffix("_new")
@@ -79,7 +79,7 @@ def test_every_reader_keeps_the_contract(kind: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", SOURCES)
-def test_events_of_a_range_carry_the_motion_within_it(kind: str, tmp_path: Path) -> None:
+def test_events_of_a_range_include_its_motion_samples(kind: str, tmp_path: Path) -> None:
     dataset = open_dataset(make_source(kind, tmp_path))
     times = dataset.recording.frame_times_ns
     events = list(dataset.events(2, 5, images=False))
@@ -91,7 +91,7 @@ def test_events_of_a_range_carry_the_motion_within_it(kind: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(("start", "stop"), [(6, None), (-1, 3), (3, 3)])
-def test_a_range_without_frames_is_refused(start: int, stop: int | None, tmp_path: Path) -> None:
+def test_rejects_a_range_without_frames(start: int, stop: int | None, tmp_path: Path) -> None:
     dataset = open_dataset(make_source("ece276a", tmp_path))
     with pytest.raises(DataError, match="holds frames 0 to 5"):
         dataset.events(start, stop)
@@ -99,7 +99,7 @@ def test_a_range_without_frames_is_refused(start: int, stop: int | None, tmp_pat
 
 @settings(deadline=None)
 @given(st.lists(st.integers(0, 40), max_size=30), st.integers(0, 3), st.integers(4, 6), st.sets(st.integers(0, 5)))
-def test_events_come_in_order_whatever_the_rates(ticks: list[int], start: int, stop: int, lost: set[int]) -> None:
+def test_events_are_in_time_order_at_any_rates(ticks: list[int], start: int, stop: int, lost: set[int]) -> None:
     recording = _recording()
     motion = [VelocitySample(10**7 * t, np.zeros(3), np.zeros(3)) for t in sorted(ticks)]
     chosen = range(start, stop)
@@ -152,7 +152,7 @@ def test_transforms_must_be_rigid(T: np.ndarray, message: str) -> None:
         checked_transform(T, "here")
 
 
-def test_a_transform_that_was_rounded_is_mended_and_an_exact_one_keeps_its_bits() -> None:
+def test_orthonormalises_a_rounded_transform_and_keeps_an_exact_one() -> None:
     assert np.array_equal(checked_transform(T_CAM0_IMU, "here"), T_CAM0_IMU)
     rounded = checked_transform(np.round(T_CAM0_IMU, 6), "here")
     assert np.abs(rounded[:3, :3].T @ rounded[:3, :3] - np.eye(3)).max() < 1e-14
@@ -160,13 +160,13 @@ def test_a_transform_that_was_rounded_is_mended_and_an_exact_one_keeps_its_bits(
 
 
 @pytest.mark.parametrize("kind", ["kitti", "ece276a", "utias", "log"])
-def test_a_kind_may_be_named(kind: str, tmp_path: Path) -> None:
+def test_accepts_a_named_kind(kind: str, tmp_path: Path) -> None:
     path = make_source(kind, tmp_path)
     assert open_dataset(f"{kind}:{path}").recording.kind == kind
     assert open_dataset(path).recording.path == path
 
 
-def test_content_not_the_suffix_tells_the_kind(tmp_path: Path) -> None:
+def test_detects_the_kind_from_content_not_suffix(tmp_path: Path) -> None:
     path = make_source("ece276a", tmp_path)
     assert open_dataset(path.rename(tmp_path / "renamed.bin")).recording.kind == "ece276a"
 
@@ -197,7 +197,7 @@ def test_a_path_with_a_colon_is_a_path_when_it_exists(tmp_path: Path, monkeypatc
         ("log:text.txt", "text.txt: is damaged or no .npz archive"),
     ],
 )
-def test_unknown_sources_are_refused_in_one_line(
+def test_rejects_unknown_sources_with_one_line_error(
     source: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -230,12 +230,12 @@ def test_every_kind_has_a_reader() -> None:
     assert {"kitti", "ece276a", "utias", "log"} <= set(READERS)
 
 
-@pytest.mark.parametrize(("place", "words"), [("folder", "cannot list"), ("file.npz", "cannot read")])
+@pytest.mark.parametrize(("target", "message"), [("folder", "cannot list"), ("file.npz", "cannot read")])
 def test_a_place_that_may_not_be_read_is_an_error_in_one_line(
-    place: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    target: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / place
-    if place == "folder":
+    path = tmp_path / target
+    if target == "folder":
         path.mkdir()
     else:
         path.write_bytes(b"PK")
@@ -243,10 +243,10 @@ def test_a_place_that_may_not_be_read_is_an_error_in_one_line(
     def denied(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, "iterdir" if place == "folder" else "open", denied)
-    with pytest.raises(DataError, match=f"{words} .*{place}: Permission denied"):
+    monkeypatch.setattr(Path, "iterdir" if target == "folder" else "open", denied)
+    with pytest.raises(DataError, match=f"{message} .*{target}: Permission denied"):
         open_dataset(path)
-    if place != "folder":
+    if target != "folder":
         monkeypatch.setattr(np, "load", denied)
         monkeypatch.setattr("zipfile.is_zipfile", lambda _: True)
         with pytest.raises(DataError, match="Permission denied; give a readable file"):

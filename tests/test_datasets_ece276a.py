@@ -1,4 +1,4 @@
-"""The ECE276A reader: both key generations, the mixed extrinsic, stale frames, bad input, the published files."""
+"""The ECE276A reader: both key generations, mixed extrinsics, stale frames, bad input, the published files."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ def mixed(arrays: Arrays) -> Arrays:
 
 @pytest.fixture(scope="module")
 def long_drive() -> Drive:
-    """Enough turning to tell the two readings of the extrinsic apart, under the noise of the course files."""
+    """A drive with enough rotation to distinguish the two extrinsics under the noise of the course files."""
     drive = make_drive(220, seed=3, pixel_sigma=0.3)
     noise = np.random.default_rng(4).standard_normal(drive.velocities.shape) * [0.5, 0.5, 0.5, 0.05, 0.05, 0.05]
     return replace(drive, velocities=drive.velocities + noise)
 
 
 @pytest.mark.parametrize("arrays_of", [ece276a_arrays, ece276a_new_arrays])
-def test_made_file_is_read_whole(arrays_of: Callable[[Drive], Arrays], tmp_path: Path) -> None:
+def test_reads_a_synthetic_file_completely(arrays_of: Callable[[Drive], Arrays], tmp_path: Path) -> None:
     drive = make_drive(8)
     dataset = read_ece276a(make_npz(tmp_path / "a.npz", arrays_of(drive)), DEFAULT)
     recording = dataset.recording
@@ -70,7 +70,7 @@ def test_made_file_is_read_whole(arrays_of: Callable[[Drive], Arrays], tmp_path:
     np.testing.assert_array_equal([m.angular for m in dataset.motion], drive.velocities[:, 3:])  # type: ignore[union-attr]
 
 
-def test_newer_extrinsics_may_map_either_way(tmp_path: Path) -> None:
+def test_accepts_newer_extrinsics_in_both_directions(tmp_path: Path) -> None:
     arrays = ece276a_new_arrays(make_drive(6))
     for key in ("extL_T_imu", "extR_T_imu"):
         arrays[key] = se3_inverse(arrays[key])
@@ -78,7 +78,7 @@ def test_newer_extrinsics_may_map_either_way(tmp_path: Path) -> None:
     np.testing.assert_allclose(dataset.recording.T_cam0_imu, T_CAM0_IMU, atol=1e-12)
 
 
-def test_left_only_features_are_told_apart(tmp_path: Path) -> None:
+def test_left_only_features_have_no_right_pixel(tmp_path: Path) -> None:
     arrays = ece276a_arrays(make_drive(6))
     j = int(np.flatnonzero(arrays["features"][0, :, 3] != -1)[0])
     arrays["features"][2:, j, 3] = -1
@@ -90,22 +90,22 @@ def test_left_only_features_are_told_apart(tmp_path: Path) -> None:
 # --- extrinsics ---------------------------------------------------------------------------------------------------
 
 
-def test_mixed_extrinsics_are_corrected_and_explained(long_drive: Drive, tmp_path: Path) -> None:
+def test_corrects_mixed_extrinsics_and_adds_a_note(long_drive: Drive, tmp_path: Path) -> None:
     path = make_npz(tmp_path / "a.npz", mixed(ece276a_arrays(long_drive)))
     recording = read_ece276a(path, DEFAULT).recording
     np.testing.assert_allclose(recording.T_cam0_imu, T_CAM0_IMU, atol=1e-12)
-    said = [note for note in recording.notes if "camera's position in the IMU frame" in note]
-    assert len(said) == 1
-    assert "corrected to t = -R t" in said[0]
+    extrinsics_notes = [note for note in recording.notes if "camera's position in the IMU frame" in note]
+    assert len(extrinsics_notes) == 1
+    assert "corrected to t = -R t" in extrinsics_notes[0]
 
 
-def test_consistent_extrinsics_are_left_alone(long_drive: Drive, tmp_path: Path) -> None:
+def test_keeps_consistent_extrinsics(long_drive: Drive, tmp_path: Path) -> None:
     recording = read_ece276a(make_npz(tmp_path / "a.npz", ece276a_arrays(long_drive)), DEFAULT).recording
     np.testing.assert_array_equal(recording.T_cam0_imu, T_CAM0_IMU)
     assert recording.notes == ()
 
 
-def test_extrinsics_of_a_straight_drive_are_taken_literally_and_said_to_be_unproved(tmp_path: Path) -> None:
+def test_keeps_undetermined_extrinsics_of_a_straight_drive_and_adds_a_note(tmp_path: Path) -> None:
     drive = make_drive(60, pixel_sigma=0.3, yaw_rate=0.0)
     recording = read_ece276a(make_npz(tmp_path / "a.npz", mixed(ece276a_arrays(drive))), DEFAULT).recording
     assert recording.T_cam0_imu is not None
@@ -114,7 +114,7 @@ def test_extrinsics_of_a_straight_drive_are_taken_literally_and_said_to_be_unpro
 
 
 @pytest.mark.parametrize(("mode", "t"), [("literal", LEVER_M), ("corrected", -R_CAM0_IMU @ LEVER_M)])
-def test_extrinsics_as_asked(mode: str, t: FloatArray, tmp_path: Path) -> None:
+def test_extrinsics_mode_is_a_setting(mode: str, t: FloatArray, tmp_path: Path) -> None:
     path = make_npz(tmp_path / "a.npz", mixed(ece276a_arrays(make_drive(6))))
     recording = read_ece276a(path, DatasetSettings(extrinsics=mode)).recording  # type: ignore[arg-type]
     assert recording.T_cam0_imu is not None
@@ -122,7 +122,7 @@ def test_extrinsics_as_asked(mode: str, t: FloatArray, tmp_path: Path) -> None:
     assert recording.notes == ()
 
 
-def test_stereo_twists_equal_the_motion_that_made_the_features() -> None:
+def test_stereo_twists_equal_the_true_motion() -> None:
     drive = make_drive(12)
     tracks = tracks_from_dense(drive.features, Path("made"))
     times = np.arange(12) * 100_000_000
@@ -188,16 +188,16 @@ def test_split_gives_every_track_a_new_id_from_its_stale_row_on(tmp_path: Path) 
     assert split.ids[after].tolist() == [renamed[j] for j in whole.ids[after].tolist()]
 
 
-def test_literal_takes_repeats_at_their_word_but_names_the_frames(tmp_path: Path) -> None:
+def test_literal_mode_keeps_repeats_and_notes_the_frames(tmp_path: Path) -> None:
     drive = make_drive(14, yaw_rate=0.1)
     arrays = {**ece276a_arrays(drive), "features": with_stale_frame(drive, 7, changed=True)}
     dataset = read_ece276a(make_npz(tmp_path / "a.npz", arrays), DatasetSettings(repeated_tracks="literal"))
     assert not dataset.tracks.stale.any()
     assert np.flatnonzero(dataset.stale_frames).tolist() == [7]
-    assert "taken at their word" in dataset.recording.notes[-1]
+    assert "used as they are" in dataset.recording.notes[-1]
 
 
-def test_a_vehicle_at_rest_repeats_its_pixels_rightly(tmp_path: Path) -> None:
+def test_repeats_of_a_stationary_vehicle_are_not_stale(tmp_path: Path) -> None:
     arrays = ece276a_arrays(make_drive(14))
     arrays["features"][:] = arrays["features"][:, :, :1]
     noise = np.random.default_rng(0).standard_normal((2, 3, 14))
@@ -207,7 +207,7 @@ def test_a_vehicle_at_rest_repeats_its_pixels_rightly(tmp_path: Path) -> None:
     assert not dataset.stale_frames.any()
 
 
-def test_moving_is_told_from_noise() -> None:
+def test_distinguishes_motion_from_noise() -> None:
     rng = np.random.default_rng(1)
     quiet = 0.5 * rng.standard_normal((400, 3))
     still = np.zeros((400, 3))
@@ -233,7 +233,7 @@ BAD = [
     (changed("features", np.zeros((4, 5, 7))), DataError, r"time_stamps has shape 1 x 6 .*expected 1 x 7"),
     (changed("linear_velocity", np.zeros((6, 3))), DataError, r"linear_velocity has shape 6 x 3 .*expected 3 x 6"),
     (changed("K", np.eye(4)), DataError, r"K has shape 4 x 4"),
-    (changed("K", np.ones((3, 3))), CalibrationError, r"K is no matrix of intrinsics \[fu 0 cu; .* but \[\["),
+    (changed("K", np.ones((3, 3))), CalibrationError, r"K is no intrinsic matrix \[fu 0 cu; .* but \[\["),
     (changed("b", 0.0), CalibrationError, r"\.npz: stereo baseline must be positive, got 0 m"),
     (changed("b", -0.5), CalibrationError, r"\.npz: stereo baseline must be positive, got -0.5 m"),
     (changed("b", "wide"), DataError, r"b has shape one value and type <U4"),
@@ -252,11 +252,11 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("spoil", "kind", "message"), BAD)
-def test_bad_file_is_refused_in_one_line(
-    spoil: Callable[[Arrays], Arrays], kind: type[Exception], message: str, tmp_path: Path
+@pytest.mark.parametrize(("corrupt", "kind", "message"), BAD)
+def test_rejects_bad_files_with_one_line_error(
+    corrupt: Callable[[Arrays], Arrays], kind: type[Exception], message: str, tmp_path: Path
 ) -> None:
-    path = make_npz(tmp_path / "bad.npz", spoil(ece276a_arrays(make_drive(6))))
+    path = make_npz(tmp_path / "bad.npz", corrupt(ece276a_arrays(make_drive(6))))
     with pytest.raises(kind, match=message) as caught:
         read_ece276a(path, DEFAULT)
     assert str(path) in str(caught.value)
@@ -264,7 +264,7 @@ def test_bad_file_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("row", [0, 2])
-def test_half_missing_features_are_refused(row: int, tmp_path: Path) -> None:
+def test_rejects_half_missing_features(row: int, tmp_path: Path) -> None:
     arrays = ece276a_arrays(make_drive(6))
     j = int(np.flatnonzero(arrays["features"][0, :, 2] != -1)[0])
     arrays["features"][row, j, 2] = -1
@@ -316,12 +316,12 @@ def test_the_second_published_file(data_dir: Path) -> None:
     assert dataset.recording.T_cam0_imu is not None
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3, 3], [-0.3141, 0.7195, -1.0891], atol=1e-4)
     assert any("corrected to t = -R t" in note for note in dataset.recording.notes)
-    assert any("go on under new ids (pixels move 1.05 steps" in note for note in dataset.recording.notes)
+    assert any("continue under new ids (pixels move 1.05 steps" in note for note in dataset.recording.notes)
     assert len(np.unique(dataset.tracks.ids)) == 3220 + 3100  # one more for each stale row
 
 
 @pytest.mark.parametrize("name", ["0027", "0022"])
-def test_a_consistent_file_made_from_a_published_one_is_left_alone(name: str, data_dir: Path, tmp_path: Path) -> None:
+def test_keeps_extrinsics_of_a_corrected_published_file(name: str, data_dir: Path, tmp_path: Path) -> None:
     arrays = dict(read_npz(data_dir / "ece276a" / f"{name}.npz"))
     R, t = arrays["cam_T_imu"][:3, :3], arrays["cam_T_imu"][:3, 3]
     arrays["cam_T_imu"] = se3_from_parts(R, -R @ t)
@@ -364,7 +364,7 @@ def test_repeated_rows_show_the_new_image_but_another_point(drive_0027: FeatureD
 
 
 def test_the_corrected_extrinsic_agrees_with_ground_truth(drive_0027: FeatureDataset, data_dir: Path) -> None:
-    """The camera's true velocity, the file's body velocity and the lever arm obey the rigid-body law best corrected."""
+    """The corrected lever arm fits camera velocity and body velocity to rigid-body motion best."""
     poses = read_trajectory(data_dir / "ece276a" / "kitti_odometry_07_poses.txt", fmt="kitti").T_world_body
     dt = np.diff(drive_0027.recording.frame_times_ns[: len(poses)]) * 1e-9
     truth = se3_log(se3_inverse(poses[:-1]) @ poses[1:]) / dt[:, None]
@@ -378,7 +378,7 @@ def test_the_corrected_extrinsic_agrees_with_ground_truth(drive_0027: FeatureDat
     corrected = -R.T @ t
     literal = -R.T @ corrected  # the file's translation is the camera's position itself
     errors = [
-        np.abs((gap - np.cross(omega, lever))[turning, :2] - np.median(gap[~turning, :2], axis=0)).mean()
-        for lever in (corrected, literal)
+        np.abs((gap - np.cross(omega, lever_arm))[turning, :2] - np.median(gap[~turning, :2], axis=0)).mean()
+        for lever_arm in (corrected, literal)
     ]
     assert errors[0] < 0.75 * errors[1]

@@ -1,4 +1,4 @@
-"""EuRoC folders: calibration and clocks are read exactly, frames come rectified, every flaw is named."""
+"""EuRoC folders: exact calibration and clocks, rectified frames, and an error that names each defect."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_calibration_clock_and_truth_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("source", ["{}", "{}/mav0", "euroc:{}", "euroc:{}/mav0"])
-def test_the_folder_or_its_mav0_are_told_from_their_content(source: str, tmp_path: Path) -> None:
+def test_detects_the_folder_or_its_mav0_from_content(source: str, tmp_path: Path) -> None:
     make_euroc(tmp_path, truth="tum")
     recording = open_dataset(source.format(tmp_path)).recording
     assert recording.kind == "euroc"
@@ -77,7 +77,7 @@ def test_the_folder_or_its_mav0_are_told_from_their_content(source: str, tmp_pat
     np.testing.assert_allclose(recording.reference.T_world_body, truth_poses(4), atol=1e-9)
 
 
-def test_events_come_in_time_order_with_the_imu_first(tmp_path: Path) -> None:
+def test_events_are_in_time_order_with_imu_samples_first(tmp_path: Path) -> None:
     dataset = _read(make_euroc(tmp_path))
     events = list(dataset.events(1, 3))
     assert [e.index for e in events if isinstance(e, StereoFrame)] == [1, 2]
@@ -98,7 +98,7 @@ def test_events_come_in_time_order_with_the_imu_first(tmp_path: Path) -> None:
 
 
 def _opencv_maps(rig: StereoRig) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Lookup maps from OpenCV's own undistortion, given our rotations and rectified camera."""
+    """Lookup maps from OpenCV's undistortion, with this package's rotations and rectified camera."""
     camera = rectify(rig).camera
     rotations = rectifying_rotations(rig)[:2]
     maps = []
@@ -138,7 +138,7 @@ def _rounded(rig: StereoRig, digits: int) -> StereoRig:
 
 
 @pytest.mark.parametrize("rig", [RECTIFIED_RIG, _rounded(RECTIFIED_RIG, 6)], ids=["exact", "six digits"])
-def test_a_rectified_folder_is_passed_through_untouched(rig: StereoRig, tmp_path: Path) -> None:
+def test_a_rectified_folder_passes_through_unchanged(rig: StereoRig, tmp_path: Path) -> None:
     dataset = _read(make_euroc(tmp_path, rig=rig))
     camera = dataset.recording.camera
     assert (camera.fu, camera.fv, camera.cu, camera.cv) == (40, 40, 31.5, 23.5)
@@ -160,8 +160,8 @@ def test_a_pair_that_is_nearly_rectified_is_rectified(turn: list[float], tmp_pat
     assert _read(make_euroc(tmp_path, rig=rig)).rectifier.maps is not None
 
 
-def test_an_imu_with_a_pose_of_its_own_is_the_body(tmp_path: Path) -> None:
-    """The same rig described from another body frame: only the world-to-body poses of the truth move along."""
+def test_the_imu_frame_is_the_body_frame(tmp_path: Path) -> None:
+    """The same rig in another body frame: only the world-to-body poses of the ground truth change."""
     T_body_imu = se3_from_parts(so3_exp([0.3, -0.2, 0.5]), [0.1, 0.2, -0.05])
     moved = replace(
         RADTAN_RIG, T_imu_cam0=T_body_imu @ RADTAN_RIG.T_imu_cam0, T_imu_cam1=T_body_imu @ RADTAN_RIG.T_imu_cam1
@@ -183,7 +183,7 @@ def test_truth_of_the_raw_camera_is_moved_to_the_imu(tmp_path: Path) -> None:
     np.testing.assert_allclose(reference.T_world_body, truth_poses(4) @ se3_inverse(T_IMU_CAM0), atol=1e-9)
 
 
-def test_images_alone(tmp_path: Path) -> None:
+def test_folder_without_imu_and_ground_truth(tmp_path: Path) -> None:
     dataset = _read(make_euroc(tmp_path, imu=False, truth=None))
     assert dataset.recording.motion == frozenset()
     assert dataset.recording.reference is None
@@ -195,22 +195,22 @@ def test_images_alone(tmp_path: Path) -> None:
 # --- lists and clocks that do not quite agree -----------------------------------------------------------------------
 
 
-def test_images_under_another_extension_are_found(tmp_path: Path) -> None:
+def test_finds_images_with_another_extension(tmp_path: Path) -> None:
     dataset = _read(make_euroc(tmp_path, suffix=".jpg"))
     assert [note for note in dataset.recording.notes if "another extension" in note] == [
-        "8 images carry another extension than their data.csv says; taken by their stem"
+        "8 images have another extension than listed in their data.csv; matched by their stem"
     ]
     assert len(_frames(dataset)) == 4
 
 
-def test_unmatched_images_are_left_out_and_counted(tmp_path: Path) -> None:
+def test_skips_and_counts_unmatched_images(tmp_path: Path) -> None:
     make_euroc(tmp_path, 6)
     left, right = (tmp_path / "mav0" / name / "data.csv" for name in ("cam0", "cam1"))
     _drop_lines(left, [1])
     _drop_lines(right, [3, 6])
     recording = _read(tmp_path).recording
     assert recording.frame_times_ns.tolist() == [camera_stamps(6)[k] for k in (1, 3, 4)]
-    assert recording.notes == ("2 images of cam0 and 1 of cam1 have no partner and are left out",)
+    assert recording.notes == ("2 images of cam0 and 1 of cam1 have no partner and are skipped",)
 
 
 def _drop_lines(path: Path, numbers: list[int]) -> None:
@@ -218,7 +218,7 @@ def _drop_lines(path: Path, numbers: list[int]) -> None:
     path.write_text("".join(line for k, line in enumerate(lines) if k not in numbers))
 
 
-def test_a_steady_offset_between_the_cameras_is_bridged(tmp_path: Path) -> None:
+def test_pairs_images_at_a_constant_clock_offset(tmp_path: Path) -> None:
     offsets = [1_200_000, 1_190_000, 1_210_000, 1_200_000, 9_000_000, -1_400_000]
     dataset = _read(make_euroc(tmp_path, 6, right_offsets_ns=offsets))
     assert dataset.recording.frame_times_ns.tolist() == camera_stamps(6)[:4]
@@ -275,25 +275,25 @@ def test_other_spellings_of_a_calibration_are_read(tmp_path: Path) -> None:
 
 # --- bad input ------------------------------------------------------------------------------------------------------
 
-Spoil = Callable[[Path], object]
+Corruption = Callable[[Path], object]
 
 
-def _edit(name: str, old: str, new: str) -> Spoil:
-    def spoil(mav: Path) -> None:
+def _edit(name: str, old: str, new: str) -> Corruption:
+    def corrupt(mav: Path) -> None:
         text = (mav / name).read_text()
         assert old in text
         (mav / name).write_text(text.replace(old, new, 1))
 
-    return spoil
+    return corrupt
 
 
-def _line(name: str, number: int, text: str) -> Spoil:
-    def spoil(mav: Path) -> None:
+def _line(name: str, number: int, text: str) -> Corruption:
+    def corrupt(mav: Path) -> None:
         lines = (mav / name).read_text().splitlines()
         lines[number - 1] = text
         (mav / name).write_text("\n".join(lines) + "\n")
 
-    return spoil
+    return corrupt
 
 
 def _swap_cameras(mav: Path) -> None:
@@ -305,19 +305,19 @@ def _same_place(mav: Path) -> None:
     (mav / "cam1" / "sensor.yaml").write_text(sensor_yaml(RADTAN_RIG.cam1, T_IMU_CAM0))
 
 
-def _shift_clock(name: str, by_ns: int) -> Spoil:
-    def spoil(mav: Path) -> None:
+def _shift_clock(name: str, by_ns: int) -> Corruption:
+    def corrupt(mav: Path) -> None:
         path = mav / name / "data.csv"
         head, *lines = path.read_text().splitlines()
         moved = [re.sub(r"^\d+", lambda m: str(int(m[0]) + by_ns), line) for line in lines]
         path.write_text("\n".join([head, *moved]) + "\n")
 
-    return spoil
+    return corrupt
 
 
 _T0, _T1 = camera_stamps(4)[:2]
 _NO_YAML_MESSAGE = r"cam1/sensor.yaml is missing; it holds the sensor's calibration"
-BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
+BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "no cam1": (
         lambda mav: (mav / "cam1").rename(mav / "camB"),
         DataError,
@@ -345,12 +345,12 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
     "three intrinsics": (
         _edit("cam0/sensor.yaml", "intrinsics: [41.0, ", "intrinsics: ["),
         CalibrationError,
-        r"'intrinsics' is .* where 4 finite numbers belong",
+        r"'intrinsics' is .* instead of 4 finite numbers",
     ),
     "text in intrinsics": (
         _edit("cam0/sensor.yaml", "intrinsics: [41.0", "intrinsics: [wide"),
         CalibrationError,
-        r"'intrinsics' is .* where 4 finite numbers belong",
+        r"'intrinsics' is .* instead of 4 finite numbers",
     ),
     "negative focal": (
         _edit("cam0/sensor.yaml", "intrinsics: [41.0", "intrinsics: [-41.0"),
@@ -383,7 +383,7 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
     "clock repeats": (_line("cam0/data.csv", 3, f"{_T0},{_T0}.png"), DataError, r"line 3: the clock repeats"),
     "clock backwards": (_line("cam0/data.csv", 3, f"12,{_T0}.png"), DataError, r"line 3: the clock runs backwards"),
     "float stamp": (_line("cam0/data.csv", 3, f"1.4e18,{_T1}.png"), DataError, "'1.4e18' is no time in whole nano"),
-    "three columns": (_line("cam0/data.csv", 3, f"{_T1},a,b"), DataError, r"line 3: 3 values where 2 belong"),
+    "three columns": (_line("cam0/data.csv", 3, f"{_T1},a,b"), DataError, r"line 3: 3 values instead of 2"),
     "empty list": (
         lambda mav: (mav / "cam0/data.csv").write_text("#timestamp [ns],filename\n"),
         DataError,
@@ -400,7 +400,7 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
         DataError,
         r"imu0/data.csv, line 4: a reading is not a finite number",
     ),
-    "imu columns": (_line("imu0/data.csv", 4, "1,2,3"), DataError, r"imu0/data.csv, line 4: 3 values where 7 belong"),
+    "imu columns": (_line("imu0/data.csv", 4, "1,2,3"), DataError, r"imu0/data.csv, line 4: 3 values instead of 7"),
     "imu repeats": (
         _line("imu0/data.csv", 4, f"{imu_stamps(4)[1]},0,0,0,0,0,9.8"),
         DataError,
@@ -408,7 +408,7 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
     ),
     "imu empty": (lambda mav: (mav / "imu0/data.csv").write_text("#t\n"), DataError, r"imu0/data.csv: holds no line"),
     "imu missing": (lambda mav: (mav / "imu0/data.csv").unlink(), DataError, r"cannot read .*imu0/data.csv"),
-    "imu elsewhere": (_shift_clock("imu0", 10**12), DataError, r"no IMU sample falls into the time of the images"),
+    "imu elsewhere": (_shift_clock("imu0", 10**12), DataError, r"no IMU sample is within the time of the images"),
     "imu noise": (
         _edit("imu0/sensor.yaml", "accelerometer_random_walk: 3.0000e-3", "accelerometer_random_walk: 0"),
         CalibrationError,
@@ -428,9 +428,9 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_folders_are_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    spoil, kind, message = BAD[case]
-    spoil(make_euroc(tmp_path) / "mav0")
+def test_rejects_bad_folders_with_one_line_error(case: str, tmp_path: Path) -> None:
+    corrupt, kind, message = BAD[case]
+    corrupt(make_euroc(tmp_path) / "mav0")
     with pytest.raises(kind, match=message) as caught:
         open_dataset(tmp_path)
     assert "\n" not in str(caught.value)
@@ -447,10 +447,10 @@ def test_unreadable_images_are_skipped_up_to_a_limit(tmp_path: Path, caplog: pyt
         _frames(_read(tmp_path, max_bad_frames=0))
 
 
-def test_images_of_another_size_than_the_calibration_are_refused(tmp_path: Path) -> None:
+def test_rejects_images_of_another_size_than_the_calibration(tmp_path: Path) -> None:
     make_euroc(tmp_path)
     cv2.imwrite(str(tmp_path / "mav0" / "cam1" / "data" / f"{_T1}.png"), np.zeros((20, 30), np.uint8))
-    with pytest.raises(DataError, match=rf"{_T1}.png is 30 x 20 pixels but .*cam1/sensor.yaml says 64 x 48; give"):
+    with pytest.raises(DataError, match=rf"{_T1}.png is 30 x 20 pixels but .*cam1/sensor.yaml specifies 64 x 48; give"):
         _frames(_read(tmp_path))
 
 
@@ -458,7 +458,7 @@ def test_an_imu_without_calibration_is_noted(tmp_path: Path) -> None:
     (make_euroc(tmp_path) / "mav0" / "imu0" / "sensor.yaml").unlink()
     dataset = _read(tmp_path)
     assert dataset.imu_noise is None
-    assert "imu0/sensor.yaml is missing; the IMU is taken for the body frame" in dataset.recording.notes[0]
+    assert "imu0/sensor.yaml is missing; the IMU is assumed to be the body frame" in dataset.recording.notes[0]
 
 
 # --- real recordings ------------------------------------------------------------------------------------------------
@@ -498,11 +498,11 @@ def test_real_keyframes_have_matching_rows(data_dir: Path) -> None:
     assert np.percentile(dv, 95) <= 0.8
 
 
-def test_real_start_at_rest_measures_gravity(data_dir: Path) -> None:
+def test_real_stationary_start_measures_gravity(data_dir: Path) -> None:
     dataset = _real(data_dir, "V1_01_static")
     _check_real(dataset.recording, 12)
     accel = np.mean([s.accel for s in dataset.motion if isinstance(s, ImuSample)], axis=0)
     assert np.linalg.norm(accel) == pytest.approx(9.81, abs=0.15)
     assert dataset.recording.T_cam0_imu is not None
     down_in_cam = dataset.recording.T_cam0_imu[:3, :3] @ -accel / np.linalg.norm(accel)
-    assert down_in_cam[1] > 0.8, "the cameras stand upright: gravity points down the image"
+    assert down_in_cam[1] > 0.8, "the cameras are upright: gravity points down the image"

@@ -1,4 +1,4 @@
-"""Strict image loading, pairing by name, and the thread that decodes ahead."""
+"""Strict image loading, pairing by name, and the prefetch thread."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_damaged_png_is_unreadable(tmp_path: Path) -> None:
     data = bytearray(_png(tmp_path))
     data[len(data) // 2] ^= 0xFF
     (tmp_path / "bent.png").write_bytes(bytes(data))
-    with pytest.raises(UnreadableImageError, match=r"bent\.png: the PNG is damaged \(wrong check sum in its 'IDAT'"):
+    with pytest.raises(UnreadableImageError, match=r"bent\.png: the PNG is damaged \(wrong checksum in its 'IDAT'"):
         load_gray(tmp_path / "bent.png")
 
 
@@ -110,7 +110,7 @@ def test_missing_image_is_unreadable(tmp_path: Path) -> None:
 
 
 def test_sizes_are_compared_by_name() -> None:
-    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png says 30 x 24"):
+    with pytest.raises(DataError, match=r"b\.png is 32 x 24 pixels but a\.png specifies 30 x 24"):
         ImageSize(30, 24, Path("a.png")).check(PIXELS, Path("b.png"))
     ImageSize(32, 24, Path("a.png")).check(PIXELS, Path("b.png"))
 
@@ -122,14 +122,14 @@ def test_a_written_png_reads_back(tmp_path: Path) -> None:
     assert bits == 8
 
 
-def test_images_are_listed_in_order_without_strangers(tmp_path: Path) -> None:
+def test_lists_images_in_order_without_other_files(tmp_path: Path) -> None:
     make_images(tmp_path / "images", 11)
     for name in ("notes.txt", ".hidden.png"):
         (tmp_path / "images" / name).write_text("x")
     assert [path.name for path in list_images(tmp_path / "images")] == [f"{k:06d}.png" for k in range(11)]
 
 
-def test_folders_without_images_are_refused(tmp_path: Path) -> None:
+def test_rejects_folders_without_images(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"cannot list .*nowhere"):
         list_images(tmp_path / "nowhere")
     with pytest.raises(DataError, match="holds no image"):
@@ -137,7 +137,7 @@ def test_folders_without_images_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("side", "counts"), [("left", (4, 5)), ("right", (5, 4))])
-def test_the_first_missing_partner_is_named(side: str, counts: tuple[int, int], tmp_path: Path) -> None:
+def test_error_names_the_first_missing_partner(side: str, counts: tuple[int, int], tmp_path: Path) -> None:
     for name in ("left", "right"):
         make_images(tmp_path / name, 5)
     (tmp_path / side / "000003.png").unlink()
@@ -180,7 +180,7 @@ def test_prefetch_runs_beside_its_consumer() -> None:
 
     taken = prefetch(load, range(3), 2)
     assert next(taken) == 0
-    assert begun.wait(timeout=10)  # item 1 is loaded although nobody asked for it yet
+    assert begun.wait(timeout=10)  # item 1 is loaded before it is requested
     taken.close()
 
 
@@ -188,12 +188,12 @@ def test_prefetch_runs_beside_its_consumer() -> None:
 def test_prefetch_passes_exceptions_at_their_place(depth: int) -> None:
     def load(k: int) -> int:
         if k == 3:
-            raise DataError("frame 3 is spoiled")
+            raise DataError("frame 3 is corrupt")
         return k
 
     taken = prefetch(load, range(10), depth)
     assert [next(taken) for _ in range(3)] == [0, 1, 2]
-    with pytest.raises(DataError, match="frame 3 is spoiled"):
+    with pytest.raises(DataError, match="frame 3 is corrupt"):
         next(taken)
     assert _prefetch_threads() == []
 

@@ -40,7 +40,7 @@ def frames_of(folder: Path, settings: DatasetSettings = DEFAULT) -> list[StereoF
     return [event for event in read_kitti(folder, settings).events() if isinstance(event, StereoFrame)]
 
 
-def test_self_contained_folder_is_read_whole(tmp_path: Path) -> None:
+def test_reads_a_self_contained_folder_completely(tmp_path: Path) -> None:
     folder = make_kitti(tmp_path / "seq", frames=5)
     dataset = read_kitti(folder, DEFAULT)
     recording = dataset.recording
@@ -78,7 +78,7 @@ def test_official_layout_finds_its_poses(tmp_path: Path, monkeypatch: pytest.Mon
         assert recording.T_cam0_imu is None
 
 
-def test_folder_with_images_alone_is_enough(tmp_path: Path) -> None:
+def test_reads_a_folder_with_images_only(tmp_path: Path) -> None:
     folder = make_kitti(tmp_path / "seq")
     for name in ("poses.txt", "velocity.csv", "T_cam0_imu.txt"):
         (folder / name).unlink()
@@ -111,21 +111,25 @@ def test_velocities_may_have_their_own_rate(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("gray", "colour", "asked", "first"),
+    ("gray", "colour", "requested", "first"),
     [(True, True, None, 0), (True, True, True, 2), (False, True, None, 2), (True, True, False, 0)],
 )
-def test_the_pair_is_chosen(gray: bool, colour: bool, asked: bool | None, first: int, tmp_path: Path) -> None:
+def test_chooses_the_gray_or_colour_pair(
+    gray: bool, colour: bool, requested: bool | None, first: int, tmp_path: Path
+) -> None:
     folder = make_kitti(tmp_path / "seq", gray=gray, colour=colour)
-    dataset = read_kitti(folder, DatasetSettings(colour=asked))
+    dataset = read_kitti(folder, DatasetSettings(colour=requested))
     assert dataset.pairs[0][0].parent.name == f"image_{first}"
     assert dataset.recording.camera.baseline_m == pytest.approx(0.54 if first == 0 else 0.53)
 
 
-@pytest.mark.parametrize(("gray", "colour", "asked"), [(True, False, True), (False, True, False)])
-def test_a_pair_that_is_not_there_is_named(gray: bool, colour: bool, asked: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("gray", "colour", "requested"), [(True, False, True), (False, True, False)])
+def test_error_names_a_missing_pair(gray: bool, colour: bool, requested: bool, tmp_path: Path) -> None:
     folder = make_kitti(tmp_path / "seq", gray=gray, colour=colour)
-    with pytest.raises(DataError, match=rf"holds no image_\d with image_\d \(dataset.colour is {str(asked).lower()}\)"):
-        read_kitti(folder, DatasetSettings(colour=asked))
+    with pytest.raises(
+        DataError, match=rf"holds no image_\d with image_\d \(dataset.colour is {str(requested).lower()}\)"
+    ):
+        read_kitti(folder, DatasetSettings(colour=requested))
 
 
 def test_colour_moves_extrinsics_and_reference_to_camera_2(tmp_path: Path) -> None:
@@ -136,7 +140,7 @@ def test_colour_moves_extrinsics_and_reference_to_camera_2(tmp_path: Path) -> No
     assert gray.reference is not None
     assert colour.T_cam0_imu is not None
     assert colour.reference is not None
-    T_cam2_cam0 = se3_from_parts(np.eye(3), [0.06, 0, 0])  # camera 2 stands 6 cm left of camera 0
+    T_cam2_cam0 = se3_from_parts(np.eye(3), [0.06, 0, 0])  # camera 2 is 6 cm left of camera 0
     np.testing.assert_allclose(colour.T_cam0_imu, T_cam2_cam0 @ gray.T_cam0_imu, atol=1e-12)
     # Both describe one motion of the body: relative poses in the imu frame agree, whichever camera was watched.
     relative = [
@@ -156,7 +160,7 @@ def test_colour_moves_extrinsics_and_reference_to_camera_2(tmp_path: Path) -> No
 
 
 def test_official_calibration_of_sequence_00(tmp_path: Path) -> None:
-    """By hand: b = 386.1448 / 718.856; camera 2 stands (45.38225 - 607.1928 * .003779761) / 718.856 m to the left."""
+    """By hand: b = 386.1448 / 718.856; camera 2 is (45.38225 - 607.1928 * .003779761) / 718.856 m to the left."""
     (tmp_path / "calib.txt").write_text(OFFICIAL_00)
     gray = read_calibration(tmp_path / "calib.txt", (0, 1))
     assert gray.camera.baseline_m == pytest.approx(0.5371657, abs=1e-6)
@@ -172,7 +176,7 @@ def test_a_pair_off_its_axis_is_noted(tmp_path: Path) -> None:
     (folder / "calib.txt").write_text(OFFICIAL_00)
     notes = read_kitti(folder, DEFAULT).recording.notes
     assert len(notes) == 1
-    assert "image_3 lies 3." in notes[0]
+    assert "image_3 is 3." in notes[0]
 
 
 # --- images that cannot be used -----------------------------------------------------------------------------------
@@ -218,11 +222,11 @@ def test_all_images_unreadable_is_an_error_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("camera", ["image_1", "both"])
-def test_images_of_different_size_are_named(camera: str, tmp_path: Path) -> None:
+def test_error_names_images_of_different_size(camera: str, tmp_path: Path) -> None:
     folder = make_kitti(tmp_path / "seq")
     for name in ("image_0", "image_1") if camera == "both" else (camera,):
         assert cv2.imwrite(str(folder / name / "000002.png"), np.zeros((24, 30), dtype=np.uint8))
-    with pytest.raises(DataError, match=r"000002\.png is 30 x 24 pixels but .*image_0.000000\.png says 32 x 24"):
+    with pytest.raises(DataError, match=r"000002\.png is 30 x 24 pixels but .*image_0.000000\.png specifies 32 x 24"):
         frames_of(folder)
 
 
@@ -236,7 +240,7 @@ def test_sixteen_bits_are_noted(tmp_path: Path) -> None:
     )
 
 
-def test_leaving_early_ends_the_thread(tmp_path: Path) -> None:
+def test_closing_the_generator_ends_the_thread(tmp_path: Path) -> None:
     events = read_kitti(make_kitti(tmp_path / "seq", frames=12), DEFAULT).events()
     assert isinstance(next(events), VelocitySample)
     assert isinstance(next(events), StereoFrame)
@@ -271,16 +275,20 @@ BAD = [
     (_remove("calib.txt"), CalibrationError, r"calib\.txt is missing; it holds the projection matrices"),
     (_write("calib.txt", calib_text(0.0)), CalibrationError, r"calib\.txt: 0 lines begin with 'P1:'"),
     (_write("calib.txt", GOOD + GOOD), CalibrationError, r"calib\.txt: 2 lines begin with 'P0:'"),
-    (_write("calib.txt", calib_text(0.0, 0.0)), CalibrationError, r"P0 and P1 give a stereo baseline of 0 m"),
+    (_write("calib.txt", calib_text(0.0, 0.0)), CalibrationError, r"P0 and P1 imply a stereo baseline of 0 m"),
     (_write("calib.txt", calib_text(0.54, 0.0)), CalibrationError, r"stereo baseline of -0\.54 m.*exchanged"),
     (_write("calib.txt", GOOD.replace("6.0e+02", "x", 1)), CalibrationError, r"line 1: P0 holds no number"),
-    (_write("calib.txt", GOOD.replace(" 1 0", " 1", 1)), CalibrationError, r"line 1: P0 holds 11 values where 12"),
-    (_write("calib.txt", GOOD.replace(" 1 0", " 2 0", 1)), CalibrationError, r"line 1: P0 is no matrix of intrinsics"),
-    (_write("calib.txt", GOOD.replace("P0: 7", "P0: -7")), CalibrationError, r"P0 is no matrix .* fu and fv positive"),
+    (_write("calib.txt", GOOD.replace(" 1 0", " 1", 1)), CalibrationError, r"line 1: P0 holds 11 values, expected 12"),
+    (_write("calib.txt", GOOD.replace(" 1 0", " 2 0", 1)), CalibrationError, r"line 1: P0 is no intrinsic matrix"),
+    (
+        _write("calib.txt", GOOD.replace("P0: 7", "P0: -7")),
+        CalibrationError,
+        r"P0 is no intrinsic matrix .* fu and fv positive",
+    ),
     (
         _write("calib.txt", re.sub("(P.): 7", r"\1: 0", GOOD)),
         CalibrationError,
-        r"P0 is no matrix .* fu and fv positive",
+        r"P0 is no intrinsic matrix .* fu and fv positive",
     ),
     (_write("calib.txt", GOOD.replace("6.0e+02", "5.0e+02", 1)), CalibrationError, r"P0 and P1 differ in focal length"),
     (_write("calib.txt", GOOD.replace("1.8e+02 0 0 0 1 0\nTr", "1.8e+02 99 0 0 1 0\nTr")), CalibrationError, "off the"),
@@ -289,13 +297,17 @@ BAD = [
     (_write("times.txt", "0\n0.1\n0.1\n0.2\n"), DataError, r"times\.txt, line 3: the clock repeats"),
     (_write("times.txt", "0\n0.1\n0.05\n0.2\n"), DataError, r"times\.txt, line 3: the clock runs backwards"),
     (_write("times.txt", "0\n0.1\nsoon\n0.2\n"), DataError, r"times\.txt, line 3: not a number"),
-    (_write("times.txt", "0\n0.1 0.2\n0.3\n0.4\n"), DataError, r"times\.txt, line 2: 2 values where 1 belong"),
-    (_remove("T_cam0_imu.txt"), CalibrationError, r"velocity\.csv stands without T_cam0_imu\.txt"),
+    (_write("times.txt", "0\n0.1 0.2\n0.3\n0.4\n"), DataError, r"times\.txt, line 2: 2 values instead of 1"),
+    (_remove("T_cam0_imu.txt"), CalibrationError, r"velocity\.csv needs T_cam0_imu\.txt"),
     (_write("T_cam0_imu.txt", "1 0 0 0\n0 1 0 0\n0 0 2 0\n"), CalibrationError, r"T_cam0_imu\.txt: not a rotation"),
     (_write("T_cam0_imu.txt", "1 0 0\n"), CalibrationError, r"T_cam0_imu\.txt: expected three or four lines"),
     (_write("T_cam0_imu.txt", ""), CalibrationError, r"T_cam0_imu\.txt: expected three or four lines"),
     (_replace("velocity.csv", "time_s", "t"), DataError, r"velocity\.csv, line 1: expected the header time_s,vx_mps"),
-    (_replace("velocity.csv", "\n0.100000,", "\n0.100000,nan,"), DataError, r"velocity\.csv, line 3: 8 values where 7"),
+    (
+        _replace("velocity.csv", "\n0.100000,", "\n0.100000,nan,"),
+        DataError,
+        r"velocity\.csv, line 3: 8 values instead of 7",
+    ),
     (
         _replace("velocity.csv", ",0.0,", ",nan,"),
         DataError,
@@ -308,21 +320,21 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("spoil", "kind", "message"), BAD)
-def test_bad_folder_is_refused_in_one_line(
-    spoil: Callable[[Path], object], kind: type[Exception], message: str, tmp_path: Path
+@pytest.mark.parametrize(("corrupt", "kind", "message"), BAD)
+def test_rejects_bad_folder_with_one_line_error(
+    corrupt: Callable[[Path], object], kind: type[Exception], message: str, tmp_path: Path
 ) -> None:
     folder = make_kitti(tmp_path / "seq")
-    spoil(folder)
+    corrupt(folder)
     with pytest.raises(kind, match=message) as caught:
         read_kitti(folder, DEFAULT)
     assert "\n" not in str(caught.value)
 
 
-def test_velocities_of_another_clock_are_refused(tmp_path: Path) -> None:
+def test_rejects_velocities_of_another_clock(tmp_path: Path) -> None:
     folder = make_kitti(tmp_path / "seq")
     (folder / "times.txt").write_text("".join(f"{1000 + 0.1 * k:.6f}\n" for k in range(4)))
-    with pytest.raises(DataError, match=r"velocity\.csv: no velocity falls into the time of the images"):
+    with pytest.raises(DataError, match=r"velocity\.csv: no velocity is within the time of the images"):
         read_kitti(folder, DEFAULT)
 
 
@@ -355,8 +367,8 @@ def test_real_recording(name: str, count: int, camera: StereoCamera, data_dir: P
 
 
 @pytest.mark.parametrize("name", ["kitti_0039", "kitti_06_head"])
-def test_real_extrinsics_tie_velocities_to_the_reference(name: str, data_dir: Path) -> None:
-    """The reference seen from the IMU moves as the velocities say; with the inverse rotation it does not.
+def test_real_extrinsics_relate_velocities_to_the_reference(name: str, data_dir: Path) -> None:
+    """The reference, moved to the IMU, agrees with the velocities; with the inverse rotation it does not.
 
     These drives turn too little to prove the translation too; the ECE276A and UTIAS tests do that for the same rig.
     """

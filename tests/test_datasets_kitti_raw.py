@@ -1,4 +1,4 @@
-"""KITTI raw drives: the calibration means what KITTI's own images show, clocks are exact, every flaw is named."""
+"""KITTI raw drives: calibration consistent with KITTI's images, exact clocks, an error that names each defect."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_frames_are_rectified_as_opencv_would(tmp_path: Path) -> None:
             assert (difference > 1).mean() < 0.002
 
 
-def test_images_that_kitti_rectified_are_passed_through(tmp_path: Path) -> None:
+def test_images_rectified_by_kitti_pass_through(tmp_path: Path) -> None:
     dataset = _read(make_kitti_raw(tmp_path, rectified=True))
     camera = dataset.recording.camera
     assert (camera.fu, camera.cu, camera.cv) == (38.0, 27.0, 19.0)
@@ -115,11 +115,11 @@ def test_timestamps_are_read_to_the_nanosecond(lines: int, rows: list[int], tmp_
 
 # --- bad input ------------------------------------------------------------------------------------------------------
 
-Spoil = Callable[[Path], object]
+Corruption = Callable[[Path], object]
 
 
-def _entry(name: str, values: str | None) -> Spoil:
-    def spoil(folder: Path) -> None:
+def _entry(name: str, values: str | None) -> Corruption:
+    def corrupt(folder: Path) -> None:
         path = folder / "calib_cam_to_cam.txt"
         text, count = re.subn(
             rf"^{name}:.*\n", "" if values is None else f"{name}: {values}\n", path.read_text(), flags=re.M
@@ -127,10 +127,10 @@ def _entry(name: str, values: str | None) -> Spoil:
         assert count == 1
         path.write_text(text)
 
-    return spoil
+    return corrupt
 
 
-def _times(*lines: str) -> Spoil:
+def _times(*lines: str) -> Corruption:
     return lambda folder: (folder / "image_00" / "timestamps.txt").write_text("\n".join(lines) + "\n")
 
 
@@ -138,7 +138,7 @@ def _images(folder: Path, camera: int) -> list[Path]:
     return sorted((folder / f"image_0{camera}" / "data").iterdir())
 
 
-BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
+BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "no right camera": (
         lambda d: (d / "image_01").rename(d / "image_03"),
         DataError,
@@ -155,14 +155,14 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
         "calib_cam_to_cam.txt is neither there nor in the folders above",
     ),
     "no K": (_entry("K_01", None), CalibrationError, "calib_cam_to_cam.txt: has no entry K_01"),
-    "short D": (_entry("D_00", "-0.3 0.2 0 0"), CalibrationError, "D_00 holds 4 values where 5 finite ones belong"),
-    "NaN in T": (_entry("T_01", "-0.5 nan 0"), CalibrationError, "T_01 holds 3 values where 3 finite ones belong"),
+    "short D": (_entry("D_00", "-0.3 0.2 0 0"), CalibrationError, "D_00 holds 4 values, expected 5 finite ones"),
+    "NaN in T": (_entry("T_01", "-0.5 nan 0"), CalibrationError, "T_01 holds 3 values, expected 3 finite ones"),
     "text": (_entry("T_01", "-0.5 a 0"), CalibrationError, "T_01 holds no number"),
-    "no matrix": (_entry("K_00", "1 2 3 4 5 6 7 8 9"), CalibrationError, "camera 00 is no matrix of intrinsics"),
+    "no matrix": (_entry("K_00", "1 2 3 4 5 6 7 8 9"), CalibrationError, "camera 00 is no intrinsic matrix"),
     "negative focal": (
         _entry("K_00", "-40 0 31 0 40 24 0 0 1"),
         CalibrationError,
-        "camera 00 is no matrix of intrinsics .* fu and fv positive",
+        "camera 00 is no intrinsic matrix .* fu and fv positive",
     ),
     "mirrored": (_entry("R_01", "1 0 0 0 1 0 0 0 -1"), CalibrationError, "R_01: not a rotation but a reflection"),
     "swapped": (_entry("T_01", "0.11 0 0"), CalibrationError, "cam_to_cam.txt: .*the cameras may be swapped"),
@@ -227,9 +227,9 @@ BAD: dict[str, tuple[Spoil, type[DataError], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_drives_are_refused_in_one_line(case: str, tmp_path: Path) -> None:
-    spoil, kind, message = BAD[case]
-    spoil(make_kitti_raw(tmp_path))
+def test_rejects_bad_drives_with_one_line_error(case: str, tmp_path: Path) -> None:
+    corrupt, kind, message = BAD[case]
+    corrupt(make_kitti_raw(tmp_path))
     with pytest.raises(kind, match=message) as caught:
         open_dataset(tmp_path)
     assert "\n" not in str(caught.value)
@@ -243,7 +243,7 @@ def _real(data_dir: Path) -> tuple[RectifiedDataset, KittiRawCalibration]:
     return _read(folder), read_cam_to_cam(folder / "calib_cam_to_cam.txt")
 
 
-def test_real_rectification_agrees_with_kittis_but_for_a_turn_about_the_baseline(data_dir: Path) -> None:
+def test_real_rectification_agrees_with_kitti_up_to_a_rotation_about_the_baseline(data_dir: Path) -> None:
     dataset, published = _real(data_dir)
     R_rect_cam0, R_rect_cam1, baseline_m = rectifying_rotations(dataset.rectifier.rig)
     turns = []
@@ -263,7 +263,7 @@ def _kitti_maps(model: CameraModel, rect: CameraModel, R: FloatArray) -> tuple[n
     return uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
 
 
-def test_the_lens_model_reproduces_kittis_own_rectified_image(data_dir: Path) -> None:
+def test_the_lens_model_reproduces_the_rectified_image_of_kitti(data_dir: Path) -> None:
     """Frame 100 of the drive is image 76 of the rectified clip: equal to rounding, so order and signs are KITTI's."""
     dataset, published = _real(data_dir)
     models = (
@@ -278,7 +278,7 @@ def test_the_lens_model_reproduces_kittis_own_rectified_image(data_dir: Path) ->
 
 
 def test_real_extrinsics_agree_with_the_odometry_folder(data_dir: Path) -> None:
-    """`T_cam0_imu` of the rectified clip is R_rect_00 T_cam0_velo T_velo_imu; ours differs by the known turn alone."""
+    """`T_cam0_imu` of the rectified clip is R_rect_00 T_cam0_velo T_velo_imu; this one differs by a known rotation."""
     dataset, published = _real(data_dir)
     other = open_dataset(data_dir / "kitti_0039").recording.T_cam0_imu
     assert other is not None
@@ -288,7 +288,7 @@ def test_real_extrinsics_agree_with_the_odometry_folder(data_dir: Path) -> None:
     np.testing.assert_allclose(dataset.recording.T_cam0_imu[:3], expected, atol=1e-4)
 
 
-def test_real_rows_are_as_good_as_kittis_own(data_dir: Path) -> None:
+def test_real_rows_are_aligned_as_well_as_by_kitti(data_dir: Path) -> None:
     """KITTI's calibration of that day leaves rows half a pixel apart, in its own rectified images as in ours."""
     from tools.check_rectification import match_sift
 

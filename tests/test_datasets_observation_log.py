@@ -1,4 +1,4 @@
-"""The observation log: replay to the bit, atomic writing, versions and damage."""
+"""The observation log: bit-exact replay, atomic writing, versions and corrupt files."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ def _seen(k: int, time_ns: int) -> Observations:
     return Observations(k, time_ns, np.array([7]), np.array([[3.0, 2, 1, 2]]), np.array([True]), np.array([False]))
 
 
-def test_a_left_eye_feature_keeps_its_arbitrary_right_pixels(tmp_path: Path) -> None:
+def test_a_left_only_feature_keeps_its_arbitrary_right_pixels(tmp_path: Path) -> None:
     z = np.array([[1.0, 2.0, np.nan, -0.0]])
     seen = Observations(1, 100, np.array([3]), z, np.array([False]), np.array([True]))
     write_observation_log(tmp_path / "a.npz", _recording(), [seen], [])
@@ -169,19 +169,19 @@ def test_a_course_file_replays_through_the_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("observed", [[_seen(2, 200), _seen(1, 100)], [_seen(1, 100), _seen(1, 100)], [_seen(1, 101)]])
-def test_observations_of_another_recording_are_refused(observed: list[Observations], tmp_path: Path) -> None:
+def test_rejects_observations_of_another_recording(observed: list[Observations], tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not in the order of the recording's frames"):
         write_observation_log(tmp_path / "a.npz", _recording(), observed, [])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unwritable_place_is_named_and_nothing_is_left(tmp_path: Path) -> None:
+def test_error_names_an_unwritable_path_and_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"cannot write .*nowhere.a\.npz"):
         write_observation_log(tmp_path / "nowhere" / "a.npz", _recording(), [], [])
     assert list(tmp_path.iterdir()) == []
 
 
-def _spoiled(tmp_path: Path, **changes: object) -> Path:
+def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
     write_observation_log(tmp_path / "good.npz", _recording(), [_seen(0, 0), _seen(2, 200)], [])
     arrays = {**read_npz(tmp_path / "good.npz"), **{k: np.asarray(v) for k, v in changes.items() if v is not None}}
     return make_npz(
@@ -197,18 +197,18 @@ def _spoiled(tmp_path: Path, **changes: object) -> Path:
         ({"z": None}, "the observation log lacks z"),
         ({"z": np.zeros((2, 4), dtype=np.int64)}, "z of the observation log has type int64"),
         ({"z": np.zeros((3, 4))}, "inconsistent: 2 ids, but z is"),
-        ({"offsets": [0, 2, 1]}, "the offsets do not part 2 rows into 2 frames"),
+        ({"offsets": [0, 2, 1]}, "the offsets do not split 2 rows into 2 frames"),
         ({"frame_indices": [0, 3]}, "frame numbers do not increase within 0 to 2"),
         ({"frame_times_ns": [0, 0, 200]}, "a clock does not increase"),
         ({"motion_values": np.zeros((1, 6))}, "0 motion times"),
         ({"image_size": [640]}, "the camera is incomplete"),
-        ({"landmark_ids": [1]}, "landmark_ids stands without landmark_p_world"),
+        ({"landmark_ids": [1]}, "landmark_ids lacks landmark_p_world"),
         ({"reference_T_world_body": np.zeros((2, 4)), "reference_body": "imu"}, "reference poses"),
     ],
 )
-def test_spoiled_log_is_refused(changes: dict[str, object], message: str, tmp_path: Path) -> None:
+def test_rejects_a_corrupt_log(changes: dict[str, object], message: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=message) as caught:
-        read_observation_log(_spoiled(tmp_path, **changes))
+        read_observation_log(_corrupt_log(tmp_path, **changes))
     assert "\n" not in str(caught.value)
 
 
@@ -219,9 +219,9 @@ def test_spoiled_log_is_refused(changes: dict[str, object], message: str, tmp_pa
         ({"T_cam0_imu": np.diag([1.0, 2, 1, 1])}, "T_cam0_imu: not a rotation"),
     ],
 )
-def test_spoiled_calibration_is_refused(changes: dict[str, object], message: str, tmp_path: Path) -> None:
+def test_rejects_a_log_with_corrupt_calibration(changes: dict[str, object], message: str, tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=message):
-        read_observation_log(_spoiled(tmp_path, **changes))
+        read_observation_log(_corrupt_log(tmp_path, **changes))
 
 
 def test_format_name_is_what_is_written(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The UTIAS reader: conventions proved on the data, bad input, made files."""
+"""The UTIAS reader: conventions verified on the data, bad input, synthetic files."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ DRIVES = {  # file, frames, features
 }
 
 
-def test_made_file_is_read_whole(tmp_path: Path) -> None:
+def test_reads_a_synthetic_file_completely(tmp_path: Path) -> None:
     drive = make_drive(8)
     dataset = read_utias(make_mat(tmp_path / "a.mat", utias_arrays(drive)), DEFAULT)
     recording = dataset.recording
@@ -50,7 +50,7 @@ def test_made_file_is_read_whole(tmp_path: Path) -> None:
     np.testing.assert_allclose(recording.reference.T_world_body, drive.T_world_imu, atol=1e-12)
     assert recording.landmarks_reference is None
     assert dataset.variances is None
-    assert recording.notes == ("velocities go on for 11 frames, features for 8; the first 8 are read",)
+    assert recording.notes == ("velocities cover 11 frames, features 8; the first 8 are read",)
     observed = dataset.observations(5)
     assert observed is not None
     seen = np.flatnonzero(drive.features[0, :, 5] != -1)
@@ -64,7 +64,7 @@ def test_pose_arrays_may_be_absent(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "kind", "message"),
+    ("corrupt", "kind", "message"),
     [
         (without("b", "t"), DataError, r"lacks t b; a UTIAS file needs y_k_j .*, found C_c_v"),
         (changed("y_k_j", np.zeros((4, 6))), DataError, r"y_k_j has shape 4 x 6; expected 4 x T x M"),
@@ -86,10 +86,10 @@ def test_pose_arrays_may_be_absent(tmp_path: Path) -> None:
         (lambda a: {**a, "y_k_j": a["y_k_j"][[2, 3, 0, 1]]}, DataError, r"left and right look swapped"),
     ],
 )
-def test_bad_file_is_refused_in_one_line(
-    spoil: Callable[[Arrays], Arrays], kind: type[Exception], message: str, tmp_path: Path
+def test_rejects_bad_files_with_one_line_error(
+    corrupt: Callable[[Arrays], Arrays], kind: type[Exception], message: str, tmp_path: Path
 ) -> None:
-    path = make_mat(tmp_path / "bad.mat", spoil(utias_arrays(make_drive(6))))
+    path = make_mat(tmp_path / "bad.mat", corrupt(utias_arrays(make_drive(6))))
     with pytest.raises(kind, match=message) as caught:
         read_utias(path, DEFAULT)
     assert str(path) in str(caught.value)
@@ -97,14 +97,14 @@ def test_bad_file_is_refused_in_one_line(
 
 
 @pytest.mark.parametrize("size", [0, 60, 128, 3000])
-def test_truncated_file_is_refused(size: int, tmp_path: Path) -> None:
+def test_rejects_a_truncated_file(size: int, tmp_path: Path) -> None:
     path = make_mat(tmp_path / "cut.mat", utias_arrays(make_drive(6)))
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(DataError, match=r"cut\.mat"):
         read_utias(path, DEFAULT)
 
 
-def test_newer_matlab_files_are_named(tmp_path: Path) -> None:
+def test_error_for_newer_matlab_files_states_the_remedy(tmp_path: Path) -> None:
     path = tmp_path / "new.mat"
     path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n" + bytes(600))
     with pytest.raises(DataError, match=r"MATLAB 7\.3 file; save it again with `save -v7`"):
@@ -203,13 +203,13 @@ def test_starry_night(starry_night: FeatureDataset) -> None:
     assert recording.landmarks_reference is not None
     assert recording.landmarks_reference.p_world.shape == (20, 3)
     assert not recording.landmarks_reference.covariance.any()
-    assert not starry_night.tracks.stale.any()  # it repeats integer pixels, but only at rest
+    assert not starry_night.tracks.stale.any()  # it repeats integer pixels, but only while stationary
     assert starry_night.variances is not None
     np.testing.assert_allclose(starry_night.variances.pixels, [37.98, 129.84, 41.95, 132.5], atol=0.1)
 
 
-def test_starry_night_reprojects_with_the_variance_that_its_makers_measured(starry_night: FeatureDataset) -> None:
-    """The known landmarks seen from the known poses through our camera give exactly the file's `y_var`."""
+def test_starry_night_reprojects_with_the_published_variance(starry_night: FeatureDataset) -> None:
+    """Reprojection of the known landmarks from the known poses has exactly the file's `y_var`."""
     recording = starry_night.recording
     assert recording.reference is not None
     assert recording.T_cam0_imu is not None
@@ -224,7 +224,7 @@ def test_starry_night_reprojects_with_the_variance_that_its_makers_measured(star
     np.testing.assert_allclose(error.var(axis=0, ddof=1), starry_night.variances.pixels, rtol=2e-3)
 
 
-def test_theta_of_the_raw_file_is_the_pose_that_we_give(data_dir: Path, starry_night: FeatureDataset) -> None:
+def test_theta_of_the_raw_file_is_the_reference_pose(data_dir: Path, starry_night: FeatureDataset) -> None:
     raw = loadmat(data_dir / "utias_starry_night" / "dataset3.mat")
     assert starry_night.recording.reference is not None
     T = starry_night.recording.reference.T_world_body[700]

@@ -65,7 +65,7 @@ def test_jacobian_with_five_coefficients() -> None:
         )
 
 
-def test_every_pixel_of_kitti_has_a_ray_that_comes_back() -> None:
+def test_unprojection_round_trip_over_the_kitti_image() -> None:
     v, u = np.mgrid[0:512:16, 0:1392:16]
     uv = np.stack([u, v], axis=-1).astype(np.float64)
     ray, valid = unproject_pixel(KITTI, uv)
@@ -78,7 +78,7 @@ def test_every_pixel_of_kitti_has_a_ray_that_comes_back() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.tuples(st.floats(-0.6, 0.3), st.floats(-0.3, 0.3), st.floats(-0.3, 0.3)))
-def test_points_are_valid_up_to_where_the_polynomial_turns(k: tuple[float, float, float]) -> None:
+def test_points_are_valid_up_to_the_fold_of_the_polynomial(k: tuple[float, float, float]) -> None:
     """Brute force: walk outwards along the u axis until the distorted radius stops growing."""
     k1, k2, k3 = k
     camera = CameraModel(1.0, 1.0, 0.0, 0.0, 2, 2, "radtan", (k1, k2, 0.0, 0.0, k3))
@@ -86,19 +86,19 @@ def test_points_are_valid_up_to_where_the_polynomial_turns(k: tuple[float, float
     _, valid = project_point(camera, np.column_stack([r, 0 * r, np.ones_like(r)]))
     slope = 1 + 3 * k1 * r**2 + 5 * k2 * r**4 + 7 * k3 * r**6
     growing = np.logical_and.accumulate(slope > 0)
-    doubtful = slope < 0.01
-    assert valid[: int(np.argmax(doubtful)) if doubtful.any() else None].all()
+    ambiguous = slope < 0.01
+    assert valid[: int(np.argmax(ambiguous)) if ambiguous.any() else None].all()
     if not growing.all():
         assert not valid[int(np.argmin(growing)) + 2 :].any()
 
 
 @pytest.mark.parametrize("count", [1, 3, 6, 8])
-def test_other_numbers_of_coefficients_are_refused(count: int) -> None:
+def test_rejects_other_numbers_of_coefficients(count: int) -> None:
     with pytest.raises(CalibrationError, match=f"takes 4 distortion coefficients or 5, got {count}"):
         CameraModel(400, 400, 320, 240, 640, 480, "radtan", (0.01,) * count)
 
 
-def test_impossible_cameras_are_named() -> None:
+def test_rejects_invalid_cameras() -> None:
     with pytest.raises(CalibrationError, match="unknown distortion model 'fisheye'; use one of pinhole, radtan, equi"):
         CameraModel(400, 400, 320, 240, 640, 480, "fisheye", (0.1,))  # type: ignore[arg-type]
     with pytest.raises(CalibrationError, match="are not finite"):
@@ -109,7 +109,7 @@ def test_impossible_cameras_are_named() -> None:
         rig_from_rectified(StereoCamera(400, 400, 320, 240, 0.1), np.eye(4))
 
 
-def test_a_rectified_pair_becomes_a_rig_and_comes_back() -> None:
+def test_rectified_pair_to_rig_round_trip() -> None:
     camera = StereoCamera(400.0, 410.0, 320.0, 240.0, 0.1, 640, 480)
     T_cam0_imu = se3_exp([0.1, -0.2, 0.3, 0.4, 0.5, 0.6])
     rig = rig_from_rectified(camera, T_cam0_imu)

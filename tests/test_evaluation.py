@@ -53,7 +53,7 @@ def wander(n: int, seed: int = 0, step_m: float = 1.0) -> FloatArray:
 
 
 def drift(T: FloatArray, seed: int = 1, sigma: float = 0.01) -> FloatArray:
-    """The same motion as an odometer with noise sees it, from another start."""
+    """The same motion as estimated by noisy odometry, from another start."""
     rng = np.random.default_rng(seed)
     out = np.empty_like(T)
     out[0] = se3_exp(rng.normal(size=6))
@@ -207,7 +207,7 @@ def straight(n: int, step_m: float = 1.0) -> FloatArray:
     return T
 
 
-def test_a_scale_error_of_one_percent_is_one_percent() -> None:
+def test_a_scale_error_of_one_percent_is_one_percent_drift() -> None:
     # A step of 1 m: the first pose more than 100 m away is the 101st, so the error is 1.01 m per 100 m.
     ours = evaluate(kitti_form(straight(301, 1.01)), kitti_form(straight(301)), align="none").kitti
     assert ours is not None
@@ -227,7 +227,7 @@ def test_sim3_takes_the_scale_error_out() -> None:
     assert ours.path_length_m == pytest.approx(303)
 
 
-def test_a_constant_turn_rate_error_is_its_rate() -> None:
+def test_a_constant_rotation_rate_error_is_the_rotational_drift() -> None:
     T_ref = straight(301)
     T_est = T_ref.copy()
     T_est[:, :3, :3] = so3_exp(
@@ -254,7 +254,7 @@ def test_exactly_the_length_is_not_yet_a_segment() -> None:
 
 
 @pytest.mark.parametrize(("lengths", "step"), [((0.0,), 10), ((100.0, -1.0), 10), ((float("nan"),), 10), ((50.0,), 0)])
-def test_impossible_segment_lengths_are_refused(lengths: tuple[float, ...], step: int) -> None:
+def test_rejects_invalid_segment_lengths(lengths: tuple[float, ...], step: int) -> None:
     with pytest.raises(EvaluationError, match="must be positive"):
         kitti_error(straight(200), straight(200), lengths, step)
 
@@ -333,7 +333,7 @@ def degenerate(kind: str) -> FloatArray:
 
 @pytest.mark.parametrize("kind", ["one pose", "two poses", "straight", "stationary", "stationary to rounding"])
 @pytest.mark.parametrize("seed", range(3))
-def test_orientations_settle_what_positions_leave_open(kind: str, seed: int) -> None:
+def test_orientations_determine_alignment_where_positions_do_not(kind: str, seed: int) -> None:
     T_ref = degenerate(kind)
     truth = se3_exp(np.random.default_rng(seed).normal(size=6) * 2)
     found = evaluate(kitti_form(se3_inverse(truth) @ T_ref), kitti_form(T_ref))
@@ -355,7 +355,7 @@ def test_sim3_along_a_line_is_defined(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["one pose", "stationary", "stationary to rounding"])
-def test_sim3_without_motion_is_refused(kind: str) -> None:
+def test_rejects_sim3_without_motion(kind: str) -> None:
     T = degenerate(kind)
     with pytest.raises(EvaluationError, match="align with se3 or none"):
         evaluate(kitti_form(T), kitti_form(T), align="sim3")
@@ -371,7 +371,7 @@ def test_a_motionless_estimate_of_a_motion_has_the_spread_of_the_reference_as_er
     assert found.ate_m.rmse == pytest.approx(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
 
 
-def test_none_aligns_nothing() -> None:
+def test_alignment_none_is_the_identity() -> None:
     T_ref = wander(10)
     T_est = T_ref.copy()
     T_est[:, 0, 3] += 3.0
@@ -398,7 +398,7 @@ def test_none_aligns_nothing() -> None:
         ([10, 11, 12], [0, 11, 30], 5, [(1, 1)]),
         ([], [1, 2], 5, []),
         ([1, 2], [], 5, []),
-        ([1403715273262142976], [1403715273262142977], 1, [(0, 0)]),  # floats could not tell these apart
+        ([1403715273262142976], [1403715273262142977], 1, [(0, 0)]),  # not distinguishable as floats
         ([1403715273262142976], [1403715273262142977], 0, []),
     ],
 )
@@ -433,7 +433,7 @@ def test_association_is_one_to_one_in_order_and_leaves_no_close_pair(a: list[int
                 assert min(crossing) <= d
 
 
-def test_a_rare_reference_scores_the_frames_it_has() -> None:
+def test_a_sparse_reference_evaluates_its_frames() -> None:
     T = wander(100)
     reference = Trajectory(T[10:90:4], 100_000_000 * np.arange(10, 90, 4) + 3_000_000, "cam0")
     found = evaluate(timed(T), reference)
@@ -445,7 +445,7 @@ def test_a_rare_reference_scores_the_frames_it_has() -> None:
     assert found.coverage.longest_gap_s == pytest.approx(0.4)
 
 
-def test_coverage_tells_a_late_start_and_a_hole() -> None:
+def test_coverage_reports_a_late_start_and_a_gap() -> None:
     T = wander(101)
     full = timed(T)
     assert full.times_ns is not None
@@ -464,7 +464,7 @@ def test_time_association_respects_the_limit() -> None:
     assert evaluate(late, timed(T), max_time_difference_s=0.015).matched == 10
 
 
-def test_different_clocks_are_told_apart() -> None:
+def test_error_reports_different_clocks() -> None:
     T = wander(10)
     with pytest.raises(EvaluationError, match=r"estimate covers 0.000 to 0.900 s, the reference 1403715273.000 to"):
         evaluate(timed(T), timed(T, start_ns=1_403_715_273 * 10**9))
@@ -525,7 +525,7 @@ def test_nothing_to_compare_is_an_error(empty: Literal["estimate", "reference"])
 
 
 @pytest.mark.parametrize(("own", "other"), [("imu", "cam0"), ("cam0", "imu")])
-def test_no_lever_arm_leaks_into_the_error(own: BodyFrame, other: BodyFrame) -> None:
+def test_lever_arm_does_not_enter_the_error(own: BodyFrame, other: BodyFrame) -> None:
     truth = timed(wander(60), body=other)
     estimate = truth.in_imu(T_CAM0_IMU) if own == "imu" else truth.in_cam0(T_CAM0_IMU)
     found = evaluate(estimate, truth, align="none", T_cam0_imu=T_CAM0_IMU)
@@ -573,7 +573,7 @@ def test_series_match_the_statistics_and_the_rows() -> None:
     assert found.ate_m.max == pytest.approx(distance.max())
 
 
-def test_the_inputs_are_left_as_they_were() -> None:
+def test_inputs_are_not_modified() -> None:
     T_ref = wander(30)
     estimate, reference = timed(drift(T_ref)), timed(T_ref)
     before = estimate.T_world_body.copy(), reference.T_world_body.copy()
@@ -603,7 +603,7 @@ def test_non_finite_poses_are_named(which: str) -> None:
         ({"lengths_m": (-5.0,)}, "must be positive"),
     ],
 )
-def test_impossible_options_are_refused(options: dict[str, Any], match: str) -> None:
+def test_rejects_invalid_options(options: dict[str, Any], match: str) -> None:
     T = wander(10)
     with pytest.raises(EvaluationError, match=match):
         evaluate(timed(T), timed(T), **options)
@@ -657,7 +657,7 @@ def test_nees_equals_the_quadratic_form_with_the_inverse() -> None:
     assert nees(np.zeros((0, 3)), np.zeros((0, 3, 3))).shape == (0,)
 
 
-def test_nees_of_a_consistent_estimate_lies_in_its_bounds() -> None:
+def test_nees_of_a_consistent_estimate_is_within_bounds() -> None:
     rng = np.random.default_rng(1)
     P = np.array([[2.0, 0.5, 0.0], [0.5, 1.0, 0.3], [0.0, 0.3, 4.0]])
     e = rng.multivariate_normal(np.zeros(3), P, size=400)
@@ -682,12 +682,12 @@ def test_nees_bounds_are_quantiles_of_chi_square(d: int, runs: int, confidence: 
         (np.full((1, 2), np.nan), np.eye(2)[None], "not finite"),
     ],
 )
-def test_impossible_nees_is_refused(errors: FloatArray, covariances: FloatArray, match: str) -> None:
+def test_rejects_invalid_nees_arguments(errors: FloatArray, covariances: FloatArray, match: str) -> None:
     with pytest.raises(EvaluationError, match=match):
         nees(errors, covariances)
 
 
 @pytest.mark.parametrize(("d", "runs", "confidence"), [(0, 1, 0.95), (1, 0, 0.95), (1, 1, 1.0), (1, 1, 0.0)])
-def test_impossible_nees_bounds_are_refused(d: int, runs: int, confidence: float) -> None:
+def test_rejects_invalid_nees_bounds(d: int, runs: int, confidence: float) -> None:
     with pytest.raises(EvaluationError, match="NEES bounds need"):
         nees_bounds(d, runs, confidence)

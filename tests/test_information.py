@@ -1,4 +1,4 @@
-"""What features say of a motion, and the greedy choice among them, against derivations that share nothing with them."""
+"""Information of features on a motion, and the greedy choice among them, against independent derivations."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def _hat(p: FloatArray) -> FloatArray:
     return np.array([[0, -p[2], p[1]], [p[2], 0, -p[0]], [-p[1], p[0], 0]])
 
 
-def test_a_point_never_seen_before_says_nothing_of_the_last_motion() -> None:
+def test_a_new_point_has_no_information_on_the_last_motion() -> None:
     assert not row_weights(np.zeros(2), np.array([True, False])).any()
 
 
@@ -105,7 +105,7 @@ def test_lazy_greedy_is_plain_greedy(n: int, budget: int, motions: int, seed: in
     chosen = found.order.tolist()
     assert np.sum(found.gain[chosen]) == pytest.approx(_gain(prior, L, chosen), rel=1e-8, abs=1e-9)
     assert log_det_gain(prior, L[chosen]) == pytest.approx(_gain(prior, L, chosen), rel=1e-8, abs=1e-9)
-    for left in set(range(n)) - set(chosen):  # what is told of the others is an upper bound
+    for left in set(range(n)) - set(chosen):  # the gains of the others are upper bounds
         assert found.gain[left] >= (_gain(prior, L, [*chosen, left]) - _gain(prior, L, chosen)) * (1 - 1e-9) - 1e-9
 
 
@@ -119,7 +119,7 @@ def test_greedy_is_close_to_the_best_of_all_subsets(n: int, budget: int, seed: i
     assert _gain(prior, L, order) <= best * (1 + 1e-9)
 
 
-def test_ties_go_to_the_smaller_id_whatever_the_order() -> None:
+def test_ties_go_to_the_smaller_id_in_any_order() -> None:
     L = np.repeat(_factors(1, 2, 3), 30, axis=0)
     prior = np.repeat(BROAD[None], 2, axis=0)
     ids = np.random.default_rng(0).permutation(30)
@@ -127,8 +127,8 @@ def test_ties_go_to_the_smaller_id_whatever_the_order() -> None:
     assert ids[found.order].tolist() == list(range(7))
 
 
-def test_what_is_kept_counts() -> None:
-    """With half of the budget kept, the rest complements it: a copy of a kept feature adds less than another one."""
+def test_kept_features_count() -> None:
+    """With half of the budget kept, the remainder complements it: a copy of a kept feature adds less than another."""
     L = _factors(30, 1, 5)
     L[1] = L[0]
     prior = BROAD[None]
@@ -136,13 +136,13 @@ def test_what_is_kept_counts() -> None:
     kept[0] = True
     found = lazy_greedy(prior, L, np.arange(30), 3, kept)
     assert found.order[0] == 0
-    rest = [i for i in range(30) if i != 0]
-    second = max(rest, key=lambda i: _gain(prior, L, [0, i]))
+    remaining = [i for i in range(30) if i != 0]
+    second = max(remaining, key=lambda i: _gain(prior, L, [0, i]))
     assert found.order[1] == second != 1
     assert len(found.order) == 3
 
 
-def test_features_that_say_nothing_are_left_out() -> None:
+def test_features_without_information_are_not_chosen() -> None:
     L = _factors(10, 1, 6)
     L[4:] = 0.0
     found = lazy_greedy(BROAD[None], L, np.arange(10), 8, np.zeros(10, dtype=np.bool_))
@@ -154,44 +154,44 @@ def test_prior_of_a_motion_known_exactly_can_be_inverted() -> None:
     assert np.isfinite(np.linalg.slogdet(prior_information(motion))[1])
 
 
-@pytest.mark.parametrize(("sigma_rad", "believed"), [(1e-4, False), (1e-1, True)])
-def test_a_feature_off_the_expected_motion_is_believed_less(sigma_rad: float, believed: bool) -> None:
-    """Ten pixels beside its place it says next to nothing, unless the motion is so uncertain that it may well be."""
+@pytest.mark.parametrize(("sigma_rad", "consistent"), [(1e-4, False), (1e-1, True)])
+def test_a_feature_off_the_predicted_motion_has_less_weight(sigma_rad: float, consistent: bool) -> None:
+    """A feature ten pixels off its prediction has almost no weight, unless the motion is that uncertain."""
     z = project(CAMERA, _points(2, 11))
     beside = z + np.array([[0.0, 0.0, 0.0, 0.0], [10.0, 0.0, 10.0, 0.0]])
     model = MotionInformation(CAMERA, 4, 0.5)
     motion = MotionPrior(np.eye(4), np.diag([1e-8] * 3 + [sigma_rad**2] * 3))
-    model.look(observations(0, 0, [0, 1], z), motion)
-    model.use(observations(0, 0, [0, 1], z), np.ones(2, dtype=np.bool_))
-    L = model.look(observations(1, 1, [0, 1], beside), motion)
+    model.add_frame(observations(0, 0, [0, 1], z), motion)
+    model.mark_used(observations(0, 0, [0, 1], z), np.ones(2, dtype=np.bool_))
+    L = model.add_frame(observations(1, 1, [0, 1], beside), motion)
     strength = np.sum(L[:, 0] ** 2, axis=(1, 2))
     alike = MotionInformation(CAMERA, 4, 0.5)
-    alike.look(observations(0, 0, [0, 1], z), None)
-    alike.use(observations(0, 0, [0, 1], z), np.ones(2, dtype=np.bool_))
-    without = np.sum(alike.look(observations(1, 1, [0, 1], beside), None)[:, 0] ** 2, axis=(1, 2))
+    alike.add_frame(observations(0, 0, [0, 1], z), None)
+    alike.mark_used(observations(0, 0, [0, 1], z), np.ones(2, dtype=np.bool_))
+    without = np.sum(alike.add_frame(observations(1, 1, [0, 1], beside), None)[:, 0] ** 2, axis=(1, 2))
     ratio = strength / without
     assert ratio[0] == pytest.approx(1.0, abs=1e-9)
-    assert ratio[1] > 0.9 if believed else ratio[1] < 0.1
+    assert ratio[1] > 0.9 if consistent else ratio[1] < 0.1
 
 
-def test_only_sightings_that_were_used_count() -> None:
-    """A feature passed over says as little of the last motion as a new one."""
+def test_only_used_observations_count() -> None:
+    """A feature that was not used has as little information on the last motion as a new one."""
     z = project(CAMERA, _points(2, 12))
     model = MotionInformation(CAMERA, 4, 0.5)
     for k in range(3):
-        L = model.look(observations(k, k, [0, 1], z), None)
+        L = model.add_frame(observations(k, k, [0, 1], z), None)
         assert not L[1, 0].any()
         assert L[0, 0].any() == (k > 0)
         assert L[:, 1].any(axis=(1, 2)).all()
-        model.use(observations(k, k, [0, 1], z), np.array([True, False]))
+        model.mark_used(observations(k, k, [0, 1], z), np.array([True, False]))
 
 
-def test_the_future_of_a_feature_counts_by_how_often_its_like_were_seen_again() -> None:
-    """One feature stays for eight frames; beside it, in every frame, a new one appears that is not seen again."""
+def test_future_information_is_weighted_by_survival_of_the_age_group() -> None:
+    """One feature lives for eight frames; in every frame a new one appears that is not observed again."""
     z, model = np.repeat(project(CAMERA, _points(1, 13)), 2, axis=0), MotionInformation(CAMERA, 3, 0.5)
     for k in range(8):
-        L = model.look(observations(k, k, [0, 100 + k], z), None)
-    # Nine of ten are believed to survive beforehand; of the new ones, the first alone did, and seven did not.
+        L = model.add_frame(observations(k, k, [0, 100 + k], z), None)
+    # The prior survival is nine of ten; of the new features, only the first survived, and seven did not.
     old, new = 9 / 10, (9 + 1) / (10 + 1 + 7)
     strength = np.sum(L**2, axis=(2, 3))
     np.testing.assert_allclose(strength[0, 1] / strength[1, 1], old / new)  # the next frame

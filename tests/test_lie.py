@@ -82,7 +82,7 @@ def test_so3_log_near_zero_is_relatively_exact(angle: float) -> None:
     close(lie.so3_log(lie.so3_exp(phi)), phi, atol=0, rtol=1e-12)
 
 
-def test_series_and_closed_forms_meet_at_the_switch() -> None:
+def test_series_and_closed_forms_agree_at_the_switch() -> None:
     direction = np.array([2.0, -1.0, 2.0]) / 3
     below, above = (direction * (1e-2 * (1 + s)) for s in (-1e-12, 1e-12))
     for f in (lie.so3_exp, lie.so3_left_jacobian, lie.so3_left_jacobian_inverse):
@@ -139,7 +139,7 @@ def test_se3_exp_of_the_negative_is_the_inverse(xi: FloatArray) -> None:
 @properties
 @given(twists)
 def test_adjoint_is_the_exponential_of_the_curly_hat(xi: FloatArray) -> None:
-    xi = xi * np.array([1e-2, 1e-2, 1e-2, 1, 1, 1])  # expm of a large nilpotent part loses digits of its own
+    xi = xi * np.array([1e-2, 1e-2, 1e-2, 1, 1, 1])  # expm of a large nilpotent part loses digits
     close(lie.se3_adjoint(lie.se3_exp(xi)), expm(lie.se3_curly_hat(xi)), atol=1e-12 * (1 + np.abs(xi).max()))
 
 

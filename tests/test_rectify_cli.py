@@ -1,4 +1,4 @@
-"""`vio rectify` and `vio run` on unrectified folders, as a stranger uses them."""
+"""`vio rectify` and `vio run` on unrectified folders."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def test_the_table_names_what_was_written(tmp_path: Path, capsys: pytest.Capture
     assert json.loads((out / MARKER).read_text())["interpolation"] == "cubic"
 
 
-def test_an_older_result_is_replaced_and_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_replaces_only_an_older_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source, out = make_euroc(tmp_path / "raw", 3), tmp_path / "rect"
     for _ in range(2):
         assert _json(capsys, "rectify", str(source), "--out", str(out))["frames"] == 3
@@ -145,7 +145,7 @@ def test_an_older_result_is_replaced_and_nothing_else(tmp_path: Path, capsys: py
     assert (other / "thesis.txt").read_text() == "mine"
 
 
-def test_what_is_rectified_already_is_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rejects_a_recording_that_is_rectified_already(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sources = (
         make_euroc(tmp_path / "euroc", rig=RECTIFIED_RIG),
         make_kitti_raw(tmp_path / "sync", rectified=True),
@@ -158,7 +158,7 @@ def test_what_is_rectified_already_is_left_alone(tmp_path: Path, capsys: pytest.
         assert not out.exists()
 
 
-def test_a_broken_image_is_left_out_and_too_many_leave_nothing(
+def test_skips_a_corrupt_image_and_too_many_leave_no_folder(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     source, out = make_euroc(tmp_path / "raw", 8), tmp_path / "rect"
@@ -179,7 +179,7 @@ def test_a_broken_image_is_left_out_and_too_many_leave_nothing(
 
 
 def _bent(rig: StereoRig) -> StereoRig:
-    """A rig whose lenses bend lines and whose cameras are not aligned."""
+    """A rig with lens distortion and misaligned cameras."""
     bend = (-0.28, 0.07, 0.0004, -0.0003)
     T_cam0_cam1 = rig.T_cam0_cam1.copy()
     T_cam0_cam1[:3, :3] = [[1, -0.004, 0.006], [0.004, 1, -0.003], [-0.006, 0.003, 1]]
@@ -243,7 +243,7 @@ def test_run_takes_an_unrectified_folder_like_a_rectified_one(
     assert again["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)
 
 
-def test_the_check_tool_supports_the_choice_to_rectify(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_tool_shows_the_benefit_of_rectification(capsys: pytest.CaptureFixture[str]) -> None:
     """At one moment: stereo rows are better in rectified images, aligned tracks in time about as good."""
     assert check(["tracking", "--moments", "1", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)

@@ -1,4 +1,4 @@
-"""`vio render`: whole folders that read back, the same bits from any number of processes, and clear refusals."""
+"""`vio render`: folders that read back, identical output from any number of processes, and clear errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
 from vio.records import ImuSample, IntArray, StereoFrame, VelocitySample
 from vio.sim.errors import SimulationError
-from vio.sim.motion import evaluate, hand_held, turned
+from vio.sim.motion import evaluate, hand_held, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU
 from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, plan
 from vio.sim.sequence import SimulatedRecording, Simulation
@@ -50,9 +50,9 @@ def straight(path: Path, start: FloatArray, end: FloatArray) -> Path:
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as recorded flights have it: truth, image times and IMU, all irregular."""
+    """A folder like a recorded flight: ground truth, image times and IMU, all with irregular times."""
     folder = tmp_path_factory.mktemp("flight")
-    motion = turned(hand_held(duration_s=2.0, start_ns=START_NS), R_FLU_EUROC_IMU)
+    motion = rotate_body_axes(hand_held(duration_s=2.0, start_ns=START_NS), R_FLU_EUROC_IMU)
     times = START_NS + np.arange(200) * 10_000_000
     T = evaluate(motion, times).T_world_imu
     quaternions = quat_xyzw_from_rotation(T[:, :3, :3])
@@ -98,7 +98,7 @@ def test_the_summary_describes_the_folder_and_the_folder_reads_back(
     assert dataset.recording.reference is not None
 
 
-def test_a_kitti_folder_comes_with_the_papers_velocities(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_kitti_folder_has_the_velocities_of_the_paper(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "kitti"
     assert render(out, "--format", "kitti", "--rate", "30", "--width", "96", "--duration", "0.1") == 0
     printed = capsys.readouterr()
@@ -112,9 +112,9 @@ def test_a_kitti_folder_comes_with_the_papers_velocities(tmp_path: Path, capsys:
     assert dataset.recording.reference is not None
 
 
-def test_a_car_comes_with_kittis_cameras_rate_and_folder() -> None:
-    words = ["render", "--out", "x", "--scene", "street", "--trajectory", "car", "--duration", "20"]
-    scenario, form = scenario_from(build_parser().parse_args(words))
+def test_car_trajectory_defaults_to_kitti_cameras_rate_and_format() -> None:
+    argv = ["render", "--out", "x", "--scene", "street", "--trajectory", "car", "--duration", "20"]
+    scenario, form = scenario_from(build_parser().parse_args(argv))
     assert (scenario.rig, scenario.rate_hz, scenario.velocity, form) == ("kitti", 10.0, "paper", "kitti")
     simulation = plan(scenario)
     assert len(simulation.taken_ns) == 200
@@ -122,7 +122,7 @@ def test_a_car_comes_with_kittis_cameras_rate_and_folder() -> None:
     assert 3 < np.median(speed) < 12
 
 
-def test_a_flight_folder_gives_its_truth_its_image_times_and_its_imu(tmp_path: Path, flight: Path) -> None:
+def test_flight_folder_provides_ground_truth_image_times_and_imu(tmp_path: Path, flight: Path) -> None:
     out = tmp_path / "flight"
     assert render(out, "--trajectory", str(flight), "--width", "96") == 0
     stamps = [int(line) for line in (flight / "image_timestamps_ns.txt").read_text().split()]
@@ -135,10 +135,10 @@ def test_a_flight_folder_gives_its_truth_its_image_times_and_its_imu(tmp_path: P
     assert "radial-tangential" in (out / "mav0/cam0/sensor.yaml").read_text()
 
 
-def test_a_rate_a_duration_and_another_imu_replace_those_of_the_flight(tmp_path: Path, flight: Path) -> None:
+def test_rate_duration_and_imu_options_override_the_flight(tmp_path: Path, flight: Path) -> None:
     common = ["render", "--out", str(tmp_path / "x"), "--trajectory", str(flight)]
-    own, _ = scenario_from(build_parser().parse_args(common))
-    assert (own.frame_times, own.imu) == (flight / "image_timestamps_ns.txt", flight / "imu0.csv")
+    default, _ = scenario_from(build_parser().parse_args(common))
+    assert (default.frame_times, default.imu) == (flight / "image_timestamps_ns.txt", flight / "imu0.csv")
     other, _ = scenario_from(build_parser().parse_args([*common, "--rate", "4", "--imu", "simulated"]))
     assert (other.frame_times, other.imu) == (None, "simulated")
     assert np.all(np.diff(plan(other).taken_ns) == 250_000_000)
@@ -146,7 +146,7 @@ def test_a_rate_a_duration_and_another_imu_replace_those_of_the_flight(tmp_path:
     assert len(plan(short).taken_ns) == 3
 
 
-def test_an_older_folder_of_ours_is_replaced_whole(tmp_path: Path) -> None:
+def test_replaces_an_older_render_folder(tmp_path: Path) -> None:
     out = tmp_path / "room"
     assert render(out, *SMALL) == 0
     assert render(out, *SMALL, "--duration", "0.1") == 0
@@ -154,7 +154,7 @@ def test_an_older_folder_of_ours_is_replaced_whole(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["room"]
 
 
-def test_several_processes_give_the_same_bits_and_their_end_is_told() -> None:
+def test_parallel_rendering_is_identical_and_reports_a_dead_process() -> None:
     scenario = Scenario(width=96, duration_s=0.3, conditions=conditions_of(["noise", "duplicated"]), seed=2)
     alone = SimulatedRecording(plan(scenario))
     with ParallelRecording(scenario, workers=2) as together:
@@ -179,13 +179,13 @@ def test_the_help_names_every_effect(monkeypatch: pytest.MonkeyPatch, capsys: py
 
 @pytest.fixture(scope="module")
 def plain() -> Simulation:
-    """One frame without effects, far enough into the motion for a swing of exposure and for blur to show."""
+    """One frame without effects, far enough into the motion for exposure changes and blur to be visible."""
     simulation = plan(Scenario(width=96, duration_s=2.0, seed=1))
     return replace(simulation, taken_ns=simulation.taken_ns[-1:], stamps_ns=simulation.stamps_ns[-1:])
 
 
 @pytest.mark.parametrize("effect", ["clean", "exposure", "gain", "gain-high", "blur", "noise", "dark"])
-def test_effects_on_the_sensor_change_the_images_they_should(plain: Simulation, effect: str) -> None:
+def test_sensor_effects_change_the_expected_images(plain: Simulation, effect: str) -> None:
     changed = replace(plain, effects=conditions_of([effect]).effects)
     before, after = SimulatedRecording(plain).images(0), SimulatedRecording(changed).images(0)
     left, right = (np.mean(a != b) for a, b in zip(before, after, strict=True))
@@ -223,9 +223,9 @@ def test_effects_on_frames_and_clocks() -> None:
     assert np.all(shifted.stamps_ns - shifted.taken_ns == 20_000_000)
 
 
-def test_single_values_come_after_named_effects(tmp_path: Path) -> None:
-    words = ["render", "--out", str(tmp_path), "--effects", "noise, dropped", "--set", "effects.read_noise=2"]
-    args = build_parser().parse_args([*words, "--set", "faults.dropped=0.5", "--set", "moving=true"])
+def test_set_options_override_named_effects(tmp_path: Path) -> None:
+    argv = ["render", "--out", str(tmp_path), "--effects", "noise, dropped", "--set", "effects.read_noise=2"]
+    args = build_parser().parse_args([*argv, "--set", "faults.dropped=0.5", "--set", "moving=true"])
     conditions = scenario_from(args)[0].conditions
     assert (conditions.effects.read_noise, conditions.effects.full_well) == (2.0, 5000.0)
     assert conditions.faults.dropped == 0.5
@@ -243,7 +243,7 @@ def test_single_values_come_after_named_effects(tmp_path: Path) -> None:
     ids=["room", "corridor", "street", "car"],
 )
 @pytest.mark.parametrize("seed", [0, 5])
-def test_ready_motions_stay_clear_of_everything_that_moves(scenario: Scenario, seed: int) -> None:
+def test_predefined_motions_avoid_moving_boxes(scenario: Scenario, seed: int) -> None:
     simulation = plan(replace(scenario, seed=seed, rate_hz=1.0, conditions=conditions_of(["moving"])))
     assert simulation.world.movers
     for time_ns in simulation.taken_ns.tolist():
@@ -262,8 +262,8 @@ def test_boxes_move_in_a_room_around_a_flight_too(flight: Path) -> None:
 
 
 @pytest.mark.parametrize("rig", ["euroc", "euroc-rectified", "kitti", "fisheye", "small"])
-def test_every_rig_looks_ahead_at_any_width(rig: str) -> None:
-    """Handheld cameras look about along the horizon, whatever the axes of the IMU; the field of view stays."""
+def test_every_rig_looks_forward_at_any_width(rig: str) -> None:
+    """Hand-held cameras look along the horizon, for all IMU axes; the field of view is unchanged."""
     wide, narrow = (plan(Scenario(rig=rig, width=width, duration_s=0.05)) for width in (None, 200))  # type: ignore[arg-type]
     T = evaluate(narrow.motion, narrow.taken_ns[0]).T_world_imu[0] @ narrow.rig.T_imu_cam0
     assert abs(T[2, 2]) < 0.5  # the optical axis is about level
@@ -309,7 +309,7 @@ def no_flight(folder: Path) -> list[str]:
     return ["--trajectory", str(folder / "empty")]
 
 
-def words(*arguments: str) -> Callable[[Path], list[str]]:
+def command_line(*arguments: str) -> Callable[[Path], list[str]]:
     return lambda folder: list(arguments)
 
 
@@ -318,49 +318,49 @@ def words(*arguments: str) -> Callable[[Path], list[str]]:
     [
         (in_a_box, "inside box 0 of the corridor"),
         (out_of_the_scene, "leaves the corridor"),
-        (words("--trajectory", "car"), "leaves the room"),
+        (command_line("--trajectory", "car"), "leaves the room"),
         (against_time, "t.tum, line 4: the clock runs backwards"),
         (frames_against_time, "frames.txt, line 2: the clock runs backwards"),
         (imu_of_another_day, "does not span the frames"),
         (no_flight, "holds no groundtruth_tum.txt"),
-        (words("--trajectory", "nowhere.tum"), "there is no such file"),
-        (words("--imu", "real.csv"), "goes with its own recorded trajectory"),
-        (words("--frame-times", "f.txt"), "go with a recorded trajectory"),
-        (words("--frame-times", "f.txt", "--rate", "5"), "exclude each other"),
-        (words("--imu", "none"), "needs an IMU"),
-        (words("--velocity", "paper"), "no place for body velocities"),
-        (words("--format", "kitti", "--imu", "simulated"), "no place for an IMU"),
-        (words("--format", "kitti", "--rig", "fisheye"), "needs a rectified rig"),
-        (words("--effects", "noise,fog"), "no effect 'fog'"),
-        (words("--scene", "street", "--effects", "bare-wall"), "no bare walls"),
-        (words("--set", "effects.read_nois=2"), "did you mean 'effects.read_noise'"),
-        (words("--set", "effects.vignetting=2"), "between 0 and 1"),
-        (words("--set", "faults.dropped=1"), "shares of the frames"),
-        (words("--set", "effects.gamma"), "takes key=value"),
-        (words("--set", "effects.gamma=[1"), "not valid YAML"),
-        (words("--width", "3"), "choose a width"),
-        (words("--rate", "0"), "choose a rate"),
-        (words("--duration", "nan"), "cannot be made"),
-        (words("--seed", "-1"), "must not be negative"),
-        (words("--workers", "0"), "1 to 64"),
+        (command_line("--trajectory", "nowhere.tum"), "there is no such file"),
+        (command_line("--imu", "real.csv"), "needs its own recorded trajectory"),
+        (command_line("--frame-times", "f.txt"), "need a recorded trajectory"),
+        (command_line("--frame-times", "f.txt", "--rate", "5"), "exclude each other"),
+        (command_line("--imu", "none"), "needs an IMU"),
+        (command_line("--velocity", "paper"), "no place for body velocities"),
+        (command_line("--format", "kitti", "--imu", "simulated"), "no place for an IMU"),
+        (command_line("--format", "kitti", "--rig", "fisheye"), "needs a rectified rig"),
+        (command_line("--effects", "noise,fog"), "no effect 'fog'"),
+        (command_line("--scene", "street", "--effects", "bare-wall"), "no bare walls"),
+        (command_line("--set", "effects.read_nois=2"), "did you mean 'effects.read_noise'"),
+        (command_line("--set", "effects.vignetting=2"), "between 0 and 1"),
+        (command_line("--set", "faults.dropped=1"), "shares of the frames"),
+        (command_line("--set", "effects.gamma"), "takes key=value"),
+        (command_line("--set", "effects.gamma=[1"), "not valid YAML"),
+        (command_line("--width", "3"), "choose a width"),
+        (command_line("--rate", "0"), "choose a rate"),
+        (command_line("--duration", "nan"), "cannot be rendered"),
+        (command_line("--seed", "-1"), "must not be negative"),
+        (command_line("--workers", "0"), "1 to 64"),
     ],
     ids=lambda value: value.__name__ if callable(value) and value.__name__ != "<lambda>" else None,
 )
-def test_bad_input_is_refused_in_one_line_before_anything_is_written(
+def test_rejects_bad_input_with_one_line_error_before_writing(
     arguments: Callable[[Path], list[str]],
     message: str,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    place = tmp_path / "place"
-    place.mkdir()
+    folder = tmp_path / "folder"
+    folder.mkdir()
     given = arguments(tmp_path)
-    assert render(place / "out", *(() if "--width" in given else ("--width", "96")), *given) == 1
+    assert render(folder / "out", *(() if "--width" in given else ("--width", "96")), *given) == 1
     error = capsys.readouterr().err
     assert message in error
     assert error.startswith("error: ")
     assert error.count("\n") == 1
-    assert not list(place.iterdir())
+    assert not list(folder.iterdir())
 
 
 def _half_full(folder: Path) -> Path:
@@ -382,7 +382,7 @@ def _below_a_file(folder: Path) -> Path:
     ("target", "message"),
     [(_half_full, "was not made by this program"), (_a_file, "not a folder"), (_below_a_file, "cannot write")],
 )
-def test_a_target_that_cannot_be_used_is_left_as_it_is(
+def test_keeps_an_unusable_target_unchanged(
     target: Callable[[Path], Path], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = target(tmp_path)
@@ -398,7 +398,7 @@ COMMAND = [sys.executable, "-c", "import sys; from vio.cli import main; sys.exit
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGXFSZ"), reason="needs POSIX file limits")
-def test_a_full_disk_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_full_disk_leaves_no_partial_output(tmp_path: Path) -> None:
     """Files are limited to 4 kB, which calibration and headers stay below and images do not."""
     import resource
 
@@ -414,13 +414,13 @@ def test_a_full_disk_leaves_nothing_behind(tmp_path: Path) -> None:
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4000, 4000)),
     )
     assert done.returncode == 1
-    assert "choose a writable place with enough free space" in done.stderr
+    assert "choose a writable path with enough free space" in done.stderr
     assert done.stderr.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-def test_a_killed_render_is_not_taken_for_a_whole_one(tmp_path: Path) -> None:
+def test_a_killed_render_leaves_no_finished_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
     with subprocess.Popen(
         [*COMMAND, "--workers", "1", "--out", str(out)], cwd=ROOT, stderr=subprocess.DEVNULL

@@ -1,4 +1,4 @@
-"""Spreads and standard errors against what they stand for."""
+"""Robust standard deviation and jackknife against known values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:
     assert float(jackknife([a[0] for a in again])) == pytest.approx(float(jackknife(again)[0]), rel=1e-12)
 
 
-def test_errors_that_last_count_when_blocks_are_longer_than_they() -> None:
+def test_jackknife_accounts_for_correlation_within_blocks() -> None:
     rng = np.random.default_rng(1)
     lasting = np.repeat(rng.standard_normal(200), 10)  # 200 independent values, each seen ten times
     single = [np.delete(lasting, k).mean() for k in range(0, 2000, 10)]
@@ -25,7 +25,7 @@ def test_errors_that_last_count_when_blocks_are_longer_than_they() -> None:
     assert float(jackknife(single)) < 0.5 * by_blocks
 
 
-def test_a_robust_spread_is_that_of_the_good_values() -> None:
+def test_robust_sigma_ignores_outliers() -> None:
     values = 3 * np.random.default_rng(2).standard_normal(20_000)
     assert robust_sigma(values) == pytest.approx(3.0, rel=0.03)
     values[:3000] = 1e6

@@ -1,4 +1,4 @@
-"""Selectors: one contract for all, and what is particular to each."""
+"""The contract of all selectors, and the properties of each."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
 @settings(max_examples=40)
 @given(seen=st.lists(st.lists(st.integers(0, 40), unique=True, max_size=30), min_size=1, max_size=8))
 def test_contract(name: str, seen: list[list[int]]) -> None:
-    """A mask of the right length, no more than asked for, the same every time."""
+    """A mask of the right length, within the budget, and reproducible."""
     record = [_frame(k, ids) for k, ids in enumerate(seen)]
     first, second = _build(name, record), _build(name, record)
     for frame in record:
@@ -73,7 +73,7 @@ def test_contract(name: str, seen: list[list[int]]) -> None:
             assert a.chosen.all()
 
 
-def test_causal_visibility_prefers_what_was_seen_most() -> None:
+def test_causal_visibility_prefers_the_most_observed_features() -> None:
     record = [_frame(0, [1, 2]), _frame(1, [2, 3]), _frame(2, [1, 2, 3, 4])]
     selector = _build("visibility", record, fraction=0.25, minimum=1)
     chosen = [frame.ids[selector.select(frame).chosen].tolist() for frame in record]
@@ -89,8 +89,8 @@ def test_whole_record_keeps_the_first_share_of_all_features() -> None:
         assert frame.ids[selector.select(frame).chosen].tolist() == [6]
 
 
-def test_grid_gives_up_no_cell() -> None:
-    """Forty long-lived features crowd one corner, three young ones lie elsewhere: all three cells survive."""
+def test_grid_selects_from_every_cell() -> None:
+    """Forty long-lived features are in one corner, three young ones elsewhere: all cells keep a feature."""
     z = np.zeros((43, 4))
     z[:40, :2] = [10, 10]
     z[40:, :2] = [[600, 10], [10, 350], [600, 350]]
@@ -106,12 +106,12 @@ def test_grid_gives_up_no_cell() -> None:
     assert not crowd_only.select(observations(5, 5, np.arange(43), z)).chosen[40:].any()
 
 
-def test_whole_record_without_a_record_says_what_to_do() -> None:
+def test_whole_record_without_a_record_states_the_remedy() -> None:
     with pytest.raises(ConfigError, match="--save-observations"):
         build_selector(SelectorSettings(name="visibility_whole"), image_size=None, whole_record=None)
 
 
-def test_grid_without_image_size_says_what_to_do() -> None:
+def test_grid_without_image_size_states_the_remedy() -> None:
     with pytest.raises(ConfigError, match="image size"):
         build_selector(SelectorSettings(name="grid"), image_size=None, whole_record=None)
 
@@ -136,7 +136,7 @@ def test_budget_is_an_absolute_number(name: str, sticky: bool) -> None:
 
 
 @pytest.mark.parametrize("name", BUDGETED)
-def test_a_sticky_feature_stays_chosen_while_it_is_seen(name: str) -> None:
+def test_a_sticky_feature_stays_chosen_while_it_is_tracked(name: str) -> None:
     record = _scene(12)
     selector = _build(name, record, budget=25, sticky=True)
     last: set[int] = set()
@@ -146,12 +146,12 @@ def test_a_sticky_feature_stays_chosen_while_it_is_seen(name: str) -> None:
         assert last & set(frame.ids.tolist()) <= chosen
         lost += len(last - set(frame.ids.tolist()))
         last = chosen
-    assert lost > 0  # some left the image, and others took their place
+    assert lost > 0  # some left the image, and others replaced them
     assert len(last) == 25
 
 
 @pytest.mark.parametrize("name", BUDGETED)
-def test_sticky_gives_way_to_a_smaller_budget(name: str) -> None:
+def test_sticky_respects_a_smaller_budget(name: str) -> None:
     """A share of fewer features may be less than what was chosen before; only chosen ones are then kept."""
     record = _scene(2)
     selector = _build(name, record, fraction=0.5, minimum=1, sticky=True)
@@ -173,8 +173,8 @@ def test_random_depends_on_seed_and_frame_alone() -> None:
     np.testing.assert_array_equal(build[0].select(record[1]).chosen, a[1])
 
 
-def test_information_spreads_over_the_image_and_takes_near_points() -> None:
-    """Many far points in one corner say little more than one of them; a near one elsewhere says of the translation."""
+def test_information_spreads_over_the_image_and_chooses_near_points() -> None:
+    """Many far points in one corner add little more than one of them; a near one elsewhere adds translation."""
     far = np.stack([np.linspace(10, 12, 30), np.linspace(-8, -7, 30), np.full(30, 30.0)], axis=1)
     near = np.array([[-1.0, 0.5, 2.0], [0.2, 0.6, 2.0], [-0.8, -0.5, 2.0]])
     z = project(CAMERA, np.concatenate([far, near]))
@@ -185,8 +185,8 @@ def test_information_spreads_over_the_image_and_takes_near_points() -> None:
     assert chosen[:30].sum() == 3
 
 
-def test_information_foresees_what_leaves_the_image() -> None:
-    """Of two points alike but for their side, the camera's turn will hide one: the other is taken."""
+def test_information_predicts_features_that_leave_the_image() -> None:
+    """Of two points symmetric in the image, the camera's rotation will hide one: the other is chosen."""
     p = np.array([[-3.2, 0.0, 5.0], [3.2, 0.0, 5.0]])
     z = project(CAMERA, p)
     turn = MotionPrior(se3_exp([0, 0, 0, 0, 0.1, 0]), 1e-4 * np.eye(6))  # points move to the right
@@ -196,7 +196,7 @@ def test_information_foresees_what_leaves_the_image() -> None:
     assert chosen.tolist() == [True, False]
 
 
-def test_information_needs_no_stereo_once_the_point_is_placed() -> None:
+def test_information_needs_no_stereo_once_the_point_is_triangulated() -> None:
     record = _scene(3, points=30)
     for placed_before in (True, False):
         selector = _build("information", [], budget=100)
@@ -210,7 +210,7 @@ def test_information_needs_no_stereo_once_the_point_is_placed() -> None:
         assert not chosen[~old].any()
 
 
-def test_information_leaves_stale_and_impossible_rows_out() -> None:
+def test_information_skips_stale_and_invalid_rows() -> None:
     frame = _scene(1)[0]
     stale = np.arange(len(frame)) % 2 == 0
     z = frame.z.copy()
@@ -222,7 +222,7 @@ def test_information_leaves_stale_and_impossible_rows_out() -> None:
     assert chosen[3::2].sum() == frame.has_right[3::2].sum()
 
 
-def test_information_without_calibration_says_what_to_do() -> None:
+def test_information_without_calibration_states_the_remedy() -> None:
     with pytest.raises(ConfigError, match="calibration"):
         build_selector(SelectorSettings(name="information"), image_size=None, whole_record=None)
 

@@ -1,4 +1,4 @@
-"""Distortion models against OpenCV, their own inverse and central differences; the ready rigs."""
+"""Distortion models against OpenCV, their own inverse and central differences; the predefined rigs."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def test_fisheye_jacobian_on_the_optical_axis() -> None:
     np.testing.assert_allclose(uv_D_p_cam(camera, p), numeric, atol=1e-5)
 
 
-def test_points_behind_and_beyond_the_fold_are_invalid() -> None:
+def test_points_behind_the_camera_and_beyond_the_model_are_invalid() -> None:
     folding = CameraModel(400, 400, 320, 240, 640, 480, "radtan", (-0.4, 0.0, 0.0, 0.0))
     _, valid = project_point(folding, [[0, 0, -1.0], [0.1, 0, 1.0], [1.2, 0, 1.0]])
     assert valid.tolist() == [False, True, False]
@@ -93,7 +93,7 @@ def test_points_behind_and_beyond_the_fold_are_invalid() -> None:
     assert unproject_pixel(folding, [[320 + 0.7 * 400, 240.0], [330.0, 240.0]])[1].tolist() == [False, True]
 
 
-def test_wrong_calibrations_are_refused() -> None:
+def test_rejects_invalid_calibrations() -> None:
     with pytest.raises(CalibrationError, match="takes 4 distortion coefficients"):
         CameraModel(400, 400, 320, 240, 640, 480, "radtan", (0.1,))
     with pytest.raises(CalibrationError, match="must be positive"):

@@ -1,4 +1,4 @@
-"""What the simulator refuses, and in which words: sizes, shares and motions that make no recording."""
+"""Error messages of the simulator for invalid sizes, fractions and motions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _with_hole() -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("make", "message"),
     [
         (lambda: fit_spline(TIMES, POSES, degree=4), "spline degree must be 3 or 5, got 4"),
         (lambda: fit_spline(TIMES[:5], POSES), "5 times for poses of shape"),
@@ -34,8 +34,8 @@ def _with_hole() -> np.ndarray:
         (lambda: car_loop(loop_m=(20.0, 10.0), corner_m=6.0), "corners of 6 m do not fit a loop of 20 x 10 m"),
         (lambda: OracleSettings(max_features=0), "must be positive"),
         (lambda: OracleSettings(sigma_px=-1.0), "must not be negative"),
-        (lambda: OracleSettings(outlier_fraction=1.5), "lie between 0 and 1"),
-        (lambda: OracleSettings(left_only_fraction=-0.1), "lie between 0 and 1"),
+        (lambda: OracleSettings(outlier_fraction=1.5), "must be between 0 and 1"),
+        (lambda: OracleSettings(left_only_fraction=-0.1), "must be between 0 and 1"),
         (lambda: OracleSettings(outlier_px=4.0), "outlier_px must be at least 5"),
         (lambda: street(0, loop_m=(100.0, 30.0)), "needs loop_m of at least 37.5 m each way"),
         (lambda: room(0, bounds=[[0, 0, 0], [5, 5, 0.4]]), "at least 0.5 m apart"),
@@ -43,13 +43,13 @@ def _with_hole() -> np.ndarray:
         (lambda: room(0, bare_walls=("+x", "up")), r"unknown walls \['up'\]; use some of"),
     ],
 )
-def test_what_makes_no_recording_is_refused(make: Callable[[], object], words: str) -> None:
-    with pytest.raises(VioError, match=words):
+def test_rejects_invalid_arguments(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(VioError, match=message):
         make()
 
 
-def test_frames_outside_the_motion_are_none() -> None:
+def test_rejects_frames_outside_the_motion() -> None:
     motion = hand_held(duration_s=1.0, seed=0)
     late = motion.end_ns + np.array([1, 2]) * 10**9
-    with pytest.raises(VioError, match="no frame lies within the motion"):
+    with pytest.raises(VioError, match="no frame is within the motion"):
         simulate(room(0, texel_m=0.05), small_rig(64, 48), motion, frame_times_ns=late, seed=0)

@@ -1,4 +1,4 @@
-"""Splines against finite differences and their records; IMU readings that integrate back to the trajectory."""
+"""Splines against finite differences and their samples; simulated IMU data integrates back to the trajectory."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from vio.sim.motion import (
     fit_spline,
     hand_held,
     recorded_motion,
+    rotate_body_axes,
     spline_from_waypoints,
-    turned,
 )
 from vio.sim.rigs import R_FLU_EUROC_IMU
 
@@ -67,7 +67,7 @@ def test_derivatives_match_central_differences(name: str) -> None:
 
 
 @pytest.mark.parametrize("degree", [3, 5])
-def test_waypoints_are_met(degree: int) -> None:
+def test_spline_passes_through_waypoints(degree: int) -> None:
     T = _waypoints(9, seed=4)
     spline = spline_from_waypoints(T, 0.5, degree=degree)
     times = np.minimum((np.arange(9) * 500_000_000), spline.end_ns)
@@ -88,31 +88,31 @@ def test_a_constant_twist_is_reproduced() -> None:
     np.testing.assert_allclose(state.acceleration_world, 0, atol=1e-5)
 
 
-def test_jumps_in_a_record_are_left_out() -> None:
+def test_robust_fit_rejects_jumps() -> None:
     source = MOTIONS["hand"]
     t = np.arange(source.start_ns, source.end_ns, 10_000_000)
     T = evaluate(source, t).T_world_imu
     rng = np.random.default_rng(0)
     T[:, :3, 3] += rng.normal(0, 3e-4, (len(t), 3))
-    spoilt = T.copy()
-    spoilt[100:104, :3, 3] += 0.3
-    spoilt[300, :3, :3] = spoilt[300, :3, :3] @ so3_exp([0.4, 0, 0])
-    spline, report = fit_spline(t, spoilt, knot_s=0.1, robust=True)
+    corrupted = T.copy()
+    corrupted[100:104, :3, 3] += 0.3
+    corrupted[300, :3, :3] = corrupted[300, :3, :3] @ so3_exp([0.4, 0, 0])
+    spline, report = fit_spline(t, corrupted, knot_s=0.1, robust=True)
     assert report.rejected == 5
     error = evaluate(spline, t).T_world_imu[:, :3, 3] - evaluate(source, t).T_world_imu[:, :3, 3]
     assert np.abs(error).max() < 2e-3
 
 
-def test_turned_changes_the_axes_only() -> None:
+def test_rotate_body_axes_changes_the_axes_only() -> None:
     spline = MOTIONS["hand"]
-    other = turned(spline, R_FLU_EUROC_IMU)
+    other = rotate_body_axes(spline, R_FLU_EUROC_IMU)
     t = np.linspace(spline.start_ns, spline.end_ns, 7).astype(np.int64)
     a, b = evaluate(spline, t), evaluate(other, t)
     np.testing.assert_allclose(b.angular_velocity, a.angular_velocity @ R_FLU_EUROC_IMU, atol=1e-9)
     np.testing.assert_allclose(b.T_world_imu[:, :3, :3], a.T_world_imu[:, :3, :3] @ R_FLU_EUROC_IMU, atol=1e-9)
 
 
-def test_hand_held_starts_at_rest_and_the_car_drives_like_kitti() -> None:
+def test_hand_held_starts_stationary_and_car_moves_like_kitti() -> None:
     still = evaluate(MOTIONS["hand"], np.arange(0, 900_000_000, 50_000_000))
     assert np.linalg.norm(still.velocity_world, axis=1).max() < 1e-3
     assert np.abs(still.angular_velocity).max() < 1e-3
@@ -124,17 +124,17 @@ def test_hand_held_starts_at_rest_and_the_car_drives_like_kitti() -> None:
     path = speed.sum() * 0.1
     assert 330 < path < 360
     forward = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.velocity_world)
-    assert np.abs(forward[:, 1]).max() < 0.1 * speed.max()  # it does not drift sideways
+    assert np.abs(forward[:, 1]).max() < 0.1 * speed.max()  # no sideslip
     assert np.linalg.norm(state.T_world_imu[-1, :3, 3] - state.T_world_imu[0, :3, 3]) < 1.5  # a closed loop
 
 
-def test_times_outside_the_motion_are_refused() -> None:
+def test_rejects_times_outside_the_motion() -> None:
     spline = MOTIONS["car"]
     with pytest.raises(SimulationError, match="the motion is defined from"):
         evaluate(spline, spline.end_ns + 1)
 
 
-def test_bad_records_are_refused(tmp_path: Path) -> None:
+def test_rejects_bad_trajectories(tmp_path: Path) -> None:
     T = np.broadcast_to(np.eye(4), (3, 4, 4))
     with pytest.raises(DataError, match="pose 2 of the trajectory: the clock repeats"):
         fit_spline([0, 10, 10], T)
@@ -173,14 +173,14 @@ def test_imu_integrates_back_to_the_trajectory() -> None:
     assert errors[-1, 1] < 2e-5
 
 
-def test_imu_at_rest_feels_gravity() -> None:
+def test_stationary_imu_measures_gravity() -> None:
     spline = spline_from_waypoints(np.broadcast_to(np.eye(4), (6, 4, 4)), 0.5)
     imu = simulate_imu(spline, noise=NO_IMU_NOISE)
     np.testing.assert_allclose(imu.accel, np.broadcast_to([0, 0, GRAVITY_MPS2], imu.accel.shape), atol=1e-9)
     np.testing.assert_allclose(imu.gyro, 0, atol=1e-12)
 
 
-def test_imu_noise_has_the_densities_it_claims() -> None:
+def test_imu_noise_has_the_specified_densities() -> None:
     spline = spline_from_waypoints(np.broadcast_to(np.eye(4), (61, 4, 4)), 1.0)
     noise = ImuNoise()
     imu = simulate_imu(spline, rate_hz=200.0, noise=noise, seed=3)
@@ -205,7 +205,7 @@ def test_imu_saturates() -> None:
     assert np.abs(imu.accel).max() == pytest.approx(9.9)
 
 
-def test_velocity_sensor_has_the_papers_noise() -> None:
+def test_velocity_sensor_has_the_noise_of_the_paper() -> None:
     spline = MOTIONS["car"]
     clean = simulate_velocity(spline, rate_hz=100, noise=VelocityNoise(0.0, 0.0))
     noisy = simulate_velocity(spline, rate_hz=100, seed=1)
@@ -217,7 +217,7 @@ def test_velocity_sensor_has_the_papers_noise() -> None:
 
 
 @pytest.mark.parametrize("flight", ["V1_02"])
-def test_a_real_flight_is_smoothed_within_its_noise(data_dir: Path, flight: str) -> None:
+def test_spline_fits_a_real_flight_within_its_noise(data_dir: Path, flight: str) -> None:
     folder = data_dir / "euroc_real_imu" / flight
     if not folder.is_dir():
         pytest.skip(f"no {folder}")

@@ -1,4 +1,4 @@
-"""Effects do what they say, recordings are honest, the oracle's statistics are right, exported folders read back."""
+"""Camera effects, simulated recordings, statistics of the oracle front end, and round trips of exported folders."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from vio.errors import DataError, VioError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_inverse, transform_points
 from vio.geometry.stereo import project
 from vio.records import FrontendOutput, ImuSample, StereoFrame, VelocitySample
-from vio.sim.effects import CLEAN, SensorEffects, develop, exposed
+from vio.sim.effects import CLEAN, SensorEffects, apply_effects, average_exposures
 from vio.sim.errors import SimulationError
 from vio.sim.export import export_euroc, export_kitti
 from vio.sim.imu import ImuNoise, VelocityNoise
-from vio.sim.motion import car_loop, hand_held, turned
+from vio.sim.motion import car_loop, hand_held, rotate_body_axes
 from vio.sim.oracle import OracleFrontend, OracleSettings
 from vio.sim.render import Radiance, correspondence
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_like_rig, kitti_like_rig, small_rig
@@ -53,48 +53,48 @@ def _recording(plain: Simulation, effects: SensorEffects) -> SimulatedRecording:
 GRAY: Radiance = np.full((80, 100), 100.0, dtype=np.float32)
 
 
-def _developed(effects: SensorEffects, *, camera: int = 0, time_ns: int = 0, frame: int = 0) -> FloatArray:
-    image = develop(GRAY, effects, time_ns=time_ns, frame_index=frame, camera=camera, seed=1)
+def _with_effects(effects: SensorEffects, *, camera: int = 0, time_ns: int = 0, frame: int = 0) -> FloatArray:
+    image = apply_effects(GRAY, effects, time_ns=time_ns, frame_index=frame, camera=camera, seed=1)
     return image.astype(np.float64)
 
 
 def test_exposure_and_gain_scale_the_signal() -> None:
-    assert np.all(_developed(CLEAN) == 100)
-    assert np.all(_developed(replace(CLEAN, exposure=0.05)) == 5)
+    assert np.all(_with_effects(CLEAN) == 100)
+    assert np.all(_with_effects(replace(CLEAN, exposure=0.05)) == 5)
     uneven = replace(CLEAN, exposure=1.2, right_gain=0.5)
-    assert np.all(_developed(uneven) == 120)
-    assert np.all(_developed(uneven, camera=1) == 60)
+    assert np.all(_with_effects(uneven) == 120)
+    assert np.all(_with_effects(uneven, camera=1) == 60)
     swinging = replace(CLEAN, exposure_swing=0.4, exposure_period_s=4.0)
-    assert np.all(_developed(swinging, time_ns=1_000_000_000) == 140)
-    assert np.all(_developed(swinging, time_ns=3_000_000_000) == 60)
+    assert np.all(_with_effects(swinging, time_ns=1_000_000_000) == 140)
+    assert np.all(_with_effects(swinging, time_ns=3_000_000_000) == 60)
 
 
 def test_vignetting_darkens_the_corners_only() -> None:
-    image = _developed(replace(CLEAN, vignetting=0.6))
+    image = _with_effects(replace(CLEAN, vignetting=0.6))
     assert image[0, 0] == image[-1, -1] == 40
     assert image[40, 50] >= 99
 
 
 def test_gamma_lifts_the_shadows() -> None:
     expected = round(255 * (100 / 255) ** (1 / 2.2))
-    assert np.all(_developed(replace(CLEAN, gamma=2.2)) == expected)
+    assert np.all(_with_effects(replace(CLEAN, gamma=2.2)) == expected)
 
 
-def test_noise_has_the_deviation_it_claims() -> None:
-    read = _developed(replace(CLEAN, read_noise=3.0))
+def test_noise_has_the_specified_standard_deviation() -> None:
+    read = _with_effects(replace(CLEAN, read_noise=3.0))
     assert read.std() == pytest.approx(np.hypot(3.0, 12**-0.5), rel=0.03)
     assert read.mean() == pytest.approx(100, abs=0.2)
     electrons = 100 / 255 * 5000
-    photon = _developed(replace(CLEAN, full_well=5000.0))
+    photon = _with_effects(replace(CLEAN, full_well=5000.0))
     assert photon.std() == pytest.approx(np.hypot(100 / np.sqrt(electrons), 12**-0.5), rel=0.03)
-    same, other = _developed(replace(CLEAN, read_noise=3.0)), _developed(replace(CLEAN, read_noise=3.0), frame=1)
+    same, other = _with_effects(replace(CLEAN, read_noise=3.0)), _with_effects(replace(CLEAN, read_noise=3.0), frame=1)
     assert np.array_equal(same, read)
     assert not np.array_equal(other, read)
-    right = _developed(replace(CLEAN, read_noise=3.0), camera=1)
+    right = _with_effects(replace(CLEAN, read_noise=3.0), camera=1)
     assert abs(np.corrcoef(read.ravel(), right.ravel())[0, 1]) < 0.05
 
 
-def test_senseless_effects_are_refused() -> None:
+def test_rejects_invalid_effects() -> None:
     for wrong in ({"gamma": 0.0}, {"vignetting": 1.5}, {"read_noise": -1.0}, {"exposure": -0.1}):
         with pytest.raises(SimulationError):
             SensorEffects(**wrong)
@@ -104,11 +104,11 @@ def test_exact_blur_is_the_mean_of_sub_exposures() -> None:
     def render_at(time_ns: int) -> Radiance:
         return np.full((2, 2), time_ns * 1e-6, dtype=np.float32)
 
-    blurred = exposed(render_at, 50_000_000, SensorEffects(blur_exposure_ms=10.0, blur_samples=5))
+    blurred = average_exposures(render_at, 50_000_000, SensorEffects(blur_exposure_ms=10.0, blur_samples=5))
     np.testing.assert_allclose(blurred, 50.0, atol=1e-4)  # symmetric about the frame's time
 
 
-def test_motion_blur_smears_along_the_motion_and_the_cheap_one_agrees(plain: Simulation) -> None:
+def test_motion_blur_is_along_the_motion_and_the_approximate_one_agrees(plain: Simulation) -> None:
     time_ns = 2_000_000_000
     sharp, cheap, exact = (
         _recording(plain, effects).radiance(time_ns)[0]
@@ -140,7 +140,7 @@ def test_flow_is_the_exact_map(plain: Simulation) -> None:
 # --- recordings -----------------------------------------------------------------------------------------------------
 
 
-def test_events_come_in_order_with_truth(plain: Simulation) -> None:
+def test_events_are_in_time_order_with_ground_truth(plain: Simulation) -> None:
     recording = SimulatedRecording(plain)
     events = list(recording.events(3, 6, images=False))
     times = [event.time_ns for event in events]
@@ -152,7 +152,7 @@ def test_events_come_in_order_with_truth(plain: Simulation) -> None:
     assert inertial == list(range(0, 500_000_001, 5_000_000)), "up to a second before the first frame, as all readers"
     velocities = [event.time_ns for event in events if isinstance(event, VelocitySample)]
     assert velocities == [300_000_000, 400_000_000, 500_000_000]
-    with pytest.raises(DataError, match="none lies between"):
+    with pytest.raises(DataError, match="none is between"):
         recording.events(5, 5)
     assert recording.recording.motion == {"imu", "velocity"}
     reference = recording.recording.reference
@@ -166,7 +166,7 @@ def test_events_come_in_order_with_truth(plain: Simulation) -> None:
     assert np.linalg.norm(state.gyro_bias) > 0
 
 
-def test_frames_are_the_same_bits_again(plain: Simulation) -> None:
+def test_frames_are_reproducible_to_the_bit(plain: Simulation) -> None:
     noisy = replace(plain, effects=SensorEffects(read_noise=2.0, full_well=8000.0))
     first, again = SimulatedRecording(noisy).frame(5), SimulatedRecording(noisy).frame(5)
     assert first.left is not None
@@ -193,7 +193,7 @@ def test_dropped_and_repeated_frames_and_clock_offset(world: World) -> None:
     assert not np.array_equal(recording.images(k + 1 if k + 1 not in repeated else k - 2)[0], recording.images(k)[0])
 
 
-def test_a_dark_corridor_is_dark() -> None:
+def test_dark_corridor_is_dark() -> None:
     sim = simulate(
         corridor(1, texel_m=0.02),
         RIG,
@@ -204,7 +204,7 @@ def test_a_dark_corridor_is_dark() -> None:
     assert left.mean() < 8
 
 
-def test_a_real_flight_goes_with_rendered_images(data_dir: Path) -> None:
+def test_renders_images_along_a_real_flight(data_dir: Path) -> None:
     folder = data_dir / "euroc_real_imu" / "V1_02"
     if not folder.is_dir():
         pytest.skip(f"no {folder}")
@@ -224,11 +224,11 @@ def test_a_real_flight_goes_with_rendered_images(data_dir: Path) -> None:
         _ = recording.recording
 
 
-def test_image_times_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+def test_rejects_image_times_outside_the_ground_truth(tmp_path: Path) -> None:
     gt, times = tmp_path / "gt.txt", tmp_path / "times.txt"
     gt.write_text("".join(f"{k * 0.1:.1f} {k} 0 0 0 0 0 1\n" for k in range(20)))
     times.write_text("5000000000\n6000000000\n")
-    with pytest.raises(DataError, match="no image time falls into the ground truth"):
+    with pytest.raises(DataError, match="no image time is within the ground truth"):
         read_flight(gt, times)
     times.write_text("100\nabc\n")
     with pytest.raises(DataError, match=r"times\.txt, line 2: 'abc' is no time in whole nanoseconds"):
@@ -296,7 +296,7 @@ def test_oracle_spreads_features_and_limits_their_age(plain: Simulation) -> None
 
 
 def test_oracle_needs_a_rectified_rig(world: World) -> None:
-    motion = turned(hand_held(duration_s=1.0), R_FLU_EUROC_IMU)
+    motion = rotate_body_axes(hand_held(duration_s=1.0), R_FLU_EUROC_IMU)
     with pytest.raises(SimulationError, match="rectified"):
         OracleFrontend(simulate(world, euroc_like_rig(), motion))
 
@@ -333,7 +333,7 @@ def test_a_kitti_folder_reads_back(plain: Simulation, tmp_path: Path) -> None:
 
 
 def test_an_euroc_folder_reads_back(world: World, tmp_path: Path) -> None:
-    motion = turned(hand_held(duration_s=1.0, start_ns=1_403_715_524_907_143_219), R_FLU_EUROC_IMU)
+    motion = rotate_body_axes(hand_held(duration_s=1.0, start_ns=1_403_715_524_907_143_219), R_FLU_EUROC_IMU)
     rig = euroc_like_rig()
     simulation = simulate(world, rig, motion, rate_hz=2.0, imu=ImuNoise())
     recording = SimulatedRecording(simulation)
@@ -363,7 +363,7 @@ def test_an_euroc_folder_reads_back(world: World, tmp_path: Path) -> None:
     np.testing.assert_allclose(state[0, 11:14], truth.gyro_bias)
 
 
-def test_folders_appear_whole_or_not_at_all(plain: Simulation, tmp_path: Path) -> None:
+def test_folders_are_written_atomically(plain: Simulation, tmp_path: Path) -> None:
     class Interrupted(Exception):  # noqa: N818
         pass
 
@@ -381,7 +381,7 @@ def test_folders_appear_whole_or_not_at_all(plain: Simulation, tmp_path: Path) -
     assert len(list((tmp_path / "out" / "image_0").iterdir())) == 2
 
 
-def test_targets_that_cannot_be_written_are_named(plain: Simulation, tmp_path: Path) -> None:
+def test_error_names_an_unwritable_target(plain: Simulation, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(VioError, match="cannot write"):
         export_kitti(_short(plain, 1), tmp_path / "file" / "out")
@@ -391,10 +391,10 @@ def test_targets_that_cannot_be_written_are_named(plain: Simulation, tmp_path: P
             export_kitti(_short(plain, 1), tmp_path / "locked" / "out")
 
 
-def test_exports_say_what_they_need(world: World, tmp_path: Path) -> None:
+def test_export_errors_name_the_missing_sensor(world: World, tmp_path: Path) -> None:
     with pytest.raises(SimulationError, match="needs an IMU"):
         export_euroc(SimulatedRecording(simulate(world, RIG, MOTION)), tmp_path / "a")
-    motion = turned(hand_held(duration_s=1.0), R_FLU_EUROC_IMU)
+    motion = rotate_body_axes(hand_held(duration_s=1.0), R_FLU_EUROC_IMU)
     with pytest.raises(SimulationError, match="rectified rig"):
         export_kitti(SimulatedRecording(simulate(world, euroc_like_rig(), motion)), tmp_path / "b")
     assert list(tmp_path.iterdir()) == []
@@ -410,6 +410,6 @@ def test_the_documented_example_runs() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_ready_scenes_leave_room_for_ready_motions(seed: int) -> None:
+def test_predefined_scenes_are_clear_of_predefined_motions(seed: int) -> None:
     simulate(room(seed), small_rig(), hand_held(seed=seed))
     simulate(street(seed), kitti_like_rig(), car_loop(seed=seed), rate_hz=10.0)

@@ -1,4 +1,4 @@
-"""Rendered images against their own exact geometry, found a second way: photometry, OpenCV, brute force."""
+"""Rendered images against exact geometry computed independently: photometry, OpenCV, brute force."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _sample(image: Radiance, uv: FloatArray) -> FloatArray:
 
 
 def _photometric(world: World, a: View, b: View) -> tuple[FloatArray, FloatArray, float]:
-    """Gray differences where a point is seen twice, the image shift they amount to, and the share seen twice."""
+    """Gray differences of points seen in both views, the equivalent image shift, and the share seen in both."""
     rays = camera_rays(a.camera), camera_rays(b.camera)
     image_a, image_b = (render(world, r, v.T_world_cam, v.time_ns) for r, v in zip(rays, (a, b), strict=True))
     u, v = np.meshgrid(np.arange(4, a.camera.width - 4), np.arange(4, a.camera.height - 4))
@@ -82,14 +82,14 @@ def _photometric(world: World, a: View, b: View) -> tuple[FloatArray, FloatArray
     there = there[visible]
     error = _sample(image_b, there) - image_a[v.ravel()[visible], u.ravel()[visible]]
     slopes = [_sample(cv2.Sobel(image_b, cv2.CV_32F, i, 1 - i, scale=1 / 8), there) for i in (1, 0)]
-    usual = np.abs(error) < 20  # not the rim of an outline
+    usual = np.abs(error) < 20  # excludes outlines
     shift = np.linalg.lstsq(np.stack(slopes, axis=1)[usual], -error[usual], rcond=None)[0]
     return error, shift, float(visible.mean())
 
 
 @pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("to", ["right image", "next frame"])
-def test_exact_geometry_reproduces_the_other_image(small_room: World, name: str, to: str) -> None:
+def test_reprojection_reproduces_the_other_image(small_room: World, name: str, to: str) -> None:
     simulation = _simulation(small_room, RIGS[name])
     a, right = views(simulation, 2_000_000_000)
     b = right if to == "right image" else views(simulation, 2_050_000_000)[0]
@@ -100,7 +100,7 @@ def test_exact_geometry_reproduces_the_other_image(small_room: World, name: str,
     assert np.abs(shift).max() < 0.015, "the images are shifted against the geometry"
 
 
-def test_the_street_reproduces_its_other_image() -> None:
+def test_reprojection_reproduces_the_other_image_of_the_street() -> None:
     world = street(2, texel_m=0.04)
     simulation = simulate(world, kitti_like_rig(414), car_loop(duration_s=2.0))
     error, shift, seen = _photometric(world, *views(simulation, 1_000_000_000))
@@ -119,7 +119,7 @@ def _wall(texture_seed: int) -> World:
     return World("wall", surfaces, TextureStore([patch], texture_seed), (), np.array([[-9.0] * 3, [2.9, 9, 9]]))
 
 
-def test_a_plane_is_imaged_where_opencv_projects_it() -> None:
+def test_a_plane_is_rendered_where_opencv_projects_it() -> None:
     """Warp the wall's texture with the homography that cv2.projectPoints gives; compare image and rendering."""
     world = _wall(5)
     camera = CameraModel(300.0, 310.0, 158.0, 101.0, 320, 200)
@@ -160,7 +160,7 @@ def test_correspondence_agrees_with_opencv_on_a_plane() -> None:
     assert np.array_equal(visible, inside_image(camera, expected))
 
 
-def test_correspondence_returns_where_it_came_from(small_room: World) -> None:
+def test_correspondence_is_invertible(small_room: World) -> None:
     a, b = views(_simulation(small_room, RIGS["radtan"]), 1_500_000_000)
     uv = np.random.default_rng(1).uniform((5, 5), (314, 194), (500, 2))
     there, visible = correspondence(small_room, a, b, uv)
@@ -169,8 +169,8 @@ def test_correspondence_returns_where_it_came_from(small_room: World) -> None:
     np.testing.assert_allclose(back, uv[visible], atol=1e-6)
 
 
-def test_hidden_points_are_known(small_room: World) -> None:
-    """A point is hidden exactly when the other camera's ray to it meets something nearer: marched in small steps."""
+def test_occluded_points_are_invisible(small_room: World) -> None:
+    """A point is occluded exactly when the other camera's ray to it hits something nearer, by ray marching."""
     camera = RIGS["pinhole"].cam0
     a = View(camera, se3_from_parts(R_BODY_CAM, [-2.0, 0.8, 1.1]))
     b = View(camera, se3_from_parts(so3_exp([0.0, 0.0, 0.3]) @ R_BODY_CAM, [-1.6, -1.3, 0.6]))
@@ -192,7 +192,7 @@ def test_hidden_points_are_known(small_room: World) -> None:
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_depth_map_is_brute_force(small_room: World, name: str) -> None:
+def test_depth_map_equals_brute_force(small_room: World, name: str) -> None:
     camera = RIGS[name].cam0
     view = views(_simulation(small_room, RIGS[name]), 1_000_000_000)[0]
     depth, surface = depth_map(small_room, camera_rays(camera), view.T_world_cam)
@@ -205,7 +205,7 @@ def test_depth_map_is_brute_force(small_room: World, name: str) -> None:
 
 
 def test_every_pixel_shows_the_surface_that_its_ray_hits(small_room: World) -> None:
-    """Paint each surface with its own gray level: away from outlines the image must be the map of surfaces."""
+    """Paint each surface with its own gray level: away from outlines the image equals the map of surfaces."""
     count = len(small_room.surfaces.size)
     level = (np.arange(count) * 67 % 200 + 20).astype(np.uint8)
 
@@ -237,7 +237,7 @@ def test_the_same_seed_gives_the_same_bits(small_room: World) -> None:
     assert not np.array_equal(first, render(other, rays, view.T_world_cam))
 
 
-def test_textures_are_rich_and_do_not_repeat() -> None:
+def test_textures_have_detail_at_every_scale_and_do_not_repeat() -> None:
     texture = paint("wall", np.array([6.0, 3.0]), 0.006, np.random.default_rng(0)).astype(np.float32)
     spectrum = np.fft.rfft2(texture - cv2.GaussianBlur(texture, (0, 0), 20))
     correlation = np.fft.irfft2(np.abs(spectrum) ** 2, s=texture.shape)
@@ -286,7 +286,7 @@ def test_a_moving_box_moves_and_carries_its_points() -> None:
     assert np.median(np.abs(error)) < 1.0
 
 
-def test_cameras_in_boxes_or_outside_are_refused(small_room: World) -> None:
+def test_rejects_cameras_in_boxes_or_outside(small_room: World) -> None:
     with pytest.raises(SimulationError, match="leaves the room at position 1 of 2"):
         check_clear(small_room, [[0, 0, 1], [0, 0, 9]])
     with pytest.raises(SimulationError, match="inside box 0 of the room"):
@@ -302,7 +302,7 @@ def test_a_room_built_around_a_motion_keeps_clear_of_it() -> None:
     simulate(world, RIGS["pinhole"], motion)  # raises if a camera meets a box
 
 
-def test_a_distortion_that_folds_inside_the_image_is_refused() -> None:
+def test_rejects_a_distortion_that_folds_inside_the_image() -> None:
     with pytest.raises(SimulationError, match="does not reach every pixel"):
         camera_rays(CameraModel(100, 100, 160, 100, 320, 200, "radtan", (-0.4, 0.0, 0.0, 0.0)))
 

@@ -1,4 +1,4 @@
-"""Chi-square against scipy's own."""
+"""Chi-square quantiles against scipy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rectified stereo camera: round trips, the paper's matrix, Jacobians, calibrations that cannot be right."""
+"""The rectified stereo camera: round trips, the paper's matrix, Jacobians, invalid calibrations."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_unusable_pixels_are_masked_and_stay_finite(camera: StereoCamera) -> Non
             [650.0, 200.0, 640.0, 200.0],  # fine
             [650.0, 200.0, 650.0, 200.0],  # at infinity
             [640.0, 200.0, 650.0, 200.0],  # behind, or the cameras are swapped
-            [650.05, 200.0, 650.0, 200.0],  # too far to tell
+            [650.05, 200.0, 650.0, 200.0],  # too far away
             [np.nan, 200.0, 640.0, 200.0],
             [650.0, 200.0, 640.0, np.inf],
         ]
@@ -139,7 +139,7 @@ def test_no_observations_give_no_points(camera: StereoCamera) -> None:
         ({"baseline_m": float("nan")}, "not finite"),
     ],
 )
-def test_impossible_calibrations_are_refused(change: dict[str, float], match: str) -> None:
+def test_rejects_invalid_stereo_calibrations(change: dict[str, float], match: str) -> None:
     v = {"fu": 700.0, "fv": 700.0, "cu": 600.0, "cv": 180.0, "baseline_m": 0.54} | change
     with pytest.raises(CalibrationError, match=match):
         StereoCamera(v["fu"], v["fv"], v["cu"], v["cv"], v["baseline_m"])

@@ -1,4 +1,4 @@
-"""Trajectory files and atomic writes: round trips to the bit, evo as the reader, every kind of bad file."""
+"""Trajectory files and atomic writes: exact round trips, compatibility with evo, every kind of bad file."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_kitti_round_trip_is_exact(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.T_world_body, trajectory.T_world_body)
 
 
-def test_an_empty_trajectory_is_written_and_refused_at_reading(tmp_path: Path) -> None:
+def test_writes_an_empty_trajectory_and_rejects_reading_it(tmp_path: Path) -> None:
     write_tum(tmp_path / "t.tum", replace(make(0), frame_indices=np.zeros(0, dtype=np.int64)))
     with pytest.raises(DataError, match="holds no poses"):
         read_trajectory(tmp_path / "t.tum")
@@ -124,27 +124,25 @@ def test_euroc_quaternions_are_w_first_and_describe_the_imu(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     "text", [f"1 {TUM_ROW}\n", f"\ufeff1 {TUM_ROW}", f"  1\t{TUM_ROW}  \n\n", f"# x\n\n1 {TUM_ROW}"]
 )
-def test_bom_tabs_blank_lines_and_comments_are_taken(tmp_path: Path, text: str) -> None:
+def test_accepts_bom_tabs_blank_lines_and_comments(tmp_path: Path, text: str) -> None:
     assert len(read_trajectory(write(tmp_path / "t.txt", text))) == 1
 
 
 # The body
 
 
-def test_the_caller_overrides_the_body_and_a_contradiction_is_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_body_argument_overrides_the_file_with_a_warning(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = write(tmp_path / "t.txt", f"# body: cam0\n1 {TUM_ROW}\n")
     assert read_trajectory(path).body == "cam0"
     assert read_trajectory(path, body="cam0").body == "cam0"
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
         assert read_trajectory(path, body="imu").body == "imu"
-    assert "says that it describes cam0" in caplog.text
+    assert "describes cam0 according to its comment" in caplog.text
     assert read_trajectory(write(tmp_path / "k.txt", KITTI_ROW), body="imu").body == "imu"
 
 
-def test_kitti_form_of_the_imu_is_refused(tmp_path: Path) -> None:
+def test_rejects_writing_imu_poses_as_kitti(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"in_cam0 first"):
         write_kitti(tmp_path / "t.kitti", make(body="imu"))
     assert not list(tmp_path.iterdir())
@@ -197,7 +195,7 @@ BAD = {
     "quaternion norm": (f"1 {TUM_ROW}\n2 0 0 0 0 0 0 1.1\n", None, "line 2: the quaternion has norm 1.1.*column order"),
     "quaternion zero": ("1 0 0 0 0 0 0 0\n", None, "line 1: the quaternion has norm 0, not 1"),
     "quaternion huge": ("1 0 0 0 0 0 0 1e300\n", None, "line 1: the quaternion has norm"),
-    "unknown body": (f"# body: left_wing\n1 {TUM_ROW}\n", None, "names the body 'left_wing'; write '# body: imu'"),
+    "unknown body": (f"# body: left_wing\n1 {TUM_ROW}\n", None, "names the body 'left_wing'; use '# body: imu'"),
     "frames: too many": (f"# frames: 0-999999999\n1 {TUM_ROW}\n", None, "does not number its 1 poses"),
     "frames: text": (f"# frames: all\n1 {TUM_ROW}\n", None, "does not number its 1 poses"),
     "frames: backwards": (f"# frames: 5-5 2-2\n1 {TUM_ROW}\n2 {TUM_ROW}\n", None, "does not number its 2 poses"),
@@ -213,25 +211,25 @@ BAD = {
     "euroc quaternion": (f"{EUROC_HEADER}1,0,0,0,2,0,0,0\n", None, "line 2: the quaternion has norm 2"),
     "empty": ("", None, "holds no poses"),
     "only comments": ("# timestamp\n", None, "holds no poses"),
-    "asked tum": (KITTI_ROW, "tum", "line 1: 12 columns instead of 8; tum form"),
-    "asked kitti": (f"1 {TUM_ROW}", "kitti", "line 1: 8 columns instead of 12; kitti form"),
-    "asked euroc": ("1 2 3", "euroc", "line 1: 3 columns instead of 8; euroc form"),
-    "asked nonsense": ("1 2 3", "csv", "unknown trajectory format 'csv'; choose one of tum, kitti, euroc"),
+    "requested tum": (KITTI_ROW, "tum", "line 1: 12 columns instead of 8; tum form"),
+    "requested kitti": (f"1 {TUM_ROW}", "kitti", "line 1: 8 columns instead of 12; kitti form"),
+    "requested euroc": ("1 2 3", "euroc", "line 1: 3 columns instead of 8; euroc form"),
+    "requested nonsense": ("1 2 3", "csv", "unknown trajectory format 'csv'; choose one of tum, kitti, euroc"),
 }
 
 
 @pytest.mark.parametrize("name", list(BAD))
-def test_bad_files_are_refused_in_one_line(tmp_path: Path, name: str) -> None:
+def test_rejects_bad_trajectory_files_with_one_line_error(tmp_path: Path, name: str) -> None:
     text, fmt, match = BAD[name]
     path = write(tmp_path / "bad.txt", text)
     with pytest.raises(DataError, match=match) as caught:
         read_trajectory(path, fmt=fmt)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
-    if name != "asked nonsense":
+    if name != "requested nonsense":
         assert str(path) in str(caught.value)
 
 
-def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
+def test_rejects_missing_folder_and_binary_files(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"cannot read .*missing\.txt: No such file"):
         read_trajectory(tmp_path / "missing.txt")
     with pytest.raises(DataError, match=r"cannot read .*directory"):
@@ -244,7 +242,7 @@ def test_missing_folder_and_binary_files_are_refused(tmp_path: Path) -> None:
 # Other programs and real files
 
 
-def test_evo_reads_what_we_write(tmp_path: Path) -> None:
+def test_evo_reads_written_files(tmp_path: Path) -> None:
     from evo.tools import file_interface
 
     trajectory = replace(make(50, body="cam0"), frame_indices=np.arange(3, 53))
@@ -258,7 +256,7 @@ def test_evo_reads_what_we_write(tmp_path: Path) -> None:
     np.testing.assert_array_equal(kitti.poses_se3, trajectory.T_world_body)
 
 
-def test_we_read_what_evo_writes(tmp_path: Path) -> None:
+def test_reads_files_written_by_evo(tmp_path: Path) -> None:
     from evo.core.trajectory import PoseTrajectory3D
     from evo.tools import file_interface
 
@@ -343,7 +341,7 @@ def test_atomic_folder_appears_at_the_end_with_ordinary_permissions(tmp_path: Pa
 
 
 def fill(target: Path, text: str, *, replace: bool = False, error: BaseException | None = None) -> None:
-    """Make a folder whose marker holds `text`, and fail half-way if asked to."""
+    """Make a folder whose marker holds `text`, and fail half-way if requested."""
     with atomic_folder(target, replace=replace, marker="m") as inside:
         (inside / "m").write_text(text)
         if error is not None:
@@ -352,7 +350,7 @@ def fill(target: Path, text: str, *, replace: bool = False, error: BaseException
 
 
 @pytest.mark.parametrize("error", [ValueError("boom"), KeyboardInterrupt("boom"), SystemExit("boom")])
-def test_a_failure_inside_leaves_nothing_behind(tmp_path: Path, error: BaseException) -> None:
+def test_a_failure_inside_leaves_no_folder(tmp_path: Path, error: BaseException) -> None:
     with pytest.raises(type(error), match="boom"):
         fill(tmp_path / "x" / "y" / "run", "new", error=error)
     assert not list(tmp_path.iterdir())
@@ -397,14 +395,14 @@ def test_a_failed_swap_puts_the_old_folder_back(tmp_path: Path, monkeypatch: pyt
     assert [p.name for p in tmp_path.iterdir()] == ["run"]
 
 
-def test_what_is_not_ours_is_never_replaced(tmp_path: Path) -> None:
+def test_never_replaces_foreign_files(tmp_path: Path) -> None:
     theirs = tmp_path / "photos"
     theirs.mkdir()
     (theirs / "holiday.jpg").write_text("x")
     (tmp_path / "file").write_text("x")
     (tmp_path / "link").symlink_to(theirs)
     cases = [
-        (theirs, False, "exists already; choose another place"),
+        (theirs, False, "exists already; choose another path"),
         (theirs, True, r"was not made by this program \(it has no m\)"),
         (tmp_path / "file", True, "is not a folder"),
         (tmp_path / "link", True, "is not a folder"),
@@ -425,7 +423,7 @@ def test_an_empty_folder_may_be_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "a").exists()
 
 
-def test_a_folder_made_meanwhile_is_not_lost(tmp_path: Path) -> None:
+def test_a_folder_created_meanwhile_is_kept(tmp_path: Path) -> None:
     inside = atomic_folder(tmp_path / "run", replace=False)
     inside.__enter__()
     fill(tmp_path / "run", "theirs")
@@ -437,6 +435,6 @@ def test_a_folder_made_meanwhile_is_not_lost(tmp_path: Path) -> None:
 
 def test_an_unwritable_parent_is_a_data_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
-    with pytest.raises(DataError, match=r"cannot write .*; choose a writable place"):
+    with pytest.raises(DataError, match=r"cannot write .*; choose a writable path"):
         fill(tmp_path / "file" / "run", "new")
     assert [p.name for p in tmp_path.iterdir()] == ["file"]

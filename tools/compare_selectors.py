@@ -111,8 +111,8 @@ class Watched:
         """Let the selector choose and note what the choice says."""
         selection = self._inner.select(observations, motion)
         # Without the run's own prediction: a run that predicts badly must not look uninformed for that.
-        L = self._information.look(observations, None)[selection.chosen, :1]
-        self._information.use(observations, selection.chosen)
+        L = self._information.add_frame(observations, None)[selection.chosen, :1]
+        self._information.mark_used(observations, selection.chosen)
         self.gain_nats.append(log_det_gain(prior_information(None)[None], L))
         self.expected.append(None if motion is None else motion.T_curr_prev)
         self.chosen.append(frozenset(observations.ids[selection.chosen].tolist()))

@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all."""
+"""Atomic writing of files and folders."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 def _sibling(path: Path, kind: str) -> Path:
-    """A name beside `path` that nobody else uses: hidden, on the same file system, so that a rename is atomic."""
+    """Return a unique hidden name beside `path`, on the same file system, so that a rename is atomic."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.{kind}")
 
 
 def _unwritable(path: Path, error: OSError) -> DataError:
-    return DataError(f"cannot write {path}: {error.strerror or error}; choose a writable place with enough free space")
+    return DataError(f"cannot write {path}: {error.strerror or error}; choose a writable path with enough free space")
 
 
 def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write a file so that it holds either its old content or all of the new; its folder must exist.
+    """Write a file atomically: it holds either its old content or all of the new. Its folder must exist.
 
     Raises:
         DataError: the folder is missing or not writable, or the disk is full.
@@ -49,7 +49,7 @@ def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
 
 
 def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
-    r"""Write a UTF-8 text file with `\n` line ends, whole or not at all; its folder must exist.
+    r"""Write a UTF-8 text file with `\n` line ends, atomically; its folder must exist.
 
     Raises:
         DataError: the folder is missing or not writable, or the disk is full.
@@ -61,18 +61,18 @@ def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
 def atomic_folder(
     path: str | os.PathLike[str], *, replace: bool, marker: str | None = None, own: Collection[str] | None = None
 ) -> Iterator[Path]:
-    """Give a temporary folder that becomes `path` when the block ends well, and vanishes when it does not.
+    """Yield a temporary folder that becomes `path` when the block succeeds, and is removed when it fails.
 
-    Missing parent folders are made (and taken away again on failure). With `replace`, an old folder is moved aside at
-    the end and removed only after the new one stands; it must be empty or hold the file named by `marker`, and nothing
-    beside the names in `own` where those are given, so that a mistyped path never costs a user's own files.
+    Missing parent folders are created (and removed again on failure). With `replace`, an old folder is moved aside at
+    the end and removed only after the new one is in place; it must be empty or hold the file named by `marker`, and
+    only names in `own` where those are given, so that a mistyped path never deletes a user's own files.
 
     Raises:
         VioError: `path` exists and may not be replaced.
         DataError: the parent is not writable, or the disk is full.
     """
     target = Path(path).absolute()
-    refuse_to_lose(target, replace, marker, own)
+    check_replaceable(target, replace, marker, own)
     partial = _sibling(target, "partial")
     parents = [parent for parent in target.parents if not parent.exists()]
     done = False
@@ -87,7 +87,7 @@ def atomic_folder(
             if error.errno in _NO_SPACE:
                 raise _unwritable(target, error) from error
             raise
-        refuse_to_lose(target, replace, marker, own)  # someone may have made it meanwhile
+        check_replaceable(target, replace, marker, own)  # another process may have created it meanwhile
         try:
             _swap_in(partial, target)
         except OSError as error:
@@ -101,28 +101,28 @@ def atomic_folder(
                     parent.rmdir()
 
 
-def refuse_to_lose(target: Path, replace: bool, marker: str | None, own: Collection[str] | None = None) -> None:
-    """Raise VioError unless `target` is free or may be replaced, as `atomic_folder` has it."""
+def check_replaceable(target: Path, replace: bool, marker: str | None, own: Collection[str] | None = None) -> None:
+    """Raise VioError unless `target` is free or may be replaced under the rules of `atomic_folder`."""
     if not os.path.lexists(target):
         return
     if not replace:
-        raise VioError(f"{target} exists already; choose another place, remove it, or allow it to be replaced")
+        raise VioError(f"{target} exists already; choose another path, remove it, or allow it to be replaced")
     if target.is_symlink() or not target.is_dir():
-        raise VioError(f"{target} is not a folder and will not be replaced; choose another place")
+        raise VioError(f"{target} is not a folder and will not be replaced; choose another path")
     if any(target.iterdir()) and (marker is None or not (target / marker).is_file()):
         wanted = "" if marker is None else f" (it has no {marker})"
-        raise VioError(f"{target} was not made by this program{wanted} and will not be replaced; choose another place")
+        raise VioError(f"{target} was not made by this program{wanted} and will not be replaced; choose another path")
     foreign = [] if own is None else sorted(path.name for path in target.iterdir() if path.name not in own)
     if foreign:
         names = ", ".join(foreign[:3]) + (" and more" if len(foreign) > 3 else "")
         raise VioError(
             f"{target} holds {names} beside an earlier result and will not be replaced; move that away, or choose "
-            "another place"
+            "another path"
         )
 
 
 def _swap_in(partial: Path, target: Path) -> None:
-    """Rename `partial` to `target`, and remove what stood there only after that."""
+    """Rename `partial` to `target`, and remove the old folder only after that."""
     if not target.exists():
         partial.rename(target)
         return
@@ -136,4 +136,4 @@ def _swap_in(partial: Path, target: Path) -> None:
     try:
         shutil.rmtree(old)
     except OSError as error:
-        logger.warning("%s stands, but the folder it replaced is still at %s: %s", target, old, error)
+        logger.warning("%s is written, but the folder it replaced is still at %s: %s", target, old, error)

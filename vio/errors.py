@@ -1,4 +1,4 @@
-"""Errors a user can mend. Each message says what is wrong, where, and what to do."""
+"""Errors that a user can correct. Each message states what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class DataError(VioError):
 
 
 class CalibrationError(DataError):
-    """A calibration is missing or cannot be right (zero baseline, reflected rotation, …)."""
+    """A calibration is missing or invalid (zero baseline, reflected rotation, …)."""
 
 
 class EstimationError(VioError):
-    """The estimator cannot go on (divergence, no usable start)."""
+    """The estimator cannot continue (divergence, failed initialisation)."""
 
 
 class EvaluationError(VioError):

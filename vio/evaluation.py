@@ -23,14 +23,14 @@ AssociationMode: TypeAlias = Literal["time", "frame"]
 
 KITTI_LENGTHS_M: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_STEP_FRAMES = 10
-RPE_DISTANCE_TOLERANCE = 0.1  # a pair counts for a distance when its path length is this close, relatively
-_COLLINEAR = 1e-13  # ratio of squared extents below which points lie on one line, to rounding
-_STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points are one, to rounding
+RPE_DISTANCE_TOLERANCE = 0.1  # relative tolerance of a pair's path length
+_COLLINEAR = 1e-13  # ratio of squared extents below which points are collinear, to rounding
+_STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points coincide, to rounding
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorStatistics:
-    """Summary of one error over all matched poses, in the unit that the field holding it names."""
+    """Summary of one error over all matched poses, in the unit given by its field name."""
 
     rmse: float
     mean: float
@@ -42,7 +42,7 @@ class ErrorStatistics:
 class RelativeError:
     """Error of the motion between pairs of poses."""
 
-    delta: float  # how far apart the poses of a pair are
+    delta: float  # distance between the poses of a pair
     unit: Literal["frames", "m"]  # frames: matched poses; m: path length of the reference
     pairs: int
     trans_rmse_m: float
@@ -51,7 +51,7 @@ class RelativeError:
 
 @dataclass(frozen=True, slots=True)
 class LengthError:
-    """The KITTI metric for one path length; None where the record holds no segment so long."""
+    """The KITTI metric for one path length; None where the record has no segment of this length."""
 
     length_m: float
     segments: int
@@ -71,7 +71,7 @@ class KittiError:
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """How much was compared."""
+    """The compared share of estimate and reference."""
 
     estimate: float  # fraction of the estimate's poses that had a reference
     reference_span: float | None  # fraction of the reference's time (or frame) span between first and last match
@@ -89,11 +89,11 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """An estimate scored against a reference; what the metrics cannot say is None."""
+    """The evaluation of an estimate against a reference; undefined metrics are None."""
 
     align: AlignMode
     association: AssociationMode
-    body: BodyFrame  # the frame that both trajectories describe here: the reference's
+    body: BodyFrame  # the body frame of both trajectories here: the reference's
     matched: int  # M
     coverage: Coverage
     path_length_m: float  # of the whole estimate, before any scaling
@@ -103,37 +103,37 @@ class Evaluation:
     ate_m: ErrorStatistics
     ate_deg: ErrorStatistics
     rpe: RelativeError | None  # over frames
-    rpe_distance: RelativeError | None  # over metres, when asked for
+    rpe_distance: RelativeError | None  # over metres, if requested
     kitti: KittiError | None  # None: the record is shorter than every length
     T_ref_est: FloatArray  # (4, 4) alignment; under sim3 the estimate is scaled first
-    rows: IntArray  # (M,) rows of the estimate that were compared
+    rows: IntArray  # (M,) matched rows of the estimate
     errors_m: FloatArray  # (M,) distance to the reference after alignment
     errors_deg: FloatArray  # (M,) rotation angle to the reference after alignment
     aligned: Trajectory  # the whole estimate (N) in the reference's world and body frame
-    reference: Trajectory  # the matched poses (M) of the reference; its row k belongs to row rows[k] of the estimate
+    reference: Trajectory  # the matched poses (M) of the reference; row k matches row rows[k] of the estimate
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures for JSON: `ate_m` is the RMSE, undefined metrics are None, arrays are left out."""
+        """Return the figures for JSON: `ate_m` is the RMSE, undefined metrics are None, arrays are omitted."""
         return {
             "align": self.align,
             "association": self.association,
             "body": self.body,
             "matched": self.matched,
-            "coverage": _plain(self.coverage),
+            "coverage": _as_plain_dict(self.coverage),
             "path_length_m": self.path_length_m,
             "matched_path_length_m": self.matched_path_length_m,
             "reference_path_length_m": self.reference_path_length_m,
             "scale": self.scale,
             "ate_m": self.ate_m.rmse,
             "ate_deg": self.ate_deg.rmse,
-            "ate_statistics_m": _plain(self.ate_m),
-            "ate_statistics_deg": _plain(self.ate_deg),
-            "rpe": _plain(self.rpe),
-            "rpe_distance": _plain(self.rpe_distance),
+            "ate_statistics_m": _as_plain_dict(self.ate_m),
+            "ate_statistics_deg": _as_plain_dict(self.ate_deg),
+            "rpe": _as_plain_dict(self.rpe),
+            "rpe_distance": _as_plain_dict(self.rpe_distance),
             "t_err_percent": None if self.kitti is None else self.kitti.t_err_percent,
             "r_err_deg_per_100m": None if self.kitti is None else self.kitti.r_err_deg_per_100m,
             "kitti_segments": 0 if self.kitti is None else self.kitti.segments,
-            "kitti_per_length": [] if self.kitti is None else [_plain(row) for row in self.kitti.per_length],
+            "kitti_per_length": [] if self.kitti is None else [_as_plain_dict(row) for row in self.kitti.per_length],
         }
 
 
@@ -148,13 +148,13 @@ def evaluate(
     rpe_delta_frames: int = 1,
     rpe_delta_m: float | None = None,
 ) -> Evaluation:
-    """Score an estimate against a reference, in the frame (cam0 or IMU) that the reference describes.
+    """Evaluate an estimate against a reference, in the frame (cam0 or IMU) that the reference describes.
 
     Args:
         estimate: N poses.
-        reference: associated by time where both have times, else by frame number; it may cover only a part.
-        align: rigid, rigid with scale, or none at all (the worlds are then taken to be the same). All metrics are
-            those of the aligned estimate, so `sim3` takes the scale out of the relative ones too.
+        reference: associated by time where both have times, else by frame number; it may cover part of the estimate.
+        align: rigid, rigid with scale, or none (the worlds are then assumed equal). All metrics are those of the
+            aligned estimate, so `sim3` removes the scale error from the relative ones too.
         lengths_m: path lengths of the KITTI metric.
         max_time_difference_s: poses further apart in time are not compared.
         T_cam0_imu: extrinsic (4, 4), needed where the two trajectories describe different frames.
@@ -206,10 +206,10 @@ def associate(
 ) -> tuple[AssociationMode, IntArray, IntArray]:
     """Pair poses one to one: the mode, rows of the estimate (M,) and rows of the reference (M,), M >= 1.
 
-    By time where both have times. Else by frame number: row k of a trajectory without frame numbers is frame k.
+    By time where both have times, else by frame number: row k of a trajectory without frame numbers is frame k.
 
     Raises:
-        EvaluationError: no pose can be paired.
+        EvaluationError: no poses match.
     """
     if len(estimate) == 0 or len(reference) == 0:
         raise EvaluationError(f"cannot compare {len(estimate)} estimated poses with {len(reference)} reference poses")
@@ -238,7 +238,7 @@ def associate(
 def associate_times(
     times_a_ns: npt.ArrayLike, times_b_ns: npt.ArrayLike, *, max_difference_ns: int
 ) -> tuple[IntArray, IntArray]:
-    """Pair two increasing clocks one to one and in order, closest pairs first; row indices (M,) into each.
+    """Pair two increasing clocks one to one and in order, closest pairs first; return row indices (M,) into each.
 
     A pair is at most `max_difference_ns` apart. Of equally close pairs the earlier one is taken.
     """
@@ -262,7 +262,7 @@ def associate_times(
 def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignment:
     """Find the alignment of M >= 1 paired poses (M, 4, 4) that minimises the squared distances of their positions.
 
-    Where positions leave the rotation open (one place, or one straight line), the orientations settle the rest.
+    Where the positions do not determine the rotation (one point, or a straight line), the orientations do.
 
     Raises:
         EvaluationError: the scale of `sim3` is undefined, because one of the two does not move.
@@ -285,7 +285,7 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
             raise EvaluationError("sim3 alignment needs two trajectories that move together; align with se3 or none")
         R = nearest_rotation(_orientation_sum(T_est, T_ref))
     elif d[1] <= _COLLINEAR * d[0]:
-        R = _turn_about(U[:, 0], R, _orientation_sum(T_est, T_ref))
+        R = _rotate_about(U[:, 0], R, _orientation_sum(T_est, T_ref))
     scale = float(d @ sign) / x_extent**2 if mode == "sim3" else 1.0
     return Alignment(R, y_mean - scale * (R @ x_mean), scale)
 
@@ -321,12 +321,12 @@ def relative_error_distance(T_est: FloatArray, T_ref: FloatArray, delta_m: float
     """
     if not (np.isfinite(delta_m) and delta_m > 0):
         raise EvaluationError(f"the distance of a pair must be positive, got {delta_m:g} m")
-    travelled = _travelled(T_ref[:, :3, 3])
+    travelled = _cumulative_path_length(T_ref[:, :3, 3])
     n = len(travelled)
     first = np.arange(n)
     target = travelled + delta_m
     beyond = np.searchsorted(travelled, target, side="left")
-    before = np.searchsorted(travelled, travelled[beyond - 1], side="left")  # the first of poses in one place
+    before = np.searchsorted(travelled, travelled[beyond - 1], side="left")  # the first of poses at one position
     gap_before = target - travelled[before]
     gap_beyond = np.where(beyond < n, travelled[np.minimum(beyond, n - 1)] - target, np.inf)
     last = np.where(gap_before <= gap_beyond, before, beyond)
@@ -340,10 +340,10 @@ def kitti_error(
     lengths_m: Sequence[float] = KITTI_LENGTHS_M,
     step_frames: int = KITTI_STEP_FRAMES,
 ) -> KittiError | None:
-    """Drift over segments of given path lengths, of paired poses (M, 4, 4); None where no segment fits.
+    """Compute the drift over segments of given path lengths, of paired poses (M, 4, 4); None where no segment fits.
 
-    A segment starts at every `step_frames`-th pose and ends at the first one that lies more than the length further
-    along the reference's path. Its errors are divided by the length.
+    A segment starts at every `step_frames`-th pose and ends at the first one more than the length further along
+    the reference's path. Its errors are divided by the length.
 
     Raises:
         EvaluationError: a length or the step is not positive.
@@ -352,7 +352,7 @@ def kitti_error(
     """
     if not all(np.isfinite(length) and length > 0 for length in lengths_m) or step_frames < 1:
         raise EvaluationError(f"segment lengths and step must be positive, got {list(lengths_m)} m, {step_frames}")
-    travelled = _travelled(T_ref[:, :3, 3])
+    travelled = _cumulative_path_length(T_ref[:, :3, 3])
     per_length: list[LengthError] = []
     all_trans: list[FloatArray] = []
     all_rot: list[FloatArray] = []
@@ -414,8 +414,8 @@ def nees(errors: npt.ArrayLike, covariances: npt.ArrayLike) -> FloatArray:
     except np.linalg.LinAlgError as error:
         worst = int(np.argmin(np.linalg.eigvalsh(P)[:, 0]))
         raise EvaluationError(f"covariance {worst} is not positive definite; the filter is inconsistent") from error
-    white = np.linalg.solve(L, e[..., None])[..., 0]
-    out: FloatArray = np.sum(white * white, axis=1)
+    whitened = np.linalg.solve(L, e[..., None])[..., 0]
+    out: FloatArray = np.sum(whitened * whitened, axis=1)
     return out
 
 
@@ -432,8 +432,8 @@ def nees_bounds(d: int, runs: int, confidence: float = 0.95) -> tuple[float, flo
     return float(low), float(high)
 
 
-def _plain(record: Any) -> Any:
-    """A flat record of numbers as a dict; None stays None."""
+def _as_plain_dict(record: Any) -> Any:
+    """Convert a flat record of numbers to a dict; None stays None."""
     return {f.name: getattr(record, f.name) for f in fields(record)} if is_dataclass(record) else record
 
 
@@ -442,12 +442,12 @@ def _require_finite(name: str, trajectory: Trajectory) -> None:
     if bad.any():
         raise EvaluationError(
             f"pose {int(np.argmax(bad))} of the {name} is not finite ({int(bad.sum())} of {len(trajectory)} are not); "
-            "remove such poses or find out why the estimator diverged"
+            "remove such poses or check why the estimator diverged"
         )
 
 
 def _in_frame_of(estimate: Trajectory, reference: Trajectory, T_cam0_imu: npt.ArrayLike | None) -> Trajectory:
-    """The estimate described by the reference's body frame, so that no lever arm enters the errors."""
+    """Return the estimate in the reference's body frame, so that no lever arm enters the errors."""
     if estimate.body == reference.body:
         return estimate
     if T_cam0_imu is None:
@@ -467,7 +467,7 @@ def _max_difference_ns(seconds: float) -> int:
 
 
 def _no_common_time(estimate_ns: IntArray, reference_ns: IntArray, limit_s: float) -> str:
-    """Say how the two clocks lie to each other."""
+    """Format how the two clocks relate to each other."""
     after = np.searchsorted(reference_ns, estimate_ns)
     left, right = np.clip(after - 1, 0, None), np.clip(after, None, len(reference_ns) - 1)
     nearest = np.minimum(np.abs(estimate_ns - reference_ns[left]), np.abs(estimate_ns - reference_ns[right]))
@@ -507,26 +507,26 @@ def _take(trajectory: Trajectory, rows: IntArray) -> Trajectory:
 
 
 def _extent(p: FloatArray) -> float:
-    """Root mean square distance from the centroid; 0 where it is mere rounding of the coordinates."""
+    """Root mean square distance from the centroid; 0 where it is within rounding of the coordinates."""
     extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
     return extent if extent > _STATIONARY * float(np.abs(p).max()) else 0.0
 
 
 def _orientation_sum(T_est: FloatArray, T_ref: FloatArray) -> FloatArray:
-    """The rotation R that fits `R_ref = R R_est` best maximises trace(R^T C) with this C (3, 3)."""
+    """Return C (3, 3) such that the best fit R of `R_ref = R R_est` maximises trace(R^T C)."""
     out: FloatArray = np.einsum("nij,nkj->ik", T_ref[:, :3, :3], T_est[:, :3, :3])
     return out
 
 
-def _turn_about(axis: FloatArray, R: FloatArray, C: FloatArray) -> FloatArray:
-    """Of all rotations `exp(angle axis^) R`, the one that maximises trace(rotation^T C)."""
+def _rotate_about(axis: FloatArray, R: FloatArray, C: FloatArray) -> FloatArray:
+    """Return the rotation `exp(angle axis^) R` that maximises trace(rotation^T C)."""
     D = C @ R.T
     angle = np.arctan2(-np.trace(so3_hat(axis) @ D), np.trace(D) - axis @ D @ axis)
     out: FloatArray = so3_exp(angle * axis) @ R
     return out
 
 
-def _travelled(positions: FloatArray) -> FloatArray:
+def _cumulative_path_length(positions: FloatArray) -> FloatArray:
     """Path length (M,) from the first position to each, metres."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return np.concatenate([np.zeros(1), np.cumsum(steps)])

@@ -1,4 +1,4 @@
-"""Spreads that a few gross errors leave alone, and standard errors that count errors which last."""
+"""Robust standard deviations, and standard errors under correlated errors."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
 
-_MEDIAN_TO_SIGMA = 1.4826  # standard deviation of a normal distribution over the median of its sizes
+_MEDIAN_TO_SIGMA = 1.4826  # standard deviation over median absolute value of a normal distribution
 
 
 def robust_sigma(values: npt.ArrayLike) -> float:
-    """Standard deviation of values around zero, by the median of their sizes."""
+    """Estimate the standard deviation of zero-mean values from the median of their absolute values."""
     return _MEDIAN_TO_SIGMA * float(np.median(np.abs(values)))
 
 
 def jackknife(values: npt.ArrayLike) -> FloatArray:
-    """Standard errors (...) of an estimate from its values (n, ...) with one block of the data left out of each.
+    """Compute standard errors (...) of an estimate from its leave-one-block-out values (n, ...).
 
-    Blocks that are longer than the errors last make the result count errors that are not independent.
+    With blocks longer than the correlation time of the errors, the result accounts for correlated errors.
     Reference: Tukey (1958), after Quenouille.
     """
-    again = np.asarray(values, dtype=np.float64)
-    out: FloatArray = np.sqrt((len(again) - 1) * np.mean((again - again.mean(axis=0)) ** 2, axis=0))
+    estimates = np.asarray(values, dtype=np.float64)
+    out: FloatArray = np.sqrt((len(estimates) - 1) * np.mean((estimates - estimates.mean(axis=0)) ** 2, axis=0))
     return out

@@ -1,9 +1,8 @@
-"""Selectors: which observations of a frame enter the filter's update, and why.
+"""Selectors of the observations that enter the filter's update.
 
 The paper sorts features by how often they are seen and keeps the first seventh. `visibility` does that frame by
-frame with what is known so far; `visibility_whole` looks at the whole record first, as the paper does. `information`
-answers what the paper leaves open: it keeps those features that together say most of the camera's motion.
-docs/selection.md compares them.
+frame with the counts so far; `visibility_whole` counts over the whole record first, as the paper does. `information`
+keeps the features that together add most information on the camera's motion. docs/selection.md compares them.
 """
 
 from __future__ import annotations
@@ -35,45 +34,45 @@ class SelectorSettings(Section):
         "all",
         "all; visibility: the most often seen so far; visibility_whole: the most often seen in the whole record, as "
         "the paper does (precomputed features only); grid: the most often seen of each image cell; random: any; "
-        "information: those that together say most of the camera's motion now and in the frames to come",
+        "information: those that together add most information on the camera's motion now and in the next frames",
     )
     budget: int | None = setting(None, "observations kept of a frame; null: the share below", at_least=1)
     keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7", above=0, at_most=1)
     minimum: int = setting(12, "keep at least this many observations of a frame (all but visibility_whole)", at_least=0)
     sticky: bool = setting(
-        False, "a feature once chosen stays chosen while it is seen, and new ones only fill the budget"
+        False, "a chosen feature stays chosen while it is tracked; new ones only fill the remaining budget"
     )
     grid_columns: int = setting(8, "cells across the image for the grid selector", at_least=1)
     grid_rows: int = setting(4, "cells down the image for the grid selector", at_least=1)
     horizon_frames: int = setting(
         4,
-        "information: beside the last motion, the next and the one so many frames ahead count",
+        "information: the gain is summed over the last motion, the next one and the one this many frames ahead",
         at_least=1,
     )
-    pixel_sigma_px: float = setting(0.5, "information: noise of one pixel coordinate", unit="px", above=0)
-    seed: int = setting(0, "random: which of the random choices", at_least=0)
+    pixel_sigma_px: float = setting(0.5, "information: standard deviation of one pixel coordinate", unit="px", above=0)
+    seed: int = setting(0, "random: seed of the random choice", at_least=0)
 
 
 class _VisibilityCount:
-    """Counts in how many frames each feature has been seen."""
+    """Counts the frames in which each feature has been observed."""
 
     def __init__(self) -> None:
         self._count: dict[int, int] = {}
 
     def add(self, ids: IntArray) -> FloatArray:
-        """Count one more sighting of each id (N,) and return the counts (N,)."""
+        """Count one more observation of each id (N,) and return the counts (N,)."""
         count = self._count
         for i in ids.tolist():
             count[i] = count.get(i, 0) + 1
         return np.array([count[i] for i in ids.tolist()], dtype=np.float64)
 
     def ranked_ids(self) -> list[int]:
-        """All ids, most often seen first; ties by id, so that the order never depends on the run."""
+        """Return all ids, most often observed first; ties by id, so that the order is reproducible."""
         return [i for i, _ in sorted(self._count.items(), key=lambda item: (-item[1], item[0]))]
 
 
 class _Budget:
-    """How many rows are chosen, and which of them because they were chosen in the last frame."""
+    """The number of rows to choose, and the rows kept from the last frame."""
 
     def __init__(self, settings: SelectorSettings) -> None:
         self._settings = settings
@@ -88,16 +87,16 @@ class _Budget:
         """Return the rows (N,) that stay chosen; none unless the selector is sticky."""
         return np.isin(ids, self._last) if self._settings.sticky else np.zeros(len(ids), dtype=np.bool_)
 
-    def remember(self, ids: IntArray, chosen: BoolArray) -> BoolArray:
-        """Note what was chosen (N,) of a frame and return it."""
+    def store(self, ids: IntArray, chosen: BoolArray) -> BoolArray:
+        """Store the chosen rows (N,) of a frame and return them."""
         self._last = ids[chosen]
         return chosen
 
     def best(self, score: FloatArray, ids: IntArray) -> BoolArray:
-        """Choose those that stay, then the rows of largest score; ties go to the smaller id."""
+        """Choose the kept rows, then those of largest score; ties go to the smaller id."""
         chosen = np.zeros(len(score), dtype=np.bool_)
         chosen[np.lexsort((ids, -score, ~self.kept(ids)))[: self.rows(len(score))]] = True
-        return self.remember(ids, chosen)
+        return self.store(ids, chosen)
 
 
 class KeepAll:
@@ -110,13 +109,13 @@ class KeepAll:
 
 
 class CausalVisibility:
-    """Ranks the features of each frame by how often they have been seen up to now."""
+    """Ranks the features of each frame by their number of observations so far."""
 
     def __init__(self, settings: SelectorSettings) -> None:
         self._seen, self._budget = _VisibilityCount(), _Budget(settings)
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
-        """Choose the most often seen rows; ties go to the older feature."""
+        """Choose the most often observed rows; ties go to the older feature."""
         score = self._seen.add(observations.ids)
         chosen = self._budget.best(score, observations.ids)
         return Selection(chosen, score, f"most seen so far, {chosen.sum()} of {len(score)}")
@@ -125,7 +124,7 @@ class CausalVisibility:
 class WholeRecordVisibility:
     """The paper's selection: rank all features of the record by visibility and keep the first share of them.
 
-    Under a budget the first of that ranking are kept in each frame.
+    With a budget, the best-ranked features of each frame are kept.
     """
 
     def __init__(self, record: Iterable[Observations], settings: SelectorSettings) -> None:
@@ -138,7 +137,7 @@ class WholeRecordVisibility:
         self._budget = None if settings.budget is None else _Budget(settings)
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
-        """Choose the rows whose feature belongs to the kept share of the whole record, or the first of them."""
+        """Choose the rows whose feature is in the kept share of the whole record, or the best-ranked ones."""
         rank = np.array([self._rank[i] for i in observations.ids.tolist()], dtype=np.float64)
         if self._budget is not None:
             chosen = self._budget.best(-rank, observations.ids)
@@ -147,7 +146,7 @@ class WholeRecordVisibility:
 
 
 class GridVisibility:
-    """The most often seen features of each image cell, so that no image region is given up."""
+    """The most often observed features of each image cell, so that no image region is empty."""
 
     def __init__(self, settings: SelectorSettings, width: int, height: int) -> None:
         self._seen, self._settings, self._size = _VisibilityCount(), settings, (width, height)
@@ -166,16 +165,16 @@ class GridVisibility:
         place_in_cell = np.arange(len(cell)) - np.repeat(starts, np.diff(starts, append=len(cell)))
         round_of = np.empty(len(score))
         round_of[order] = place_in_cell
-        # Those that stay, then earlier rounds; within a round the most often seen.
+        # Kept rows, then earlier rounds; within a round the most often observed.
         by_round = np.lexsort((ids, -score, round_of, fresh))
         chosen = np.zeros(len(score), dtype=np.bool_)
         chosen[by_round[: self._budget.rows(len(score))]] = True
-        self._budget.remember(ids, chosen)
+        self._budget.store(ids, chosen)
         return Selection(chosen, score, f"most seen of each cell, {chosen.sum()} of {len(score)}")
 
 
 class RandomChoice:
-    """Any features, as a control: the same ones for the same seed and frame."""
+    """Random features, as a baseline: the same ones for the same seed and frame."""
 
     def __init__(self, settings: SelectorSettings) -> None:
         self._seed, self._budget = settings.seed, _Budget(settings)
@@ -188,16 +187,16 @@ class RandomChoice:
 
 
 class InformationGain:
-    """The features that together say most of the camera's last motion and of those to come (docs/selection.md)."""
+    """The features with the largest joint information on the last and the coming motions (docs/selection.md)."""
 
     def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
         self._settings, self._budget = settings, _Budget(settings)
         self._model = MotionInformation(camera, settings.horizon_frames, settings.pixel_sigma_px)
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
-        """Choose rows one at a time, each time the one that adds most to the log-determinant."""
+        """Choose rows greedily by their gain in the log-determinant."""
         ids = observations.ids
-        L = self._model.look(observations, motion)
+        L = self._model.add_frame(observations, motion)
         prior = np.repeat(prior_information(motion)[None], L.shape[1], axis=0)
         budget = self._budget.rows(len(ids))
         kept = self._budget.kept(ids) & ~observations.stale
@@ -206,8 +205,8 @@ class InformationGain:
         greedy = lazy_greedy(prior, L, ids, budget, kept)
         chosen = np.zeros(len(ids), dtype=np.bool_)
         chosen[greedy.order] = True
-        self._model.use(observations, chosen)
-        self._budget.remember(ids, chosen)
+        self._model.mark_used(observations, chosen)
+        self._budget.store(ids, chosen)
         nats = log_det_gain(prior, L[chosen])
         return Selection(chosen, greedy.gain, f"{nats:.1f} nats from {chosen.sum()} of {len(ids)}")
 
@@ -224,22 +223,22 @@ def build_selector(
     Args:
         settings: the selector's section of the configuration.
         image_size: width and height in pixels; None where unknown (feature files).
-        whole_record: yields all observations of the record; None where they are not known in advance.
+        whole_record: yields all observations of the record; None where they are not available in advance.
         camera: the rectified pair, which the information selector needs.
 
     Raises:
-        ConfigError: the selector needs what the recording cannot give.
+        ConfigError: the recording lacks data that the selector needs.
     """
     if settings.name == "visibility_whole":
         if whole_record is None:
             raise ConfigError(
-                "selector visibility_whole must know the whole record in advance: run once with --save-observations "
+                "selector visibility_whole needs the whole record in advance: run once with --save-observations "
                 "and process that file, or use selector.name=visibility"
             )
         return WholeRecordVisibility(whole_record(), settings)
     if settings.name == "grid":
         if image_size is None:
-            raise ConfigError("selector grid needs the image size, which this recording does not know; use visibility")
+            raise ConfigError("selector grid needs the image size, which this recording lacks; use visibility")
         return GridVisibility(settings, *image_size)
     if settings.name == "information":
         if camera is None:

@@ -1,4 +1,4 @@
-"""Quantiles of chi-square: the bounds of gates and of consistency tests."""
+"""Chi-square quantiles for gates and consistency tests."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from vio.geometry.lie import FloatArray
 
 
 def chi_square_quantile(probability: npt.ArrayLike, dof: npt.ArrayLike) -> FloatArray:
-    """Value (...) that chi-square with `dof` degrees of freedom (...) stays below with this probability (...).
+    """Compute the chi-square quantile (...) at a probability (...) for `dof` degrees of freedom (...).
 
-    Twice the quantile of the gamma distribution of shape `dof / 2`, as `scipy.stats.chi2.ppf` has it; but importing
-    `scipy.stats` takes longer than importing all else that a run needs.
+    Twice the quantile of the gamma distribution of shape `dof / 2`, equal to `scipy.stats.chi2.ppf`, without the slow
+    import of `scipy.stats`.
     """
     quantile: FloatArray = 2 * np.asarray(gammaincinv(np.asarray(dof) / 2, probability))
     return quantile

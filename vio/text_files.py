@@ -1,4 +1,4 @@
-"""Text files both ways: numbered lines, exact digits, and clocks in integer nanoseconds that only increase."""
+"""Read and write text files: numbered lines, exact digits, and increasing clocks in integer nanoseconds."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ INT64_MAX = 2**63 - 1
 
 
 def text_lines(path: Path) -> list[tuple[int, str]]:
-    """The lines of a text file with their numbers from 1, blank lines at its end dropped.
+    """Read the lines of a text file with their numbers from 1, without blank lines at its end.
 
     Raises:
         DataError: the file is missing or is no text.
@@ -42,7 +42,7 @@ def read_numbers(path: Path, columns: int, *, separator: str | None = None, skip
     for number, line in text_lines(path)[skip:]:
         fields = line.split(separator)
         if len(fields) != columns:
-            raise DataError(f"{path}, line {number}: {len(fields)} values where {columns} belong; mend that line")
+            raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns}; correct that line")
         try:
             rows.append([float(value) for value in fields])
         except ValueError as error:
@@ -56,22 +56,22 @@ def write_text(path: Path, text: str) -> None:
 
 
 def exact_text(values: npt.ArrayLike, separator: str = " ") -> str:
-    """The shortest decimals of numbers (any shape, row by row) that read back to the same bits."""
+    """Format numbers (any shape, row by row) as the shortest decimals that read back to the same bits."""
     return separator.join(repr(float(value)) for value in np.ravel(values))
 
 
 def seconds_text(time_ns: int) -> str:
-    """Decimal seconds of nanoseconds, exact to the last digit."""
-    whole, rest = divmod(abs(int(time_ns)), NS_PER_S)
-    return f"{'-' if time_ns < 0 else ''}{whole}.{rest:09d}"
+    """Format nanoseconds as decimal seconds, exact to the last digit."""
+    whole, remainder = divmod(abs(int(time_ns)), NS_PER_S)
+    return f"{'-' if time_ns < 0 else ''}{whole}.{remainder:09d}"
 
 
 def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> IntArray:
-    """Return times (N,) in nanoseconds that strictly increase.
+    """Check that times (N,) in nanoseconds strictly increase, and return them.
 
     Args:
         times_ns: integers that fit 64 bits.
-        where: names the entry of a given number, for the message ("times.txt, line 3").
+        where: returns the location of an entry for the error message ("times.txt, line 3").
 
     Raises:
         DataError: a time is not later than the one before; the message names its entry.

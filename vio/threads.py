@@ -1,4 +1,4 @@
-"""Linear algebra on one thread: the filter's matrices are small, and a second thread only waits for the first."""
+"""Single-threaded linear algebra: the filter's matrices are too small for a second thread to help."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ logger = logging.getLogger(__name__)
 
 TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
 
-ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one that is still read as rounding
+ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one accepted as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _MAX_S = Decimal(INT64_MAX).scaleb(-9)
 _COLUMNS: dict[TrajectoryFormat, str] = {
@@ -46,7 +46,7 @@ _DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """The fields of a text file, still text, and where they stood."""
+    """The fields of a text file as text, with their line numbers."""
 
     path: Path
     comments: list[str]  # without the leading '#'
@@ -64,11 +64,11 @@ class _Table:
 def read_trajectory(
     path: str | os.PathLike[str], *, fmt: TrajectoryFormat | None = None, body: BodyFrame | None = None
 ) -> Trajectory:
-    """Read a trajectory; the format is told from the content unless given.
+    """Read a trajectory; the format is detected from the content unless given.
 
-    A KITTI file describes cam0 and has no times; an EuRoC file describes the IMU; a TUM file describes what its
-    comment `# body: imu` or `# body: cam0` says, else the IMU. `body` overrides all of these. A comment
-    `# frames: 0-41 45-99` in a TUM file (as `write_tum` leaves) numbers the poses.
+    A KITTI file describes cam0 and has no times; an EuRoC file describes the IMU; a TUM file describes the
+    frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body` overrides all of these. A comment
+    `# frames: 0-41 45-99` in a TUM file (written by `write_tum`) numbers the poses.
 
     Raises:
         DataError: the file cannot be used; the message names file, line and remedy.
@@ -84,12 +84,12 @@ def read_trajectory(
         return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
     times_ns = _times_ns(table, kind)
     poses = _quaternion_poses(table, kind)
-    said = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
+    header_body = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
     frames = _header(table, r"frames:\s*(.*\S)") if kind == "tum" else None
     return Trajectory(
         poses,
         times_ns,
-        _body(table, said, body) or _DEFAULT_BODY[kind],
+        _body(table, header_body, body) or _DEFAULT_BODY[kind],
         None if frames is None else _parse_frames(table, frames),
     )
 
@@ -98,7 +98,7 @@ def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     """Write `timestamp tx ty tz qx qy qz qw`, seconds with nine decimals, metres; body and frames in the comments.
 
     Raises:
-        DataError: the trajectory has no times, or the place cannot be written.
+        DataError: the trajectory has no times, or the file cannot be written.
     """
     if trajectory.times_ns is None:
         raise DataError(f"cannot write {path}: a TUM file needs times and this trajectory has none; write KITTI form")
@@ -117,10 +117,10 @@ def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
 def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     """Write the first three rows of each cam0 pose as 12 numbers a line, without comments.
 
-    Row k is taken for frame k by every reader of this form; frames numbered otherwise are warned of.
+    Every reader of this form assumes that row k is frame k; other frame numbers are logged as a warning.
 
     Raises:
-        DataError: the poses describe the IMU, or the place cannot be written.
+        DataError: the poses describe the IMU, or the file cannot be written.
     """
     if trajectory.body != "cam0":
         raise DataError(f"cannot write {path}: KITTI form describes cam0; convert with Trajectory.in_cam0 first")
@@ -136,7 +136,7 @@ def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
 
 
 def in_first_cam0(trajectory: Trajectory, T_cam0_imu: FloatArray) -> Trajectory:
-    """Return a trajectory as KITTI writes it: cam0 poses relative to the first one."""
+    """Return a trajectory in KITTI's convention: cam0 poses relative to the first one."""
     cam0 = trajectory.in_cam0(T_cam0_imu)
     return replace(cam0, T_world_body=se3_inverse(cam0.T_world_body[0]) @ cam0.T_world_body)
 
@@ -155,7 +155,7 @@ def _read_table(path: Path) -> _Table:
 
 
 def _detect(table: _Table) -> TrajectoryFormat:
-    """Tell the format from the first row."""
+    """Detect the format from the first row."""
     if table.commas:
         return "euroc"
     n = len(table.rows[0])
@@ -181,7 +181,7 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
         try:
             out[row] = [float(field) for field in fields[first:last]]
         except ValueError as error:
-            table.fail(row, f"{error}; only numbers and comment lines with '#' may stand here")
+            table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
     bad = ~np.isfinite(out).all(axis=1)
     if bad.any():
         table.fail(int(np.argmax(bad)), f"a pose is not finite (first of {int(bad.sum())}); remove such lines")
@@ -205,7 +205,7 @@ def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
     except InvalidOperation:
         seconds = Decimal("NaN")
     if not seconds.is_finite():
-        table.fail(row, f"the time {text!r} is not a number of seconds; remove or mend this line")
+        table.fail(row, f"the time {text!r} is not a number of seconds; remove or correct this line")
     if not -_MAX_S <= seconds <= _MAX_S:
         table.fail(row, f"the time {text!r} cannot be in seconds; divide nanoseconds by 1e9 first")
     return int(seconds.scaleb(9).to_integral_value())
@@ -235,28 +235,32 @@ def _kitti_poses(table: _Table) -> FloatArray:
         row = int(np.argmax(bad))
         why = "mirrors" if deviation[row] <= ROTATION_TOLERANCE else f"is off orthonormal by {deviation[row]:.3g}"
         table.fail(row, f"the rotation {why}; KITTI form has {_COLUMNS['kitti']}, row by row")
-    mended = np.where((deviation <= _EXACT)[:, None, None], R, nearest_rotation(R))
-    return se3_from_parts(mended, values[:, :, 3])
+    orthonormal = np.where((deviation <= _EXACT)[:, None, None], R, nearest_rotation(R))
+    return se3_from_parts(orthonormal, values[:, :, 3])
 
 
 def _header(table: _Table, pattern: str) -> str | None:
-    """What the first comment that fits the pattern says."""
+    """Return the value of the first comment that matches the pattern."""
     found = (re.fullmatch(pattern, comment) for comment in table.comments)
     return next((match.group(1) for match in found if match), None)
 
 
-def _body(table: _Table, said: str | None, asked: BodyFrame | None) -> BodyFrame | None:
-    if said is not None and said not in get_args(BodyFrame):
-        raise DataError(f"{table.path}: its comment names the body {said!r}; write '# body: imu' or '# body: cam0'")
-    if asked is not None:
-        if said is not None and said != asked:
-            logger.warning("%s says that it describes %s; read as %s, as asked", table.path, said, asked)
-        return asked
-    return "cam0" if said == "cam0" else "imu" if said == "imu" else None
+def _body(table: _Table, header_body: str | None, requested: BodyFrame | None) -> BodyFrame | None:
+    if header_body is not None and header_body not in get_args(BodyFrame):
+        raise DataError(
+            f"{table.path}: its comment names the body {header_body!r}; use '# body: imu' or '# body: cam0'"
+        )
+    if requested is not None:
+        if header_body is not None and header_body != requested:
+            logger.warning(
+                "%s describes %s according to its comment; read as %s, as requested", table.path, header_body, requested
+            )
+        return requested
+    return "cam0" if header_body == "cam0" else "imu" if header_body == "imu" else None
 
 
 def _format_frames(frames: IntArray) -> str:
-    """Frame numbers as runs: [0 1 2 5] becomes '0-2 5-5'."""
+    """Format frame numbers as ranges: [0 1 2 5] becomes '0-2 5-5'."""
     starts = np.flatnonzero(np.diff(frames, prepend=frames[0] - 2) != 1)
     ends = np.append(starts[1:], len(frames)) - 1
     return " ".join(f"{frames[a]}-{frames[b]}" for a, b in zip(starts, ends, strict=True))
@@ -269,6 +273,6 @@ def _parse_frames(table: _Table, text: str) -> IntArray:
     if not all(runs) or not ordered or sum(map(len, spans)) != len(table.rows):
         raise DataError(
             f"{table.path}: its comment '# frames: {text[:60]}' does not number its {len(table.rows)} poses; "
-            "remove the comment or mend it"
+            "remove the comment or correct it"
         )
     return np.concatenate([np.arange(span.start, span.stop, dtype=np.int64) for span in spans])

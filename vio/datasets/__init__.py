@@ -1,4 +1,4 @@
-"""Readers of recordings. A source is a path whose kind is told from its content, or `kind:path`."""
+"""Readers of recordings. A source is a path whose kind is detected from its content, or `kind:path`."""
 
 from __future__ import annotations
 
@@ -69,12 +69,12 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
     """Open a recording.
 
     Args:
-        source: a path whose kind is told from its content, or `kind:path`.
-        options: how to read it.
+        source: a path whose kind is detected from its content, or `kind:path`.
+        options: reader settings.
 
     Raises:
-        DataError: nothing is there, or its content is of no known kind; the message says what was looked for.
-        CalibrationError: the recording's calibration cannot be right.
+        DataError: the path does not exist, or its content is of no known kind; the message lists the known kinds.
+        CalibrationError: the recording's calibration is invalid.
     """
     kind, path = _parse(os.fspath(source))
     if not path.exists():
@@ -83,7 +83,7 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
 
 
 def _parse(source: str) -> tuple[str | None, Path]:
-    """Split `kind:path`. A path that exists as it stands is no such pair, nor is a drive letter a kind."""
+    """Split `kind:path`. An existing path is never split, and a drive letter is no kind."""
     head, colon, tail = source.partition(":")
     if not colon or len(head) < 2 or not head.replace("_", "").isalnum() or Path(source).exists():
         return None, Path(source)
@@ -97,10 +97,10 @@ def _parse(source: str) -> tuple[str | None, Path]:
 
 
 def _detect(path: Path) -> str:
-    """Tell the kind of a recording from its content.
+    """Detect the kind of a recording from its content.
 
     Raises:
-        DataError: it is none of those known.
+        DataError: the kind is unknown.
     """
     kind = _folder_kind(path) if path.is_dir() else _file_kind(path)
     if kind is None:

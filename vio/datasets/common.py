@@ -1,4 +1,4 @@
-"""What the readers share: integer clocks, events in time order, checked calibrations and archives."""
+"""Helpers shared by the readers: integer clocks, events in time order, checked calibrations and archives."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from vio.records import (
 )
 from vio.text_files import check_increasing
 
-_ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I that is still read as rounding
+_ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
-_EXACT_ENTRY = 1e-8  # to which the zeros and the one of a matrix of intrinsics must be so
+_EXACT_ENTRY = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
 
 
 def seconds_to_ns(seconds: npt.ArrayLike) -> IntArray:
@@ -40,11 +40,11 @@ def seconds_to_ns(seconds: npt.ArrayLike) -> IntArray:
 
 
 def clock_ns(seconds: npt.ArrayLike, where: Callable[[int], str]) -> IntArray:
-    """Turn float seconds (N,) into nanoseconds (N,), refusing a clock that is not finite or does not increase.
+    """Convert float seconds (N,) to nanoseconds (N,) and check that they are finite and increasing.
 
     Args:
         seconds: times, seconds.
-        where: names the entry of a given number, for the message ("times.txt, line 3").
+        where: returns the location of an entry for the error message ("times.txt, line 3").
 
     Raises:
         DataError: the message names the entry.
@@ -65,7 +65,7 @@ def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
         where: names the file and the entry, for the message.
 
     Raises:
-        CalibrationError: entries are not finite, or the rotation stretches, shears or mirrors.
+        CalibrationError: entries are not finite, or the rotation part is not a rotation.
     """
     T_ = np.asarray(T, dtype=np.float64)
     if T_.shape not in ((3, 4), (4, 4)) or not np.isfinite(T_).all():
@@ -92,40 +92,40 @@ def velocity_samples(times_ns: IntArray, linear: FloatArray, angular: FloatArray
 
 
 def numbers_in(text: str, count: int, where: str) -> FloatArray:
-    """The numbers (count,) in one entry of a calibration file.
+    """Parse the numbers (count,) in one entry of a calibration file.
 
     Args:
         text: the entry.
-        count: how many numbers belong there.
+        count: expected number of values.
         where: names the file and the entry, for the message.
 
     Raises:
-        CalibrationError: there are more, fewer, or others than finite numbers.
+        CalibrationError: the count is wrong, or a value is not a finite number.
     """
     try:
         values = np.array([float(value) for value in text.split()])
     except ValueError as error:
         raise CalibrationError(f"{where} holds no number ({error}); copy the calibration again") from error
     if values.shape != (count,) or not np.isfinite(values).all():
-        raise CalibrationError(f"{where} holds {len(values)} values where {count} finite ones belong; copy it again")
+        raise CalibrationError(f"{where} holds {len(values)} values, expected {count} finite ones; copy it again")
     return values
 
 
 def check_intrinsics(K: FloatArray, where: str) -> None:
-    """Raise CalibrationError unless a matrix (3, 3) has the form of intrinsics, with positive focal lengths."""
+    """Raise CalibrationError unless K (3, 3) is an intrinsic matrix with positive focal lengths."""
     form = np.allclose(K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1], atol=_EXACT_ENTRY)
     if not (form and K[0, 0] > 0 and K[1, 1] > 0):
         raise CalibrationError(
-            f"{where} is no matrix of intrinsics [fu 0 cu; 0 fv cv; 0 0 1], fu and fv positive, but {K.tolist()}; "
+            f"{where} is no intrinsic matrix [fu 0 cu; 0 fv cv; 0 0 1], fu and fv positive, but {K.tolist()}; "
             "check the order"
         )
 
 
 def image_size(values: Sequence[float], where: str) -> tuple[int, int]:
-    """Return width and height in whole pixels, as a calibration states them.
+    """Return width and height in whole pixels from a calibration.
 
     Raises:
-        CalibrationError: they are no whole numbers, or none that an image can have.
+        CalibrationError: they are not positive whole numbers.
     """
     width, height = (int(value) for value in values)
     if [width, height] != list(values) or min(width, height) < 1:
@@ -136,10 +136,10 @@ def image_size(values: Sequence[float], where: str) -> tuple[int, int]:
 
 
 def finite_rows(values: FloatArray, what: str) -> FloatArray:
-    """Return values (F, k) of frames, all finite.
+    """Return per-frame values (F, k) after checking that all are finite.
 
     Raises:
-        DataError: a frame's are not; the message begins with `what`, which names file and variable.
+        DataError: a value is not finite; the message begins with `what`, which names file and variable.
     """
     bad: BoolArray = np.asarray(~np.isfinite(values).all(axis=1))
     if bad.any():
@@ -151,13 +151,13 @@ def finite_rows(values: FloatArray, what: str) -> FloatArray:
 
 
 def shape_text(array: np.ndarray) -> str:
-    """The shape of an array for a message: '4 x 3', or 'one value'."""
+    """Format the shape of an array for a message: '4 x 3', or 'one value'."""
     return " x ".join(map(str, array.shape)) or "one value"
 
 
 @contextlib.contextmanager
 def naming(where: Path | str) -> Iterator[None]:
-    """Put the place of a calibration before the message of a CalibrationError raised within."""
+    """Prefix a CalibrationError raised within the block with its location."""
     try:
         yield
     except CalibrationError as error:
@@ -165,7 +165,7 @@ def naming(where: Path | str) -> Iterator[None]:
 
 
 def imu_samples(record: ImuRecord) -> tuple[ImuSample, ...]:
-    """Turn a record into events."""
+    """Convert a record to events."""
     return tuple(
         ImuSample(t, gyro, accel)
         for t, gyro, accel in zip(record.times_ns.tolist(), record.gyro, record.accel, strict=True)
@@ -173,16 +173,16 @@ def imu_samples(record: ImuRecord) -> tuple[ImuSample, ...]:
 
 
 def frame_range(recording: Recording, start: int, stop: int | None) -> range:
-    """The frame numbers `start <= index < stop` that the recording has.
+    """Return the frame numbers `start <= index < stop` of the recording.
 
     Raises:
-        DataError: the range is empty or begins past the last frame.
+        DataError: the range is empty or begins after the last frame.
     """
     count = len(recording.frame_times_ns)
     end = count if stop is None else min(stop, count)
     if not 0 <= start < end:
-        asked = "the end" if stop is None else str(stop)
-        raise DataError(f"{recording.path}: holds frames 0 to {count - 1}; none lies between start {start} and {asked}")
+        limit = "the end" if stop is None else str(stop)
+        raise DataError(f"{recording.path}: holds frames 0 to {count - 1}; none is between start {start} and {limit}")
     return range(start, end)
 
 
@@ -191,13 +191,13 @@ def merge_events(
 ) -> Iterator[Event]:
     """Yield the motion samples and frames of a range in time order, a sample before a frame of the same time.
 
-    Raw IMU begins a second before the first frame, so that an estimator can see gravity before it sees an image.
+    Raw IMU begins a second before the first frame, so that an estimator can determine gravity before the first image.
 
     Args:
-        recording: names the frames' times.
+        recording: the frame times.
         chosen: frame numbers.
         motion: samples of the whole recording, in time order.
-        frames: the frames of the range, in time order; some may be missing. Closed at the end.
+        frames: the frames of the range, in time order; some may be missing. The generator is closed at the end.
     """
     first_ns, last_ns = (int(recording.frame_times_ns[k]) for k in (chosen[0], chosen[-1]))
     begins = {ImuSample: first_ns - NS_PER_S, VelocitySample: first_ns}
@@ -215,10 +215,10 @@ def merge_events(
 
 
 def read_npz(path: Path) -> Mapping[str, np.ndarray]:
-    """All arrays of an `.npz`, without pickle.
+    """Read all arrays of an `.npz`, without pickle.
 
     Raises:
-        DataError: the file is missing, damaged, no archive, or holds pickled objects.
+        DataError: the file is missing, corrupt, no archive, or holds pickled objects.
     """
     try:
         if not zipfile.is_zipfile(path) and path.is_file():

@@ -5,7 +5,8 @@ Two generations of key names are read: `time_stamps features linear_velocity rot
 
 In the published files of the first kind `cam_T_imu` mixes two conventions: its rotation maps the IMU frame to the
 camera, but its translation is the camera's position in the IMU frame. The consistent transform has `t = -R t_file`.
-Nothing in the matrix itself betrays this, so the recording is asked: see `vio.calibration.levers.judge_levers`.
+The matrix alone does not reveal this, so the recording's motion decides:
+see `vio.calibration.lever_arm.judge_lever_arms`.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.calibration.levers import LeverVerdict, judge_levers
+from vio.calibration.lever_arm import LeverArmVerdict, judge_lever_arms
 from vio.datasets.common import (
     check_intrinsics,
     checked_transform,
@@ -29,7 +30,7 @@ from vio.datasets.common import (
 )
 from vio.datasets.features import FeatureDataset
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
-from vio.datasets.tracks import moving_frames, settle_repeats, tracks_from_dense
+from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
@@ -37,15 +38,15 @@ from vio.records import FeatureTracks, IntArray, Recording
 
 OLD_KEYS = ("time_stamps", "features", "linear_velocity", "rotational_velocity", "K", "b", "cam_T_imu")
 NEW_KEYS = ("timestamps", "features", "v_t", "w_t", "K_l", "K_r", "extL_T_imu", "extR_T_imu")
-_RECTIFIED = 0.02  # share of the baseline by which a rectified right camera may lie off the left one's x axis
-_SAME_M = 1e-3  # both readings of the translation agree to this
-_ALIGNED = 2e-3  # largest entry by which the rotation between rectified cameras may differ from identity
+_RECTIFIED = 0.02  # allowed offset of the right camera from the left one's x axis, as a share of the baseline
+_SAME_M = 1e-3  # difference below which both interpretations of the translation are the same
+_ALIGNED = 2e-3  # largest deviation from identity of the rotation between rectified cameras
 
 
 @dataclass(frozen=True, slots=True)
 class _Calibration:
     camera: StereoCamera
-    T_cam0_imu: FloatArray  # as the file has it
+    T_cam0_imu: FloatArray  # as in the file
     ambiguous: bool  # the translation may follow either convention
 
 
@@ -53,8 +54,8 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
     """Read a course file.
 
     Raises:
-        DataError: keys, shapes, clocks or values are wrong; the message says which and what was expected.
-        CalibrationError: the calibration cannot be right.
+        DataError: keys, shapes, clocks or values are wrong; the message names which and the expected form.
+        CalibrationError: the calibration is invalid.
     """
     arrays = read_npz(path)
     if set(OLD_KEYS) <= set(arrays):
@@ -76,10 +77,10 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
     )
     linear = _velocities(arrays, linear_key, path, count)
     angular = _velocities(arrays, angular_key, path, count)
-    tracks, stale_frames, notes = settle_repeats(
+    tracks, stale_frames, notes = resolve_repeats(
         tracks_from_dense(features, path), moving_frames(linear, angular), settings.repeated_tracks
     )
-    T_cam0_imu, said = _settle_extrinsics(
+    T_cam0_imu, extrinsics_notes = _resolve_extrinsics(
         calibration, tracks, times_ns, np.concatenate([linear, angular], axis=1), settings.extrinsics
     )
     recording = Recording(
@@ -91,7 +92,7 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
         has_images=False,
         motion=frozenset({"velocity"}),
         reference=None,
-        notes=(*said, *notes),
+        notes=(*extrinsics_notes, *notes),
     )
     motion = velocity_samples(times_ns, linear, angular)
     return FeatureDataset(recording, tracks, motion, np.arange(count), stale_frames)
@@ -133,7 +134,7 @@ def _old_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
 
 
 def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibration:
-    """Both cameras' extrinsics are given, so that the rectified pair itself tells which way they map."""
+    """Read the newer calibration; the two extrinsics of a rectified pair determine which way they map."""
     K, K_right = _intrinsics(arrays, "K_l", path), _intrinsics(arrays, "K_r", path)
     if not np.allclose(K, K_right, rtol=1e-6):
         raise CalibrationError(f"{path}: K_l and K_r differ, so the features are not rectified; rectify them first")
@@ -149,14 +150,14 @@ def _new_calibration(arrays: Mapping[str, np.ndarray], path: Path) -> _Calibrati
             return _Calibration(_camera(K, float(-x), path), left, ambiguous=False)
     raise CalibrationError(
         f"{path}: extL_T_imu and extR_T_imu place the cameras {np.round(T_cam1_cam0[:3, 3], 4).tolist()} m apart; the "
-        "right camera of a rectified pair lies on the left one's positive x axis, turned alike"
+        "right camera of a rectified pair is on the left one's positive x axis, with the same orientation"
     )
 
 
-def _settle_extrinsics(
+def _resolve_extrinsics(
     calibration: _Calibration, tracks: FeatureTracks, times_ns: IntArray, velocities: FloatArray, mode: ExtrinsicsMode
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Choose between the translation as it stands and the one for which it was mistaken."""
+    """Choose between the literal translation and the corrected one."""
     literal = calibration.T_cam0_imu
     if not calibration.ambiguous or mode == "literal":
         return literal, ()
@@ -166,18 +167,18 @@ def _settle_extrinsics(
         return literal, ()
     if mode == "corrected":
         return corrected, ()
-    verdict = judge_levers(calibration.camera, tracks, times_ns, velocities, R, (-R.T @ t, t))
+    verdict = judge_lever_arms(calibration.camera, tracks, times_ns, velocities, R, (-R.T @ t, t))
     if verdict.better == 1:
         return corrected, (_explain(verdict, t),)
     if verdict.better is None:
         return literal, (
-            "cam_T_imu is taken literally: this recording turns too little to tell whether its translation is the "
-            "camera's position in the IMU frame, as in the published files; set dataset.extrinsics if you know",
+            "cam_T_imu is taken literally: this recording turns too little to decide whether its translation is the "
+            "camera's position in the IMU frame, as in the published files; set dataset.extrinsics if it is known",
         )
     return literal, ()
 
 
-def _explain(verdict: LeverVerdict, t: FloatArray) -> str:
+def _explain(verdict: LeverArmVerdict, t: FloatArray) -> str:
     x, y, z = t
     return (
         f"the translation of cam_T_imu ({x:.2f}, {y:.2f}, {z:.2f}) is the camera's position in the IMU frame, not the "

@@ -1,11 +1,11 @@
 """EuRoC folders in the ASL form: unrectified stereo images, a raw inertial record and ground truth.
 
 `mav0/` holds `cam0 cam1 imu0`, each with `sensor.yaml` and `data.csv`, images in `camN/data/`, and ground truth in
-`state_groundtruth_estimate0/data.csv`. A `groundtruth_tum.txt` beside `mav0` serves as well.
+`state_groundtruth_estimate0/data.csv`. A `groundtruth_tum.txt` beside `mav0` is read as well.
 
 `T_BS` maps sensor coordinates to the body frame. EuRoC's body is the IMU; where the IMU has a `T_BS` of its own, all
-is moved to the IMU's frame. Frames are rectified as they are read: `Recording.camera` and `Recording.T_cam0_imu` are
-those of the rectified left camera.
+poses are transformed to the IMU's frame. Frames are rectified as they are read: `Recording.camera` and
+`Recording.T_cam0_imu` are those of the rectified left camera.
 Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 """
 
@@ -43,23 +43,23 @@ from vio.trajectory_io import read_trajectory
 from vio.watch.clocks import judge_clocks
 
 _PAIRED_NS = 3_000_000  # stamps further apart belong to different exposures
-_JITTER_NS = 1_000_000  # by which the offset between paired stamps may vary around its median
+_JITTER_NS = 1_000_000  # allowed deviation of the offset between paired stamps from its median
 
 
 @dataclass(frozen=True, slots=True)
 class _Camera:
-    """What the folder of one camera says."""
+    """The contents of one camera's folder."""
 
     model: CameraModel
     T_body_cam: FloatArray  # (4, 4)
     times_ns: IntArray  # (N,) strictly increasing
     files: tuple[Path, ...]  # N images
-    renamed: int  # images that carry another extension than their list says
+    renamed: int  # number of images whose extension differs from their list
 
 
 @dataclass(frozen=True, slots=True)
 class _Imu:
-    """What the folder of the IMU says."""
+    """The contents of the IMU's folder."""
 
     T_body_imu: FloatArray  # (4, 4)
     noise: ImuDensities | None
@@ -68,7 +68,7 @@ class _Imu:
 
 
 def is_euroc_folder(path: Path) -> bool:
-    """Say whether a folder holds `mav0`, or is one."""
+    """Return whether a folder holds `mav0`, or is one."""
     return (path / "mav0").is_dir() or any((path / "cam0" / name).is_file() for name in ("sensor.yaml", "data.csv"))
 
 
@@ -77,7 +77,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
 
     Raises:
         DataError: files are missing, lists and clocks are wrong, or no images match; the message names the remedy.
-        CalibrationError: a `sensor.yaml` is missing or cannot be right.
+        CalibrationError: a `sensor.yaml` is missing or invalid.
     """
     mav = _mav(path)
     left, right = (_read_camera(mav / name) for name in ("cam0", "cam1"))
@@ -90,8 +90,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
         (finding,) = judge_clocks(times_ns, np.array([x.time_ns for x in imu.samples], dtype=np.int64))
         raise DataError(
-            f"{mav / 'imu0' / 'data.csv'}: no IMU sample falls into the time of the images; {finding.message}; or take "
-            "imu0 away"
+            f"{mav / 'imu0' / 'data.csv'}: no IMU sample is within the time of the images; {finding.message}; or "
+            "remove imu0"
         )
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
     recording = Recording(
@@ -138,7 +138,7 @@ def _read_camera(folder: Path) -> _Camera:
 
 
 def _find_images(folder: Path, names: Sequence[str], path: Path, lines: Sequence[int]) -> tuple[tuple[Path, ...], int]:
-    """The listed images, and how many of them carry another extension than the list says."""
+    """Return the listed images, and how many have another extension than listed."""
     there = list_images(folder)
     by_name, by_stem = {file.name: file for file in there}, {file.stem: file for file in there}
     found = [by_name.get(name) or by_stem.get(Path(name).stem) for name in names]
@@ -153,7 +153,7 @@ def _find_images(folder: Path, names: Sequence[str], path: Path, lines: Sequence
 
 
 def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray, tuple[str, ...]]:
-    """Indices (F,), (F,) of the left and right images that make a pair, and what there is to say about them.
+    """Indices (F,), (F,) of the left and right images that form pairs, and notes about the pairing.
 
     Raises:
         DataError: no image has a partner.
@@ -167,10 +167,10 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
         )
     notes: list[str] = []
     if renamed := left.renamed + right.renamed:
-        notes.append(f"{renamed} images carry another extension than their data.csv says; taken by their stem")
-    alone = len(left.times_ns) - len(a), len(right.times_ns) - len(b)
-    if any(alone):
-        notes.append(f"{alone[0]} images of cam0 and {alone[1]} of cam1 have no partner and are left out")
+        notes.append(f"{renamed} images have another extension than listed in their data.csv; matched by their stem")
+    unpaired = len(left.times_ns) - len(a), len(right.times_ns) - len(b)
+    if any(unpaired):
+        notes.append(f"{unpaired[0]} images of cam0 and {unpaired[1]} of cam1 have no partner and are skipped")
     offset_ms = float(np.median(right.times_ns[b] - left.times_ns[a])) / 1e6
     if np.any(right.times_ns[b] != left.times_ns[a]):
         notes.append(
@@ -181,7 +181,7 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
 
 
 def pair_stamps(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray, IntArray]:
-    """Indices (F,), (F,) of stamps that belong together: equal ones, or nearest ones at a small, steady offset."""
+    """Indices (F,), (F,) of paired stamps: equal ones, or nearest ones at a small, constant offset."""
     _, equal_a, equal_b = np.intersect1d(left_ns, right_ns, assume_unique=True, return_indices=True)
     b = _nearest(left_ns, right_ns)
     a = np.arange(len(left_ns))
@@ -212,12 +212,12 @@ def _read_imu(folder: Path) -> _Imu:
     if (path := folder / "sensor.yaml").is_file():
         T_body_imu, noise = read_imu_yaml(path)
     else:
-        notes = (f"{path} is missing; the IMU is taken for the body frame, its noise is unknown",)
+        notes = (f"{path} is missing; the IMU is assumed to be the body frame, its noise is unknown",)
     return _Imu(T_body_imu, noise, imu_samples(read_imu_csv(folder / "data.csv")), notes)
 
 
 def _read_reference(mav: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory | None:
-    """Ground truth of the IMU. EuRoC's describes the body; a TUM file may say that it describes the (raw) cam0."""
+    """Read the ground truth of the IMU. EuRoC's describes the body; a TUM file may describe the (raw) cam0."""
     if (path := mav / STATE_CSV).is_file():
         truth = read_trajectory(path, fmt="euroc", body="imu")
     elif (path := mav.absolute().parent / TUM_FILE).is_file():
@@ -237,8 +237,8 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progre
 
     Args:
         dataset: an unrectified EuRoC recording.
-        out: an existing, empty folder; `mav0` is made in it.
-        progress: told after each frame.
+        out: an existing, empty folder; `mav0` is created in it.
+        progress: called after each frame.
 
     Returns:
         The number of frames written.
@@ -248,8 +248,8 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progre
     """
     source, mav = _mav(dataset.recording.path), out / "mav0"
     rig = rig_from_rectified(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
-    sheet = source / "imu0" / "sensor.yaml"
-    T_body_imu = read_imu_yaml(sheet)[0] if sheet.is_file() else np.eye(4)
+    imu_yaml_path = source / "imu0" / "sensor.yaml"
+    T_body_imu = read_imu_yaml(imu_yaml_path)[0] if imu_yaml_path.is_file() else np.eye(4)
     folders = [mav / name for name in ("cam0", "cam1")]
     for folder in folders:
         (folder / "data").mkdir(parents=True)
@@ -269,7 +269,7 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progre
 
 
 def _copy(source: Path, target: Path) -> None:
-    """Copy a file if it is there."""
+    """Copy a file if it exists."""
     if not source.is_file():
         return
     target.parent.mkdir(parents=True, exist_ok=True)

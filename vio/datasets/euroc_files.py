@@ -1,4 +1,4 @@
-"""The files of an EuRoC (ASL) folder, both ways: `sensor.yaml` of cameras and IMU, and the `data.csv` of each sensor.
+"""Read and write the files of an EuRoC (ASL) folder: `sensor.yaml` and `data.csv` of cameras and IMU.
 
 Times are integer nanoseconds; numbers are written with all their digits. `T_BS` maps sensor coordinates to the body.
 Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
@@ -56,23 +56,23 @@ def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
     Raises:
         CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
     """
-    sheet = _read_yaml(path)
-    if (kind := sheet.get("camera_model", "pinhole")) != "pinhole":
+    entries = _read_yaml(path)
+    if (kind := entries.get("camera_model", "pinhole")) != "pinhole":
         raise CalibrationError(f"{path}: camera_model {kind!r} is not supported; only 'pinhole' is (with distortion)")
-    name = sheet.get("distortion_model", "none")
+    name = entries.get("distortion_model", "none")
     if not isinstance(name, str) or name not in DISTORTION_MODELS:
         raise CalibrationError(
             f"{path}: distortion_model {name!r} is unknown; the known ones are {', '.join(DISTORTION_MODELS)}"
         )
     model = DISTORTION_MODELS[name]
-    coefficients = () if model == "pinhole" else _numbers(sheet, "distortion_coefficients", path)
+    coefficients = () if model == "pinhole" else _numbers(entries, "distortion_coefficients", path)
     if model == "radtan" and not any(coefficients):
         model, coefficients = "pinhole", ()
-    fu, fv, cu, cv = _numbers(sheet, "intrinsics", path, 4)
-    width, height = image_size(_numbers(sheet, "resolution", path, 2), f"{path}, resolution")
+    fu, fv, cu, cv = _numbers(entries, "intrinsics", path, 4)
+    width, height = image_size(_numbers(entries, "resolution", path, 2), f"{path}, resolution")
     with naming(path):
         camera = CameraModel(fu, fv, cu, cv, width, height, model, coefficients)
-    return camera, _T_BS(sheet, path)
+    return camera, _T_BS(entries, path)
 
 
 def camera_yaml(camera: CameraModel, T_body_cam: FloatArray, *, comment: str, rate_hz: float) -> str:
@@ -89,20 +89,20 @@ def camera_yaml(camera: CameraModel, T_body_cam: FloatArray, *, comment: str, ra
 
 
 def read_imu_yaml(path: Path) -> tuple[FloatArray, ImuDensities | None]:
-    """Read the IMU's `sensor.yaml`: its `T_BS` (4, 4) to the body, and its noise where that is stated.
+    """Read the IMU's `sensor.yaml`: its `T_BS` (4, 4) to the body, and its noise where given.
 
     Raises:
         CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
     """
-    sheet = _read_yaml(path)
-    return _T_BS(sheet, path), _noise(sheet, path)
+    entries = _read_yaml(path)
+    return _T_BS(entries, path), _noise(entries, path)
 
 
-def _noise(sheet: Mapping[str, object], path: Path) -> ImuDensities | None:
-    """The noise figures; None where none is stated."""
-    if not any(key in sheet for key in _NOISE):
+def _noise(entries: Mapping[str, object], path: Path) -> ImuDensities | None:
+    """Return the noise densities; None where none is given."""
+    if not any(key in entries for key in _NOISE):
         return None
-    values = [_numbers(sheet, key, path, 1)[0] for key in _NOISE]
+    values = [_numbers(entries, key, path, 1)[0] for key in _NOISE]
     for key, value in zip(_NOISE, values, strict=True):
         if not value > 0:
             raise CalibrationError(f"{path}: {key} is {value:g}; a noise density must be positive")
@@ -120,7 +120,7 @@ def imu_yaml(T_body_imu: FloatArray, noise: ImuDensities, *, comment: str, rate_
 
 
 def median_rate_hz(times_ns: IntArray) -> float:
-    """How often a sensor reported by its times (N,); a single time tells no rate, and gives 0."""
+    """Return the median rate of sample times (N,); 0 for a single time."""
     return NS_PER_S / float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
 
 
@@ -130,37 +130,37 @@ def _read_yaml(path: Path) -> Mapping[str, object]:
     # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
     lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
     try:
-        sheet = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
+        entries = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
     except yaml.YAMLError as error:
         raise CalibrationError(f"{path}: not a YAML file ({' '.join(str(error).split())}); copy it again") from error
-    if not isinstance(sheet, dict):
+    if not isinstance(entries, dict):
         raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
-    return sheet
+    return entries
 
 
 def _number(value: object) -> float:
-    """A number as YAML or csv has it (PyYAML takes 1e-3 for text); NaN where it is none."""
+    """Parse a number from YAML or csv (PyYAML reads 1e-3 as text); NaN where it is none."""
     try:
         return float(value) if isinstance(value, (int, float, str)) else float("nan")
     except ValueError:
         return float("nan")
 
 
-def _numbers(sheet: Mapping[str, object], key: str, path: Path, count: int | None = None) -> tuple[float, ...]:
-    """A list of finite numbers, or a lone one."""
-    if key not in sheet:
+def _numbers(entries: Mapping[str, object], key: str, path: Path, count: int | None = None) -> tuple[float, ...]:
+    """Return a list of finite numbers, or a single one as a list."""
+    if key not in entries:
         raise CalibrationError(f"{path}: has no entry '{key}'; copy the calibration again")
-    value = sheet[key]
+    value = entries[key]
     numbers = tuple(_number(v) for v in (value if isinstance(value, list) else [value]))
     if (count is not None and len(numbers) != count) or not np.all(np.isfinite(numbers)):
         wanted = "finite numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
-        raise CalibrationError(f"{path}: '{key}' is {value!r} where {wanted} belong")
+        raise CalibrationError(f"{path}: '{key}' is {value!r} instead of {wanted}")
     return numbers
 
 
-def _T_BS(sheet: Mapping[str, object], path: Path) -> FloatArray:
-    """The transform from the sensor to the body, as an OpenCV matrix or as a list of rows."""
-    entry = sheet.get("T_BS")
+def _T_BS(entries: Mapping[str, object], path: Path) -> FloatArray:
+    """Read the transform from the sensor to the body, given as an OpenCV matrix or a list of rows."""
+    entry = entries.get("T_BS")
     values = entry.get("data") if isinstance(entry, dict) else entry
     if isinstance(values, list) and all(isinstance(row, list) for row in values):
         values = [value for row in values for value in row]
@@ -186,7 +186,7 @@ def read_imu_csv(path: Path) -> ImuRecord:
     """Read `timestamp [ns], gyro x y z [rad/s], accel x y z [m/s^2]`.
 
     Raises:
-        DataError: a line has not seven finite numbers, or the clock does not increase; the message names the line.
+        DataError: a line lacks seven finite numbers, or the clock does not increase; the message names the line.
     """
     times_ns, rows, lines = stamped_rows(path, 7, "timestamp [ns], gyro x y z, accel x y z")
     try:
@@ -227,10 +227,10 @@ def _stamped_csv(header: str, times_ns: IntArray, values: FloatArray) -> str:
 
 
 def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[list[str]], list[int]]:
-    """Times (N,) of a csv, its other fields, and the lines they stood in; lines that begin with '#' are let be.
+    """Return the times (N,) of a csv, its other fields, and their line numbers; '#' comment lines are skipped.
 
     Raises:
-        DataError: the file is missing or empty, a line has other fields, or the clock does not increase.
+        DataError: the file is missing or empty, a line has a wrong number of fields, or the clock does not increase.
     """
     times: list[int] = []
     rows: list[list[str]] = []
@@ -240,7 +240,7 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[li
             continue
         fields = [field.strip() for field in line.split(",")]
         if len(fields) != columns:
-            raise DataError(f"{path}, line {number}: {len(fields)} values where {columns} belong ({form})")
+            raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})")
         if not re.fullmatch(r"\d{1,19}", fields[0]) or int(fields[0]) > INT64_MAX:
             raise DataError(f"{path}, line {number}: {fields[0]!r} is no time in whole nanoseconds ({form})")
         times.append(int(fields[0]))

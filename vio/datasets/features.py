@@ -1,4 +1,4 @@
-"""A recording whose features are known: no images, observations and motion samples from memory."""
+"""A recording of precomputed features: no images, observations and motion samples in memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vio.records import BoolArray, Event, FeatureTracks, IntArray, MotionSample,
 
 @dataclass(frozen=True, slots=True)
 class SensorVariances:
-    """Noise that the recording's makers measured."""
+    """Noise variances supplied with the recording."""
 
     linear: FloatArray  # (3,) (m/s)^2
     angular: FloatArray  # (3,) (rad/s)^2
@@ -29,11 +29,11 @@ class FeatureDataset:
     tracks: FeatureTracks
     motion: tuple[MotionSample, ...]  # in time order
     present: IntArray  # (P,) numbers of the frames that events may yield, increasing
-    stale_frames: BoolArray  # (F,) more than half of the tracks that go on repeat their pixels while moving
+    stale_frames: BoolArray  # (F,) more than half of the continued tracks repeat their pixels while moving
     variances: SensorVariances | None = None
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
-        """Yield events of the frames `start <= index < stop` in time order; there are no images to give.
+        """Yield events of the frames `start <= index < stop` in time order, without images.
 
         Raises:
             DataError: the range holds no frame.
@@ -45,6 +45,6 @@ class FeatureDataset:
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def observations(self, index: int) -> Observations | None:
-        """Return the features of one frame; none were kept of a frame that events leave out."""
+        """Return the features of one frame; none for a frame that events omit."""
         chosen = frame_range(self.recording, index, index + 1)
         return self.tracks.at(chosen.start, int(self.recording.frame_times_ns[chosen.start]))

@@ -1,4 +1,4 @@
-"""Recordings made of two folders of image files: pairs by name, read ahead, a few unreadable ones left out."""
+"""Recordings of two image folders: paired by name, prefetched, with a few unreadable frames skipped."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ImagePairs = tuple[tuple[Path, Path], ...]  # left and right image of each frame
 
 
 def pair_images(left: Path, right: Path) -> ImagePairs:
-    """The image files of two folders, paired by name.
+    """Pair the image files of two folders by name.
 
     Raises:
         DataError: a file lacks its partner; the message gives both counts and names the first one.
@@ -38,7 +38,7 @@ def pair_images(left: Path, right: Path) -> ImagePairs:
 
 @dataclass(frozen=True, slots=True)
 class BadFrame:
-    """A frame with an unreadable image, and why."""
+    """A frame with an unreadable image, and the reason."""
 
     index: int
     why: str
@@ -47,7 +47,7 @@ class BadFrame:
 def readable_frames(
     load: Callable[[int], StereoFrame | BadFrame], chosen: Iterable[int], settings: DatasetSettings
 ) -> Generator[StereoFrame]:
-    """Load frames ahead in a thread, leaving unreadable ones out with a warning up to the limit of the settings.
+    """Prefetch frames in a thread, and skip unreadable ones with a warning up to the limit of the settings.
 
     Raises:
         DataError: too many frames are unreadable, or whatever `load` raises.
@@ -70,7 +70,7 @@ def first_readable(pairs: ImagePairs, max_bad_frames: int) -> tuple[Path, Image,
     """The first left image that can be read: its file, its pixels (H, W) and its bits per channel.
 
     Raises:
-        UnreadableImageError: more than `max_bad_frames` before it cannot, or none can.
+        UnreadableImageError: the first `max_bad_frames` images are all unreadable.
     """
     for path, _ in pairs[:max_bad_frames]:
         with contextlib.suppress(UnreadableImageError):
@@ -91,7 +91,7 @@ class ImageSize:
         """Raise DataError unless an image (H, W) has this size."""
         if image.shape != (self.height, self.width):
             raise DataError(
-                f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} says {self.width} x "
+                f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} specifies {self.width} x "
                 f"{self.height}; give images of one size, and the calibration of these images"
             )
 
@@ -109,7 +109,7 @@ class ImageDataset:
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
 
-        A frame with an unreadable image is left out with a warning, up to `max_bad_frames` of them.
+        A frame with an unreadable image is skipped with a warning, up to `max_bad_frames` of them.
 
         Raises:
             DataError: the range holds no frame, an image has another size, or too many are unreadable.
@@ -126,7 +126,7 @@ class ImageDataset:
         return None
 
     def prepared(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Return what becomes of a pair as it lies in the files (H, W each): itself, as it is rectified."""
+        """Preprocess a pair as read from the files (H, W each); returned unchanged, as it is rectified."""
         return left, right
 
     def _frame(self, index: int, left: Image | None, right: Image | None) -> StereoFrame:

@@ -1,7 +1,7 @@
-"""Gray image files: read strictly and ahead of time, and written.
+"""Read gray image files with strict checks and prefetching, and write them.
 
-OpenCV fills what a truncated file lacks with gray and reports nothing, so a file's end is checked before it is
-decoded.
+OpenCV fills the missing part of a truncated file with gray and reports no error, so a file's end is checked before it
+is decoded.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ Loaded = TypeVar("Loaded")
 
 
 class UnreadableImageError(DataError):
-    """One image file is missing, truncated or damaged; a reader may skip its frame."""
+    """An image file is missing, truncated or corrupt; a reader may skip its frame."""
 
 
 def load_gray(path: Path) -> tuple[Image, int]:
     """Read a PNG or JPEG as 8-bit gray (H, W); return it with the file's own bits per channel (8 or 16).
 
-    Colour is turned to gray with OpenCV's weights (.299 R + .587 G + .114 B); 16 bits are scaled to 8 by 1/257.
+    Colour is converted to gray with OpenCV's weights (.299 R + .587 G + .114 B); 16 bits are scaled to 8 by 1/257.
 
     Raises:
         UnreadableImageError: the file cannot be read, is truncated, or does not decode.
@@ -64,7 +64,7 @@ def load_gray(path: Path) -> tuple[Image, int]:
 
 
 def write_png(path: Path, image: Image) -> None:
-    """Write a gray image (H, W) as PNG, quickly rather than small."""
+    """Write a gray image (H, W) as PNG, with fast compression."""
     import cv2
 
     _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
@@ -72,7 +72,7 @@ def write_png(path: Path, image: Image) -> None:
 
 
 def _damage(data: bytes) -> str | None:
-    """What is wrong with an encoded image, in words; None: it is whole."""
+    """Describe the damage of an encoded image; None: it is complete."""
     if not data:
         return "the file is empty"
     if data.startswith(_PNG_START):
@@ -83,7 +83,7 @@ def _damage(data: bytes) -> str | None:
 
 
 def _png_damage(data: bytes) -> str | None:
-    """Walk the chunks up to IEND and check their sums. Reference: PNG specification (W3C), section 5."""
+    """Check the chunks up to IEND and their checksums. Reference: PNG specification (W3C), section 5."""
     at = len(_PNG_START)
     while at + 12 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, at)
@@ -91,7 +91,7 @@ def _png_damage(data: bytes) -> str | None:
         if end > len(data):
             break
         if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
-            return f"the PNG is damaged (wrong check sum in its {kind.decode('latin-1')!r} chunk)"
+            return f"the PNG is damaged (wrong checksum in its {kind.decode('latin-1')!r} chunk)"
         if kind == b"IEND":
             return None
         at = end
@@ -118,7 +118,7 @@ def list_images(folder: Path) -> tuple[Path, ...]:
 def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) -> Generator[Loaded]:
     """Yield `load(item)` in order, loading up to `depth` items ahead in one thread; 0 loads in the caller's.
 
-    What `load` raises reaches the caller at its item. Closing the generator drops what waits and ends the thread.
+    An exception of `load` is raised at its item. Closing the generator drops pending items and ends the thread.
     """
     if depth <= 0:
         yield from map(load, items)

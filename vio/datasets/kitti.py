@@ -1,11 +1,11 @@
-"""KITTI odometry folders: the official layout, and a self-contained one with our small extras.
+"""KITTI odometry folders: the official layout, and a self-contained one with motion and extrinsics.
 
 Official: `sequences/NN/` with `image_0 image_1 calib.txt times.txt` (and `image_2 image_3` in colour), poses in
 `../../poses/NN.txt`. Self-contained: the same folder with, when present, `poses.txt`, `velocity.csv` (body velocity
 and angular rate in the IMU frame) and `T_cam0_imu.txt`.
 
 KITTI's poses and `T_cam0_imu.txt` describe camera 0. Where the colour pair is used, the left camera is camera 2, some
-6 cm beside it, and what this reader calls cam0 is the camera used: both are moved over.
+6 cm beside it, and this reader's cam0 is the camera used: both are transformed to it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from vio.trajectory_io import read_trajectory
 
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 _GRAY, _COLOUR = (0, 1), (2, 3)
-_RECTIFIED = 0.02  # share of the baseline by which the right camera may lie off the left one's x axis
-_NOTED_M = 1e-3  # an offset off that axis worth a word
+_RECTIFIED = 0.02  # allowed offset of the right camera from the left one's x axis, as a share of the baseline
+_OFF_AXIS_NOTE_M = 1e-3  # an offset from that axis above this is noted
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
 
     Raises:
         DataError: files are missing, counts differ or a clock is wrong; the message names file and remedy.
-        CalibrationError: the calibration is missing or cannot be right.
+        CalibrationError: the calibration is missing or invalid.
     """
     cameras = _choose_cameras(path, settings.colour)
     calibration = read_calibration(path / "calib.txt", cameras)
@@ -56,14 +56,14 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     T_cam0_imu = read_extrinsics(path / "T_cam0_imu.txt")
     if motion and T_cam0_imu is None:
         raise CalibrationError(
-            f"{path}: velocity.csv stands without T_cam0_imu.txt, the transform from the IMU to camera 0; add it, or "
-            "take velocity.csv away to use the images alone"
+            f"{path}: velocity.csv needs T_cam0_imu.txt, the transform from the IMU to camera 0; add it, or "
+            "remove velocity.csv to use the images alone"
         )
     notes = [] if bits == 8 else [f"images have {bits} bits ({measured.name}); scaled to 8 bits by 1/257"]
-    if calibration.off_axis_m > _NOTED_M:
+    if calibration.off_axis_m > _OFF_AXIS_NOTE_M:
         notes.append(
-            f"the camera of image_{cameras[1]} lies {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of "
-            f"image_{cameras[0]}; the pair is taken as rectified all the same"
+            f"the camera of image_{cameras[1]} is {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of "
+            f"image_{cameras[0]}; the pair is treated as rectified anyway"
         )
     recording = Recording(
         kind="kitti",
@@ -80,7 +80,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
 
 
 def is_kitti_folder(path: Path) -> bool:
-    """Say whether a folder looks like a KITTI sequence."""
+    """Return whether a folder looks like a KITTI sequence."""
     return (path / "image_0").is_dir() or (path / "image_2").is_dir() or (path / "calib.txt").is_file()
 
 
@@ -95,7 +95,7 @@ def _choose_cameras(path: Path, colour: bool | None) -> tuple[int, int]:
 
 
 def read_calibration(path: Path, cameras: tuple[int, int]) -> _Calibration:
-    """Read `P0: … P1: …` (12 numbers each, other lines are let be) for a left and a right camera.
+    """Read `P0: … P1: …` (12 numbers each, other lines are ignored) for a left and a right camera.
 
     Raises:
         CalibrationError: the file or a matrix is missing, malformed, or describes no rectified pair.
@@ -111,8 +111,8 @@ def read_calibration(path: Path, cameras: tuple[int, int]) -> _Calibration:
     x, y, z = offsets[0] - offsets[1]  # the right camera in the left camera's frame
     if not x > 0:
         raise CalibrationError(
-            f"{path}: {names} give a stereo baseline of {x:g} m; it must be positive (the right camera's fourth column "
-            "is -focal * baseline), so check for equal or exchanged matrices"
+            f"{path}: {names} imply a stereo baseline of {x:g} m; it must be positive (the right camera's fourth "
+            "column is -focal * baseline), so check for equal or exchanged matrices"
         )
     off_axis = float(np.hypot(y, z))
     if off_axis > _RECTIFIED * x:
@@ -125,7 +125,7 @@ def read_calibration(path: Path, cameras: tuple[int, int]) -> _Calibration:
 
 
 def _projection(path: Path, name: str) -> FloatArray:
-    """One projection matrix (3, 4) `K [I | t]`."""
+    """Read one projection matrix (3, 4) `K [I | t]`."""
     found = [(number, line.split(":", 1)[1]) for number, line in text_lines(path) if line.startswith(f"{name}:")]
     if len(found) != 1:
         raise CalibrationError(f"{path}: {len(found)} lines begin with '{name}:'; exactly one must")
@@ -163,13 +163,13 @@ def _read_velocity(path: Path, frame_times_ns: IntArray) -> tuple[VelocitySample
     times_ns = clock_ns(table[:, 0], lambda k: f"{path}, line {k + 2}")
     if not len(times_ns) or times_ns[-1] < frame_times_ns[0] or times_ns[0] > frame_times_ns[-1]:
         raise DataError(
-            f"{path}: no velocity falls into the time of the images (times.txt); use the same clock for both"
+            f"{path}: no velocity is within the time of the images (times.txt); use the same clock for both"
         )
     return velocity_samples(times_ns, table[:, 1:4], table[:, 4:])
 
 
 def read_extrinsics(path: Path) -> FloatArray | None:
-    """`T_cam0_imu` as three or four lines of four numbers, or one line of 12."""
+    """Read `T_cam0_imu` from three or four lines of four numbers, or one line of 12."""
     if not path.is_file():
         return None
     lines = text_lines(path)
@@ -182,7 +182,7 @@ def read_extrinsics(path: Path) -> FloatArray | None:
 
 
 def _read_reference(path: Path, times_ns: IntArray, T_left_cam0: FloatArray) -> Trajectory | None:
-    """Ground truth of camera 0, moved to the left camera; the world moves along, so that identity stays identity."""
+    """Read the ground truth of camera 0 and move it, and the world, to the left camera; identity stays identity."""
     absolute = path.absolute()
     candidates = [path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"]
     file = next((candidate for candidate in candidates if candidate.is_file()), None)

@@ -2,9 +2,9 @@
 
 `DRIVE/image_00/data/0000000000.png`, `DRIVE/image_01/data/…`, and `calib_cam_to_cam.txt calib_velo_to_cam.txt
 calib_imu_to_velo.txt` in the drive or a folder above it, as KITTI lays them out by date. The drives named `_extract`
-are unrectified: they are rectified as they are read, with rotations of our own (`R_rect_00` and `P_rect_00` belong to
-KITTI's). The drives named `_sync` are rectified already, and taken with `P_rect_00`, `P_rect_01` and `R_rect_00`; the
-size of the images tells one from the other.
+are unrectified: they are rectified as they are read, with rotations computed here (`R_rect_00` and `P_rect_00` belong
+to KITTI's). The drives named `_sync` are rectified already, and used with `P_rect_00`, `P_rect_01` and `R_rect_00`; the
+image size distinguishes the two.
 
 In KITTI's files `R_0k`, `T_0k` map coordinates of camera 0 to camera k. The IMU's record (`oxts`) is not read.
 Reference: Geiger et al., Vision meets robotics: the KITTI dataset (2013).
@@ -38,7 +38,7 @@ IMU = "calib_imu_to_velo.txt"
 _FRAME_NS = 100_000_000
 _MAX_PARENTS = 3
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
-_MAX_SINCE = timedelta(days=100_000)  # nanoseconds then still fit 64 bits
+_MAX_SINCE = timedelta(days=100_000)  # so that nanoseconds fit 64 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class KittiRawCalibration:
 
 
 def is_kitti_raw_folder(path: Path) -> bool:
-    """Say whether a folder looks like a drive of KITTI raw."""
+    """Return whether a folder looks like a KITTI raw drive."""
     return (path / "image_00").is_dir()
 
 
@@ -65,7 +65,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
 
     Raises:
         DataError: images are missing, counts differ or a clock is wrong; the message names file and remedy.
-        CalibrationError: the calibration is missing or cannot be right.
+        CalibrationError: the calibration is missing or invalid.
     """
     for name in ("image_00", "image_01"):
         if not (path / name / "data").is_dir():
@@ -99,7 +99,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
 
 
 def _find(path: Path, name: str) -> Path | None:
-    """A calibration file in a folder or in those above it."""
+    """Find a calibration file in a folder or its parents."""
     absolute = path.absolute()
     folders = [absolute, *absolute.parents[:_MAX_PARENTS]]
     return next((folder / name for folder in folders if (folder / name).is_file()), None)
@@ -112,7 +112,7 @@ def _rectifier(
     settings: DatasetSettings,
     where: Path,
 ) -> Rectifier:
-    """Rectify raw images; pass those through that KITTI has rectified, which their size betrays."""
+    """Build the rectifier of raw images; images of the rectified size pass through unchanged."""
     c = calibration
     T_imu_cam0 = np.eye(4) if T_cam0_imu is None else se3_inverse(T_cam0_imu)
     raw, rectified = (c.cam0.width, c.cam0.height), (c.rect0.width, c.rect0.height)
@@ -189,7 +189,7 @@ def _rotation(entries: Mapping[str, str], name: str, path: Path) -> FloatArray:
 
 
 def _read_imu_pose(path: Path) -> tuple[FloatArray | None, tuple[str, ...]]:
-    """`T_cam0_imu` (4, 4) of the raw camera 0, by way of the laser scanner; None where a file is missing."""
+    """`T_cam0_imu` (4, 4) of the raw camera 0, through the laser scanner's frame; None where a file is missing."""
     velo, imu = _find(path, VELO), _find(path, IMU)
     if velo is None or imu is None:
         lacking = " and ".join(name for name, found in ((VELO, velo), (IMU, imu)) if found is None)
@@ -205,7 +205,7 @@ def _read_rigid(path: Path) -> FloatArray:
 
 
 def _read_entries(path: Path) -> dict[str, str]:
-    """The lines `name: values`.
+    """Read the lines `name: values`.
 
     Raises:
         CalibrationError: a line is of another form, or a name occurs twice.
@@ -232,7 +232,7 @@ def _entry(entries: Mapping[str, str], name: str, count: int, path: Path) -> Flo
 
 
 def _frame_numbers(pairs: ImagePairs) -> IntArray:
-    """The numbers (F,) that the images are named by."""
+    """Read the frame numbers (F,) from the image names."""
     bad = next((left for left, _ in pairs if not re.fullmatch(r"\d{1,18}", left.stem)), None)
     if bad is not None:
         raise DataError(f"{bad}: an image of KITTI raw is named by its frame number (0000000000.png); rename it")
@@ -247,7 +247,7 @@ def _frame_numbers(pairs: ImagePairs) -> IntArray:
 
 
 def _read_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...]]:
-    """Times (F,) of the images, and a note where they had to be made up."""
+    """Return times (F,) of the images, and a note where they follow from the frame numbers."""
     if not path.is_file():
         note = f"{path} is missing; times follow from the frame numbers at 10 Hz"
         return numbers * _FRAME_NS, (note,)
@@ -266,7 +266,7 @@ def _read_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...
 
 
 def _parse_time(text: str, path: Path, number: int) -> int:
-    """Nanoseconds since 1970 of '2011-09-26 14:02:25.951199337', taken as UTC."""
+    """Parse '2011-09-26 14:02:25.951199337' as UTC, to nanoseconds since 1970."""
     whole, _, fraction = text.strip().partition(".")
     try:
         since = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc) - _EPOCH
@@ -288,7 +288,7 @@ def write_rectified_kitti(dataset: RectifiedDataset, out: Path, progress: Progre
     Args:
         dataset: an unrectified drive.
         out: an existing, empty folder.
-        progress: told after each frame.
+        progress: called after each frame.
 
     Returns:
         The number of frames written.

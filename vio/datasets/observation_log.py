@@ -1,7 +1,7 @@
-"""Our own log of a run's observations and motion samples: a source of its own, replayed to the bit.
+"""The log of a run's observations and motion samples: a source that replays to the bit.
 
-One `.npz` without pickle. The rows of all frames lie one behind the other, `offsets` parts them. What the recording
-lacks (extrinsics, reference, …) is absent from the archive, never coded by a special number.
+One `.npz` without pickle. The rows of all frames are concatenated; `offsets` separates them. Data that the recording
+lacks (extrinsics, reference, …) are absent from the archive, never coded by a special number.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _REQUIRED: dict[str, tuple[str, int]] = {  # array kinds (numpy's letters) and d
     "motion_is_imu": ("b", 1),
     "motion_values": ("f", 2),
 }
-_GROUPS = {  # what must stand together
+_GROUPS = {  # keys that need others
     "reference_T_world_body": ("reference_body",),
     "landmark_ids": ("landmark_p_world", "landmark_covariance"),
 }
@@ -64,16 +64,16 @@ def write_observation_log(
     observations: Sequence[Observations],
     motion_samples: Sequence[MotionSample],
 ) -> None:
-    """Write the observations of a run and the motion samples that it took, whole or not at all, to the bit.
+    """Write the observations of a run and its motion samples atomically, exact to the bit.
 
     Args:
-        path: the file to make; its folder must exist.
-        recording: what was run on.
+        path: the file to write; its folder must exist.
+        recording: the source of the run.
         observations: one record for each processed frame, in time order.
-        motion_samples: every sample that the estimator was given, in time order.
+        motion_samples: every sample that the estimator received, in time order.
 
     Raises:
-        DataError: the place cannot be written.
+        DataError: the file cannot be written.
         ValueError: observations disagree with the recording's frames, or are out of order.
     """
     frames = np.array([o.frame_index for o in observations], dtype=np.int64)
@@ -138,7 +138,7 @@ def _optional_arrays(recording: Recording) -> dict[str, np.ndarray]:
 
 
 def is_observation_log(names: Sequence[str]) -> bool:
-    """Say whether the member names of an `.npz` are those of a log."""
+    """Return whether the member names of an `.npz` are those of a log."""
     return {"format", "version", "offsets"} <= set(names)
 
 
@@ -146,7 +146,7 @@ def read_observation_log(path: Path) -> FeatureDataset:
     """Read a log; frames that were not processed when it was written yield no event.
 
     Raises:
-        DataError: no such log, made by a newer version, or inconsistent.
+        DataError: the file is no log, was written by a newer version, or is inconsistent.
     """
     arrays = read_npz(path)
     _check_format(arrays, path)
@@ -184,18 +184,18 @@ def _check_format(arrays: Mapping[str, np.ndarray], path: Path) -> None:
             raise DataError(f"{path}: the observation log lacks {key}; write it again")
         if arrays[key].dtype.kind != kind or arrays[key].ndim != dimensions:
             raise DataError(f"{path}: {key} of the observation log has type {arrays[key].dtype}, {arrays[key].ndim}-D")
-    if problem := _disagreement(arrays):
+    if problem := _inconsistency(arrays):
         raise DataError(f"{path}: the observation log is inconsistent: {problem}; write it again")
 
 
-def _disagreement(arrays: Mapping[str, np.ndarray]) -> str | None:
-    """What does not fit together, in words."""
+def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
+    """Describe an inconsistency; None: there is none."""
     rows, offsets, frames = len(arrays["ids"]), arrays["offsets"], arrays["frame_indices"]
     times_ns, samples = arrays["frame_times_ns"], len(arrays["motion_times_ns"])
     if arrays["z"].shape != (rows, 4) or len(arrays["has_right"]) != rows or len(arrays["stale"]) != rows:
         return f"{rows} ids, but z is {arrays['z'].shape} with {len(arrays['stale'])} stale marks"
     if len(offsets) != len(frames) + 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) < 0).any():
-        return f"the offsets do not part {rows} rows into {len(frames)} frames"
+        return f"the offsets do not split {rows} rows into {len(frames)} frames"
     if (np.diff(times_ns) <= 0).any() or (np.diff(arrays["motion_times_ns"]) < 0).any():
         return "a clock does not increase"
     if len(frames) and (frames[0] < 0 or frames[-1] >= len(times_ns) or (np.diff(frames) <= 0).any()):
@@ -206,7 +206,7 @@ def _disagreement(arrays: Mapping[str, np.ndarray]) -> str | None:
         return "the camera is incomplete"
     for first, group in _GROUPS.items():
         if first in arrays and any(key not in arrays for key in group):
-            return f"{first} stands without {' '.join(key for key in group if key not in arrays)}"
+            return f"{first} lacks {' '.join(key for key in group if key not in arrays)}"
     poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
     stamps = [len(arrays[key]) for key in ("reference_times_ns", "reference_frame_indices") if key in arrays]
     if poses.shape[1:] != (4, 4) or any(count != len(poses) for count in stamps):
@@ -224,7 +224,7 @@ def _extrinsics(arrays: Mapping[str, np.ndarray], path: Path) -> FloatArray | No
     if "T_cam0_imu" not in arrays:
         return None
     checked_transform(arrays["T_cam0_imu"], f"{path}, T_cam0_imu")
-    return arrays["T_cam0_imu"]  # the written bits, not the mended ones
+    return arrays["T_cam0_imu"]  # the stored bits, not the orthonormalised ones
 
 
 def _motion_samples(arrays: Mapping[str, np.ndarray]) -> tuple[MotionSample, ...]:

@@ -23,7 +23,7 @@ from vio.records import Image, ImuDensities, IntArray, StereoFrame
 
 @dataclass(frozen=True, slots=True)
 class Rectifier:
-    """How raw images of a rig become rectified ones."""
+    """The rectification of a rig's raw images."""
 
     rig: StereoRig
     camera: StereoCamera  # rectified
@@ -32,22 +32,22 @@ class Rectifier:
     interpolation: Interpolation
 
     def __call__(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Rectify one raw pair, each image (H, W) as large as its camera's."""
+        """Rectify one raw pair, each image (H, W) of its camera's size."""
         if self.maps is None:
             return left, right
         return _remap(left, self.maps[0], self.interpolation), _remap(right, self.maps[1], self.interpolation)
 
 
 def make_rectifier(rig: StereoRig, interpolation: Interpolation, where: Path) -> Rectifier:
-    """Prepare the rectification of a rig; one that is rectified already is passed through untouched.
+    """Prepare the rectification of a rig; a rig that is rectified already passes images through unchanged.
 
     Args:
         rig: both cameras as calibrated.
         interpolation: how gray values between pixels are found.
-        where: the calibration's place, for messages.
+        where: the calibration file, for messages.
 
     Raises:
-        CalibrationError: the cameras coincide, look apart, are swapped, or share no field of view.
+        CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
     """
     if (pair := rectified_pair(rig)) is not None:
         return Rectifier(rig, pair, se3_inverse(rig.T_imu_cam0), None, interpolation)
@@ -57,7 +57,7 @@ def make_rectifier(rig: StereoRig, interpolation: Interpolation, where: Path) ->
 
 
 def rig_sizes(rig: StereoRig, calibrated_in: tuple[Path, Path]) -> tuple[ImageSize, ImageSize]:
-    """The sizes of left and right files that a rig is calibrated for, and which file says so."""
+    """Return the calibrated sizes of left and right images, and the files that specify them."""
     left, right = calibrated_in
     return ImageSize(rig.cam0.width, rig.cam0.height, left), ImageSize(rig.cam1.width, rig.cam1.height, right)
 
@@ -66,7 +66,7 @@ def _remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpo
     import cv2
 
     codes = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos4": cv2.INTER_LANCZOS4}
-    # The maps stay inside the image, so the border is met by the outermost taps of the interpolation only.
+    # The maps stay inside the image, so only the outermost taps of the interpolation reach the border.
     out = cv2.remap(image, maps[0], maps[1], codes[interpolation], borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(out, dtype=np.uint8)
 
@@ -79,12 +79,12 @@ class RectifiedDataset(ImageDataset):
     imu_noise: ImuDensities | None = None
 
     def prepared(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Rectify one raw pair, each image (H, W) as large as its camera's."""
+        """Rectify one raw pair, each image (H, W) of its camera's size."""
         return self.rectifier(left, right)
 
 
-def refuse_rectified(dataset: RectifiedDataset) -> None:
-    """Raise DataError where a recording is rectified already, so that rectifying it would only copy it."""
+def check_not_rectified(dataset: RectifiedDataset) -> None:
+    """Raise DataError if a recording is rectified already, as rectifying would only copy it."""
     if dataset.rectifier.maps is None:
         raise DataError(
             f"{dataset.recording.path} is rectified already (equal pinhole cameras, rows aligned): there is nothing to "
@@ -98,9 +98,9 @@ def write_frames(
     """Write every readable frame as two PNG files; return the times (N,) of those written.
 
     Args:
-        dataset: what to rectify.
+        dataset: the recording to rectify.
         name: the two files of a frame, given the frame and how many were written before it; folders must exist.
-        progress: told after each frame.
+        progress: called after each frame.
 
     Raises:
         DataError: too many images are unreadable, or one has the wrong size.

@@ -24,22 +24,22 @@ class DatasetSettings(Section):
     )
     extrinsics: ExtrinsicsMode = setting(
         "auto",
-        "ECE276A files: the translation of cam_T_imu as it stands (literal), read as the camera's position in the "
+        "ECE276A files: the translation of cam_T_imu as stored (literal), read as the camera's position in the "
         "IMU frame (corrected), or whichever the file's own velocities and features support (auto)",
     )
     repeated_tracks: RepeatsMode = setting(
         "auto",
         "feature files, rows that repeat old pixels while the vehicle moves: mark them stale and give the track a new "
-        "id from there on (split), mark them and keep the id (flag), take them at their word (literal), or judge by "
-        "the motion of the pixels afterwards whether the track changed its point (auto: split if so, else flag)",
+        "id from there on (split), mark them and keep the id (flag), use them as they are (literal), or decide by the "
+        "motion of the pixels afterwards whether the track switched to another point (auto: split if so, else flag)",
     )
     interpolation: Interpolation = setting(
         "linear",
-        "unrectified images: how gray values between pixels are found in rectifying (cubic and lanczos4 cost 5 and 15 "
-        "times as much for hardly better tracks)",
+        "unrectified images: how gray values between pixels are interpolated in rectifying (cubic and lanczos4 cost 5 "
+        "and 15 times as much for barely better tracks)",
     )
     max_bad_frames: int = setting(
-        5, "image folders: unreadable stereo frames skipped before the reader gives up", at_least=0
+        5, "image folders: unreadable stereo frames skipped before the reader stops with an error", at_least=0
     )
     prefetch_frames: int = setting(
         4, "image folders: stereo frames decoded ahead in a thread; 0: no thread", at_least=0, at_most=1000

@@ -1,13 +1,13 @@
-"""Feature tracks as files hold them: dense arrays in, one ragged table out, repeated pixels found and judged.
+"""Feature tracks of files: dense arrays converted to one ragged table, with repeated pixels detected and classified.
 
-A tracker that repeats old pixels does one of two things. Either it went on from its true last image, and the repeated
-row alone is wrong; or it took the old pixels for positions in the new image and went on from there, and then the
-track has left its point for good: whatever lies at that pixel in the new image is what it shows from now on. The two
-differ in how far the pixels jump after the repeat: two steps of ordinary motion, or one.
+A tracker that repeats old pixels does one of two things. Either it continues from its true last image, and only the
+repeated row is wrong. Or it uses the old pixels as positions in the new image and continues from there: the track has
+then switched permanently to whatever scene point is at that pixel. The two differ in the pixel motion after the repeat:
+two steps of ordinary motion, or one.
 
-The ECE276A files do the second (0027.npz against ground truth, 91 stale frames t: repeated rows fit frames t and t + 1
-as one point to 0.25 px in u and 0.32 px in v, as good as any, and miss the point of frame t - 1 by 6.2 px). A stale
-frame thus has good features and no link to the past, and its tracks get new ids there.
+The ECE276A files show the second case. In 0027.npz, over 91 stale frames t and against ground truth, repeated rows fit
+frames t and t + 1 as one point to 0.25 px in u and 0.32 px in v, as other rows do, and miss the point of frame t - 1 by
+6.2 px. A stale frame thus has good features and no link to the past, and its tracks get new ids there.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, FeatureTracks, IntArray
 
-_MISSING = -1.0  # the files' code for "not seen"; it ends here
-_HALF_WINDOW = 5  # frames on each side over which a noisy velocity is averaged
-_REST_MPS, _REST_RADPS = 0.05, 0.1  # slower than this counts as standing still
-_SIGNIFICANCE = 4.0  # standard errors by which an averaged velocity must differ from zero
-_JUMP_BETWEEN = 1.5  # steps: a jump below says that the track changed its point (1), above that it did not (2)
-_MIN_JUMPS = 20  # rows needed to judge
+_MISSING = -1.0  # the files' code for "not seen"
+_HALF_WINDOW = 5  # frames on each side of the moving average of velocities
+_STATIONARY_MPS, _STATIONARY_RADPS = 0.05, 0.1  # speeds below are stationary
+_SIGNIFICANCE = 4.0  # standard errors by which a mean velocity must differ from zero
+_JUMP_THRESHOLD = 1.5  # steps: below, the track switched its point (1); above, it did not (2)
+_MIN_JUMPS = 20  # rows needed to decide
 
 
 def tracks_from_dense(features: FloatArray, path: Path) -> FeatureTracks:
-    """Turn a dense array (4, M, T) into rows; a column of -1 means that the feature is not seen in that frame.
+    """Convert a dense array (4, M, T) to rows; a column of -1 means that the feature is not seen in that frame.
 
-    A row with -1 in both right coordinates only is seen in the left image alone.
+    A row with -1 in both right coordinates only is visible in the left image only.
 
     Raises:
         DataError: a row is half missing or not finite, or left and right are swapped.
@@ -67,14 +67,14 @@ def _refuse_swapped(tracks: FeatureTracks, path: Path) -> None:
 
 
 def moving_frames(linear: FloatArray, angular: FloatArray) -> BoolArray:
-    """Say for each frame whether the vehicle moves, from noisy velocities (F, 3) m/s and rates (F, 3) rad/s.
+    """Return for each frame whether the vehicle moves, from noisy velocities (F, 3) m/s and rates (F, 3) rad/s.
 
-    It does where the mean over a few frames stands out of its own scatter on any axis and is no mere creep.
+    It moves where, on any axis, the mean over a few frames is significant and exceeds a minimum speed.
     """
-    return _stands_out(linear, _REST_MPS) | _stands_out(angular, _REST_RADPS)
+    return _differs_from_zero(linear, _STATIONARY_MPS) | _differs_from_zero(angular, _STATIONARY_RADPS)
 
 
-def _stands_out(values: FloatArray, rest: float) -> BoolArray:
+def _differs_from_zero(values: FloatArray, stationary: float) -> BoolArray:
     count = len(values)
     k = np.arange(count)
     low, high = np.maximum(k - _HALF_WINDOW, 0), np.minimum(k + _HALF_WINDOW + 1, count)
@@ -83,24 +83,24 @@ def _stands_out(values: FloatArray, rest: float) -> BoolArray:
     mean = (total[high] - total[low]) / n
     scatter = np.maximum((squares[high] - squares[low]) / n - mean**2, 0.0)
     error = np.sqrt(scatter / n)
-    out: BoolArray = (np.abs(mean) > np.maximum(rest, _SIGNIFICANCE * error)).any(axis=1)
+    out: BoolArray = (np.abs(mean) > np.maximum(stationary, _SIGNIFICANCE * error)).any(axis=1)
     return out
 
 
 @dataclass(frozen=True, slots=True)
 class Repeats:
-    """What was found about repeated pixels."""
+    """Statistics of repeated pixels."""
 
-    frames: BoolArray  # (F,) more than half of the tracks that go on repeat their pixels
-    rows: int  # observations that do
-    jump: float | None  # median motion after a repeat over the motion before it, in steps; None: too few to tell
+    frames: BoolArray  # (F,) more than half of the continued tracks repeat their pixels
+    rows: int  # number of repeated observations
+    jump: float | None  # median motion after a repeat over the motion before it, in steps; None: too few samples
 
 
 def mark_repeats(tracks: FeatureTracks, moving: BoolArray) -> tuple[FeatureTracks, Repeats]:
     """Mark rows stale whose pixels are bit-identical to the last ones of the same id while the vehicle moves.
 
     Args:
-        tracks: as the file has them.
+        tracks: as in the file.
         moving: (F,) frames in which the vehicle moves.
     """
     frames = tracks.frames
@@ -119,7 +119,7 @@ def mark_repeats(tracks: FeatureTracks, moving: BoolArray) -> tuple[FeatureTrack
 
 
 def _previous_rows(tracks: FeatureTracks) -> IntArray:
-    """For each row, the row (R,) in which the same id was last seen; -1: never."""
+    """Return for each row the previous row (R,) of the same id; -1: none."""
     order = np.lexsort((tracks.frames, tracks.ids))
     previous = np.full(len(order), -1, dtype=np.int64)
     same = tracks.ids[order][1:] == tracks.ids[order][:-1]
@@ -128,7 +128,7 @@ def _previous_rows(tracks: FeatureTracks) -> IntArray:
 
 
 def _jump(tracks: FeatureTracks, previous: IntArray, carried: BoolArray) -> float | None:
-    """Median over repeated rows b of |z(c) - z(b)| / |z(a) - z(a')|, frames a' a b c in direct succession."""
+    """Median over repeated rows b of |z(c) - z(b)| / |z(a) - z(a')|, consecutive frames a' a b c."""
     c = np.flatnonzero(carried & tracks.stale[previous] & ~tracks.stale)
     b = previous[c]
     a = previous[b]
@@ -144,10 +144,10 @@ def _jump(tracks: FeatureTracks, previous: IntArray, carried: BoolArray) -> floa
     return float(np.median(after[clear] / before[clear]))
 
 
-def settle_repeats(
+def resolve_repeats(
     tracks: FeatureTracks, moving: BoolArray, mode: RepeatsMode
 ) -> tuple[FeatureTracks, BoolArray, tuple[str, ...]]:
-    """Flag repeated rows, give tracks that changed their point a new id from there on, and say so.
+    """Flag repeated rows, and give tracks that switched their point a new id from there on.
 
     Returns:
         The tracks, the mask (F,) of stale frames, and notes for the user.
@@ -161,17 +161,17 @@ def settle_repeats(
         "frame before while the vehicle moves"
     )
     if mode == "literal":
-        return tracks, found.frames, (f"{note}; taken at their word as asked",)
+        return tracks, found.frames, (f"{note}; used as they are, as requested",)
     jump = "" if found.jump is None else f" (pixels move {found.jump:.2f} steps afterwards"
-    changed = found.jump is not None and found.jump < _JUMP_BETWEEN
+    changed = found.jump is not None and found.jump < _JUMP_THRESHOLD
     if mode == "flag" or (mode == "auto" and not changed):
         return marked, found.frames, (f"{note}; they are flagged{jump and jump + ')'}",)
     why = jump and jump + (", not 2: they show other points of the scene)" if changed else ")")
-    return split_ids(marked), found.frames, (f"{note}; they are flagged, and their tracks go on under new ids{why}",)
+    return split_ids(marked), found.frames, (f"{note}; they are flagged, and their tracks continue under new ids{why}",)
 
 
 def split_ids(tracks: FeatureTracks) -> FeatureTracks:
-    """Give every track a new id from each stale row on; first parts keep theirs, new ids count up in time order."""
+    """Give every track a new id from each stale row on; first parts keep theirs, new ids are numbered in time order."""
     order = np.lexsort((tracks.frames, tracks.ids))
     ids, stale = tracks.ids[order], tracks.stale[order]
     begins = np.concatenate([[True], ids[1:] != ids[:-1]]) if len(ids) else np.zeros(0, dtype=np.bool_)

@@ -1,6 +1,6 @@
 """UTIAS course files: KITTI drives tracked by KLT, and the Starry Night rig, as MATLAB `.mat`.
 
-Conventions, checked on the data by the tests: `p_c = C_c_v (p_v - rho_v_c_v)`, and `theta_vk_i` is the rotation vector
+Conventions, verified on the data by the tests: `p_c = C_c_v (p_v - rho_v_c_v)`, and `theta_vk_i` is the rotation vector
 of `R_i_v`, which maps the vehicle's axes to the inertial frame.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from vio.datasets.common import checked_transform, clock_ns, finite_rows, naming, shape_text, velocity_samples
 from vio.datasets.features import FeatureDataset, SensorVariances
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tracks import moving_frames, settle_repeats, tracks_from_dense
+from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
@@ -26,11 +26,11 @@ OPTIONAL_KEYS = ("r_i_vk_i", "theta_vk_i", "rho_i_pj_i", "v_var", "w_var", "y_va
 
 
 def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
-    """Read a course file; velocities and poses beyond the last feature frame are left out.
+    """Read a course file; velocities and poses after the last feature frame are ignored.
 
     Raises:
-        DataError: variables, shapes, clocks or values are wrong; the message says which and what was expected.
-        CalibrationError: the calibration cannot be right.
+        DataError: variables, shapes, clocks or values are wrong; the message names which and the expected form.
+        CalibrationError: the calibration is invalid.
     """
     arrays = _read_mat(path)
     features = arrays["y_k_j"]
@@ -40,12 +40,12 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
     times_ns = clock_ns(_rows(arrays, "t", path, 1, count)[:, 0], lambda k: f"{path}, t[{k}]")
     linear = _finite(arrays, "v_vk_vk_i", path, count)
     angular = _finite(arrays, "w_vk_vk_i", path, count)
-    tracks, stale_frames, notes = settle_repeats(
+    tracks, stale_frames, notes = resolve_repeats(
         tracks_from_dense(np.swapaxes(features, 1, 2), path), moving_frames(linear, angular), settings.repeated_tracks
     )
     longest = max(arrays[key].shape[1] for key in ("v_vk_vk_i", "w_vk_vk_i"))
     if longest > count:
-        notes = (f"velocities go on for {longest} frames, features for {count}; the first {count} are read", *notes)
+        notes = (f"velocities cover {longest} frames, features {count}; the first {count} are read", *notes)
     recording = Recording(
         kind="utias",
         path=path,

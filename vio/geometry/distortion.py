@@ -1,4 +1,4 @@
-"""One real camera: pinhole, radial-tangential or equidistant, and the stereo rig made of two of them.
+"""Camera models: pinhole, radial-tangential or equidistant, and the stereo rig of two cameras.
 
 Pixels: u right, v down, the centre of the top-left pixel is (0, 0). Rays and points are in the camera frame
 (x right, y down, z forward).
@@ -23,7 +23,7 @@ DistortionModel: TypeAlias = Literal["pinhole", "radtan", "equidistant"]
 _COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
-# A pair that is rectified up to the digits of its calibration file: rows off by less than 0.01 px.
+# Tolerances of a pair that is rectified up to the rounding of its calibration file: rows within 0.01 px.
 _ALIGNED_RAD = 2e-5
 _ALIGNED_SHARE = 1e-4  # of the baseline
 _SAME_INTRINSICS = 1e-6
@@ -83,7 +83,7 @@ class StereoRig:
 
 
 def rectified_pair(rig: StereoRig) -> StereoCamera | None:
-    """Return the rectified pair that a rig is up to the rounding of its calibration; None: it needs rectifying."""
+    """Return the rectified pair equal to a rig up to rounding; None: the rig needs rectifying."""
     a, b, T_cam0_cam1 = rig.cam0, rig.cam1, rig.T_cam0_cam1
     x, y, z = T_cam0_cam1[:3, 3]
     same_size = (a.width, a.height) == (b.width, b.height)
@@ -95,7 +95,7 @@ def rectified_pair(rig: StereoRig) -> StereoCamera | None:
 
 
 def rectified_camera(rig: StereoRig) -> StereoCamera:
-    """Return the rectified pair that the rig is.
+    """Return the rectified pair equal to the rig.
 
     Raises:
         CalibrationError: the rig is not rectified (distortion, different intrinsics, or rows not aligned).
@@ -106,7 +106,7 @@ def rectified_camera(rig: StereoRig) -> StereoCamera:
 
 
 def rig_from_rectified(camera: StereoCamera, T_cam0_imu: npt.ArrayLike) -> StereoRig:
-    """Return the rig of two equal pinhole cameras that a rectified pair describes.
+    """Return a rectified pair as a rig of two equal pinhole cameras.
 
     Raises:
         CalibrationError: the image size is unknown.
@@ -121,10 +121,10 @@ def rig_from_rectified(camera: StereoCamera, T_cam0_imu: npt.ArrayLike) -> Stere
 
 
 def project_point(camera: CameraModel, p_cam: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Pixels (..., 2) of points (..., 3) in the camera frame, and a mask (...) of those the model can image.
+    """Pixels (..., 2) of points (..., 3) in the camera frame, and a mask (...) of those that the model can project.
 
     False in the mask: behind the camera, or beyond the angle where the distortion polynomial folds back. The pixel
-    is then finite but arbitrary. Whether a pixel lies inside the image is not looked at.
+    is then finite but arbitrary. Whether a pixel is inside the image is not checked.
     """
     p = np.asarray(p_cam, dtype=np.float64)
     if camera.model == "equidistant":
@@ -155,9 +155,9 @@ def uv_D_p_cam(camera: CameraModel, p_cam: npt.ArrayLike) -> FloatArray:
 
 
 def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Unit rays (..., 3) in the camera frame of pixels (..., 2), and a mask (...) of those that Newton's method found.
+    """Unit rays (..., 3) in the camera frame of pixels (..., 2), and a mask (...) where Newton's method converged.
 
-    A pixel that no ray of the model reaches gets False and an arbitrary finite ray.
+    A pixel outside the model's range has False in the mask and an arbitrary finite ray.
     """
     uv = np.asarray(uv, dtype=np.float64)
     xy = (uv - (camera.cu, camera.cv)) / (camera.fu, camera.fv)
@@ -171,7 +171,7 @@ def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray,
 
 
 def _five(coefficients: tuple[float, ...]) -> tuple[float, float, float, float, float]:
-    """The radial-tangential coefficients k1 k2 p1 p2 k3; a k3 that is not given is zero."""
+    """Return the radial-tangential coefficients k1 k2 p1 p2 k3; an absent k3 is zero."""
     k1, k2, p1, p2 = coefficients[:4]
     return k1, k2, p1, p2, coefficients[4] if len(coefficients) == 5 else 0.0
 
@@ -205,7 +205,7 @@ def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
 def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
     """Radius on the undistorted plane where the radial polynomial stops growing: the model folds back beyond it."""
     k1, k2, _, _, k3 = _five(coefficients)
-    # In 1/r^2 the polynomial is monic, so that no coefficient is too small to divide by.
+    # In 1/r^2 the polynomial is monic, which avoids dividing by a small coefficient.
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     inverse = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 1e-12]
     return float(1 / np.sqrt(max(inverse))) if inverse else np.inf
@@ -235,7 +235,7 @@ def _undistort_radtan(coefficients: tuple[float, ...], target: FloatArray) -> tu
 
 
 def _theta_polynomial(coefficients: tuple[float, ...], theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Distorted angle and its derivative."""
+    """Return the distorted angle and its derivative."""
     k1, k2, k3, k4 = coefficients
     t2 = theta * theta
     value = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))

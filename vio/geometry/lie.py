@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
 
-# Below this angle the closed forms lose digits to cancellation and the Taylor series is exact to rounding.
+# Below this angle the closed forms suffer from cancellation and the Taylor series is exact to rounding.
 _SMALL_ANGLE_RAD = 1e-2
 
 
@@ -48,12 +48,12 @@ def so3_exp(phi: npt.ArrayLike) -> FloatArray:
 def quat_xyzw_from_rotation(R: npt.ArrayLike) -> FloatArray:
     """Unit quaternions (..., 4) in x y z w order, w >= 0, of rotation matrices (..., 3, 3).
 
-    Takes the largest of the four components first, so no rotation is close to a division by zero.
+    Computes the largest of the four components first, which avoids division by small numbers.
     Reference: Shepperd, Quaternion from rotation matrix, J. Guidance and Control (1978).
     """
     R = np.asarray(R, dtype=np.float64)
     trace: FloatArray = np.trace(R, axis1=-2, axis2=-1)
-    # Rows of 4 q q^T, one for each component that may be the largest.
+    # Rows of 4 q q^T, one for each candidate of the largest component.
     d0, d1, d2 = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     s01, s02, s12 = R[..., 0, 1] + R[..., 1, 0], R[..., 0, 2] + R[..., 2, 0], R[..., 1, 2] + R[..., 2, 1]
     a0, a1, a2 = R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]
@@ -129,7 +129,7 @@ def se3_exp(xi: npt.ArrayLike) -> FloatArray:
 
 
 def se3_log(T: npt.ArrayLike) -> FloatArray:
-    """Twists (..., 6) `[rho; phi]` of transforms (..., 4, 4); the rotation angle lies in [0, pi]."""
+    """Twists (..., 6) `[rho; phi]` of transforms (..., 4, 4); the rotation angle is in [0, pi]."""
     T = np.asarray(T, dtype=np.float64)
     phi = so3_log(T[..., :3, :3])
     rho = (so3_left_jacobian_inverse(phi) @ T[..., :3, 3, None])[..., 0]
@@ -174,8 +174,8 @@ def se3_adjoint(T: npt.ArrayLike) -> FloatArray:
 def se3_left_jacobian(xi: npt.ArrayLike) -> FloatArray:
     """Left Jacobian of SE(3), (..., 6, 6): exp(xi + d) = exp(J d) exp(xi) to first order in d.
 
-    Summed as a power series in the curly hat, which converges for every twist; fit for one step of motion, where a
-    few terms suffice. Reference: Barfoot (2017), equation 7.83.
+    Summed as a power series in the curly hat, which converges for every twist; for one step of motion a few
+    terms suffice. Reference: Barfoot (2017), equation 7.83.
     """
     curly = se3_curly_hat(xi)
     term = np.broadcast_to(np.eye(6), curly.shape)

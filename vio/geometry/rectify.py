@@ -1,4 +1,4 @@
-"""Rectification: two real cameras become one rectified pair, by a rotation each and a lookup map each.
+"""Stereo rectification: a rotation and a lookup map for each of two cameras.
 
 The rectified cameras share the direction of the baseline as x axis, and the mean of the two optical axes, made
 perpendicular to it, as z axis. References: Fusiello, Trucco & Verri, A compact algorithm for rectification of stereo
@@ -19,15 +19,15 @@ from vio.geometry.stereo import StereoCamera, left_rays
 
 MapArray = npt.NDArray[np.float32]
 
-_BORDER_SAMPLES = 60  # points along each image border that decide the common field of view
-_MAX_TANGENT = 1.4  # a rectified image is flat: beyond about 54 degrees off axis it only stretches pixels
+_BORDER_SAMPLES = 60  # points along each image border that determine the common field of view
+_MAX_TANGENT = 1.4  # beyond about 54 degrees off axis a planar image only stretches pixels
 _MIN_TANGENT_WIDTH = 0.1
-_MAX_TURN_DEG = 30.0  # a camera that must be turned by more is not one half of a stereo pair
+_MAX_ROTATION_DEG = 30.0  # a camera that needs a larger rotation is not one half of a stereo pair
 
 
 @dataclass(frozen=True, slots=True)
 class Rectification:
-    """How the images of a rig become rectified ones."""
+    """The rectifying rotations and maps of a rig."""
 
     camera: StereoCamera
     R_rect_cam0: FloatArray  # (3, 3)
@@ -38,10 +38,10 @@ class Rectification:
 
 
 def rectify(rig: StereoRig) -> Rectification:
-    """Find the rectified pair of a rig; its images have the size of the left one and show no pixel from outside.
+    """Find the rectified pair of a rig; its images have the size of the left one and no invalid border.
 
     Raises:
-        CalibrationError: the cameras coincide, look apart, are swapped, or share no field of view.
+        CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
     """
     R_rect_cam0, R_rect_cam1, baseline_m = rectifying_rotations(rig)
     low0, high0 = _inner_rectangle(rig.cam0, R_rect_cam0)
@@ -51,7 +51,7 @@ def rectify(rig: StereoRig) -> Rectification:
     if extent.min() < _MIN_TANGENT_WIDTH:
         raise CalibrationError("the two cameras share no field of view; check the extrinsics T_BS of both cameras")
     width, height = rig.cam0.width, rig.cam0.height
-    # One focal length for both axes, so large that the shared field of view fills the image on both of them.
+    # One focal length for both axes, large enough that the shared field of view fills the image along both.
     f = float(max((width - 1) / extent[0], (height - 1) / extent[1]))
     centre = (low + high) / 2
     cu, cv = (width - 1) / 2 - f * centre[0], (height - 1) / 2 - f * centre[1]
@@ -71,7 +71,7 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
     """Return `R_rect_cam0`, `R_rect_cam1` (3, 3) and the baseline in metres.
 
     Raises:
-        CalibrationError: the cameras coincide, or one would have to turn too far.
+        CalibrationError: the cameras coincide, or a rectifying rotation is too large.
     """
     T_cam0_cam1 = rig.T_cam0_cam1
     t, R_cam0_cam1 = T_cam0_cam1[:3, 3], T_cam0_cam1[:3, :3]
@@ -82,15 +82,15 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
     forward = np.array([0.0, 0, 1]) + R_cam0_cam1[:, 2]
     z = forward - (forward @ x) * x
     if np.linalg.norm(z) < 1e-6:
-        raise CalibrationError("the cameras look along their baseline, or opposite ways; check both T_BS")
+        raise CalibrationError("the cameras look along their baseline, or in opposite directions; check both T_BS")
     z /= np.linalg.norm(z)
     R_rect_cam0 = np.stack([x, np.cross(z, x), z])
     R_rect_cam1 = R_rect_cam0 @ R_cam0_cam1
     for name, R in (("left", R_rect_cam0), ("right", R_rect_cam1)):
-        turn_deg = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
-        if turn_deg > _MAX_TURN_DEG:
+        angle_deg = np.degrees(np.arccos(np.clip((np.trace(R) - 1) / 2, -1, 1)))
+        if angle_deg > _MAX_ROTATION_DEG:
             raise CalibrationError(
-                f"rectifying would turn the {name} camera by {turn_deg:.0f} deg; cam1 must lie to the right of cam0, "
+                f"rectifying would rotate the {name} camera by {angle_deg:.0f} deg; cam1 must be to the right of cam0, "
                 "so the cameras may be swapped, or an extrinsic T_BS inverted"
             )
     return R_rect_cam0, R_rect_cam1, baseline_m
@@ -99,9 +99,9 @@ def rectifying_rotations(rig: StereoRig) -> tuple[FloatArray, FloatArray, float]
 def rectify_pixels(
     camera: CameraModel, R_rect_cam: FloatArray, rectified: StereoCamera, uv: npt.ArrayLike
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Rectified pixels (N, 2) of raw pixels (N, 2) of one camera, and a mask (N,) of those that have one.
+    """Rectified pixels (N, 2) of raw pixels (N, 2) of one camera, and a mask (N,) of valid ones.
 
-    Both rectified cameras have the same intrinsics, so this serves left and right alike.
+    Both rectified cameras share their intrinsics, so this applies to left and right alike.
     """
     ray, valid = unproject_pixel(camera, uv)
     ray = ray @ R_rect_cam.T
@@ -125,7 +125,7 @@ def _inner_rectangle(camera: CameraModel, R_rect_cam: FloatArray) -> tuple[Float
         ray, valid = unproject_pixel(camera, uv)
         ray = ray @ R_rect_cam.T
         ahead = valid & (ray[:, 2] > 0.1)
-        # A border that leaves the half space in front, or that no ray of the lens model reaches, bounds nothing.
+        # A border point behind the camera, or outside the lens model's range, sets no bound.
         direction = {"left": [-1, 0], "right": [1, 0], "top": [0, -1], "bottom": [0, 1]}[name]
         far = np.array(direction, dtype=np.float64) * 1e9
         plane[name] = np.where(ahead[:, None], ray[:, :2] / np.where(ahead, ray[:, 2], 1.0)[:, None], far)

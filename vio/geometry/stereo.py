@@ -85,10 +85,10 @@ def z_D_p_cam(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
 def triangulate(
     camera: StereoCamera, z: npt.ArrayLike, *, min_disparity_px: float = 0.1
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Points (N, 3) in the cam0 frame from stereo pixels (N, 4), and a mask (N,) of those that are usable.
+    """Points (N, 3) in the cam0 frame from stereo pixels (N, 4), and a mask (N,) of valid ones.
 
-    The vertical coordinate is the mean of both images'. A disparity `ul - ur` below `min_disparity_px` (a point
-    behind the cameras, or too far to tell) gives False in the mask and an arbitrary finite point.
+    The vertical coordinate is the mean of both images. A disparity `ul - ur` below `min_disparity_px` (a point
+    behind the cameras, or too far away) has False in the mask and an arbitrary finite point.
     """
     z = np.asarray(z, dtype=np.float64)
     disparity = z[..., 0] - z[..., 2]

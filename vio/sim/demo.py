@@ -16,14 +16,14 @@ from vio.sim.world import street
 _RATE_HZ = 10.0
 _DURATION_S = 14.0
 _WIDTH_PX = 800
-_START_M = 12.0  # so that the drive takes a straight, a corner and another straight
+_START_M = 12.0  # the drive then covers a straight, a corner and another straight
 
 
 def write_demo_recording(out: Path, progress: Progress | None = None) -> Path:
     """Render the demo's recording as a KITTI folder with ground truth, velocities and extrinsics; return the folder.
 
     Raises:
-        VioError: the place cannot be written, or holds something else.
+        VioError: the folder cannot be written, or holds foreign files.
     """
     simulation = simulate(
         street(seed=4),

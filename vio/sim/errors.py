@@ -1,4 +1,4 @@
-"""The simulator's own expected failure."""
+"""The simulator's expected errors."""
 
 from __future__ import annotations
 
@@ -6,4 +6,4 @@ from vio.errors import VioError
 
 
 class SimulationError(VioError):
-    """A scene, trajectory or setting cannot be simulated as asked."""
+    """A scene, trajectory or setting cannot be simulated as requested."""

@@ -1,4 +1,4 @@
-"""Write a simulated recording as an EuRoC ASL folder or as a KITTI odometry folder, whole or not at all."""
+"""Write a simulated recording as an EuRoC ASL folder or a KITTI odometry folder, atomically."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ def export_euroc(
 ) -> None:
     """Render all frames into `out/mav0` as EuRoC's ASL format.
 
-    Ground truth is written at 200 Hz, in the IMU's clock; its bias columns are zero where a real IMU goes with the
-    images.
+    Ground truth is written at 200 Hz, in the IMU's clock; its bias columns are zero for a recorded
+    IMU.
 
     Args:
         recording: what to write; any rig.
-        out: folder to make.
+        out: folder to create.
         replace: whether an older export at `out` may be replaced.
-        noise: the figures written into the IMU's sensor.yaml.
-        progress: told after each frame.
+        noise: densities written to the IMU's sensor.yaml.
+        progress: called after each frame.
 
     Raises:
         SimulationError: the simulation has no IMU.
@@ -68,19 +68,19 @@ def export_euroc(
     if record is None:
         raise SimulationError("an EuRoC folder needs an IMU; simulate with imu=ImuNoise() or with a recorded one")
     rig, stamps = simulation.rig, simulation.stamps_ns
-    made = "recorded" if record.gyro_bias is None else "simulated"
+    origin = "recorded" if record.gyro_bias is None else "simulated"
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
         mav = folder / "mav0"
         for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
             (mav / name / "data").mkdir(parents=True)
-            sheet = camera_yaml(camera, T_imu_cam, comment=f"simulated {name}", rate_hz=median_rate_hz(stamps))
-            write_text(mav / name / "sensor.yaml", sheet)
+            calibration = camera_yaml(camera, T_imu_cam, comment=f"simulated {name}", rate_hz=median_rate_hz(stamps))
+            write_text(mav / name / "sensor.yaml", calibration)
             write_text(mav / name / "data.csv", image_list_csv(stamps))
         for name, text in (("imu0", imu_csv(record)), (STATE_CSV.parent.name, _truth_csv(recording))):
             (mav / name).mkdir()
             write_text(mav / name / "data.csv", text)
-        sheet = imu_yaml(np.eye(4), noise, comment=f"{made} imu0", rate_hz=median_rate_hz(record.times_ns))
-        write_text(mav / "imu0" / "sensor.yaml", sheet)
+        calibration = imu_yaml(np.eye(4), noise, comment=f"{origin} imu0", rate_hz=median_rate_hz(record.times_ns))
+        write_text(mav / "imu0" / "sensor.yaml", calibration)
         write_text(folder / MARKER, _description(recording))
         files = [tuple(mav / name / "data" / f"{t}.png" for name in ("cam0", "cam1")) for t in stamps]
         _write_images(recording, files, progress)
@@ -92,7 +92,7 @@ def export_kitti(
     """Render all frames as a self-contained KITTI odometry folder.
 
     It holds `image_0 image_1 calib.txt times.txt poses.txt T_cam0_imu.txt` and, where the simulation has the velocity
-    sensor, `velocity.csv`. Times start at zero; poses are those of cam0 relative to its first.
+    sensor, `velocity.csv`. Times start at zero; poses are those of cam0 relative to its first pose.
 
     Raises:
         SimulationError: the rig is not rectified.
@@ -149,7 +149,7 @@ def _truth_csv(recording: SimulatedRecording) -> str:
 
 
 def _description(recording: SimulatedRecording) -> str:
-    """What the folder was made from."""
+    """Describe the simulation as JSON."""
     simulation = recording.simulation
     facts = {
         "scene": simulation.world.name,

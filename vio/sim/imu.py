@@ -1,7 +1,8 @@
-"""Inertial and velocity sensors read off a motion, with noise and drifting biases as data sheets give them.
+"""Simulate inertial and velocity sensors along a motion, with noise and bias random walks.
 
 Reference: Furgale, Rehder, Siegwart, Unified temporal and spatial calibration for multi-sensor systems (2013), and the
-Kalibr IMU noise model: white noise of density s has deviation s sqrt(rate) per sample, a bias walks by s_b sqrt(dt).
+Kalibr IMU noise model: white noise of density s has standard deviation s sqrt(rate) per sample, a bias walks by
+s_b sqrt(dt).
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ class ImuNoise:
     """Errors of an inertial measurement unit; the defaults are those of EuRoC's."""
 
     densities: ImuDensities = ADIS16448  # white noise and bias walks
-    gyro_bias_sigma: float = setting(5e-3, "deviation of the gyroscope bias at the start", unit="rad/s")
-    accel_bias_sigma: float = setting(5e-2, "deviation of the accelerometer bias at the start", unit="m/s^2")
+    gyro_bias_sigma: float = setting(5e-3, "standard deviation of the gyroscope bias at the start", unit="rad/s")
+    accel_bias_sigma: float = setting(5e-2, "standard deviation of the accelerometer bias at the start", unit="m/s^2")
     gyro_limit: float = setting(17.45, "gyroscope saturation, each axis", unit="rad/s")
     accel_limit: float = setting(176.5, "accelerometer saturation, each axis", unit="m/s^2")
 
@@ -43,8 +44,8 @@ NO_IMU_NOISE = ImuNoise(ImuDensities(0.0, 0.0, 0.0, 0.0), gyro_bias_sigma=0.0, a
 class VelocityNoise:
     """White noise of the paper's control input."""
 
-    linear_sigma: float = setting(0.5, "deviation of the body velocity, each axis", unit="m/s")
-    angular_sigma: float = setting(0.05, "deviation of the angular rate, each axis", unit="rad/s")
+    linear_sigma: float = setting(0.5, "standard deviation of the body velocity, each axis", unit="m/s")
+    angular_sigma: float = setting(0.05, "standard deviation of the angular rate, each axis", unit="rad/s")
 
 
 def sample_times(spline: MotionSpline, rate_hz: float, start_ns: int | None = None) -> IntArray:
@@ -58,9 +59,9 @@ def sample_times(spline: MotionSpline, rate_hz: float, start_ns: int | None = No
 def simulate_imu(
     spline: MotionSpline, *, rate_hz: float = 200.0, noise: ImuNoise | None = None, seed: int = 0
 ) -> ImuRecord:
-    """Read gyroscope and accelerometer off a motion.
+    """Simulate gyroscope and accelerometer along a motion.
 
-    Without `noise` the defaults of `ImuNoise` apply; `NO_IMU_NOISE` gives the exact values. Samples are instantaneous.
+    Without `noise` the defaults of `ImuNoise` apply; `NO_IMU_NOISE` yields exact values. Samples are instantaneous.
     """
     noise = ImuNoise() if noise is None else noise
     times = sample_times(spline, rate_hz)
@@ -84,7 +85,7 @@ def simulate_imu(
 
 
 def _walk(rng: np.random.Generator, n: int, rate_hz: float, density: float, start_sigma: float) -> FloatArray:
-    """Brownian bias (n, 3) from a random start."""
+    """Random-walk bias (n, 3) from a random start."""
     start = start_sigma * rng.standard_normal(3)
     steps = density / np.sqrt(rate_hz) * rng.standard_normal((n, 3))
     steps[0] = 0.0
@@ -99,7 +100,7 @@ def simulate_velocity(
     seed: int = 0,
     times_ns: npt.ArrayLike | None = None,
 ) -> tuple[VelocitySample, ...]:
-    """Read the paper's control input `u = [v; omega]` off a motion, in the imu frame, with the paper's noise.
+    """Simulate the paper's control input `u = [v; omega]` along a motion, in the imu frame, with the paper's noise.
 
     `times_ns` (N,) overrides the rate.
     """

@@ -30,7 +30,7 @@ logger = logging.getLogger(__name__)
 _S_PER_NS = 1e-9
 _ROBUST_ROUNDS = 8
 _OUTLIER_SIGMAS = 5.0
-_OUTLIER_FLOOR = (0.002, 0.01)  # m, rad: smaller residuals are motion that the spline smooths, not jumps
+_OUTLIER_FLOOR = (0.002, 0.01)  # m, rad: smaller residuals are smoothing, not outliers
 _ROTATION_ROUNDS = 12
 _ROTATION_TOLERANCE_RAD = 1e-10
 
@@ -65,10 +65,10 @@ class MotionState:
 
 @dataclass(frozen=True, slots=True)
 class FitReport:
-    """How far a fitted spline stays from its record."""
+    """Residuals of a fitted spline."""
 
     samples: int
-    rejected: int  # samples taken for outliers
+    rejected: int  # samples rejected as outliers
     position_rms_m: float  # over the samples kept
     position_max_m: float
     rotation_rms_rad: float
@@ -106,7 +106,7 @@ def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, In
     if len(t) and (t.min() < spline.start_ns or t.max() > spline.end_ns):
         raise SimulationError(
             f"the motion is defined from {spline.start_ns} to {spline.end_ns} ns; "
-            f"asked for {t.min()} to {t.max()}: shorten the request or lengthen the trajectory"
+            f"requested {t.min()} to {t.max()}: shorten the request or lengthen the trajectory"
         )
     position: FloatArray = np.multiply(t - spline.start_ns, _S_PER_NS / spline.knot_s, dtype=np.float64)
     segments = len(spline.p_control) - spline.degree
@@ -118,7 +118,7 @@ def evaluate(spline: MotionSpline, times_ns: npt.ArrayLike) -> MotionState:
     """Pose and its first two derivatives at times (N,) in nanoseconds.
 
     Raises:
-        SimulationError: a time lies outside the motion.
+        SimulationError: a time is outside the motion.
     """
     t, first, u = _locate(spline, times_ns)
     k, rate = spline.degree + 1, 1 / spline.knot_s
@@ -151,8 +151,8 @@ def fit_spline(
     """Fit a spline to poses (N, 4, 4) at strictly increasing times (N,) by least squares.
 
     The attitude is fitted by Gauss-Newton steps: the residual rotation vectors are fitted like a position and moved
-    into the control attitudes. With `robust`, samples farther than 5 robust deviations (and 2 mm
-    or 10 mrad) are left out.
+    into the control attitudes. With `robust`, samples farther than 5 robust standard deviations (and 2 mm
+    or 10 mrad) are rejected.
 
     Raises:
         DataError: times do not increase, values are not finite, or there are too few poses.
@@ -209,7 +209,7 @@ def _design(first: IntArray, u: FloatArray, segments: int, degree: int) -> scipy
 
 
 def _solver(design: scipy.sparse.csr_matrix, keep: BoolArray) -> tuple[scipy.sparse.csr_matrix, object]:
-    """Normal equations with a whisper of curvature penalty, which decides where a gap leaves control points free."""
+    """Normal equations with a small curvature penalty, which determines control points within gaps."""
     A = design[keep]
     m = A.shape[1]
     curvature = scipy.sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(m - 2, m))
@@ -224,7 +224,7 @@ def _fit(design: scipy.sparse.csr_matrix, T: FloatArray, keep: BoolArray, step: 
     p_control = factor.solve(A.T @ (p - middle)) + middle  # type: ignore[attr-defined]
     R = T[keep, :3, :3]
     m, degree = design.shape[1], int(np.diff(design.indptr)[0]) - 1
-    # Start from the sample nearest to where each control point weighs most.
+    # Initialise each control point from the sample nearest to its largest weight.
     sample = np.asarray(A @ np.arange(m, dtype=np.float64)).ravel()
     nearest = np.abs(np.interp(np.arange(m), sample, np.arange(len(sample)))).round().astype(np.int64)
     R_control: FloatArray = R[nearest]
@@ -258,7 +258,7 @@ def _residuals(
     degree: int,
     position: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Distances (N,) in metres and angles (N,) in radians between spline and record."""
+    """Distances (N,) in metres and angles (N,) in radians between spline and samples."""
     R = _attitude(R_control, first, _weights(degree, position - first, 0))
     distance = np.linalg.norm(design @ p_control - T[:, :3, 3], axis=1)
     return distance, np.linalg.norm(so3_log(np.swapaxes(R, 1, 2) @ T[:, :3, :3]), axis=1)
@@ -272,7 +272,7 @@ def _limit(kept: FloatArray, floor: float) -> float:
 def spline_from_waypoints(
     T_world_imu: npt.ArrayLike, interval_s: float, *, start_ns: int = 0, degree: int = 5
 ) -> MotionSpline:
-    """Return the motion that passes through waypoints (N, 4, 4) at equal intervals, smoothly where left free.
+    """Return a smooth motion through waypoints (N, 4, 4) at equal intervals.
 
     Raises:
         DataError: fewer than two waypoints, or one is not finite.
@@ -284,8 +284,8 @@ def spline_from_waypoints(
     return spline
 
 
-def turned(spline: MotionSpline, R_body_imu: npt.ArrayLike) -> MotionSpline:
-    """Describe the motion of a body by an IMU whose axes are turned in it: `R_world_imu = R_world_body R_body_imu`."""
+def rotate_body_axes(spline: MotionSpline, R_body_imu: npt.ArrayLike) -> MotionSpline:
+    """Express a body's motion in rotated IMU axes: `R_world_imu = R_world_body R_body_imu`."""
     return replace(spline, R_control=spline.R_control @ np.asarray(R_body_imu, dtype=np.float64))
 
 
@@ -312,12 +312,12 @@ def car_loop(
     seed: int = 0,
     start_ns: int = 0,
 ) -> MotionSpline:
-    """Drive counter-clockwise along a rectangle with round corners, slower there, on a slightly swaying suspension.
+    """Drive counter-clockwise along a rectangle with rounded corners, slower in them, with small suspension motion.
 
     Args:
-        loop_m: extent of the middle line along x and y, about the origin; the same as `street`'s.
+        loop_m: extent of the centre line along x and y, about the origin; the same as `street`'s.
         corner_m: radius of the corners.
-        speed_mps: speed on the straights; corners are taken at up to 2.5 m/s^2 across.
+        speed_mps: speed on the straights; lateral acceleration in corners is at most 2.5 m/s^2.
         duration_s: length of the record; None drives one loop.
         height_m: height of the body above the ground; 0.93 puts `kitti_like_rig`'s cameras at 1.65.
         start_m: where on the loop to start, from the middle of the lower side.
@@ -336,7 +336,7 @@ def car_loop(
         curvature[(s >= edge) & (s < edge + np.pi / 2 * corner_m)] = 1 / corner_m
         edge += np.pi / 2 * corner_m + side
     speed = np.minimum(speed_mps, np.sqrt(2.5 / np.maximum(curvature, 1e-6)))
-    speed = _smooth_periodic(_braked(speed, step), 6.0 / step)
+    speed = _smooth_periodic(_limit_acceleration(speed, step), 6.0 / step)
     curvature = _smooth_periodic(curvature, 2.0 / step)
     heading = np.cumsum(curvature) * step
     heading *= 2 * np.pi / heading[-1]
@@ -368,8 +368,8 @@ def _smooth_periodic(values: FloatArray, width: float) -> FloatArray:
     return out
 
 
-def _braked(speed: FloatArray, step: float, limit_mps2: float = 2.0) -> FloatArray:
-    """Lower speeds so that neither braking nor gaining speed exceeds a limit, around the loop."""
+def _limit_acceleration(speed: FloatArray, step: float, limit_mps2: float = 2.0) -> FloatArray:
+    """Lower speeds so that braking and accelerating stay within a limit, around the loop."""
     square = np.concatenate([speed, speed, speed]) ** 2
     for order in (range(1, len(square)), range(len(square) - 2, -1, -1)):
         shift = -1 if order.step > 0 else 1
@@ -380,7 +380,7 @@ def _braked(speed: FloatArray, step: float, limit_mps2: float = 2.0) -> FloatArr
 
 
 def _sway(t: FloatArray, seed: int, amplitude: FloatArray, band_hz: tuple[float, float]) -> FloatArray:
-    """Smooth random motions (N, C) of given deviations, made of sines in a frequency band."""
+    """Smooth random motions (N, C) of given standard deviations, summed from sines in a frequency band."""
     rng = np.random.default_rng([seed, 11])
     out = np.zeros((len(t), len(amplitude)))
     for channel, size in enumerate(amplitude):
@@ -400,23 +400,23 @@ def hand_held(
     seed: int = 0,
     start_ns: int = 0,
 ) -> MotionSpline:
-    """Fly or carry the body around a room: a Lissajous path about `centre`, looking along it and about.
+    """Carry the body around a room: a Lissajous path about `centre`, looking along the path and to the sides.
 
     The IMU axes are forward, left, up; for EuRoC's rig, whose body looks along its z axis, apply
-    `turned(spline, R_FLU_EUROC_IMU)`.
+    `rotate_body_axes(spline, R_FLU_EUROC_IMU)`.
 
     Args:
         centre: middle of the path, m.
         extent: half of the path's size along x, y, z, m.
         duration_s: length of the record.
-        period_s: time of one round.
-        still_s: rest at the start, for filters that want it.
-        seed: of phases and of the wandering gaze.
+        period_s: duration of one round.
+        still_s: duration of standstill at the start.
+        seed: of the phases and of the viewing direction.
         start_ns: time of the first pose.
     """
     t = np.arange(0.0, duration_s + 0.025, 0.025)
     moving = np.maximum(t - still_s, 0.0)
-    phase = _eased(moving)
+    phase = _ramped_time(moving)
     rng = np.random.default_rng([seed, 12])
     w = 2 * np.pi / period_s
     shift = rng.uniform(0, 2 * np.pi, 3)
@@ -432,8 +432,8 @@ def hand_held(
     return fit_spline(times, se3_from_parts(R, p + shake[:, 3:]), knot_s=0.1)[0]
 
 
-def _eased(t: FloatArray, ramp_s: float = 2.0) -> FloatArray:
-    """Time that starts at rest: its rate grows smoothly (quintic) from 0 to 1 over the ramp."""
+def _ramped_time(t: FloatArray, ramp_s: float = 2.0) -> FloatArray:
+    """Warped time: its rate grows smoothly (quintic) from 0 at standstill to 1 over the ramp."""
     u = np.clip(t / ramp_s, 0.0, 1.0)
     integral = u**4 * (2.5 + u * (u - 3))  # of 10 u^3 - 15 u^4 + 6 u^5
     return ramp_s * integral + np.maximum(t - ramp_s, 0.0)
@@ -454,10 +454,10 @@ def recorded_motion(path: Path, *, knot_s: float = 0.1, degree: int = 5) -> tupl
     times = truth.times_ns
     gap_s = float(np.diff(times).max()) * _S_PER_NS
     if gap_s > 5 * knot_s:
-        logger.warning("%s has a gap of %.2f s; the motion is made up there", path, gap_s)
+        logger.warning("%s has a gap of %.2f s; the motion is interpolated there", path, gap_s)
     spline, report = fit_spline(times, truth.T_world_body, knot_s=knot_s, degree=degree, robust=True)
     logger.info(
-        "%s: spline within %.1f mm and %.2f mrad rms, %d of %d poses left out",
+        "%s: spline within %.1f mm and %.2f mrad rms, %d of %d poses rejected",
         path,
         1e3 * report.position_rms_m,
         1e3 * report.rotation_rms_rad,

@@ -1,7 +1,7 @@
-"""A front end that knows the truth: perfect or noise-controlled observations, with known outliers.
+"""A front end with access to ground truth: exact or noisy observations, with known outliers.
 
 Features are points on the scene's surfaces, found by casting rays through the left image, so they are spread evenly
-over it and never lie behind anything. It needs no images and runs at hundreds of frames a second.
+over it and are never occluded. It needs no images and runs at hundreds of frames a second.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from vio.sim.world import Surfaces, surfaces_at
 
 @dataclass(frozen=True, slots=True)
 class OracleSettings:
-    """What the oracle observes and how badly."""
+    """Feature count, noise and outliers of the oracle."""
 
     max_features: int = setting(100, "features kept in view")
-    sigma_px: float = setting(0.5, "deviation of the noise on each of the four pixel coordinates", unit="px")
+    sigma_px: float = setting(0.5, "standard deviation of the noise on each of the four pixel coordinates", unit="px")
     outlier_fraction: float = setting(0.0, "share of rows replaced by gross errors", unit="0..1")
     outlier_px: float = setting(30.0, "outliers are off by 5 px to this much, in both images alike or not", unit="px")
     left_only_fraction: float = setting(0.0, "share of rows without a right match", unit="0..1")
-    max_track_length: int | None = setting(None, "frames after which a feature is given up; None: never")
+    max_track_length: int | None = setting(None, "frames after which a feature is dropped; None: never")
     max_depth_m: float = setting(80.0, "features farther away are not taken", unit="m")
     margin_px: float = setting(4.0, "features this close to the border are not seen", unit="px")
 
@@ -39,20 +39,20 @@ class OracleSettings:
         if self.max_features < 1 or self.sigma_px < 0 or (self.max_track_length or 1) < 1:
             raise SimulationError("max_features and max_track_length must be positive, sigma_px must not be negative")
         if not (0 <= self.outlier_fraction <= 1 and 0 <= self.left_only_fraction <= 1):
-            raise SimulationError("outlier_fraction and left_only_fraction lie between 0 and 1")
-        if self.outlier_px < _LEAST_OUTLIER_PX:
-            raise SimulationError(f"outlier_px must be at least {_LEAST_OUTLIER_PX:g}")
+            raise SimulationError("outlier_fraction and left_only_fraction must be between 0 and 1")
+        if self.outlier_px < _MIN_OUTLIER_PX:
+            raise SimulationError(f"outlier_px must be at least {_MIN_OUTLIER_PX:g}")
 
 
-_LEAST_OUTLIER_PX = 5.0
-_CELL_PX = 48  # new features are drawn one to a cell
+_MIN_OUTLIER_PX = 5.0
+_CELL_PX = 48  # new features are sampled one per cell
 
 
 class OracleFrontend:
-    """The `Frontend` of a simulation with a rectified rig. Two with equal arguments give the same bits."""
+    """The `Frontend` of a simulation with a rectified rig; equal arguments give the same bits."""
 
     def __init__(self, simulation: Simulation, settings: OracleSettings | None = None, *, seed: int = 0) -> None:
-        """Prepare; frames then come in order, those of the simulation.
+        """Initialise; process the simulation's frames in order.
 
         Raises:
             SimulationError: the rig is not rectified.
@@ -60,11 +60,11 @@ class OracleFrontend:
         try:
             self._camera = rectified_camera(simulation.rig)
         except CalibrationError as error:
-            raise SimulationError("the oracle gives rectified pixels and needs a rectified rig") from error
+            raise SimulationError("the oracle outputs rectified pixels and needs a rectified rig") from error
         self._simulation = simulation
         self._settings = OracleSettings() if settings is None else settings
         self._seed = seed
-        # All features ever made, by id, and those now in view.
+        # All features created so far, by id, and those now in view.
         self._surface: IntArray = np.zeros(0, dtype=np.int64)
         self._place: FloatArray = np.zeros((0, 2))
         self._age: IntArray = np.zeros(0, dtype=np.int64)
@@ -73,7 +73,7 @@ class OracleFrontend:
         self._exact: dict[int, FloatArray] = {}
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
-        """Observe one frame; its images are not looked at, nor is the prior."""
+        """Observe one frame; its images and the prior are ignored."""
         settings = self._settings
         time_ns = int(self._simulation.taken_ns[frame.index])
         rng = np.random.default_rng([self._seed, frame.index, 51])
@@ -89,7 +89,7 @@ class OracleFrontend:
         n = len(self._live)
         noisy = exact + settings.sigma_px * rng.standard_normal((n, 4))
         wrong = rng.random(n) < settings.outlier_fraction
-        noisy[wrong] += _gross(rng, int(wrong.sum()), settings.outlier_px)
+        noisy[wrong] += _gross_errors(rng, int(wrong.sum()), settings.outlier_px)
         has_right = rng.random(n) >= settings.left_only_fraction
         self._outliers[frame.index], self._exact[frame.index] = wrong, exact
         output = observations(frame.index, frame.time_ns, self._live, noisy, has_right)
@@ -104,7 +104,7 @@ class OracleFrontend:
         return self._exact[frame_index]
 
     def points(self, ids: npt.ArrayLike, time_ns: int) -> FloatArray:
-        """True world positions (N, 3) of features (N,) at a true time; only those on moving boxes depend on it."""
+        """True world positions (N, 3) of features (N,) at a true time; points on moving boxes move with it."""
         index = np.asarray(ids, dtype=np.int64)
         surfaces = surfaces_at(self._simulation.world, time_ns)
         return surface_points(surfaces, self._surface[index], self._place[index])
@@ -130,7 +130,7 @@ class OracleFrontend:
         wanted: int,
         rng: np.random.Generator,
     ) -> tuple[IntArray, FloatArray]:
-        """Make up to `wanted` features, first in the image cells (`_CELL_PX`) that hold the fewest."""
+        """Create up to `wanted` features, first in the image cells (`_CELL_PX`) with the fewest."""
         if wanted <= 0:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 4))
         columns, rows = -(-left.camera.width // _CELL_PX), -(-left.camera.height // _CELL_PX)
@@ -149,16 +149,16 @@ class OracleFrontend:
         ids = first + np.arange(len(uv))
         z, seen = self._observe(surfaces, left, right, ids)
         good = np.flatnonzero(seen & hits.found)[:wanted]
-        # Forget the points that were not taken, so that ids count the features made.
+        # Discard the rejected points, so that ids count the features created.
         self._surface = np.concatenate([self._surface[:first], hits.surface[good]])
         self._place = np.concatenate([self._place[:first], hits.place[good]])
         self._age = np.concatenate([self._age, np.zeros(len(good), dtype=np.int64)])
         return first + np.arange(len(good)), z[good]
 
 
-def _gross(rng: np.random.Generator, count: int, largest: float) -> FloatArray:
-    """Errors (N, 4): half of them a wrong track (both images alike), half a wrong match (right image only)."""
-    angle, size = rng.uniform(0, 2 * np.pi, count), rng.uniform(_LEAST_OUTLIER_PX, largest, count)
+def _gross_errors(rng: np.random.Generator, count: int, largest: float) -> FloatArray:
+    """Errors (N, 4): half of them wrong tracks (both images alike), half wrong matches (right image only)."""
+    angle, size = rng.uniform(0, 2 * np.pi, count), rng.uniform(_MIN_OUTLIER_PX, largest, count)
     shift = size[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     both = rng.random(count) < 0.5
     return np.concatenate([np.where(both[:, None], shift, 0.0), shift], axis=1)

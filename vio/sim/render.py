@@ -1,11 +1,11 @@
-"""Ray-cast images of a world, and the exact map from any pixel to any other view.
+"""Ray-cast images of a world, and the exact correspondence of any pixel in any other view.
 
 A ray `d` from the camera centre c meets a surface with corner p0, axes e_s, e_t and normal n (h = n . (c - p0) > 0 in
 front of it) where `w = -(n . d) / h`, the inverse distance in units of d. Texture coordinates times w and w itself are
 linear in d, so every surface is one 3x3 matrix `G` with `G d = (w U, w V, w)`: in a pinhole image, a homography. All
 tests (inside the rectangle, nearest) are linear inequalities in d; where they hold at the corners of a tile they hold
-all over it. Tiles that show one surface are shaded whole; along outlines each pixel
-is sampled at eight places of its own.
+all over it. Tiles that show one surface are shaded at once; along outlines each pixel
+has eight samples, each with its own visibility test.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _CAST_PAIRS = 400_000  # rays times surfaces held in memory at once
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One camera, where it is, and when."""
+    """One camera with its pose and time."""
 
     camera: CameraModel
     T_world_cam: FloatArray  # (4, 4)
@@ -56,13 +56,13 @@ class CameraRays:
     # Rays in the camera frame, unit length for fisheye cameras and of unit depth for others.
     centre: npt.NDArray[np.float32]  # (3, H, W) through pixel centres
     corner: npt.NDArray[np.float32]  # (3, H + 1, W + 1) through pixel corners; [.., 0, 0] is pixel (-0.5, -0.5)
-    fine: FloatArray  # (R, C, 4, 3) rays whose cone holds each tile
+    fine: FloatArray  # (R, C, 4, 3) rays whose cone contains each tile
     coarse: FloatArray  # (R', C', 4, 3) the same for blocks of tiles
 
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """Where rays meet the scene."""
+    """Intersections of rays with the scene."""
 
     surface: IntArray  # (N,) index of the surface; arbitrary where nothing is hit
     distance: FloatArray  # (N,) along the unit ray, m
@@ -97,7 +97,7 @@ def _grid(width: int, height: int, start: float) -> FloatArray:
 
 
 def _cones(corner: FloatArray, tile: int) -> FloatArray:
-    """Four rays per tile that span a cone holding all its rays, found on a plane across its middle ray."""
+    """Four rays per tile that span a cone containing all its rays, found on a plane normal to its central ray."""
     height, width = corner.shape[0] - 1, corner.shape[1] - 1
     rows, columns = -(-height // tile), -(-width // tile)
     out = np.empty((rows, columns, 4, 3))
@@ -127,7 +127,7 @@ def _cones(corner: FloatArray, tile: int) -> FloatArray:
 
 
 def _surface_matrices(surfaces: Surfaces, T_world_cam: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Matrices G (K, 3, 3) with `G d = (w s, w t, w)` for camera-frame rays d, of the K surfaces turned this way."""
+    """Matrices G (K, 3, 3) with `G d = (w s, w t, w)` for camera-frame rays d, of the K surfaces facing it."""
     c, R = T_world_cam[:3, 3], T_world_cam[:3, :3]
     from_corner = c - surfaces.origin
     normal = surfaces.normal
@@ -149,7 +149,7 @@ def cast(surfaces: Surfaces, T_world_cam: npt.ArrayLike, rays: npt.ArrayLike, *,
         surfaces: the scene at one time.
         T_world_cam: pose (4, 4) of the camera.
         rays: unit rays (N, 3), camera frame.
-        among: indices of the only surfaces to look at.
+        among: indices of the surfaces to test; None: all.
     """
     d = np.asarray(rays, dtype=np.float64).reshape(-1, 3)
     G, index = _surface_matrices(surfaces, np.asarray(T_world_cam, dtype=np.float64))
@@ -189,7 +189,7 @@ def surface_points(surfaces: Surfaces, surface: IntArray, place: FloatArray) -> 
 def correspondence(world: World, frame_a: View, frame_b: View, uv: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
     """Map pixels (N, 2) of one view to another view (of the same or another camera, at the same or another time).
 
-    Exact at sub-pixel positions: the ray is intersected, nothing is interpolated. Points of moving boxes move along.
+    Exact at sub-pixel positions: the ray is intersected, nothing is interpolated. Points on moving boxes move along.
 
     Returns:
         Pixels (N, 2) in `frame_b`, and a mask (N,): True where the point is inside the other image and nothing is
@@ -205,14 +205,14 @@ def correspondence(world: World, frame_a: View, frame_b: View, uv: npt.ArrayLike
 
 
 def observe(surfaces: Surfaces, view: View, p_world: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
-    """Pixels (N, 2) of world points (N, 3) on surfaces, and a mask (N,) of those inside the image and not hidden."""
+    """Pixels (N, 2) of world points (N, 3) on surfaces, and a mask (N,) of those inside the image and not occluded."""
     p_cam = transform_points(se3_inverse(view.T_world_cam), np.asarray(p_world, dtype=np.float64).reshape(-1, 3))
     uv, valid = project_point(view.camera, p_cam)
     visible = valid & inside_image(view.camera, uv)
     distance = np.linalg.norm(p_cam, axis=1)
     rays = p_cam[visible] / distance[visible, None]
     hits = cast(surfaces, view.T_world_cam, rays)
-    # A point seen from behind its surface meets either nothing at its distance or another surface in front.
+    # For a point seen from behind its surface, the ray hits nothing at its distance, or another surface in front.
     reached = hits.found & (np.abs(hits.distance - distance[visible]) < _SAME_POINT * (1 + distance[visible]))
     visible[visible] = reached
     return uv, visible
@@ -229,7 +229,7 @@ def inside_image(camera: CameraModel, uv: npt.ArrayLike, *, margin_px: float = 0
 def depth_map(
     world: World, rays: CameraRays, T_world_cam: npt.ArrayLike, time_ns: int = 0
 ) -> tuple[FloatArray, IntArray]:
-    """Exact depth along the optical axis (H, W) in metres at pixel centres, and the surface seen there (H, W).
+    """Exact depth along the optical axis (H, W) in metres at pixel centres, and the visible surface (H, W).
 
     Depth is infinite where no surface is hit.
     """
@@ -255,7 +255,7 @@ def depth_map(
 
 
 def _candidates(G: FloatArray, size: FloatArray, rays: CameraRays) -> BoolArray:
-    """Surfaces (R, C, K) that may be seen in each tile; exactly one where that is certain."""
+    """Surfaces (R, C, K) that may be visible in each tile; exactly one where that is certain."""
     rows, columns = rays.fine.shape[:2]
     coarse = _cull(G, size, rays.coarse.reshape(-1, 4, 3)).reshape(*rays.coarse.shape[:2], len(G))
     out = np.zeros((rows, columns, len(G)), dtype=np.bool_)
@@ -268,7 +268,7 @@ def _candidates(G: FloatArray, size: FloatArray, rays: CameraRays) -> BoolArray:
 
 
 def _cull(G: FloatArray, size: FloatArray, cones: FloatArray) -> BoolArray:
-    """Surfaces (B, K) that may be seen in cones (B, 4, 3) of rays: five linear inequalities at the four edges."""
+    """Surfaces (B, K) that may be visible in cones (B, 4, 3) of rays: five linear inequalities at the four edges."""
     forms = np.einsum("kij,bqj->ibqk", G, cones, optimize=True)
     w = forms[2]
     limits = (w, forms[0], forms[1], size[:, 0] * w - forms[0], size[:, 1] * w - forms[1])
@@ -321,7 +321,7 @@ def render(world: World, rays: CameraRays, T_world_cam: npt.ArrayLike, time_ns: 
 
 
 def _shown(scene: _Scene, candidates: BoolArray, rays: CameraRays, r: int) -> npt.NDArray[np.int16]:
-    """The surface that each pixel (h, W) of a row of tiles shows all over, _EDGE_MARK on outlines, or _NONE."""
+    """The one surface visible in each pixel (h, W) of a row of tiles, _EDGE_MARK on outlines, or _NONE."""
     rows = slice(r * _TILE, min((r + 1) * _TILE, rays.camera.height))
     out = np.full((rows.stop - rows.start, rays.camera.width), _NONE, dtype=np.int16)
     for c, allowed in enumerate(candidates):
@@ -370,7 +370,7 @@ def _shade_row(
 
 
 def _runs(seen: npt.NDArray[np.intp], longest: int) -> Iterator[tuple[int, int]]:
-    """Intervals [first, last) that hold all columns seen, without wide gaps and none longer than `longest`."""
+    """Intervals [first, last) that cover all given columns, without wide gaps and at most `longest` long."""
     cuts = np.flatnonzero(np.diff(seen) > _TILE) + 1
     for part in np.split(seen, cuts):
         first, end = int(part[0]), int(part[-1]) + 1
@@ -380,7 +380,7 @@ def _runs(seen: npt.NDArray[np.intp], longest: int) -> Iterator[tuple[int, int]]
 
 
 def _samples(across: int, down: int) -> npt.NDArray[np.float32]:
-    """Sample positions (N, 2) within a pixel, the two colours of a chessboard one after the other.
+    """Sample positions (N, 2) within a pixel, one colour of a chessboard after the other.
 
     The halves take their texture from neighbouring mip levels where the level of detail lies between two; each half
     is symmetric about the pixel's centre, so the blend shifts nothing.
@@ -392,7 +392,7 @@ def _samples(across: int, down: int) -> npt.NDArray[np.float32]:
 
 
 _SQUARE, _WIDE, _TALL = _samples(2, 2), _samples(4, 2), _samples(2, 4)
-# Eight queens that stay in place under half a turn: eight different heights and widths, symmetric about the centre.
+# A symmetric eight-queens pattern: eight different rows and columns, symmetric about the centre.
 _QUEENS = (2, 4, 1, 7, 0, 6, 3, 5)
 _FINE = np.array([((i + 0.5) / 8 - 0.5, (j + 0.5) / 8 - 0.5) for i, j in enumerate(_QUEENS)], dtype=np.float32)
 _STRETCHED = 2.0  # ratio of footprint sides from which the longer one gets twice the samples
@@ -416,7 +416,7 @@ def _levels(square: npt.NDArray[np.float32], texture: MipTexture, phase: float) 
 
 
 def _shade(scene: _Scene, k: int, rays: CameraRays, rows: slice, columns: slice) -> Radiance:
-    """Texture of surface k over a block of pixels (h, w), whether or not it is seen there."""
+    """Texture of surface k over a block of pixels (h, w), whether or not it is visible there."""
     d = rays.centre[:, rows, columns]
     h, w = d.shape[1:]
     texture, G = scene.textures[k], scene.G[k]
@@ -506,7 +506,7 @@ def _sample_points(
     level = texture.levels[_levels(square, texture, 0.5)]
     x = forms[0] / forms[2] * level[:, 0] + level[:, 2]
     y = forms[1] / forms[2] * level[:, 1] + level[:, 3]
-    width = 1024  # cv2.remap wants an image
+    width = 1024  # cv2.remap needs an image
     padded = np.zeros((2, -(-len(x) // width) * width), dtype=np.float32)
     padded[0, : len(x)], padded[1, : len(x)] = x, y
     maps = padded.reshape(2, -1, width)

@@ -1,4 +1,4 @@
-"""Ready stereo rigs: KITTI-like, EuRoC-like, fisheye, and a small one for demos and tests."""
+"""Predefined stereo rigs: KITTI-like, EuRoC-like, fisheye, and a small one for demos and tests."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def small_rig(width: int = 640, height: int = 360) -> StereoRig:
 def kitti_like_rig(width: int = 1242) -> StereoRig:
     """Rectified rig like KITTI's gray pair (1242x375, 0.537 m), scaled to any width.
 
-    The IMU lies behind, below and to the left of the left camera, its axes forward, left, up.
+    The IMU is behind, below and to the left of the left camera, its axes forward, left, up.
     Reference: Geiger et al., Vision meets robotics: the KITTI dataset (2013).
     """
     scale = width / 1242

@@ -1,4 +1,4 @@
-"""Ready recordings by name: scene, trajectory, rig and effects become one plan, the same in every process."""
+"""Named recordings: scene, trajectory, rig and effects define one plan, identical in every process."""
 
 from __future__ import annotations
 
@@ -25,7 +25,15 @@ from vio.records import NS_PER_S, Image, ImuRecord, IntArray
 from vio.sim.effects import CLEAN, SensorEffects
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ImuNoise, VelocityNoise
-from vio.sim.motion import MotionSpline, car_loop, evaluate, hand_held, look_rotation, spline_from_waypoints, turned
+from vio.sim.motion import (
+    MotionSpline,
+    car_loop,
+    evaluate,
+    hand_held,
+    look_rotation,
+    rotate_body_axes,
+    spline_from_waypoints,
+)
 from vio.sim.rigs import (
     R_FLU_EUROC_IMU,
     euroc_like_rig,
@@ -50,7 +58,7 @@ RIGS: dict[str, Callable[[], StereoRig]] = {
 }
 _EUROC_AXES = ("euroc", "euroc-rectified")  # rigs whose IMU axes are up, right, forward
 _MARGIN_S = 0.25  # of motion before the first and after the last frame, for shutters and clock offsets
-_AHEAD = 3  # frames in flight for each process
+_AHEAD = 3  # pending frames per process
 _LEAD_M = 14.0  # to the car ahead
 _WALL_GAP_M = 0.4  # from a wall to the middle of a box that moves along it
 
@@ -59,7 +67,7 @@ FLIGHT_FILES = ("groundtruth_tum.txt", "image_timestamps_ns.txt", "imu0.csv")
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What makes a recording hard; the defaults are a well-lit scene and a good camera."""
+    """Adverse conditions of a recording; the defaults are a well-lit scene and a good camera."""
 
     effects: SensorEffects = field(default_factory=SensorEffects)
     faults: FrameFaults = field(default_factory=FrameFaults)
@@ -68,32 +76,32 @@ class Conditions:
     moving: bool = False  # boxes that move on their own
 
 
-def _seen(**values: Any) -> Callable[[Conditions], Conditions]:
+def _with_effects(**values: Any) -> Callable[[Conditions], Conditions]:
     return lambda conditions: replace(conditions, effects=replace(conditions.effects, **values))
 
 
-def _faulty(**values: float) -> Callable[[Conditions], Conditions]:
+def _with_faults(**values: float) -> Callable[[Conditions], Conditions]:
     return lambda conditions: replace(conditions, faults=replace(conditions.faults, **values))
 
 
 EFFECTS: dict[str, Callable[[Conditions], Conditions]] = {
     "clean": lambda conditions: replace(conditions, effects=CLEAN),
-    "exposure": _seen(exposure_swing=0.3),
-    "gain": _seen(right_gain=0.6),
-    "gain-high": _seen(right_gain=1.6),
-    "blur": _seen(blur_exposure_ms=15.0),
-    "noise": _seen(read_noise=5.0, full_well=5000.0),
-    "dark": _seen(exposure=0.06, read_noise=1.5, full_well=10000.0),
+    "exposure": _with_effects(exposure_swing=0.3),
+    "gain": _with_effects(right_gain=0.6),
+    "gain-high": _with_effects(right_gain=1.6),
+    "blur": _with_effects(blur_exposure_ms=15.0),
+    "noise": _with_effects(read_noise=5.0, full_well=5000.0),
+    "dark": _with_effects(exposure=0.06, read_noise=1.5, full_well=10000.0),
     "bare-wall": lambda conditions: replace(conditions, bare_wall=True),
     "moving": lambda conditions: replace(conditions, moving=True),
-    "dropped": _faulty(dropped=0.1),
-    "duplicated": _faulty(duplicated=0.1),
-    "time-offset": _faulty(time_offset_ms=20.0),
+    "dropped": _with_faults(dropped=0.1),
+    "duplicated": _with_faults(duplicated=0.1),
+    "time-offset": _with_faults(time_offset_ms=20.0),
 }
 
 
 def conditions_of(names: Sequence[str]) -> Conditions:
-    """Return the conditions that effects called by name make together, applied in order.
+    """Return the conditions that named effects produce, applied in order.
 
     Raises:
         SimulationError: there is no effect of that name.
@@ -108,7 +116,7 @@ def conditions_of(names: Sequence[str]) -> Conditions:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """A recording to make, in words; everything in it follows from these and travels to other processes."""
+    """The picklable description of a recording, which other processes can rebuild it from."""
 
     scene: SceneName = "room"  # along a recorded trajectory a room is built around it
     trajectory: ReadyMotion | Path = "handheld"  # or a TUM file of the IMU's poses
@@ -124,10 +132,10 @@ class Scenario:
 
 
 def plan(scenario: Scenario) -> Simulation:
-    """Build scene, motion and sensors, and check that the recording can be made; nothing is rendered yet.
+    """Build scene, motion and sensors, and check that the recording can be simulated; nothing is rendered yet.
 
     Raises:
-        SimulationError: a value makes no sense, or a camera would be outside the scene or in a box.
+        SimulationError: a value is invalid, or a camera would be outside the scene or in a box.
         DataError: a recorded file cannot be used; the message names it.
     """
     _check(scenario)
@@ -156,11 +164,11 @@ def _check(scenario: Scenario) -> None:
     if not (0 <= faults.dropped < 1 and 0 <= faults.duplicated < 1):
         raise SimulationError("faults.dropped and faults.duplicated are shares of the frames, from 0 to below 1")
     if scenario.width is not None and not 64 <= scenario.width <= 8192:
-        raise SimulationError(f"images {scenario.width} px wide cannot be made; choose a width from 64 to 8192")
+        raise SimulationError(f"images {scenario.width} px wide cannot be rendered; choose a width from 64 to 8192")
     if not 0 < scenario.rate_hz <= 1000:
-        raise SimulationError(f"{scenario.rate_hz:g} frames a second cannot be made; choose a rate up to 1000")
+        raise SimulationError(f"{scenario.rate_hz:g} frames a second cannot be rendered; choose a rate up to 1000")
     if scenario.duration_s is not None and not 0 < scenario.duration_s <= 36000:
-        raise SimulationError(f"a recording of {scenario.duration_s:g} s cannot be made; choose up to 36000 s")
+        raise SimulationError(f"a recording of {scenario.duration_s:g} s cannot be rendered; choose up to 36000 s")
     if scenario.seed < 0:
         raise SimulationError(f"the seed must not be negative, got {scenario.seed}")
     if scenario.conditions.bare_wall and scenario.scene == "street":
@@ -209,15 +217,15 @@ def _recorded(scenario: Scenario) -> tuple[MotionSpline, IntArray, ImuRecord | N
 
 def _ready(scenario: Scenario) -> tuple[MotionSpline, IntArray, None]:
     if scenario.frame_times is not None:
-        raise SimulationError("frame times go with a recorded trajectory; give a rate instead")
+        raise SimulationError("frame times need a recorded trajectory; give a rate instead")
     if isinstance(scenario.imu, Path):
-        raise SimulationError("a recorded IMU goes with its own recorded trajectory; simulate one instead")
+        raise SimulationError("a recorded IMU needs its own recorded trajectory; simulate one instead")
     duration_s = 30.0 if scenario.duration_s is None else scenario.duration_s
-    # A whole number of frame times, so that sensors that start with the motion at that rate meet the frames.
+    # A whole number of frame periods, so that sensors of that rate sample at the frame times.
     before = math.ceil(_MARGIN_S * scenario.rate_hz)
     motion = _motion(scenario, duration_s + before / scenario.rate_hz + _MARGIN_S)
     if scenario.rig in _EUROC_AXES:
-        motion = turned(motion, R_FLU_EUROC_IMU)
+        motion = rotate_body_axes(motion, R_FLU_EUROC_IMU)
     return motion, _regular(motion.start_ns, duration_s, scenario.rate_hz, first=before), None
 
 
@@ -231,7 +239,7 @@ def _motion(scenario: Scenario, duration_s: float) -> MotionSpline:
 
 
 def _walk(duration_s: float, seed: int) -> MotionSpline:
-    """Walk up and down the corridor, turning round near its ends, with an unsteady hand."""
+    """Walk up and down the corridor, turning near its ends, with hand shake."""
     interval_s = 0.5
     t = np.arange(0.0, duration_s + interval_s, interval_s)
     rng = np.random.default_rng([seed, 13])
@@ -259,12 +267,12 @@ def _world(scenario: Scenario, motion: MotionSpline) -> World:
         return street(seed, moving=_traffic(motion, seed) if hard.moving else ())
     if scenario.scene == "corridor":
         lane = np.array([[3.0, 0.95, 1.1], [27.0, 0.95, 1.1]])
-        moving = (_patrol(lane, motion.start_ns, 25.0),) if hard.moving else ()
+        moving = (_oscillating_box(lane, motion.start_ns, 25.0),) if hard.moving else ()
         return corridor(seed, bare_walls=("+y", "-y") if hard.bare_wall else ("+y",), moving=moving)
     walls = ("+x", "+y") if hard.bare_wall else ()
     if not isinstance(scenario.trajectory, Path):
         plain = room(seed)
-        return room(seed, bare_walls=walls, moving=_visitors(plain, motion) if hard.moving else ())
+        return room(seed, bare_walls=walls, moving=_boxes_along_walls(plain, motion) if hard.moving else ())
     around = room_around(motion, seed=seed)
     if not (walls or hard.moving):
         return around
@@ -276,21 +284,21 @@ def _world(scenario: Scenario, motion: MotionSpline) -> World:
         pictures=20,
         keep_clear=evaluate(motion, times).T_world_imu[:, :3, 3],
         bare_walls=walls,
-        moving=_visitors(around, motion) if hard.moving else (),
+        moving=_boxes_along_walls(around, motion) if hard.moving else (),
     )
 
 
-def _visitors(world: World, motion: MotionSpline) -> tuple[MovingBox, ...]:
-    """Boxes that glide up and down along the four walls, where neither ready motions nor flights go."""
+def _boxes_along_walls(world: World, motion: MotionSpline) -> tuple[MovingBox, ...]:
+    """Boxes that move back and forth along the four walls, clear of all camera trajectories."""
     low, high = world.bounds[0] + _WALL_GAP_M, world.bounds[1] - _WALL_GAP_M
     z = (world.bounds[0, 2] + world.bounds[1, 2]) / 2
     corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
     lanes = [np.array([[*corners[i], z], [*corners[(i + 1) % 4], z]]) for i in range(4)]
-    return tuple(_patrol(lane, motion.start_ns, 8.0 + i) for i, lane in enumerate(lanes))
+    return tuple(_oscillating_box(lane, motion.start_ns, 8.0 + i) for i, lane in enumerate(lanes))
 
 
-def _patrol(lane: FloatArray, start_ns: int, period_s: float) -> MovingBox:
-    """A box that swings between the two ends (2, 3) of a lane."""
+def _oscillating_box(lane: FloatArray, start_ns: int, period_s: float) -> MovingBox:
+    """A box that oscillates between the two ends (2, 3) of a lane."""
 
     def pose(time_ns: int) -> FloatArray:
         along = 0.5 - 0.5 * np.cos(2 * np.pi * (time_ns - start_ns) / NS_PER_S / period_s)
@@ -300,7 +308,7 @@ def _patrol(lane: FloatArray, start_ns: int, period_s: float) -> MovingBox:
 
 
 def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
-    """A car ahead in the same lane, and one that comes towards it on the inner lane again and again."""
+    """A car ahead in the same lane, and an oncoming one that circles the inner lane."""
     seconds = (motion.end_ns - motion.start_ns) / NS_PER_S
     ahead = car_loop(duration_s=seconds, start_m=_LEAD_M, height_m=0.85, seed=seed, start_ns=motion.start_ns)
     inner = car_loop(loop_m=(103.6, 63.6), corner_m=5.0, height_m=0.85, seed=seed + 1)
@@ -320,14 +328,14 @@ def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
 
 
 class ParallelRecording(SimulatedRecording):
-    """A scenario's recording whose images are made ahead by other processes; the bits are those of one process.
+    """A scenario's recording, rendered ahead by other processes; the images equal those of one process to the bit.
 
-    Use it as a context manager, and ask for frames in order. Every process plans the scenario for itself, from the
+    Use it as a context manager, and request frames in order. Every process plans the scenario itself, from the
     same seed.
     """
 
     def __init__(self, scenario: Scenario, *, workers: int, simulation: Simulation | None = None) -> None:
-        """Start up to `workers` processes when the first image is asked for."""
+        """Prepare a pool of `workers` processes, started with the first request."""
         super().__init__(plan(scenario) if simulation is None else simulation)
         self._scenario = scenario
         self._workers = workers
@@ -343,7 +351,7 @@ class ParallelRecording(SimulatedRecording):
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def images(self, index: int) -> tuple[Image, Image]:
-        """Return both images (H, W) of one frame with all effects, and have the next ones made.
+        """Return both images (H, W) of one frame with all effects, and schedule the next ones.
 
         Raises:
             SimulationError: a process ended unexpectedly.
@@ -359,13 +367,13 @@ class ParallelRecording(SimulatedRecording):
             ) from error
 
 
-def usual_workers(frames: int) -> int:
-    """Processes worth starting: one for short recordings, which are done before a second one is up."""
+def default_workers(frames: int) -> int:
+    """Default number of processes: one for short recordings, which finish before a second one has started."""
     return min(2, os.cpu_count() or 1) if frames >= 100 else 1
 
 
 def _start_worker() -> None:
-    """One thread each; the interrupt of a user is for the main process, which ends the others."""
+    """Limit the process to one thread; the main process alone handles a user's interrupt."""
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,4 +1,4 @@
-"""A simulated recording: rendered on the fly behind the `Dataset` protocol, with the truth at hand."""
+"""A simulated recording: rendered on the fly behind the `Dataset` protocol, with exact ground truth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vio.records import (
     Trajectory,
     VelocitySample,
 )
-from vio.sim.effects import SensorEffects, develop, exposed, smeared
+from vio.sim.effects import SensorEffects, apply_effects, average_exposures, blur_along_flow
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
 from vio.sim.motion import FitReport, MotionSpline, evaluate, recorded_motion
@@ -39,28 +39,28 @@ from vio.text_files import check_increasing
 logger = logging.getLogger(__name__)
 
 _CLEARANCE_STEP_NS = 20_000_000
-_FLOW_GRID = 16  # pixels between exact flow vectors of the cheap blur
+_FLOW_GRID = 16  # pixels between exact flow vectors of the approximate blur
 _WALL_MARGIN_M = 1.2  # of a room built around a recorded flight
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFaults:
-    """What goes wrong with whole frames and clocks."""
+    """Faults of whole frames and of the clocks."""
 
     dropped: float = 0.0  # share of frames that never arrive
-    duplicated: float = 0.0  # share of frames that show the image before, under their own time
-    time_offset_ms: float = 0.0  # stamps of frames are their true times plus this; the IMU's clock is the truth
+    duplicated: float = 0.0  # share of frames that repeat the previous image under their own time
+    time_offset_ms: float = 0.0  # frame stamps are true times plus this; the IMU's clock is exact
 
 
 @dataclass(frozen=True, slots=True)
 class Simulation:
-    """Everything that a simulated recording follows from; two equal ones give the same bits."""
+    """The full definition of a simulated recording; equal definitions give the same bits."""
 
     world: World
     rig: StereoRig
     motion: MotionSpline
     taken_ns: IntArray  # (F,) when the content of each frame was exposed, true time; repeats where duplicated
-    stamps_ns: IntArray  # (F,) time that each frame claims, strictly increasing
+    stamps_ns: IntArray  # (F,) time stamp of each frame, strictly increasing
     imu: ImuRecord | None
     velocity: tuple[VelocitySample, ...]
     effects: SensorEffects
@@ -69,7 +69,7 @@ class Simulation:
 
 @dataclass(frozen=True, slots=True)
 class TrueState:
-    """What a filter tries to find out, at one time."""
+    """The true state at one time."""
 
     time_ns: int
     T_world_imu: FloatArray  # (4, 4)
@@ -94,21 +94,21 @@ def simulate(
     faults: FrameFaults | None = None,
     seed: int = 0,
 ) -> Simulation:
-    """Plan a recording and check that it can be made; nothing is rendered yet.
+    """Plan a recording and check that it can be simulated; nothing is rendered yet.
 
     Args:
         world: scene.
-        rig: cameras on their body, whose IMU `motion` moves.
+        rig: cameras, mounted on the body that `motion` moves.
         motion: motion of the body.
         rate_hz: frames per second.
         frame_times_ns: true times (F,) of the frames in place of a fixed rate; those outside the motion are left out.
-        imu: noise of a simulated IMU, or a real record to go with the images; None: no IMU.
+        imu: noise of a simulated IMU, or a recorded IMU to use with the images; None: no IMU.
         imu_rate_hz: rate of the simulated IMU.
         velocity: noise of the paper's velocity sensor; None: no such sensor.
         velocity_rate_hz: its rate; None: that of the frames.
-        effects: how the cameras see; None: the defaults of `SensorEffects`.
+        effects: camera effects; None: the defaults of `SensorEffects`.
         faults: dropped and repeated frames, clock offset.
-        seed: everything random follows from it.
+        seed: seed of all random numbers.
 
     Raises:
         SimulationError: a camera would be outside the scene or in a box, or no frame is left.
@@ -117,7 +117,7 @@ def simulate(
     effects = SensorEffects() if effects is None else effects
     times = _frame_times(motion, rate_hz, frame_times_ns, effects, faults)
     _check_cameras(world, rig, motion, times)
-    taken, stamps = _faulty(times, faults, seed)
+    taken, stamps = _apply_faults(times, faults, seed)
     record = simulate_imu(motion, rate_hz=imu_rate_hz, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
     samples: tuple[VelocitySample, ...] = ()
     if velocity is not None:
@@ -128,7 +128,7 @@ def simulate(
 def _frame_times(
     motion: MotionSpline, rate_hz: float, given: npt.ArrayLike | None, effects: SensorEffects, faults: FrameFaults
 ) -> IntArray:
-    """True times of all frames whose shutter and stamp lie within the motion."""
+    """True times of all frames whose shutter interval and stamp are within the motion."""
     if given is None:
         count = int((motion.end_ns - motion.start_ns) * 1e-9 * rate_hz) + 1
         times = motion.start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
@@ -139,7 +139,7 @@ def _frame_times(
     inside = (times - half_shutter >= motion.start_ns) & (times + half_shutter <= motion.end_ns)
     inside &= (times + offset >= motion.start_ns) & (times + offset <= motion.end_ns)
     if not inside.any():
-        raise SimulationError("no frame lies within the motion; check the frame times and the length of the motion")
+        raise SimulationError("no frame is within the motion; check the frame times and the length of the motion")
     return times[inside]
 
 
@@ -147,8 +147,8 @@ def _offset_ns(faults: FrameFaults) -> int:
     return round(faults.time_offset_ms * 1e6)
 
 
-def _faulty(times: IntArray, faults: FrameFaults, seed: int) -> tuple[IntArray, IntArray]:
-    """Times of content and stamps of the frames that arrive; the first frame always does."""
+def _apply_faults(times: IntArray, faults: FrameFaults, seed: int) -> tuple[IntArray, IntArray]:
+    """Exposure times and stamps of the frames that arrive; the first frame always does."""
     rng = np.random.default_rng([seed, 41])
     draw = rng.random((2, len(times)))
     arrives = draw[0] >= faults.dropped
@@ -187,17 +187,17 @@ def true_state(simulation: Simulation, time_ns: int) -> TrueState:
 
 
 def views(simulation: Simulation, time_ns: int) -> tuple[View, View]:
-    """Return both cameras where they truly are at one time."""
+    """Return the true views of both cameras at one time."""
     T = evaluate(simulation.motion, time_ns).T_world_imu[0]
     rig = simulation.rig
     return View(rig.cam0, T @ rig.T_imu_cam0, time_ns), View(rig.cam1, T @ rig.T_imu_cam1, time_ns)
 
 
 class SimulatedRecording:
-    """The `Dataset` of a simulation: frames are rendered when they are asked for."""
+    """The `Dataset` of a simulation; frames are rendered on request."""
 
     def __init__(self, simulation: Simulation) -> None:
-        """Take a plan; nothing is rendered before it is asked for."""
+        """Store the plan; frames are rendered on request."""
         self.simulation = simulation
         self._rays: tuple[CameraRays, CameraRays] | None = None
 
@@ -285,17 +285,19 @@ class SimulatedRecording:
         """Render both images (H, W) of one frame with all effects."""
         simulation = self.simulation
         time_ns = int(simulation.taken_ns[index])
-        # A repeated frame is the same picture to the bit, so its noise follows from the frame it repeats.
+        # A repeated frame is identical to the bit, so its noise is seeded by the frame it repeats.
         source = int(np.searchsorted(simulation.taken_ns, time_ns))
         left, right = self.radiance(time_ns)
-        developed = [
-            develop(image, simulation.effects, time_ns=time_ns, frame_index=source, camera=camera, seed=simulation.seed)
+        images = [
+            apply_effects(
+                image, simulation.effects, time_ns=time_ns, frame_index=source, camera=camera, seed=simulation.seed
+            )
             for camera, image in enumerate((left, right))
         ]
-        return developed[0], developed[1]
+        return images[0], images[1]
 
     def radiance(self, time_ns: int) -> tuple[Radiance, Radiance]:
-        """Render both linear images (H, W) at a true time, blurred if the effects say so."""
+        """Render both linear images (H, W) at a true time, with motion blur where the effects set it."""
         effects = self.simulation.effects
         if effects.blur_exposure_ms <= 0:
             return self._sharp(0, time_ns), self._sharp(1, time_ns)
@@ -308,13 +310,13 @@ class SimulatedRecording:
     def _blurred(self, camera: int, time_ns: int) -> Radiance:
         effects = self.simulation.effects
         if effects.blur_exact:
-            return exposed(lambda t: self._sharp(camera, t), time_ns, effects)
+            return average_exposures(lambda t: self._sharp(camera, t), time_ns, effects)
         half = round(effects.blur_exposure_ms * 0.5e6)
         before, after = (self.flow(camera, time_ns, time_ns + sign * half) for sign in (-1, 1))
-        return smeared(self._sharp(camera, time_ns), before, after, effects)
+        return blur_along_flow(self._sharp(camera, time_ns), before, after, effects)
 
     def flow(self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _FLOW_GRID) -> FloatArray:
-        """Optical flow (H, W, 2) of one camera between two true times, exact on a grid and interpolated between.
+        """Optical flow (H, W, 2) of one camera between two true times, exact on a grid and interpolated between nodes.
 
         Where a grid point leaves the image its flow is still that of its surface point.
         """
@@ -336,7 +338,7 @@ class SimulatedRecording:
 
 
 def _dense(grid: FloatArray, width: int, height: int) -> FloatArray:
-    """Bilinear interpolation of a grid (R, C, 2) whose outer rows and columns lie on the image's outer pixels."""
+    """Bilinear interpolation of a grid (R, C, 2) whose outer rows and columns are at the image's outer pixels."""
     rows, columns = grid.shape[:2]
     y, x = np.linspace(0, rows - 1, height), np.linspace(0, columns - 1, width)
     r, c = np.minimum(y.astype(int), rows - 2), np.minimum(x.astype(int), columns - 2)
@@ -362,7 +364,7 @@ class RecordedFlight:
 def read_flight(
     groundtruth: Path, image_times: Path | None = None, imu_csv: Path | None = None, *, knot_s: float = 0.1
 ) -> RecordedFlight:
-    """Read a flight recorded elsewhere, to render images along it.
+    """Read a recorded flight, to render images along it.
 
     Args:
         groundtruth: TUM file of the IMU's poses.
@@ -380,14 +382,14 @@ def read_flight(
         times, _, _ = stamped_rows(image_times, 1, "nanoseconds, one integer a line")
     times = times[(times >= motion.start_ns) & (times <= motion.end_ns)]
     if len(times) == 0:
-        raise DataError(f"no image time falls into the ground truth {groundtruth}; use the same clock for both")
+        raise DataError(f"no image time is within the ground truth {groundtruth}; use the same clock for both")
     return RecordedFlight(motion, fit, times, None if imu_csv is None else read_imu_csv(imu_csv))
 
 
 def room_around(
     motion: MotionSpline, *, seed: int = 0, margin_m: float = _WALL_MARGIN_M, texel_m: float | None = None
 ) -> World:
-    """Build a room that holds a motion, its furniture out of the way."""
+    """Build a room around a motion; its furniture keeps clear of the path."""
     times = np.arange(motion.start_ns, motion.end_ns, _CLEARANCE_STEP_NS)
     p = evaluate(motion, times).T_world_imu[:, :3, 3]
     low, high = p.min(axis=0) - margin_m, p.max(axis=0) + margin_m

@@ -1,6 +1,6 @@
 """Procedural textures with detail at every scale, and the mip chains they are sampled from.
 
-Each texture is drawn once for its surface from its own seed, at the surface's full size, so nothing repeats.
+Each texture is painted once for its surface from its own seed, at full size, so nothing repeats.
 Values are linear intensities in gray levels of a well exposed image, uint8.
 """
 
@@ -42,7 +42,7 @@ class MipTexture:
 def build_mips(texture: Image) -> MipTexture:
     """Pack a texture (H, W) and its half-octave mip levels into one page.
 
-    A level-0 coordinate U in [0, W], texel centres at the halves, lies at `scale * U + offset` of the page.
+    A level-0 coordinate U in [0, W], texel centres at the halves, maps to `scale * U + offset` on the page.
     """
     height, width = texture.shape
     if width > _MAX_SIDE:
@@ -104,7 +104,7 @@ def octave_noise(
     finest_texels: float = 1.0,
     falloff: float = 0.8,
 ) -> _Canvas:
-    """Zero-mean value noise (height, width) of about unit deviation, octave upon octave.
+    """Zero-mean value noise (height, width) of about unit standard deviation, summed over octaves.
 
     Args:
         coarsest_texels: wavelength of the first octave.
@@ -171,7 +171,7 @@ def _polygons(
 
 
 def _scatter(canvas: _Canvas, per_m: float, rng: np.random.Generator, *, density: float, contrast: float) -> None:
-    """Strew marks of every size from half a metre to a centimetre, ever more of the smaller ones."""
+    """Add marks of every size from half a metre to a centimetre, more of the smaller ones."""
     height, width = canvas.shape
     area = width * height / per_m**2
     for low, high, weight in ((0.15, 0.5, 1.5), (0.05, 0.15, 8.0), (0.015, 0.05, 30.0)):
@@ -204,7 +204,7 @@ def _wall(width: int, height: int, per_m: float, rng: np.random.Generator) -> _C
 
 
 def _poster(canvas: _Canvas, per_m: float, rng: np.random.Generator) -> None:
-    """Hang one sheet with its own content on a wall."""
+    """Add one poster with its own content to a wall."""
     height, width = canvas.shape
     w, h = (int(x) for x in rng.uniform(0.3, 0.9, 2) * per_m)
     if w < 12 or h < 12 or w >= width or h >= height:
@@ -230,7 +230,7 @@ def _picture(width: int, height: int, per_m: float, rng: np.random.Generator) ->
 
 
 def _floor(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
-    """Planks of changing length and shade under rugs and marks."""
+    """Planks of varying length and shade, with rugs and marks."""
     canvas = 110 + 22 * _noise(width, height, per_m, rng, 2.0, 0.9)
     plank = 0.14 * per_m
     for row in range(int(height / plank) + 1):
@@ -273,7 +273,7 @@ def _crate(width: int, height: int, per_m: float, rng: np.random.Generator) -> _
 
 
 def _edged(canvas: _Canvas, per_m: float, rng: np.random.Generator) -> _Canvas:
-    """Darken a thin rim, so that boxes stand out from one another."""
+    """Darken a thin rim, so that boxes are distinguishable."""
     rim = max(1, round(0.012 * per_m))
     for edge in (canvas[:rim], canvas[-rim:], canvas[:, :rim], canvas[:, -rim:]):
         edge *= 0.45
@@ -281,7 +281,7 @@ def _edged(canvas: _Canvas, per_m: float, rng: np.random.Generator) -> _Canvas:
 
 
 def _facade(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
-    """A house front: masonry, window rows with differing content, a door, signs, stains."""
+    """A building facade: masonry, window rows with differing content, a door, signs, stains."""
     canvas = rng.uniform(95, 160) + 20 * _noise(width, height, per_m, rng, 3.0, 0.88)
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
     course = rng.uniform(0.25, 0.4) * per_m
@@ -351,7 +351,7 @@ def _fill(canvas: _Canvas, box: tuple[float, float, float, float], value: float)
 
 
 def _asphalt(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
-    """Road: grain, mended patches, cracks, worn paint, lids."""
+    """Road: grain, repair patches, cracks, worn paint, manhole covers."""
     canvas = 95 + 24 * _noise(width, height, per_m, rng, 4.0, 0.92)
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
     area = width * height / per_m**2

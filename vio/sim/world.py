@@ -1,7 +1,7 @@
-"""Seeded scenes of textured rectangles and boxes: a room, a street canyon around a block, a corridor with a bare wall.
+"""Seeded scenes of textured rectangles and boxes: a room, a street around a block, a corridor with a bare wall.
 
 World frame: z up, metres. A surface is a rectangle seen from its front: s runs right, t down, both in metres from
-the upper left corner (`origin`). Surfaces are one-sided; boxes show their outsides.
+the upper left corner (`origin`). Surfaces are one-sided; boxes are visible from outside.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SceneName: TypeAlias = Literal["room", "street", "corridor"]
 ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_object (4, 4)
 
 _OF_WOOD: tuple[TextureKind, ...] = ("wood", "crate")
-_ONWARD_M = 80.0  # how far the streets run on beyond the block
+_ONWARD_M = 80.0  # length of the streets beyond the block
 _CORNER_FREE_M = 13.0  # no parked box this close to a corner, which cars cut
 _FACES: dict[str, tuple[int, int]] = {
     "+x": (0, 1),
@@ -37,7 +37,7 @@ _FACES: dict[str, tuple[int, int]] = {
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """One textured rectangle of an object, as a scene lists it."""
+    """One textured rectangle of an object."""
 
     origin: FloatArray  # (3,) upper left corner, object frame, m
     axis_s: FloatArray  # (3,) unit, right as seen from the front
@@ -82,7 +82,7 @@ class Surfaces:
 
 
 class TextureStore:
-    """The textures of a world, each painted from its own seed when it is first asked for."""
+    """The textures of a world, each painted from its own seed on first use."""
 
     def __init__(self, patches: Sequence[Patch], seed: int) -> None:
         self._patches = tuple(patches)
@@ -106,7 +106,7 @@ class TextureStore:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A scene: its surfaces, their textures, and where a camera may be."""
+    """A scene: its surfaces, their textures, and the space free for cameras."""
 
     name: str
     surfaces: Surfaces  # moving boxes in their own frames; `surfaces_at` places them
@@ -117,7 +117,7 @@ class World:
 
 
 def surfaces_at(world: World, time_ns: int) -> Surfaces:
-    """Return all surfaces where they are at one time."""
+    """Return all surfaces at their poses of one time."""
     if not world.movers:
         return world.surfaces
     fixed = world.surfaces
@@ -131,10 +131,10 @@ def surfaces_at(world: World, time_ns: int) -> Surfaces:
 
 
 def check_clear(world: World, positions: npt.ArrayLike, *, margin_m: float = 0.05, what: str = "the camera") -> None:
-    """Make sure that positions (N, 3) lie inside the scene and in no box.
+    """Check that positions (N, 3) are inside the scene and in no box.
 
     Raises:
-        SimulationError: the first offending position, and where it is.
+        SimulationError: a position is not; the message names the first one.
     """
     p = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     outside = ((p < world.bounds[0] + margin_m) | (p > world.bounds[1] - margin_m)).any(axis=1) | ~np.isfinite(p).all(1)
@@ -174,7 +174,7 @@ def room(
     """Build an indoor room with furniture boxes on the floor and framed pictures on the walls.
 
     Args:
-        seed: everything random follows from it.
+        seed: seed of all random numbers.
         bounds: lower and upper corner (2, 3) of the room, metres.
         furniture: boxes to place; fewer where there is no space.
         pictures: thin boxes on the walls.
@@ -248,7 +248,7 @@ def street(
     moving: Sequence[MovingBox] = (),
     texel_m: float = 0.015,
 ) -> World:
-    """Build a street around a block of houses, house fronts at both sides, parked boxes, poles, a far skyline.
+    """Build a street around a block of houses, with facades at both sides, parked boxes, poles, a distant skyline.
 
     The middle of the street is a rectangle of `loop_m` (along x, along y) about the origin, so a car loop along it
     is about twice their sum long.
@@ -349,7 +349,7 @@ def _shell(box: FloatArray, bare_walls: tuple[str, ...], texel_m: float) -> list
 
 
 def _default_clear(box: FloatArray) -> FloatArray:
-    """An ellipse of positions at mid height that leaves the rim of the room to furniture."""
+    """An ellipse of positions at mid height that leaves the border of the room to furniture."""
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     middle, half = (box[0] + box[1]) / 2, (box[1] - box[0]) / 2
     ring = np.stack([np.cos(angle) * half[0], np.sin(angle) * half[1], 0 * angle], axis=1)
@@ -419,12 +419,12 @@ def _hang_picture(box: FloatArray, rng: np.random.Generator, scale: float, bare_
 
 
 def _house_row(rim: FloatArray, width_m: float, rng: np.random.Generator, *, outwards: bool) -> list[tuple[Solid, str]]:
-    """Houses along a rectangle of half size `rim`, each with its unseen face: inside it facing out, or around it."""
+    """Houses along a rectangle of half size `rim`, each with its hidden face: inside it facing out, or around it."""
     houses = []
     depth = 8.0
     for axis in (0, 1):
         for sign in (-1, 1):
-            # The streets along x run on beyond the block, towards the skyline.
+            # The streets along x continue beyond the block, towards the skyline.
             extent = rim[axis] if outwards else (rim[0] + _ONWARD_M if axis == 0 else rim[1] - width_m)
             x = -extent
             while x < extent - 3:
@@ -443,7 +443,7 @@ def _house_row(rim: FloatArray, width_m: float, rng: np.random.Generator, *, out
 
 
 def _road(inner: FloatArray, outer: FloatArray, texel_m: float) -> list[Patch]:
-    """Four strips around the block, reaching under the house fronts, above one coarse plain."""
+    """Four strips around the block, extending under the facades, above one coarse ground plane."""
     low, high = inner - 2.0, outer + 2.0
     up, down = np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0])
     out = []
