@@ -205,7 +205,7 @@ def _begin(birth: _Birth, names: list[int], surfaces: Surfaces, left: View, uv: 
     rays, _ = unproject_pixel(left.camera, around.reshape(-1, 2))
     hits = cast(surfaces, left.T_world_cam, rays)
     distance = np.where(hits.found, hits.distance, np.inf).reshape(len(uv), -1)
-    surface, place = hits.surface.reshape(len(uv), -1), hits.place.reshape(len(uv), -1, 2)
+    surface, place = hits.surface.reshape(len(uv), -1), hits.coordinates.reshape(len(uv), -1, 2)
     nearest = np.where(distance.min(axis=1) < (1 - _OTHER_DEPTH) * distance[:, 0], distance.argmin(axis=1), 0)
     for k, name in enumerate(names):
         rim = int(nearest[k])

@@ -34,7 +34,7 @@ _CALIBRATE = ("tests/test_online_calibration.py",)
 _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
 _SCORE = ("tests/test_evaluation.py",)
-_VOTE = ("tests/test_frontend_outliers.py",)
+_RANSAC = ("tests/test_frontend_outliers.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
@@ -549,39 +549,39 @@ MUTATIONS = (
     ),
     # --- frontend ---
     Mutation(
-        "vote: step on the wrong side of the motion",
+        "RANSAC: step on the wrong side of the motion",
         "frontend/outliers.py",
         "T = se3_exp(xi) @ T",
         "T = T @ se3_exp(xi)",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
-        "vote: turn from the prediction not transposed",
+        "RANSAC: rotation of the prior not transposed",
         "frontend/outliers.py",
         "so3_log(T[:3, :3] @ R.T)",
         "so3_log(T[:3, :3] @ R)",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
-        "vote: what it denies does not count for the prediction",
+        "RANSAC: inliers of the prior not limited to outliers of the consensus",
         "frontend/outliers.py",
         "(kept & ~inliers).sum() >= needed",
         "kept.sum() >= needed",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
         "two views: sign of the turn's derivative",
         "frontend/outliers.py",
         "r_D_turn = np.cross(turned,",
         "r_D_turn = -np.cross(turned,",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
         "two views: forwards taken for backwards",
         "frontend/outliers.py",
         "np.maximum(off_u * way_u + off_v * way_v, 0.0)",
         "np.maximum(-off_u * way_u - off_v * way_v, 0.0)",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
         "tracking: disparity to the wrong side",
