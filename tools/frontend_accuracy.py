@@ -90,7 +90,7 @@ class _Birth:
 
     frame: dict[int, int] = field(default_factory=dict)
     surface: dict[int, tuple[int, int]] = field(default_factory=dict)  # own, rim
-    place: dict[int, FloatArray] = field(default_factory=dict)  # (2, 2) m on the own surface, on the rim
+    coordinates: dict[int, FloatArray] = field(default_factory=dict)  # (2, 2) m on the own surface, on the rim
     offset: dict[int, FloatArray] = field(default_factory=dict)  # (2,) px from the rim's point to the feature
 
 
@@ -172,11 +172,11 @@ def _evaluate_life(
     fresh = [k for k, name in enumerate(names) if name not in birth.frame]
     _begin(birth, [names[k] for k in fresh], surfaces, left, now.z[fresh, :2], frame_index)
     own, rim = np.array([birth.surface[name] for name in names]).T
-    place = np.array([birth.place[name] for name in names])
-    p_world = surface_points(surfaces, own, place[:, 0])
+    coordinates = np.array([birth.coordinates[name] for name in names])
+    p_world = surface_points(surfaces, own, coordinates[:, 0])
     true, visible = observe(surfaces, left, p_world)
     error = now.z[:, :2] - true
-    on_rim, _ = observe(surfaces, left, surface_points(surfaces, rim, place[:, 1]))
+    on_rim, _ = observe(surfaces, left, surface_points(surfaces, rim, coordinates[:, 1]))
     rim_error = now.z[:, :2] - on_rim - np.array([birth.offset[name] for name in names])
     follows_rim = np.linalg.norm(rim_error, axis=1) < np.linalg.norm(error, axis=1)
     age = frame_index - np.array([birth.frame[name] for name in names])
@@ -205,13 +205,13 @@ def _begin(birth: _Birth, names: list[int], surfaces: Surfaces, left: View, uv: 
     rays, _ = unproject_pixel(left.camera, around.reshape(-1, 2))
     hits = cast(surfaces, left.T_world_cam, rays)
     distance = np.where(hits.found, hits.distance, np.inf).reshape(len(uv), -1)
-    surface, place = hits.surface.reshape(len(uv), -1), hits.coordinates.reshape(len(uv), -1, 2)
+    surface, coordinates = hits.surface.reshape(len(uv), -1), hits.coordinates.reshape(len(uv), -1, 2)
     nearest = np.where(distance.min(axis=1) < (1 - _OTHER_DEPTH) * distance[:, 0], distance.argmin(axis=1), 0)
     for k, name in enumerate(names):
         rim = int(nearest[k])
         birth.frame[name] = frame_index
         birth.surface[name] = int(surface[k, 0]), int(surface[k, rim])
-        birth.place[name] = place[k, [0, rim]]
+        birth.coordinates[name] = coordinates[k, [0, rim]]
         birth.offset[name] = -ring[rim]
 
 
