@@ -219,6 +219,14 @@ class Landmarks:
 
 
 @dataclass(frozen=True, slots=True)
+class DisparityField:
+    """What the right pixels are off by against the stereo calibration, as coefficients of equation (R1)."""
+
+    coefficients: FloatArray  # (6,) of 1 + x^2, x, y, x y, x^2, y^2; times f: pixels
+    covariance: FloatArray  # (6, 6)
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """The filter's belief at one time."""
 
@@ -233,6 +241,7 @@ class Estimate:
     T_cam0_imu_covariance: FloatArray | None = None  # (6, 6) of xi in T_cam0_imu = T_hat exp(xi), [rho; phi], m and rad
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
+    disparity_field: DisparityField | None = None
 
 
 @dataclass(frozen=True, slots=True)

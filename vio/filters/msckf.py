@@ -18,11 +18,18 @@ from scipy.linalg import block_diag
 
 from vio.errors import ConfigError, EstimationError
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
-from vio.filters.multiview import MIN_DEPTH, Views, eliminate_points, landmark_residuals
+from vio.filters.multiview import MIN_DEPTH, LandmarkResiduals, Views, eliminate_points, landmark_residuals
 from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, Transition, TwistMotion
 from vio.filters.noise import MotionNoise, StepErrors
 from vio.filters.online_calibration import first_calibration
 from vio.filters.settings import MsckfSettings
+from vio.filters.stereo_calibration import (
+    StereoInformation,
+    corrected_views,
+    disparity_basis,
+    eliminate_points_from_columns,
+    landmark_columns,
+)
 from vio.filters.tracks import latest_pixels
 from vio.filters.window import Window, posterior
 from vio.filters.window_posterior import WindowPosterior
@@ -294,12 +301,18 @@ class Msckf:
         return self._predicted_step[1]
 
     def _propagate_calibration(self, window: Window, step_s: float) -> None:
-        """Estimate the calibration once the motion is known, and let it walk from then on."""
-        if window.calibration.dim:
-            if not window.calibrating and self._time_ns - self._began_ns >= 1e9 * self._settings.calibrate_after_s:
-                window.start_calibration()
-            if window.calibrating:
-                window.add_calibration_noise(self._calibration[2] * step_s)
+        """Add the calibration's random walk; begin to estimate extrinsics and clocks once the motion is known."""
+        calibration = window.calibration
+        if not calibration.dim:
+            return
+        after_s = (self._time_ns - self._began_ns) * 1e-9
+        if (
+            calibration.dim > calibration.stereo_dim
+            and not window.calibrating
+            and after_s >= self._settings.calibrate_after_s
+        ):
+            window.start_calibration()
+        window.add_calibration_noise(self._calibration[2] * step_s)
 
     def _body_time(self, time_ns: int) -> int:
         """The time on the IMU's clock to which the navigation state is carried for a frame."""
@@ -326,7 +339,7 @@ class Msckf:
         self._tracks.table.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
 
         predicted, expected = self._predicted_move(window)
-        tracks = self._tracks.linearise(window.T_cam0_world(), self._tracks.choose(len(window.clones)), _FIRST_STEPS)
+        tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _FIRST_STEPS)
         innovation = tracks.newest_innovation()
         tracks, P = self._fit(window, tracks, pixels, innovation)
         step = self._step_errors(window, tracks, predicted, expected, P)
@@ -361,10 +374,9 @@ class Msckf:
         """
         if not len(pixels.z):
             return pixels, 0
-        variance, T = self._tracks.variance, window.T_cam0_world()[-1]
-        at = landmark_residuals(self._camera, T, window.landmarks, pixels, variance)
+        at = self._landmark_residuals(window, pixels)
         covariance = window.landmark_covariance(P)
-        nis = leave_one_out_nis(at.r, at.J, covariance, at.weight, variance)
+        nis = leave_one_out_nis(at.r, at.J, covariance, at.weight, self._tracks.variance)
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
         used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
         self._keep_landmarks(window, ~dropped)
@@ -388,6 +400,10 @@ class Msckf:
             window.absorb_measurement(measurement)
             self._stationary_ns = window.clones[-1].time_ns
 
+    def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
+        """Linearise tracks at the window's present means."""
+        return self._tracks.linearise(window.T_cam0_world(), rows, steps, window.calibration.disparity)
+
     def _predicted_move(self, window: Window) -> tuple[FloatArray | None, FloatArray]:
         """The motion since the last frame as predicted (4, 4), None in the first frame, and its covariance (6, 6)."""
         moved = window.move_since(-2) if len(window.clones) > 1 else None
@@ -403,9 +419,9 @@ class Msckf:
             A, b = self._information(window, tracks, everything, pixels)
             P, shift = posterior(window.P, A, b + A @ window.prior_delta)
             error = shift - window.prior_delta
-            self._tracks.move_points(tracks, window.exposure_errors(error))
+            self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
             window.relinearise(error)
-            tracks = self._tracks.linearise(window.T_cam0_world(), tracks.rows, _LATER_STEPS)
+            tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go.
             if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
@@ -440,13 +456,26 @@ class Msckf:
         """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
         poses, size = 6 * len(window.clones), 6 * len(window.clones) + 3 * len(window.landmarks)
         A, b, variance = np.zeros((size, size)), np.zeros(size), self._tracks.variance
+        stereo = StereoInformation.none(size) if window.calibration.stereo_dim else None
         if chosen.any():
             A[:poses, :poses], b[:poses] = eliminate_points(tracks.information, chosen)
+            if stereo is not None and tracks.stereo is not None:
+                stereo = stereo + eliminate_points_from_columns(tracks.stereo, tracks.information, chosen)
         if pixels is not None and len(pixels.z):
-            T = window.T_cam0_world()[-1]
-            at = landmark_residuals(self._camera, T, window.landmarks, pixels, variance)
+            at = self._landmark_residuals(window, pixels)
             window.add_landmark_information(A, b, *at.information())
-        return window.lift_information(A / variance, b / variance)
+            if stereo is not None:
+                basis = disparity_basis(self._camera, pixels.z)
+                stereo = stereo + landmark_columns(at, basis, len(window.clones))
+        scaled = None if stereo is None else stereo.scaled(1 / variance)
+        return window.lift_information(A / variance, b / variance, scaled)
+
+    def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
+        """Residuals of the landmarks' pixels in the newest exposure."""
+        if window.calibration.disparity is not None:
+            pixels = corrected_views(self._camera, pixels, window.calibration.disparity)
+        T = window.T_cam0_world()[-1]
+        return landmark_residuals(self._camera, T, window.landmarks, pixels, self._tracks.variance)
 
     def _marginalise(self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views) -> int:
         """Absorb what ends in this frame into the prior, estimate with all that is good, and make room.
@@ -468,7 +497,7 @@ class Msckf:
         A, b = self._information(window, tracks, good & ~ending, None)
         P, shift = posterior(window.P, A, b + A @ window.prior_delta)
         error = shift - window.prior_delta
-        self._tracks.move_points(tracks, window.exposure_errors(error))
+        self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
         window.relinearise(error)
         own = slice(0, window.first_clone)
         self._output = P[own, own]
@@ -500,7 +529,9 @@ class Msckf:
         p = tracks.p_world[chosen]
         point_D_poses = -C_inverse @ np.swapaxes(info.G[chosen], 1, 2)
         point_D_poses[:, :, -3:] += so3_hat(p)  # the anchor: rotation of the newest exposure
-        A = window.chain(point_D_poses)
+        columns = tracks.stereo
+        point_D_stereo = None if columns is None else -C_inverse @ np.swapaxes(columns.G[chosen], 1, 2)
+        A = window.chain(point_D_poses, point_D_stereo)
         covariance = np.asarray(self._tracks.variance * C_inverse, dtype=np.float64)
         window.add_landmarks(table.ids(tracks.rows[chosen]), p, A.reshape(-1, len(window.P)), covariance)
         return chosen

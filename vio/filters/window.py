@@ -15,6 +15,7 @@ from scipy.linalg import solve_triangular
 
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.filters.online_calibration import Calibration, body_twists, pose_D_calibration, with_calibration
+from vio.filters.stereo_calibration import TERMS, StereoInformation
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
 from vio.records import BoolArray, IntArray
 
@@ -101,7 +102,8 @@ class Window:
         """What the calibration's errors do to the exposures' poses (6N, C)."""
         if not self.calibrating:
             return np.zeros((6 * len(self.clones), self.calibration.dim))
-        full = pose_D_calibration(self.exposures(), self._twists())
+        poses = pose_D_calibration(self.exposures(), self._twists())
+        full = np.concatenate([np.zeros((*poses.shape[:2], TERMS)), poses], axis=2)
         return full[:, :, self.calibration.columns].reshape(6 * len(full), -1)
 
     def current_pose(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -121,12 +123,24 @@ class Window:
         clones = error[self.first_clone : self.first_landmark]
         return clones + self._pose_D_calibration() @ error[DIM : self.first_clone] if self.calibration.dim else clones
 
-    def chain(self, out_D_exposures: FloatArray) -> FloatArray:
-        """Turn Jacobians (..., 6N) by the exposures' poses into Jacobians (..., D) by the error vector."""
+    @property
+    def stereo_rows(self) -> slice:
+        """Rows of the disparity field's coefficients, empty where they are not estimated."""
+        return slice(DIM, DIM + self.calibration.stereo_dim)
+
+    def chain(self, out_D_exposures: FloatArray, out_D_stereo: FloatArray | None = None) -> FloatArray:
+        """Turn Jacobians into Jacobians (..., D) by the error vector.
+
+        Args:
+            out_D_exposures: by the exposures' poses (..., 6N).
+            out_D_stereo: by the disparity field's coefficients (..., S), where they are estimated.
+        """
         out = np.zeros((*out_D_exposures.shape[:-1], len(self.P)))
         out[..., self.first_clone : self.first_landmark] = out_D_exposures
         if self.calibration.dim:
             out[..., DIM : self.first_clone] = out_D_exposures @ self._pose_D_calibration()
+        if out_D_stereo is not None:
+            out[..., self.stereo_rows] += out_D_stereo
         return out
 
     def add_landmark_information(self, A: FloatArray, b: FloatArray, C: FloatArray, g: FloatArray) -> None:
@@ -149,13 +163,32 @@ class Window:
             A[rho, own] -= C[k]
             b[own] += g[k]
 
-    def lift_information(self, A: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Turn information about exposures' poses and landmarks (6N + 3M) into that about the error vector (D)."""
+    def lift_information(
+        self, A: FloatArray, b: FloatArray, stereo: StereoInformation | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Turn information about exposures' poses and landmarks (6N + 3M) into that about the error vector (D).
+
+        Args:
+            A: information matrix (6N + 3M, 6N + 3M).
+            b: information vector (6N + 3M,).
+            stereo: the part that concerns the disparity field, where it is estimated.
+        """
         out, vector = np.zeros_like(self.P), np.zeros(len(self.P))
-        if self.calibration.dim:
+        M = self._pose_D_calibration()
+        if self.calibrating:
             landmarks = np.zeros((3 * len(self.landmarks), self.calibration.dim))
-            A, b = with_calibration(A, b, np.concatenate([self._pose_D_calibration(), landmarks]))
-        out[DIM:, DIM:], vector[DIM:] = A, b
+            A, b = with_calibration(A, b, np.concatenate([M, landmarks]))
+            out[DIM:, DIM:], vector[DIM:] = A, b
+        else:
+            first = self.first_clone
+            out[first:, first:], vector[first:] = A, b
+        if stereo is not None:
+            rows = self.stereo_rows
+            cross = np.concatenate([stereo.cross[:, : len(M)] @ M, stereo.cross], axis=1)  # (S, C + 6N + 3M)
+            out[rows, DIM:] += cross
+            out[DIM:, rows] += cross.T
+            out[rows, rows] += stereo.A
+            vector[rows] += stereo.b
         return out, vector
 
     def move_since(self, index: int) -> FloatArray:
@@ -205,9 +238,10 @@ class Window:
         self.P, self.prior_delta = 0.5 * (P + P.T), S @ self.prior_delta
 
     def add_calibration_noise(self, extra: FloatArray) -> None:
-        """Add noise (C, C) to the calibration's errors."""
-        rows = slice(DIM, self.first_clone)
-        self.P[rows, rows] += extra
+        """Add noise (C, C) to the errors of what is being calibrated."""
+        size = self.calibration.dim if self.calibrating else self.calibration.stereo_dim
+        rows = slice(DIM, DIM + size)
+        self.P[rows, rows] += extra[:size, :size]
 
     def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise (15, 15) to the last step, as if its motion had been known less; the newest clone ends it."""

@@ -14,7 +14,9 @@ from vio.filters.multiview import (
     CAUCHY,
     Residuals,
     TrackInformation,
+    Views,
     first_points,
+    point_D_pose,
     refine_points,
     residuals,
     robust_weights,
@@ -22,6 +24,7 @@ from vio.filters.multiview import (
     within,
 )
 from vio.filters.settings import MsckfSettings
+from vio.filters.stereo_calibration import StereoColumns, corrected_views, disparity_basis, stereo_columns
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -43,6 +46,7 @@ class LinearTracks:
     p_world: FloatArray  # (F, 3)
     at: Residuals
     information: TrackInformation
+    stereo: StereoColumns | None  # where the disparity field is estimated
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
@@ -56,6 +60,7 @@ class WindowTracks:
     def __init__(self, camera: StereoCamera, settings: MsckfSettings) -> None:
         self._camera, self._settings = camera, settings
         self.table = TrackTable(settings.clones + 1)
+        self._disparity: FloatArray | None = None  # the field at the last linearisation
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
 
     def choose(self, clones: int) -> IntArray:
@@ -71,22 +76,26 @@ class WindowTracks:
             rows = rows[np.sort(best)]
         return rows
 
-    def linearise(self, T_cam0_world: FloatArray, rows: IntArray, steps: int) -> LinearTracks:
+    def linearise(
+        self, T_cam0_world: FloatArray, rows: IntArray, steps: int, disparity: FloatArray | None = None
+    ) -> LinearTracks:
         """Triangulate tracks, from where their points were last, and linearise them.
 
         Args:
             T_cam0_world: camera poses (N, 4, 4) at the clones.
             rows: tracks; those without a usable point are left out.
             steps: Gauss-Newton steps on each point.
+            disparity: coefficients (6,) of the disparity field, taken out of the right pixels; None: not estimated.
         """
         camera, table, T, clones = self._camera, self.table, T_cam0_world, len(T_cam0_world)
-        views = table.views(rows, clones)
+        self._disparity = disparity
+        views = self._views(rows, clones)
         fresh = ~table.has_point[rows]
         if fresh.any():
             start, known = first_points(camera, T, views.take(fresh))
             table.points[rows[fresh]], table.has_point[rows[fresh]] = start, known
             rows = rows[table.has_point[rows]]
-            views = table.views(rows, clones)
+            views = self._views(rows, clones)
         p = refine_points(camera, T, table.points[rows], views, steps, CAUCHY * float(np.sqrt(self.variance)))
         at = residuals(camera, T, p, views)
         keep = at.ahead & within(camera, T, p, self._settings.max_distance * camera.baseline_m)
@@ -108,12 +117,24 @@ class WindowTracks:
         return self._linear(tracks.rows[enough], tracks.p_world[enough], at.take(enough))
 
     def _linear(self, rows: IntArray, p_world: FloatArray, at: Residuals) -> LinearTracks:
-        return LinearTracks(rows, p_world, at, track_information(at, p_world, robust_weights(at, self.variance)))
+        weight = robust_weights(at, self.variance)
+        information = track_information(at, p_world, weight)
+        if self._disparity is None:
+            return LinearTracks(rows, p_world, at, information, None)
+        basis = disparity_basis(self._camera, self.table.views(rows, at.r.shape[1]).z)
+        return LinearTracks(rows, p_world, at, information, stereo_columns(at, basis, point_D_pose(p_world), weight))
 
-    def move_points(self, tracks: LinearTracks, exposure_errors: FloatArray) -> None:
-        """Move each point as its own normal equations say once the clones have moved (6N,): back-substitution."""
+    def _views(self, rows: IntArray, clones: int) -> Views:
+        """What rows showed, less the disparity field."""
+        views = self.table.views(rows, clones)
+        return views if self._disparity is None else corrected_views(self._camera, views, self._disparity)
+
+    def move_points(self, tracks: LinearTracks, exposure_errors: FloatArray, stereo_errors: FloatArray) -> None:
+        """Move each point as its own normal equations say once the clones (6N,) and the field (S,) have moved."""
         info = tracks.information
         right = info.point_gradient - np.einsum("fik,i->fk", info.G, exposure_errors)
+        if tracks.stereo is not None:
+            right = right - np.einsum("fsk,s->fk", tracks.stereo.G, stereo_errors)
         step = np.linalg.solve(info.C, right[..., None])[..., 0]
         self.table.points[tracks.rows] = tracks.p_world + step
 
