@@ -5,15 +5,18 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from vio.config import Config, load_config
 from vio.errors import ConfigError, DataError, VioError
+from vio.filters.msckf import Msckf
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.pipeline import resolve_motion, run
@@ -189,6 +192,31 @@ def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
         tracemalloc.stop()
     growth = (Watch.sizes[199] - Watch.sizes[99]) / 100
     assert growth < 4096, f"{growth:.0f} bytes a frame"
+
+
+def _blas_threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_run_uses_one_blas_thread_and_restores_the_callers_number(fails: bool) -> None:
+    inside: list[set[int]] = []
+
+    class Watched(Msckf):
+        def update(self, seen: Observations) -> UpdateReport:
+            inside.append(_blas_threads())
+            if fails:
+                raise DataError("enough")
+            return super().update(seen)
+
+    drive = FakeDrive(frames=3)
+    backend = Watched(CAMERA, T_CAM0_IMU, Config().msckf, motion="velocity")
+    with threadpool_limits(limits=2, user_api="blas"):
+        assert _blas_threads() == {2}
+        with pytest.raises(DataError, match="enough") if fails else nullcontext():
+            run(drive, Config(), backend=backend)
+        assert _blas_threads() == {2}
+    assert inside == [{1}] * (1 if fails else 3)
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ _CALIBRATE = ("tests/test_online_calibration.py",)
 _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
 _SCORE = ("tests/test_evaluation.py",)
+_PIPELINE = ("tests/test_pipeline.py",)
 _VOTE = ("tests/test_frontend_outliers.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
@@ -511,6 +512,13 @@ MUTATIONS = (
         "(survival**step *",
         "(1.0 *",
         _SELECT,
+    ),
+    Mutation(
+        "pipeline: BLAS left with all of its threads",
+        "vio/pipeline.py",
+        "@one_blas_thread()\ndef run(",
+        "def run(",
+        _PIPELINE,
     ),
     Mutation(
         "alignment: scale forgotten in the translation",

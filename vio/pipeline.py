@@ -29,6 +29,7 @@ from vio.records import (
     UpdateReport,
 )
 from vio.selectors import build_selector
+from vio.threads import one_blas_thread
 from vio.watch.run import RunWatch
 
 log = logging.getLogger(__name__)
@@ -101,6 +102,7 @@ class NullViewer:
         """Nothing is held."""
 
 
+@one_blas_thread()
 def run(
     dataset: Dataset,
     config: Config,
@@ -113,7 +115,7 @@ def run(
     selector: Selector | None = None,
     backend: Backend | None = None,
 ) -> RunResult:
-    """Process a recording from its frame `start` to before frame `stop`.
+    """Process a recording from its frame `start` to before frame `stop`, with BLAS pinned to one thread meanwhile.
 
     Args:
         dataset: the recording.
