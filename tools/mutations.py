@@ -35,6 +35,7 @@ _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
 _SCORE = ("tests/test_evaluation.py",)
 _PIPELINE = ("tests/test_pipeline.py",)
+_REPRODUCE = ("tests/test_reproduce.py",)
 _VOTE = ("tests/test_frontend_outliers.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
@@ -519,6 +520,13 @@ MUTATIONS = (
         "@one_blas_thread()\ndef run(",
         "def run(",
         _PIPELINE,
+    ),
+    Mutation(
+        "configuration of the paper: repeated tracks renamed",
+        "configs/paper.yaml",
+        "repeated_tracks: literal",
+        "repeated_tracks: auto",
+        _REPRODUCE,
     ),
     Mutation(
         "alignment: scale forgotten in the translation",
