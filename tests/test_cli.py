@@ -120,6 +120,28 @@ def test_saved_observations_replay_bit_identically(
     assert (first / "trajectory.tum").read_bytes() == (third / "trajectory.tum").read_bytes()
 
 
+def test_log_replays_the_motion_of_its_run(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A log holds the velocities even of a run on images alone."""
+    first, again, other = (tmp_path / name for name in ("first", "again", "other"))
+    _json(capsys, "run", str(recording), "--motion", "none", "--save-observations", "--out", str(first))
+    log = str(first / "observations.npz")
+    assert _json(capsys, "run", log, "--out", str(again))["motion"] == "none"
+    assert (first / "trajectory.tum").read_bytes() == (again / "trajectory.tum").read_bytes()
+    assert _json(capsys, "run", log, "--motion", "velocity", "--out", str(other))["motion"] == "velocity"
+
+
+def test_log_of_unknown_motion_takes_its_sensor_and_says_so(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """As logs of version 1 are."""
+    _json(capsys, "run", str(recording), "--motion", "none", "--save-observations", "--out", str(tmp_path / "first"))
+    arrays = dict(np.load(tmp_path / "first" / "observations.npz"))
+    del arrays["run_motion"]
+    np.savez(tmp_path / "old.npz", **(arrays | {"version": np.array(1)}))
+    assert _json(capsys, "run", str(tmp_path / "old.npz"), "--out", str(tmp_path / "again"))["motion"] == "velocity"
+    assert caplog.text.count("the log does not say which motion its run used; motion auto takes its velocity") == 1
+
+
 def test_effective_configuration_reproduces_the_run(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

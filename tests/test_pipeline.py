@@ -27,6 +27,7 @@ from vio.records import (
     Landmarks,
     Observations,
     Recording,
+    RunMotion,
     StereoFrame,
     Trajectory,
     UpdateReport,
@@ -230,6 +231,20 @@ def test_run_uses_one_blas_thread_and_restores_the_callers_number(fails: bool) -
 def test_motion_that_cannot_be_had_is_an_error(overrides: list[str], velocity: bool, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         resolve_motion(FakeDrive(velocity=velocity).recording, load_config(None, overrides))
+
+
+@pytest.mark.parametrize(
+    ("run_motion", "backend", "expected"),
+    [
+        ("none", "msckf", None),
+        ("velocity", "msckf", "velocity"),
+        ("imu", "msckf", "imu"),
+        ("imu", "vislam", "velocity"),
+    ],
+)
+def test_motion_auto_takes_that_of_the_logged_run(run_motion: RunMotion, backend: str, expected: str | None) -> None:
+    both = replace(FakeDrive().recording, kind="log", motion=frozenset({"imu", "velocity"}), run_motion=run_motion)
+    assert resolve_motion(both, load_config(None, [f"backend={backend}"])) == expected
 
 
 @pytest.mark.parametrize(("start", "stop"), [(-1, None), (5, 5), (30, None)])

@@ -529,6 +529,13 @@ MUTATIONS = (
         _REPRODUCE,
     ),
     Mutation(
+        "observation log: replay takes whatever sensor it holds",
+        "vio/pipeline.py",
+        'if recording.run_motion == "none":',
+        "if False:",
+        _PIPELINE,
+    ),
+    Mutation(
         "alignment: scale forgotten in the translation",
         "vio/evaluation.py",
         "y_mean - scale * (R @ x_mean)",

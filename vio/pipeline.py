@@ -225,11 +225,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     if config.motion == "none":
         return None
     if config.motion == "auto":
-        found = next((source for source in taken if source in recording.motion), None)
-        if found is None and recording.motion:
-            held = ", ".join(sorted(recording.motion))
-            log.warning("%s: backend %s has no model for its %s; images alone", recording.path, config.backend, held)
-        return found
+        return _auto_motion(recording, config.backend)
     if config.motion not in taken:
         raise ConfigError(
             f"backend {config.backend} has no model for --motion {config.motion}; it takes {', '.join(taken)} or none"
@@ -238,6 +234,26 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
         held = ", ".join(sorted(recording.motion)) or "no motion sensor"
         raise ConfigError(f"{recording.path}: --motion {config.motion} asked for, but the recording holds {held}")
     return config.motion
+
+
+def _auto_motion(recording: Recording, backend: BackendName) -> MotionSource | None:
+    """Return what the run behind an observation log used, else the best that recording and back end share."""
+    taken = _BACKENDS[backend].motion_sources
+    if recording.run_motion == "none":
+        return None
+    if recording.run_motion in taken and recording.run_motion in recording.motion:
+        return recording.run_motion
+    found = next((source for source in taken if source in recording.motion), None)
+    if found is None and recording.motion:
+        held = ", ".join(sorted(recording.motion))
+        log.warning("%s: backend %s has no model for its %s; images alone", recording.path, backend, held)
+    elif found is not None and recording.kind == "log" and recording.run_motion is None:
+        log.warning(
+            "%s: the log does not say which motion its run used; motion auto takes its %s (--motion none: images alone)",
+            recording.path,
+            found,
+        )
+    return found
 
 
 class _StageTimer:

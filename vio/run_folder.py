@@ -228,4 +228,6 @@ def _write_observations(path: Path, result: RunResult) -> None:
 
     assert result.observations is not None
     assert result.motion_samples is not None
-    write_observation_log(path, result.recording, result.observations, result.motion_samples)
+    write_observation_log(
+        path, result.recording, result.observations, result.motion_samples, run_motion=result.motion or "none"
+    )
