@@ -517,15 +517,15 @@ MUTATIONS = (
     Mutation(
         "pipeline: BLAS left with all of its threads",
         "vio/pipeline.py",
-        "@one_blas_thread()\ndef run(",
-        "def run(",
+        "@one_blas_thread()",
+        "",
         _PIPELINE,
     ),
     Mutation(
-        "configuration of the paper: repeated tracks renamed",
-        "configs/paper.yaml",
-        "repeated_tracks: literal",
-        "repeated_tracks: auto",
+        "the paper's experiment: repeated tracks renamed",
+        "vio/reproduce.py",
+        'AS_FILED = DatasetSettings(repeated_tracks="literal")',
+        "AS_FILED = DatasetSettings()",
         _REPRODUCE,
     ),
     Mutation(

@@ -249,7 +249,7 @@ def _auto_motion(recording: Recording, backend: BackendName) -> MotionSource | N
         log.warning("%s: backend %s has no model for its %s; images alone", recording.path, backend, held)
     elif found is not None and recording.kind == "log" and recording.run_motion is None:
         log.warning(
-            "%s: the log does not say which motion its run used; motion auto takes its %s (--motion none: images alone)",
+            "%s: the log does not say which motion its run used; motion auto takes its %s, --motion none images alone",
             recording.path,
             found,
         )
