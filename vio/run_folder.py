@@ -93,6 +93,8 @@ def score(
     try:
         truth = _with_times(reference, result)
         own = evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
+        for note in own.notes:
+            log.warning("%s", note)
         other = result.dead_reckoning
         return own, None if other is None else evaluate(
             other, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m
