@@ -564,6 +564,13 @@ MUTATIONS = (
         _SCORE,
     ),
     Mutation(
+        "picture: a straight road seen from beside",
+        "vio/plotting.py",
+        "if len(points) and spread[second] < _STRAIGHT * spread[along]:",
+        "if False:",
+        ("tests/test_plotting.py",),
+    ),
+    Mutation(
         "alignment: scale forgotten in the translation",
         "vio/evaluation.py",
         "y_mean - scale * (R @ x_mean)",
