@@ -68,8 +68,8 @@ def warped_patches(image: FloatImage, warp: FloatArray, radius: int) -> npt.NDAr
     """
     if len(warp) == 0:
         return np.zeros((0, (2 * radius + 1) ** 2), dtype=np.float32)
-    place = (warp.reshape(-1, 3).astype(np.float32) @ offsets(radius)).reshape(len(warp), 2, -1)
-    u, v = np.ascontiguousarray(place[:, 0]), np.ascontiguousarray(place[:, 1])
+    uv = (warp.reshape(-1, 3).astype(np.float32) @ offsets(radius)).reshape(len(warp), 2, -1)
+    u, v = np.ascontiguousarray(uv[:, 0]), np.ascontiguousarray(uv[:, 1])
     parts = [
         cv2.remap(
             image, u[k : k + _REMAP_ROWS], v[k : k + _REMAP_ROWS], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -205,9 +205,9 @@ def shift_warps(centres: FloatArray) -> FloatArray:
     return warp
 
 
-def on_peak(place: FloatArray, start: FloatArray) -> BoolArray:
+def on_peak(pixels: FloatArray, start: FloatArray) -> BoolArray:
     """Mask (N,) of fitted pixels (N, 2) near their start (N, 2); others have left the correlation peak."""
-    return np.asarray(np.abs(place - start).max(axis=1) <= _MAX_MOVE_PX)
+    return np.asarray(np.abs(pixels - start).max(axis=1) <= _MAX_MOVE_PX)
 
 
 def template_points(warp: FloatArray, offset: FloatArray) -> FloatArray:

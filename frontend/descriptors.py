@@ -146,7 +146,7 @@ class _Tracks:
 
 
 @dataclass(frozen=True, slots=True)
-class _Memory:
+class _PreviousFrame:
     """State kept from the previous frame."""
 
     time_ns: int
@@ -171,7 +171,7 @@ class DescriptorFrontend:
         self._match = match
         self._validator = FrameValidator(camera, name)
         self._swap = SwapDetector(_SWAP_FEW)
-        self._memory: _Memory | None = None
+        self._previous: _PreviousFrame | None = None
         self._next_id = 0
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
@@ -189,7 +189,7 @@ class DescriptorFrontend:
         watch.lap("track")
         tracked = len(tracks)
         tracks = self._add_new_features(tracks, pair, used, images[0])
-        self._memory = _Memory(frame.time_ns, views[0], tracks, twist)
+        self._previous = _PreviousFrame(frame.time_ns, views[0], tracks, twist)
         width = images[0].shape[1]
         self._swap.check(
             frame,
@@ -214,14 +214,14 @@ class DescriptorFrontend:
 
     def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[FloatImage, FloatImage]) -> _Pair:
         """Match the key points of the left image into the right one."""
-        place, has_right = np.zeros((len(left), 2)), np.zeros(len(left), dtype=np.bool_)
+        right_pixels, has_right = np.zeros((len(left), 2)), np.zeros(len(left), dtype=np.bool_)
         pairs = self._match(left, right, self._allowed(left, right, views[0].shape[1]))
         rows = pairs[:, 0]
         target = right.pixels[pairs[:, 1]]
-        place[rows], alike = self._refine(views[0], left.pixels[rows], views[1], target, target[:, 1])
-        disparity = left.pixels[rows, 0] - place[rows, 0]
+        right_pixels[rows], alike = self._refine(views[0], left.pixels[rows], views[1], target, target[:, 1])
+        disparity = left.pixels[rows, 0] - right_pixels[rows, 0]
         has_right[rows] = alike & (disparity >= self._disparity.min_disparity_px)
-        return _Pair(left, place, has_right)
+        return _Pair(left, right_pixels, has_right)
 
     def _refine(
         self,
@@ -238,9 +238,9 @@ class DescriptorFrontend:
         offset = points - centres
         store, slots = templates(cut_patches(source, centres, _REFINE_RADIUS)), np.arange(len(points))
         warp, score = align(store, slots, target, shift_warps(start - offset), _REFINE_ITERATIONS, rows)
-        place = template_points(warp, offset)
-        good = (score >= _REFINE_MIN_CORRELATION) & on_peak(place, start)
-        return np.where(good[:, None], place, start), good
+        pixels = template_points(warp, offset)
+        good = (score >= _REFINE_MIN_CORRELATION) & on_peak(pixels, start)
+        return np.where(good[:, None], pixels, start), good
 
     # --- tracking in time ---------------------------------------------------------------------------------------------
 
@@ -248,23 +248,23 @@ class DescriptorFrontend:
         self, frame: StereoFrame, pair: _Pair, view: FloatImage, prior: TrackPrior | None
     ) -> tuple[_Tracks, FloatArray, BoolArray]:
         """Match the previous tracks to key points; return tracks, motion per second, and the mask of used points."""
-        memory, used = self._memory, np.zeros(len(pair.keypoints), dtype=np.bool_)
-        if memory is None or len(memory.tracks) == 0:
+        previous, used = self._previous, np.zeros(len(pair.keypoints), dtype=np.bool_)
+        if previous is None or len(previous.tracks) == 0:
             nothing = np.zeros(0, dtype=np.int64)
             empty = _Tracks(
                 nothing, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), take(pair.keypoints, nothing)
             )
-            return empty, np.zeros(6) if memory is None else memory.twist_per_s, used
-        old, left = memory.tracks, pair.keypoints.pixels
-        seconds = (frame.time_ns - memory.time_ns) * 1e-9
-        expected = se3_exp(memory.twist_per_s * seconds)
+            return empty, np.zeros(6) if previous is None else previous.twist_per_s, used
+        old, left = previous.tracks, pair.keypoints.pixels
+        seconds = (frame.time_ns - previous.time_ns) * 1e-9
+        expected = se3_exp(previous.twist_per_s * seconds)
         p_prev, has_depth = triangulate(self._camera, np.concatenate([old.left, old.right], axis=1))
         has_depth &= old.has_right
         far = left_rays(self._camera, old.left) * _FAR_M
         guess = self._guess(old, np.where(has_depth[:, None], p_prev, far), expected, prior)
         pairs = self._match(old.keypoints, pair.keypoints, self._near_guess(old, guess, left, view.shape[1]))
         rows, found = pairs[:, 0], pairs[:, 1]
-        pixels, alike = self._refine(memory.left, old.left[rows], view, left[found])
+        pixels, alike = self._refine(previous.left, old.left[rows], view, left[found])
         rows, found, pixels = rows[alike], found[alike], pixels[alike]
         R_prior = T_prior = None
         if prior is not None:
@@ -277,7 +277,7 @@ class DescriptorFrontend:
         keep, motion = static_tracks(problem, old.left[rows], p_rows, known, pixels, expected, R_prior, T_prior)
         # The right pixel belongs to the key point; it is shifted by the refinement.
         right = pair.right[found] + np.stack([pixels[:, 0] - left[found, 0], np.zeros(len(found))], axis=1)
-        agrees, twist = pair.has_right[found], memory.twist_per_s
+        agrees, twist = pair.has_right[found], previous.twist_per_s
         if motion is not None:
             keep[~known] = False
             twist = se3_log(motion.T_curr_prev) / seconds

@@ -17,7 +17,7 @@ from frontend.patches import FloatImage, View, half_image, inside
 from frontend.prediction import moved_pixels, prior_pixels, usable_prior
 from frontend.settings import FrontendSettings
 from frontend.stereo_fit import StereoFit
-from frontend.tracks import AnchorBank, Tracks, newborn, no_tracks
+from frontend.tracks import AnchorBank, Tracks, new_tracks, no_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
@@ -34,7 +34,7 @@ _BANK_SPARE = 3  # templates allocated, over the number of features
 
 
 @dataclass(frozen=True, slots=True)
-class _Memory:
+class _PreviousFrame:
     """State kept from the previous frame."""
 
     time_ns: int
@@ -49,7 +49,7 @@ class _Memory:
 class _Start:
     """Start of the alignment of the previous frame's features with their anchors."""
 
-    place: FloatArray  # (N, 2) left pixels
+    pixels: FloatArray  # (N, 2) left pixels
     scale: FloatArray  # (N,) predicted change of scale since the previous frame
     point: FloatArray  # (N, 3) moved by the camera motion where it is known, cam0 frame, metres
     tried: BoolArray  # (N,) to be aligned
@@ -72,8 +72,8 @@ class KltFrontend:
         self._validator = FrameValidator(camera, "klt")
         self._swap = SwapDetector(_SWAP_FEW)
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, self._settings.anchor_radius_px)
-        self._memory: _Memory | None = None
-        self._sized: tuple[StereoFit, BoolArray | None] | None = None  # set up with the image size of the first frame
+        self._previous: _PreviousFrame | None = None
+        self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
         self._next_id = 0
         self._skipped = 0  # frames in a row
 
@@ -85,7 +85,7 @@ class KltFrontend:
         """
         watch = Stopwatch()
         left, right = (self._view(image) for image in self._validator.validate(frame))
-        stereo, allowed = self._for_size(left)
+        stereo, allowed = self._set_up(left)
         watch.lap("prepare")
         if self._contrast_lost(left):
             return make_output(frame, no_tracks(), 0, watch)
@@ -95,14 +95,14 @@ class KltFrontend:
         corners = detect_corners(left.half, tracks.left, wanted, self._grid, self._settings, allowed)
         watch.lap("detect")
         tracks = self._add_new_features(left, right, tracks, corners, motion, stereo)
-        stereo.learn_rows(tracks)
+        stereo.update_rows(tracks)
         watch.lap("stereo")
         points, matched = tracks.left, int(tracks.has_right.sum())
         self._swap.check(frame, len(points), matched, lambda: stereo.count_mirrored(left, right, points))
         tracks = self._promote(tracks)
         seen = take(tracks, tracks.shown)
         tracked = self._count_tracked(seen)
-        self._remember(frame, left, right, tracks, motion)
+        self._store(frame, left, right, tracks, motion)
         watch.lap("check")
         return make_output(frame, seen, tracked, watch)
 
@@ -112,42 +112,43 @@ class KltFrontend:
             image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
         return View(image.astype(np.float32), half_image(image))
 
-    def _for_size(self, left: View) -> tuple[StereoFit, BoolArray | None]:
+    def _set_up(self, left: View) -> tuple[StereoFit, BoolArray | None]:
         """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame."""
-        if self._sized is None:
+        if self._setup is None:
             height, width = left.full.shape
             allowed = None if self._mask is None else half_mask(self._mask, left.full.shape, left.half.shape)
-            self._sized = StereoFit(self._camera, self._settings, self._disparity, self._bank, (width, height)), allowed
-        return self._sized
+            stereo = StereoFit(self._camera, self._settings, self._disparity, self._bank, (width, height))
+            self._setup = stereo, allowed
+        return self._setup
 
     def _contrast_lost(self, left: View) -> bool:
         """Whether the image has no contrast although the previous one had: black, saturated or covered for a moment.
 
         Such a frame is skipped and tracking continues from the one before, for at most `max_blind_frames` frames.
         """
-        memory, before = self._memory, self._skipped
+        previous, before = self._previous, self._skipped
         self._skipped = 0
-        if memory is None or len(memory.tracks) == 0 or before >= self._settings.max_blind_frames:
+        if previous is None or len(previous.tracks) == 0 or before >= self._settings.max_blind_frames:
             return False
-        if lost_contrast(left.half, memory.left.half):
+        if lost_contrast(left.half, previous.left.half):
             self._skipped = before + 1
         return self._skipped > 0
 
     def _count_tracked(self, seen: Tracks) -> int:
         """Count the features that were output in the previous frame, too."""
-        if self._memory is None:
+        if self._previous is None:
             return 0
-        old = self._memory.tracks
+        old = self._previous.tracks
         return int(np.isin(seen.ids, old.ids[old.shown], assume_unique=True).sum())
 
-    def _remember(self, frame: StereoFrame, left: View, right: View, tracks: Tracks, motion: Consensus | None) -> None:
+    def _store(self, frame: StereoFrame, left: View, right: View, tracks: Tracks, motion: Consensus | None) -> None:
         """Store the state that the next frame needs."""
         self._bank.keep_only(tracks.slot)
-        before = self._memory
+        before = self._previous
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
-        self._memory = _Memory(frame.time_ns, left, right.half, tracks, twist, motion is not None)
+        self._previous = _PreviousFrame(frame.time_ns, left, right.half, tracks, twist, motion is not None)
 
     # --- features of the previous frame -------------------------------------------------------------------------------
 
@@ -161,22 +162,22 @@ class KltFrontend:
         watch: Stopwatch,
     ) -> tuple[Tracks, Consensus | None]:
         """Track the features of the previous frame into both images; return those kept and the consensus motion."""
-        memory = self._memory
-        if memory is None or len(memory.tracks) == 0:
+        previous = self._previous
+        if previous is None or len(previous.tracks) == 0:
             return no_tracks(), None
-        old, settings = memory.tracks, self._settings
-        expected = se3_exp(memory.twist_per_s * ((frame.time_ns - memory.time_ns) * 1e-9))
+        old, settings = previous.tracks, self._settings
+        expected = se3_exp(previous.twist_per_s * ((frame.time_ns - previous.time_ns) * 1e-9))
         guess = self._guess(old, prior, expected, left.full)
-        trusted = prior is not None or memory.trusted
-        found, seen = track_with_retries(memory.left.half, left, old.left, guess, trusted, settings)
+        trusted = prior is not None or previous.trusted
+        found, seen = track_with_retries(previous.left.half, left, old.left, guess, trusted, settings)
         watch.lap("track")
         rng = np.random.default_rng((self._consensus.seed, frame.index))
         problem = RansacProblem(self._camera, self._consensus, settings.consensus_px, rng)
         seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, stereo.max_disparity_px)
         watch.lap("reject")
-        tracks = self._align_with_anchors(memory, left, found, seen, motion)
+        tracks = self._align_with_anchors(previous, left, found, seen, motion)
         watch.lap("align")
-        tracks = stereo.track_right(tracks, right, memory.right_half, motion is not None)
+        tracks = stereo.track_right(tracks, right, previous.right_half, motion is not None)
         watch.lap("stereo")
         return tracks, motion
 
@@ -235,7 +236,7 @@ class KltFrontend:
     # --- alignment with anchors ---------------------------------------------------------------------------------------
 
     def _align_with_anchors(
-        self, memory: _Memory, left: View, found: FloatArray, seen: BoolArray, motion: Consensus | None
+        self, previous: _PreviousFrame, left: View, found: FloatArray, seen: BoolArray, motion: Consensus | None
     ) -> Tracks:
         """Align the features with their anchors; return those kept, with their new pixels.
 
@@ -243,32 +244,32 @@ class KltFrontend:
         the pixels predicted by the consensus motion. Features that were found, but differ from their anchor, get a new
         anchor from the previous frame.
         """
-        settings, old = self._settings, memory.tracks
+        settings, old = self._settings, previous.tracks
         start = self._start(old, left, found, seen, motion)
         rows = np.flatnonzero(start.tried)
         warp = old.warp[rows]
         warp[:, :, :2] *= start.scale[rows, None, None]
-        warp[:, :, 2] = start.place[rows]
+        warp[:, :, 2] = start.pixels[rows]
         warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _ITERATIONS)
         change = np.abs(np.log(scale_change(warp)))
-        good = (score >= settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.place[rows])
+        good = (score >= settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.pixels[rows])
         good &= change <= np.log(2 * settings.max_anchor_scale)
         kept, has_point = good.copy(), old.has_point.copy()
-        again = np.flatnonzero(~good & seen[rows] & (score >= _ANCHOR_LOST))
-        if len(again):
-            warp[again], kept[again] = self._realign(memory, left, rows[again], start)
+        retry = np.flatnonzero(~good & seen[rows] & (score >= _ANCHOR_LOST))
+        if len(retry):
+            warp[retry], kept[retry] = self._realign(previous, left, rows[retry], start)
         if motion is not None:
-            astray = (
+            deviates = (
                 pixel_errors(self._camera, motion.T_curr_prev, old.point[rows], warp[:, :, 2]) > settings.consensus_px
             )
-            kept &= ~(astray & old.has_point[rows] & old.has_right[rows])
-            has_point[rows[astray]] = False  # its depth was propagated without a measurement, and was wrong
-        far = good & (change > np.log(settings.max_anchor_scale))
-        rows, warp, far = rows[kept], warp[kept], far[kept]
-        if far.any():
-            centres = rounded(warp[far, :, 2])
-            self._bank.renew(old.slot[rows[far]], left.full, centres)
-            warp[far] = shift_warps(centres)
+            kept &= ~(deviates & old.has_point[rows] & old.has_right[rows])
+            has_point[rows[deviates]] = False  # its depth was propagated without a measurement, and was wrong
+        rescaled = good & (change > np.log(settings.max_anchor_scale))
+        rows, warp, rescaled = rows[kept], warp[kept], rescaled[kept]
+        if rescaled.any():
+            centres = rounded(warp[rescaled, :, 2])
+            self._bank.replace(old.slot[rows[rescaled]], left.full, centres)
+            warp[rescaled] = shift_warps(centres)
         now = replace(
             take(old, rows),
             left=warp[:, :, 2].copy(),
@@ -296,17 +297,19 @@ class KltFrontend:
             seen | (old.has_point & inside(left.full, predicted, margin)),
         )
 
-    def _realign(self, memory: _Memory, left: View, rows: IntArray, start: _Start) -> tuple[FloatArray, BoolArray]:
+    def _realign(
+        self, previous: _PreviousFrame, left: View, rows: IntArray, start: _Start
+    ) -> tuple[FloatArray, BoolArray]:
         """Align features with a new anchor from the previous frame; return warps (N, 2, 3) and a mask (N,)."""
-        old = memory.tracks
+        old = previous.tracks
         centres = rounded(old.left[rows])
-        self._bank.renew(old.slot[rows], memory.left.full, centres)
-        warp = shift_warps(start.place[rows] + centres - old.left[rows])
+        self._bank.replace(old.slot[rows], previous.left.full, centres)
+        warp = shift_warps(start.pixels[rows] + centres - old.left[rows])
         warp[:, :, :2] *= start.scale[rows, None, None]
         warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _ITERATIONS)
         # The anchor was cut at a rounded pixel; correct the offset to the feature.
         warp[:, :, 2] = template_points(warp, old.left[rows] - centres)
-        return warp, (score >= self._settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.place[rows])
+        return warp, (score >= self._settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.pixels[rows])
 
     # --- new features -------------------------------------------------------------------------------------------------
 
@@ -320,26 +323,26 @@ class KltFrontend:
         stereo: StereoFit,
     ) -> Tracks:
         """Search right matches for new corners and for features without one; add the best new corners."""
-        lacking = ~tracks.has_right
+        unmatched = ~tracks.has_right
         if motion is not None:
             # A feature with a known point that was not matched near it must not be matched elsewhere.
-            lacking &= ~tracks.has_point
-        rows = np.flatnonzero(lacking)
+            unmatched &= ~tracks.has_point
+        rows = np.flatnonzero(unmatched)
         disparity, unique = stereo.search(left, right, np.concatenate([tracks.left[rows], corners]))
-        again, fresh = np.split(disparity, [len(rows)])
+        disparity_old, disparity_new = np.split(disparity, [len(rows)])
         known, unique = np.split(unique, [len(rows)])
-        tracks = stereo.match_near(tracks, right, rows[known], again[known])
+        tracks = stereo.match_near(tracks, right, rows[known], disparity_old[known])
         tracks = replace(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
         tracks = take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames)
-        stays = self._stays(corners, fresh, motion, left.full)
+        stays = self._stay_visible(corners, disparity_new, motion, left.full)
         chosen, with_depth = self._select_corners(tracks, unique, stays)
         centres = rounded(corners[chosen])
-        born = newborn(centres, self._bank.put(left.full, centres))
-        born = stereo.match_near(born, right, np.arange(with_depth), fresh[chosen[:with_depth]])
-        born = replace(born, left_only_frames=np.where(born.has_right, 0, 1))
+        new = new_tracks(centres, self._bank.add(left.full, centres))
+        new = stereo.match_near(new, right, np.arange(with_depth), disparity_new[chosen[:with_depth]])
+        new = replace(new, left_only_frames=np.where(new.has_right, 0, 1))
         room = max(0, self._grid.target_features - len(tracks))
-        good = np.flatnonzero(born.has_right | (len(chosen) > with_depth))
-        return joined(tracks, take(born, good[np.argsort(~born.has_right[good], kind="stable")][:room]))
+        good = np.flatnonzero(new.has_right | (len(chosen) > with_depth))
+        return joined(tracks, take(new, good[np.argsort(~new.has_right[good], kind="stable")][:room]))
 
     def _select_corners(self, tracks: Tracks, unique: BoolArray, stays: BoolArray) -> tuple[IntArray, int]:
         """Return the rows of the corners (K,) to try, in this order, and how many of them have a depth.
@@ -351,14 +354,14 @@ class KltFrontend:
         target, matched = self._grid.target_features, int(tracks.has_right.sum())
         room, least = max(0, target - len(tracks)), self._settings.least_features * target
         tried = round(_TRIED * room)
-        lasting, leaving = np.flatnonzero(unique & stays)[:tried], np.flatnonzero(unique & ~stays)[:tried]
-        leaving = leaving[: max(0, round(_TRIED * (least - matched - len(lasting) / _TRIED)))]
-        flat = np.flatnonzero(~unique)[:room]
+        staying, leaving = np.flatnonzero(unique & stays)[:tried], np.flatnonzero(unique & ~stays)[:tried]
+        leaving = leaving[: max(0, round(_TRIED * (least - matched - len(staying) / _TRIED)))]
+        no_depth = np.flatnonzero(~unique)[:room]
         if matched > _FEW * least:
-            flat = flat[:0]
-        return np.concatenate([lasting, leaving, flat]), len(lasting) + len(leaving)
+            no_depth = no_depth[:0]
+        return np.concatenate([staying, leaving, no_depth]), len(staying) + len(leaving)
 
-    def _stays(
+    def _stay_visible(
         self, corners: FloatArray, disparity: FloatArray, motion: Consensus | None, image: FloatImage
     ) -> BoolArray:
         """Mask (K,) of corners that stay in the image for a while if the camera motion continues."""

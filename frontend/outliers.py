@@ -281,8 +281,8 @@ def epipolar_distance(
         ends.append(p[:, :2] / depth * [camera.fu, camera.fv] + [camera.cu, camera.cv])
     far, along = ends[0], ends[1] - ends[0]
     length2 = np.maximum((along**2).sum(axis=1), 1e-12)
-    place = np.clip(((current - far) * along).sum(axis=1) / length2, 0.0, 1.0)
-    return np.linalg.norm(current - far - place[:, None] * along, axis=1)
+    position = np.clip(((current - far) * along).sum(axis=1) / length2, 0.0, 1.0)
+    return np.linalg.norm(current - far - position[:, None] * along, axis=1)
 
 
 def fit_motion(

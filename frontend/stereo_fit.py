@@ -58,17 +58,17 @@ class StereoFit:
         rows = np.flatnonzero(tracks.has_point & (tracks.point[:, 2] > _MIN_DEPTH_M))
         known = take(tracks, rows)
         expected = self._camera.fu * self._camera.baseline_m / known.point[:, 2]
-        place, skew, valid = self._fit(known, right, expected)
+        pixels, skew, valid = self._fit(known, right, expected)
         if moved:
-            valid &= np.abs(known.left[:, 0] - place[:, 0] - expected) <= self._settings.consensus_px
+            valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= self._settings.consensus_px
         if self._settings.circle_check:
-            valid &= self._closes_circle(known, place, last_half, right)
-        return self._with_right_pixels(tracks, rows[valid], place[valid], skew[valid])
+            valid &= self._closes_circle(known, pixels, last_half, right)
+        return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
 
     def match_near(self, tracks: Tracks, right: View, rows: IntArray, disparity: FloatArray) -> Tracks:
         """Match the given rows (K,) near their disparities (K,)."""
-        place, skew, valid = self._fit(take(tracks, rows), right, disparity)
-        return self._with_right_pixels(tracks, rows[valid], place[valid], skew[valid])
+        pixels, skew, valid = self._fit(take(tracks, rows), right, disparity)
+        return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
 
     def search(self, left: View, right: View, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are unique."""
@@ -81,9 +81,9 @@ class StereoFit:
         disparity, unique = self._search(a, b, flipped, self._settings.min_correlation)
         return int((unique & (disparity >= 1.0)).sum())
 
-    def learn_rows(self, tracks: Tracks) -> None:
+    def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
-        self._rows.learn(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
+        self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
 
     def _search(
         self, left_half: Image, right_half: Image, points: FloatArray, min_correlation: float
@@ -104,19 +104,19 @@ class StereoFit:
         warp[:, 1, 2] = rows
         start = warp[:, :, 2].copy()
         warp, score = align(self._bank.store, tracks.slot, right.full, warp, _ITERATIONS, rows)
-        place, skew = warp[:, :, 2], warp[:, :, :2] - tracks.warp[:, :, :2]
-        found = tracks.left[:, 0] - place[:, 0]
+        pixels, skew = warp[:, :, 2], warp[:, :, :2] - tracks.warp[:, :, :2]
+        found = tracks.left[:, 0] - pixels[:, 0]
         valid = (
             (score >= self._settings.min_correlation)
-            & on_peak(place, start)
+            & on_peak(pixels, start)
             & (np.abs(skew).max(axis=(1, 2)) <= _MAX_STRETCH)
-            & (np.abs(rows - place[:, 1]) <= self._settings.max_epipolar_px)
+            & (np.abs(rows - pixels[:, 1]) <= self._settings.max_epipolar_px)
             & (found >= self._min_disparity_px)
             & (found <= self.max_disparity_px)
         )
-        return place, skew, valid
+        return pixels, skew, valid
 
-    def _closes_circle(self, tracks: Tracks, place: FloatArray, last_half: Image, right: View) -> BoolArray:
+    def _closes_circle(self, tracks: Tracks, pixels: FloatArray, last_half: Image, right: View) -> BoolArray:
         """Mask (N,) of right pixels (N, 2) that agree with temporal tracking from the last right image.
 
         Features without a right match in the last frame cannot be checked, and pass.
@@ -124,15 +124,15 @@ class StereoFit:
         closes = tracks.left_only_frames > 0
         rows = np.flatnonzero(~closes)
         last = match_brightness(last_half, right.half)
-        gap = circle_errors(last, right.half, tracks.right[rows], place[rows], self._settings)
+        gap = circle_errors(last, right.half, tracks.right[rows], pixels[rows], self._settings)
         closes[rows] = gap <= self._settings.max_circle_px
         return closes
 
-    def _with_right_pixels(self, tracks: Tracks, rows: IntArray, place: FloatArray, skew: FloatArray) -> Tracks:
+    def _with_right_pixels(self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray) -> Tracks:
         """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of the given rows (K,)."""
         right, has_right, skews = tracks.right.copy(), tracks.has_right.copy(), tracks.skew.copy()
-        right[rows], has_right[rows], skews[rows] = place, True, skew
-        p_cam, valid = triangulate(self._camera, np.concatenate([tracks.left[rows], place], axis=1))
+        right[rows], has_right[rows], skews[rows] = pixels, True, skew
+        p_cam, valid = triangulate(self._camera, np.concatenate([tracks.left[rows], pixels], axis=1))
         point, has_point = tracks.point.copy(), tracks.has_point.copy()
         point[rows[valid]], has_point[rows[valid]] = p_cam[valid], True
         return replace(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)

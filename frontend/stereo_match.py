@@ -46,7 +46,7 @@ class RowField:
         """Expected rows (N,) in the right image of left pixels (N, 2)."""
         return left[:, 1] + self._terms(left) @ self._field
 
-    def learn(self, left: FloatArray, right: FloatArray) -> None:
+    def update(self, left: FloatArray, right: FloatArray) -> None:
         """Update the estimate with the matches (N, 2) and (N, 2) of one frame; outliers have little weight."""
         terms = self._terms(left)
         off = right[:, 1] - left[:, 1]

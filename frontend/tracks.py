@@ -34,7 +34,7 @@ class Tracks:
         return len(self.ids)
 
 
-def newborn(left: FloatArray, slot: IntArray) -> Tracks:
+def new_tracks(left: FloatArray, slot: IntArray) -> Tracks:
     """New features at left pixels (N, 2), with anchors in slots (N,)."""
     n = len(left)
     return Tracks(
@@ -55,7 +55,7 @@ def newborn(left: FloatArray, slot: IntArray) -> Tracks:
 
 def no_tracks() -> Tracks:
     """No features."""
-    return newborn(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
+    return new_tracks(np.zeros((0, 2)), np.zeros(0, dtype=np.int64))
 
 
 class AnchorBank:
@@ -66,17 +66,17 @@ class AnchorBank:
         self._radius_px = radius_px
         self._taken = np.zeros(count, dtype=np.bool_)
 
-    def put(self, image: FloatImage, centres: FloatArray) -> IntArray:
+    def add(self, image: FloatImage, centres: FloatArray) -> IntArray:
         """Cut new anchors around pixels (N, 2) of an image; return their slots (N,)."""
         free = np.flatnonzero(~self._taken)[: len(centres)]
         if len(free) < len(centres):
             self._grow(len(self._taken) + len(centres))
             free = np.flatnonzero(~self._taken)[: len(centres)]
         self._taken[free] = True
-        self.renew(free, image, centres)
+        self.replace(free, image, centres)
         return free
 
-    def renew(self, slots: IntArray, image: FloatImage, centres: FloatArray) -> None:
+    def replace(self, slots: IntArray, image: FloatImage, centres: FloatArray) -> None:
         """Replace the anchors in slots (N,) by the patches around pixels (N, 2) of an image."""
         new = templates(cut_patches(image, centres, self._radius_px))
         for column in fields(Templates):

@@ -136,7 +136,7 @@ def test_measures_cameras_that_cannot_be_rectified(
     (swapped / "aside").rename(cam1)
     facts = _calibrate(capsys, swapped, tmp_path / "out", pairs=5)
     assert _faults(facts) == ["cameras swapped"]
-    assert "the reader refuses this calibration" in facts["notes"][0]
+    assert "the reader rejects this calibration" in facts["notes"][0]
     assert "must be corrected first" in facts["imu"]["verdict"]
 
 

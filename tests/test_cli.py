@@ -198,9 +198,9 @@ def test_replaces_an_earlier_run_but_no_other_files(
     before = (out / "metrics.json").read_bytes()
     capsys.readouterr()
     assert main(run) == 1
-    said = capsys.readouterr().err
-    assert "holds check, notes.md beside an earlier result" in said
-    assert said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert "holds check, notes.md beside an earlier result" in error
+    assert error.count("\n") == 1
     assert (out / "notes.md").read_text() == "what I thought"
     assert (out / "metrics.json").read_bytes() == before
 

@@ -73,7 +73,7 @@ def test_detects_the_folder_or_its_mav0_from_content(source: str, tmp_path: Path
     make_euroc(tmp_path, truth="tum")
     recording = open_dataset(source.format(tmp_path)).recording
     assert recording.kind == "euroc"
-    assert recording.reference is not None, "groundtruth_tum.txt lies beside mav0"
+    assert recording.reference is not None, "groundtruth_tum.txt is beside mav0"
     np.testing.assert_allclose(recording.reference.T_world_body, truth_poses(4), atol=1e-9)
 
 

@@ -370,7 +370,7 @@ def test_real_recording(name: str, count: int, camera: StereoCamera, data_dir: P
 def test_real_extrinsics_relate_velocities_to_the_reference(name: str, data_dir: Path) -> None:
     """The reference, moved to the IMU, agrees with the velocities; with the inverse rotation it does not.
 
-    These drives turn too little to prove the translation too; the ECE276A and UTIAS tests do that for the same rig.
+    These drives rotate too little to verify the translation too; the ECE276A and UTIAS tests do that for the same rig.
     """
     dataset = read_kitti(data_dir / name, DEFAULT)
     recording = dataset.recording

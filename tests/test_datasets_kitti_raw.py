@@ -308,7 +308,7 @@ def test_real_rows_are_aligned_as_well_as_by_kitti(data_dir: Path) -> None:
 
 
 def test_a_rig_of_the_real_files_is_consistent(data_dir: Path) -> None:
-    """The right camera seen through `R_01 T_01` lies where `P_rect_01` puts it."""
+    """The right camera's position agrees between `R_01 T_01` and `P_rect_01`."""
     dataset, published = _real(data_dir)
     rig: StereoRig = dataset.rectifier.rig
     np.testing.assert_allclose(rig.T_cam0_cam1, se3_inverse(published.T_cam1_cam0), atol=1e-12)

@@ -1,4 +1,4 @@
-"""The documentation as a stranger would use it: commands and Python blocks run, and what they name exists.
+"""The documentation's commands and Python blocks run, and all that they name exists.
 
 The README's commands run word for word in a folder where every path that they name exists, small. A line added to the
 README therefore fails here unless it works, and a line that is too long for a test needs an entry in `_SMALLER` or
@@ -35,7 +35,7 @@ ROOT = Path(__file__).resolve().parent.parent
 README = "README.md"
 DOCS = (README, "CHANGELOG.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))))
 
-# Options behind a command of the README that make it small; what stands in front of them is run as written.
+# Options behind a command of the README that make it small; the command itself is run as written.
 _SMALLER = {
     "vio render --scene room --trajectory handheld --duration 10 --out room": "--duration 0.2 --rig small --width 200",
     "vio calibrate FOLDER": "--pairs 3",
@@ -52,7 +52,7 @@ def _make(target: str) -> list[str]:
 
 
 def _make_demo() -> None:
-    """The environment, then the command that `workshop` has run."""
+    """The environment, then the command that `readme_folder` has run."""
     *before, last = _make("demo")
     assert any("-m venv" in line for line in before)
     assert any("pip install" in line and line.endswith("-e .") for line in before)
@@ -82,7 +82,7 @@ _ELSEWHERE: dict[str, Callable[[], None]] = {
 }
 
 
-# --- what stands in the documents -----------------------------------------------------------------------------------
+# --- contents of the documents --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ def _text(name: str) -> str:
 
 
 def _blocks(name: str) -> Iterator[_Block]:
-    """Yield fenced blocks, and indented ones that stand between empty lines."""
+    """Yield fenced blocks, and indented ones between empty lines."""
     text = _text(name)
     for found in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
         yield _Block(found.group(1), text[: found.start(2)].count("\n"), found.group(2))
@@ -125,12 +125,12 @@ def _snippets(name: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def readme_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with everything that the README's commands name: a short drive, a short flight, a course file, runs."""
-    root = tmp_path_factory.mktemp("workshop")
+    root = tmp_path_factory.mktemp("readme_folder")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(root)
-        # A second of the demo's drive in place of fourteen; the rest of it is the demo.
+        # A second of the demo's drive instead of fourteen; otherwise it is the demo.
         patch.setattr(vio.sim.demo, "_DURATION_S", 1.2)
         patch.setattr(vio.sim.demo, "_WIDTH_PX", 400)
         assert main(["demo", "--out", "demo"]) == 0
@@ -159,9 +159,9 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("command", dict.fromkeys(_commands(README)))
 def test_readme_commands_run(
-    command: str, workshop: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    command: str, readme_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.chdir(workshop)
+    monkeypatch.chdir(readme_folder)
     program, *argv = shlex.split(f"{command} {_SMALLER.get(command, '')}")
     if program == "vio":
         assert main(argv) == 0
@@ -172,12 +172,12 @@ def test_readme_commands_run(
         _ELSEWHERE[command]()
 
 
-def test_entries_stand_in_the_readme() -> None:
+def test_exception_entries_are_in_the_readme() -> None:
     assert set(_SMALLER) | set(_ELSEWHERE) <= set(_commands(README))
 
 
 def test_readme_blocks_hold_commands_or_the_demos_output() -> None:
-    """So that no line escapes the tests above because it looks like none."""
+    """Every line is either a command, tested above, or output of the demo."""
     commands = _commands(README)
     plain = [block.text for block in _blocks(README) if block.language not in ("python", "bibtex")]
     outputs = [text for text in plain if text.startswith("frames ")]
@@ -187,37 +187,37 @@ def test_readme_blocks_hold_commands_or_the_demos_output() -> None:
 
 
 def test_readme_shows_what_the_demo_prints(
-    workshop: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    readme_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Line by line, numbers apart; the small demo is too short for the line `drift`."""
-    from vio.cli.output import answer
+    from vio.cli.output import print_result
     from vio.cli.running import rows_of
 
-    monkeypatch.chdir(workshop)
-    metrics = yaml.safe_load((workshop / "demo/run/metrics.json").read_text(encoding="utf-8"))
-    answer({}, rows_of({**metrics, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039}), as_json=False)
+    monkeypatch.chdir(readme_folder)
+    metrics = yaml.safe_load((readme_folder / "demo/run/metrics.json").read_text(encoding="utf-8"))
+    print_result({}, rows_of({**metrics, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039}), as_json=False)
     shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
     assert re.sub(r"[\d.]+\d", "#", capsys.readouterr().out) == re.sub(r"[\d.]+\d", "#", shown)
 
 
 def test_readme_python_runs(
-    workshop: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    readme_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(workshop)
+    monkeypatch.chdir(readme_folder)
     blocks = [block for block in _blocks(README) if block.language == "python"]
     assert len(blocks) == 1
     _execute(README, blocks[0], {})
-    told = re.search(r"ATE (\d\.\d+) m over (\d+\.\d) m", capsys.readouterr().out)
-    assert told is not None
-    assert float(told.group(1)) < 0.1
-    assert float(told.group(2)) > 5
+    printed = re.search(r"ATE (\d\.\d+) m over (\d+\.\d) m", capsys.readouterr().out)
+    assert printed is not None
+    assert float(printed.group(1)) < 0.1
+    assert float(printed.group(2)) > 5
 
 
-def test_readme_names_what_a_run_leaves_behind(workshop: Path) -> None:
-    text = _text(README).partition("## What a run leaves behind")[2].partition("```")[0]
+def test_readme_names_the_output_files_of_a_run(readme_folder: Path) -> None:
+    text = _text(README).partition("## Output of a run")[2].partition("```")[0]
     named = set(re.findall(r"`(\w+\.\w+)`", text))
     assert len(named) > 5
-    assert named <= {path.name for path in (workshop / "RUN").iterdir()}
+    assert named <= {path.name for path in (readme_folder / "RUN").iterdir()}
 
 
 # --- Python blocks of the other documents ---------------------------------------------------------------------------
@@ -371,7 +371,7 @@ def test_yaml_of_the_docs_is_a_configuration(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", DOCS)
-def test_links_lead_somewhere(name: str) -> None:
+def test_links_are_valid(name: str) -> None:
     broken = []
     for target in re.findall(r"\]\(([^)\s]+)\)", _text(name)):
         path, _, heading = target.partition("#")

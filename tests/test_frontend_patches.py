@@ -187,7 +187,7 @@ def test_row_field_estimates_rectification_error() -> None:
         off = 0.3 + 0.001 * (left[:, 0] - 320) + 5e-6 * (left[:, 0] - 320) * (left[:, 1] - 180)
         right = left + np.stack([np.full(150, -20.0), off + rng.normal(0, 0.15, 150)], axis=1)
         right[:15, 1] += rng.uniform(-5, 5, 15)
-        field.learn(left, right)
+        field.update(left, right)
     grid = np.stack(np.meshgrid(np.arange(20.0, 640, 60), np.arange(20.0, 360, 40)), axis=-1).reshape(-1, 2)
     expected = 0.3 + 0.001 * (grid[:, 0] - 320) + 5e-6 * (grid[:, 0] - 320) * (grid[:, 1] - 180)
     assert np.abs(field.rows(grid) - grid[:, 1] - expected).max() < 0.1
@@ -344,14 +344,14 @@ def test_take_and_joined_work_on_nested_records() -> None:
 def test_anchors_keep_their_slots_when_the_bank_grows() -> None:
     image = PLAIN.astype(np.float32)
     bank = AnchorBank(4, 3)
-    first = bank.put(image, POINTS[:3])
+    first = bank.add(image, POINTS[:3])
     before = bank.store.patch[first].copy()
-    more = bank.put(image, POINTS[3:20])
+    more = bank.add(image, POINTS[3:20])
     assert not set(first) & set(more)
     np.testing.assert_array_equal(bank.store.patch[first], before)
     np.testing.assert_array_equal(bank.store.patch[more], templates(cut_patches(image, POINTS[3:20], 3)).patch)
     bank.keep_only(first)
-    again = bank.put(image, POINTS[20:22])
+    again = bank.add(image, POINTS[20:22])
     assert not set(first) & set(again)
     assert set(again) <= set(more) | {3}  # free slots are reused
 

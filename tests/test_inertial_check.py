@@ -47,7 +47,7 @@ def _observe(
     seed: int,
     sigma_px: float = 0.5,
 ) -> list[Observations]:
-    """Points on the walls of a cube `reach` metres around the path, with noise on their pixels."""
+    """Return noisy observations of points on the walls of a cube `reach` metres around the path."""
     rng = np.random.default_rng([seed, 1])
     centre, half = (f(T_world_imu[:, :3, 3], axis=0) for f in (np.mean, np.ptp))
     points = rng.uniform(-1, 1, (6000, 3))
@@ -97,7 +97,7 @@ def _recording(name: str, seed: int = 0, mount: str = "euroc") -> Watched:
 
 @cache
 def _real(folder: Path, seconds: float) -> Watched:
-    """The real IMU record of a flight, and points seen along its ground truth."""
+    """Return the real IMU data of a flight, and observations of points along its ground truth."""
     truth = read_trajectory(folder / "groundtruth_tum.txt", fmt="tum")
     truth_ns, poses = truth.times_ns, truth.T_world_body
     assert truth_ns is not None

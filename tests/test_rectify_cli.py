@@ -237,7 +237,7 @@ def test_run_takes_an_unrectified_folder_like_a_rectified_one(
     metrics = _json(capsys, "run", str(folder), "--out", str(tmp_path / "run"), "--backend", "vislam")
     assert metrics["frames"] == 8
     assert metrics["ate_m"] < 0.02, "the ground truth of the IMU is found and honoured"
-    assert metrics["motion"] == "none", "the paper's filter has no model for an IMU and takes the images alone"
+    assert metrics["motion"] == "none", "the paper's filter has no IMU model and uses the images alone"
     assert _json(capsys, "rectify", str(folder), "--out", str(tmp_path / "rect"))["frames"] == 8
     again = _json(capsys, "run", str(tmp_path / "rect"), "--out", str(tmp_path / "run2"), "--backend", "vislam")
     assert again["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)

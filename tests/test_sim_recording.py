@@ -110,7 +110,7 @@ def test_exact_blur_is_the_mean_of_sub_exposures() -> None:
 
 def test_motion_blur_is_along_the_motion_and_the_approximate_one_agrees(plain: Simulation) -> None:
     time_ns = 2_000_000_000
-    sharp, cheap, exact = (
+    sharp, approximate, exact = (
         _recording(plain, effects).radiance(time_ns)[0]
         for effects in (
             CLEAN,
@@ -118,9 +118,9 @@ def test_motion_blur_is_along_the_motion_and_the_approximate_one_agrees(plain: S
             replace(CLEAN, blur_exposure_ms=30.0, blur_samples=9, blur_exact=True),
         )
     )
-    contrast = [cv2.Laplacian(image, cv2.CV_32F).std() for image in (sharp, cheap, exact)]
+    contrast = [cv2.Laplacian(image, cv2.CV_32F).std() for image in (sharp, approximate, exact)]
     assert contrast[2] < 0.8 * contrast[0]
-    assert np.abs(cheap - exact).mean() < 0.35 * np.abs(sharp - exact).mean()
+    assert np.abs(approximate - exact).mean() < 0.35 * np.abs(sharp - exact).mean()
 
 
 def test_flow_is_the_exact_map(plain: Simulation) -> None:

@@ -178,7 +178,7 @@ def test_occluded_points_are_invisible(small_room: World) -> None:
     rays, _ = unproject_pixel(a.camera, uv)
     surfaces = surfaces_at(small_room, 0)
     hits = cast(surfaces, a.T_world_cam, rays)
-    p = surface_points(surfaces, hits.surface, hits.place)
+    p = surface_points(surfaces, hits.surface, hits.coordinates)
     there, visible = correspondence(small_room, a, b, uv)
     in_view = inside_image(b.camera, there) & ((p - b.T_world_cam[:3, 3]) @ b.T_world_cam[:3, 2] > 0)
     steps = np.linspace(0.002, 0.998, 400)[:, None, None]
@@ -223,7 +223,7 @@ def test_every_pixel_shows_the_surface_that_its_ray_hits(small_room: World) -> N
         same = cv2.erode(expected, np.ones((3, 3))) == cv2.dilate(expected, np.ones((3, 3)))
         assert np.abs(image - expected)[same].max() < 1e-3
         assert same.mean() > 0.7
-        # On outlines, the mixture lies between the neighbours and averages to the exact coverage.
+        # On outlines, the mixture is between the neighbours and averages to the exact coverage.
         assert abs(float((image - expected)[~same].mean())) < 4
 
 

@@ -55,8 +55,8 @@ _CROSSED_FRAMES = 3  # a track on the wrong surface for more frames counts as ke
 _MARGIN_PX = 12.0  # points closer to the image border are not required to be tracked
 _CORNERS = 150  # strongest corners of an image, for the recall of repeatable corners
 _CORNER_GAP_PX = 24.0
-_AGAIN_PX = 1.5  # distance from the true pixel up to which a corner is repeated
-_HELD_PX = 3.0  # distance up to which a track covers a corner
+_REPEATED_PX = 1.5  # distance from the true pixel up to which a corner is repeated
+_COVERED_PX = 3.0  # distance up to which a track covers a corner
 
 
 @dataclass
@@ -69,17 +69,17 @@ class Tally:
     disparity: list[FloatArray] = field(default_factory=list)  # (N,) px
     row: list[FloatArray] = field(default_factory=list)  # (N,) px, right row minus true
     order: list[FloatArray] = field(default_factory=list)  # (N,) ul - ur
-    held: list[int] = field(default_factory=list)  # features in each frame
+    features: list[int] = field(default_factory=list)  # features in each frame
     matched: list[int] = field(default_factory=list)  # features with a right match in each frame
-    lived: dict[int, int] = field(default_factory=dict)  # number of frames of each feature
+    frames_of: dict[int, int] = field(default_factory=dict)  # number of frames of each feature
     crossed: dict[int, int] = field(
         default_factory=dict
     )  # largest number of consecutive frames of each feature on another surface
-    could_go_on: int = 0  # features whose point is visible in the next frame
-    went_on: int = 0  # of these, tracked there within _OUTLIER_PX
+    trackable: int = 0  # features whose point is visible in the next frame
+    tracked: int = 0  # of these, tracked there within _OUTLIER_PX
     kept: int = 0  # of these, tracked there at any error
     corners: int = 0  # repeatable corners
-    corners_held: int = 0  # of these, covered by one track in both images
+    corners_covered: int = 0  # of these, covered by one track in both images
     reused: int = 0  # ids that reappeared after they were lost
     ms: list[float] = field(default_factory=list)
 
@@ -90,7 +90,7 @@ class _Birth:
 
     frame: dict[int, int] = field(default_factory=dict)
     surface: dict[int, tuple[int, int]] = field(default_factory=dict)  # own, rim
-    place: dict[int, FloatArray] = field(default_factory=dict)  # (2, 2) m on the own surface, on the rim
+    coordinates: dict[int, FloatArray] = field(default_factory=dict)  # (2, 2) m on the own surface, on the rim
     offset: dict[int, FloatArray] = field(default_factory=dict)  # (2,) px from the rim's point to the feature
 
 
@@ -119,12 +119,12 @@ def evaluate(simulation: Simulation, frames: Iterable[StereoFrame], frontend: Fr
 
 
 def _count(tally: Tally, output: FrontendOutput, now: Observations, before: Observations | None) -> None:
-    tally.held.append(len(now))
+    tally.features.append(len(now))
     tally.matched.append(int(now.has_right.sum()))
     alive = set() if before is None else set(before.ids.tolist())
     for name in now.ids.tolist():
-        tally.reused += name in tally.lived and name not in alive
-        tally.lived[name] = tally.lived.get(name, 0) + 1
+        tally.reused += name in tally.frames_of and name not in alive
+        tally.frames_of[name] = tally.frames_of.get(name, 0) + 1
 
 
 def _evaluate_stereo(tally: Tally, simulation: Simulation, now: Observations, left: View, right: View) -> None:
@@ -143,10 +143,10 @@ def _evaluate_step(
     _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
     error = now.z[j, :2] - true[i]
     tally.step.append(error[visible[i]])
-    open_to = visible & inside_image(left.camera, true, margin_px=_MARGIN_PX)
-    tally.could_go_on += int(open_to.sum())
-    tally.kept += int(open_to[i].sum())
-    tally.went_on += int((open_to[i] & (np.linalg.norm(error, axis=1) <= _OUTLIER_PX)).sum())
+    trackable = visible & inside_image(left.camera, true, margin_px=_MARGIN_PX)
+    tally.trackable += int(trackable.sum())
+    tally.kept += int(trackable[i].sum())
+    tally.tracked += int((trackable[i] & (np.linalg.norm(error, axis=1) <= _OUTLIER_PX)).sum())
 
 
 def _evaluate_life(
@@ -172,11 +172,11 @@ def _evaluate_life(
     fresh = [k for k, name in enumerate(names) if name not in birth.frame]
     _begin(birth, [names[k] for k in fresh], surfaces, left, now.z[fresh, :2], frame_index)
     own, rim = np.array([birth.surface[name] for name in names]).T
-    place = np.array([birth.place[name] for name in names])
-    p_world = surface_points(surfaces, own, place[:, 0])
+    coordinates = np.array([birth.coordinates[name] for name in names])
+    p_world = surface_points(surfaces, own, coordinates[:, 0])
     true, visible = observe(surfaces, left, p_world)
     error = now.z[:, :2] - true
-    on_rim, _ = observe(surfaces, left, surface_points(surfaces, rim, place[:, 1]))
+    on_rim, _ = observe(surfaces, left, surface_points(surfaces, rim, coordinates[:, 1]))
     rim_error = now.z[:, :2] - on_rim - np.array([birth.offset[name] for name in names])
     follows_rim = np.linalg.norm(rim_error, axis=1) < np.linalg.norm(error, axis=1)
     age = frame_index - np.array([birth.frame[name] for name in names])
@@ -205,13 +205,13 @@ def _begin(birth: _Birth, names: list[int], surfaces: Surfaces, left: View, uv: 
     rays, _ = unproject_pixel(left.camera, around.reshape(-1, 2))
     hits = cast(surfaces, left.T_world_cam, rays)
     distance = np.where(hits.found, hits.distance, np.inf).reshape(len(uv), -1)
-    surface, place = hits.surface.reshape(len(uv), -1), hits.place.reshape(len(uv), -1, 2)
+    surface, coordinates = hits.surface.reshape(len(uv), -1), hits.coordinates.reshape(len(uv), -1, 2)
     nearest = np.where(distance.min(axis=1) < (1 - _OTHER_DEPTH) * distance[:, 0], distance.argmin(axis=1), 0)
     for k, name in enumerate(names):
         rim = int(nearest[k])
         birth.frame[name] = frame_index
         birth.surface[name] = int(surface[k, 0]), int(surface[k, rim])
-        birth.place[name] = place[k, [0, rim]]
+        birth.coordinates[name] = coordinates[k, [0, rim]]
         birth.offset[name] = -ring[rim]
 
 
@@ -226,14 +226,14 @@ def _evaluate_corners(
     if len(corners) == 0 or len(again) == 0:
         return
     true, visible = correspondence(simulation.world, before[2], now[2], corners)
-    repeatable = visible & (_distances(true, again).min(axis=1) <= _AGAIN_PX)
+    repeatable = visible & (_distances(true, again).min(axis=1) <= _REPEATED_PX)
     tally.corners += int(repeatable.sum())
     _, i, j = np.intersect1d(before[0].ids, now[0].ids, assume_unique=True, return_indices=True)
     if len(i) == 0:
         return
-    here = _distances(corners, before[0].z[i, :2]) <= _HELD_PX
-    there = _distances(true, now[0].z[j, :2]) <= _HELD_PX
-    tally.corners_held += int((repeatable & (here & there).any(axis=1)).sum())
+    here = _distances(corners, before[0].z[i, :2]) <= _COVERED_PX
+    there = _distances(true, now[0].z[j, :2]) <= _COVERED_PX
+    tally.corners_covered += int((repeatable & (here & there).any(axis=1)).sum())
 
 
 def _corners(image: Image) -> FloatArray:
@@ -251,14 +251,14 @@ def _distances(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def figures(tally: Tally) -> dict[str, Any]:
     """Reduce a tally to plain numbers; errors in pixels, shares from 0 to 1, None without observations."""
-    lives = np.array(list(tally.lived.values()) or [0])
+    lives = np.array(list(tally.frames_of.values()) or [0])
     tracked = int((lives > 1).sum())
     crossed = np.array(list(tally.crossed.values()), dtype=int)
     order = _joined(tally.order, 1)
     return {
-        "frames": len(tally.held),
-        "features_median": float(np.median(tally.held)),
-        "features_least": int(min(tally.held)),
+        "frames": len(tally.features),
+        "features_median": float(np.median(tally.features)),
+        "features_least": int(min(tally.features)),
         "stereo_median": float(np.median(tally.matched)),
         "stereo_least": int(min(tally.matched)),
         "step": _errors(_joined(tally.step, 2)),
@@ -266,14 +266,14 @@ def figures(tally: Tally) -> dict[str, Any]:
         "disparity": _errors(_joined(tally.disparity, 1)),
         "row": _errors(_joined(tally.row, 1)),
         "least_disparity_px": float(order.min()) if len(order) else None,
-        "tracks": len(tally.lived),
+        "tracks": len(tally.frames_of),
         "life_mean": float(lives.mean()),
         "life_median": float(np.median(lives)),
         "life_95": float(np.percentile(lives, 95)),
         "life_of_an_observation": float((lives**2).sum() / max(lives.sum(), 1)),
-        "survival": tally.kept / tally.could_go_on if tally.could_go_on else None,
-        "recall": tally.went_on / tally.could_go_on if tally.could_go_on else None,
-        "corner_recall": tally.corners_held / tally.corners if tally.corners else None,
+        "survival": tally.kept / tally.trackable if tally.trackable else None,
+        "recall": tally.tracked / tally.trackable if tally.trackable else None,
+        "corner_recall": tally.corners_covered / tally.corners if tally.corners else None,
         "crossed": len(crossed) / tracked if tracked else None,
         "crossed_and_kept": int((crossed > _CROSSED_FRAMES).sum()) / tracked if tracked else None,
         "ids_reused": tally.reused,

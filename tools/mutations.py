@@ -36,7 +36,7 @@ _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
 _SCORE = ("tests/test_evaluation.py",)
 _PIPELINE = ("tests/test_pipeline.py",)
 _REPRODUCE = ("tests/test_reproduce.py",)
-_VOTE = ("tests/test_frontend_outliers.py",)
+_RANSAC = ("tests/test_frontend_outliers.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
@@ -50,7 +50,7 @@ MUTATIONS = (
         _LIE,
     ),
     Mutation(
-        "SO(3): inverse Jacobian of the other side",
+        "SO(3): inverse right Jacobian for the left",
         "vio/geometry/lie.py",
         "np.eye(3) - 0.5 * W",
         "np.eye(3) + 0.5 * W",
@@ -71,7 +71,7 @@ MUTATIONS = (
         _LIE,
     ),
     Mutation(
-        "SE(3): translation not turned in the inverse",
+        "SE(3): translation not rotated in the inverse",
         "vio/geometry/lie.py",
         "-(Rt @ T[..., :3, 3, None])[..., 0]",
         "-T[..., :3, 3]",
@@ -99,14 +99,14 @@ MUTATIONS = (
         _STEREO,
     ),
     Mutation(
-        "projection's Jacobian: baseline forgotten",
+        "Jacobian of the projection: baseline missing",
         "vio/geometry/stereo.py",
         "(x - camera.baseline_m)",
         "x",
         _STEREO,
     ),
     Mutation(
-        "triangulation's Jacobian: term dropped",
+        "Jacobian of the triangulation: term dropped",
         "vio/geometry/stereo.py",
         "depth / camera.fu + ray_x * depth_D_ul",
         "depth / camera.fu",
@@ -134,7 +134,7 @@ MUTATIONS = (
         _LENS,
     ),
     Mutation(
-        "lens: where the model folds back, a term dropped",
+        "lens: term of the fold radius dropped",
         "vio/geometry/distortion.py",
         "3 * k1, 5 * k2, 7 * k3]",
         "3 * k1, 5 * k2, 0 * k3]",
@@ -155,14 +155,14 @@ MUTATIONS = (
         _RECTIFY,
     ),
     Mutation(
-        "rectification: extrinsics not turned along",
+        "rectification: extrinsics not rotated",
         "vio/geometry/rectify.py",
         "se3_from_parts(R_rect_cam0, np.zeros(3)) @ T_cam0_imu",
         "T_cam0_imu",
         _RECTIFY,
     ),
     Mutation(
-        "rectification: lookup turned the wrong way",
+        "rectification: lookup map rotated the wrong way",
         "vio/geometry/rectify.py",
         "rays @ R_rect_cam)",
         "rays @ R_rect_cam.T)",
@@ -501,14 +501,14 @@ MUTATIONS = (
         _SELECT,
     ),
     Mutation(
-        "information: a point's own doubt ignored",
+        "information: uncertainty of the point ignored",
         "vio/information.py",
         "both = n / (n + 1)",
         "both = n / n.clip(1)",
         _SELECT,
     ),
     Mutation(
-        "information: no doubt that a feature is seen again",
+        "information: feature survival ignored",
         "vio/information.py",
         "(survival**step *",
         "(1.0 *",
@@ -571,7 +571,7 @@ MUTATIONS = (
         ("tests/test_plotting.py",),
     ),
     Mutation(
-        "alignment: scale forgotten in the translation",
+        "alignment: scale missing in the translation",
         "vio/evaluation.py",
         "y_mean - scale * (R @ x_mean)",
         "y_mean - R @ x_mean",
@@ -599,7 +599,7 @@ MUTATIONS = (
         _SCORE,
     ),
     Mutation(
-        "NEES: triangle on the wrong side",
+        "NEES: multiplied by the Cholesky factor, not its inverse",
         "vio/evaluation.py",
         "np.linalg.solve(L, e[..., None])",
         "(L @ e[..., None])",
@@ -607,39 +607,39 @@ MUTATIONS = (
     ),
     # --- frontend ---
     Mutation(
-        "vote: step on the wrong side of the motion",
+        "RANSAC: step on the wrong side of the motion",
         "frontend/outliers.py",
         "T = se3_exp(xi) @ T",
         "T = T @ se3_exp(xi)",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
-        "vote: turn from the prediction not transposed",
+        "RANSAC: rotation of the prior not transposed",
         "frontend/outliers.py",
         "so3_log(T[:3, :3] @ R.T)",
         "so3_log(T[:3, :3] @ R)",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
-        "vote: what it denies does not count for the prediction",
+        "RANSAC: inliers of the prior not limited to outliers of the consensus",
         "frontend/outliers.py",
         "(kept & ~inliers).sum() >= needed",
         "kept.sum() >= needed",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
         "two views: sign of the turn's derivative",
         "frontend/outliers.py",
         "r_D_turn = np.cross(turned,",
         "r_D_turn = -np.cross(turned,",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
         "two views: forwards taken for backwards",
         "frontend/outliers.py",
         "np.maximum(off_u * way_u + off_v * way_v, 0.0)",
         "np.maximum(-off_u * way_u - off_v * way_v, 0.0)",
-        _VOTE,
+        _RANSAC,
     ),
     Mutation(
         "tracking: disparity to the wrong side",

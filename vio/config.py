@@ -239,10 +239,10 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
 
     A name may be split over section and setting: `consensus_samples` is `consensus.samples`.
     """
-    namesakes = [row.key for row in describe(root) if f".{row.key}".replace(".", "_").endswith(f"_{key}")]
-    sisters = [name for name in namesakes if name.startswith(prefix[: prefix.find(".") + 1])]
+    same_name = [row.key for row in describe(root) if f".{row.key}".replace(".", "_").endswith(f"_{key}")]
+    siblings = [name for name in same_name if name.startswith(prefix[: prefix.find(".") + 1])]
     similar = [prefix + name for name in difflib.get_close_matches(key, names, 1, cutoff=0.4)]
-    for found in (sisters, similar, namesakes):
+    for found in (siblings, similar, same_name):
         if found:
             return f"; did you mean '{found[0]}'?"
     return f"; valid here: {', '.join(prefix + name for name in names)}"

@@ -261,7 +261,7 @@ def associate_times(
 ) -> tuple[IntArray, IntArray]:
     """Pair two increasing clocks one to one and in order, closest pairs first; return row indices (M,) into each.
 
-    A pair is at most `max_difference_ns` apart. Of equally close pairs the earlier one is taken.
+    A pair is at most `max_difference_ns` apart. Of equally close pairs the earlier one is chosen.
     """
     a, b = np.asarray(times_a_ns, dtype=np.int64), np.asarray(times_b_ns, dtype=np.int64)
     low = np.searchsorted(b, a - max_difference_ns, side="left")

@@ -306,11 +306,18 @@ class _RunRecorder:
             self._revise(len(self.estimates) - self._lag, len(self.estimates))
 
     def _revise(self, first: int, end: int) -> None:
-        """Give estimates the poses that the back end has for them now."""
+        """Replace estimates by the smoothed ones: pose, covariance, velocity and biases."""
         for k in range(max(first, 0), end):
-            T = self._backend.pose_of(self.frames[k].index)
-            if T is not None:
-                self.estimates[k] = replace(self.estimates[k], T_world_imu=T)
+            smoothed = self._backend.smoothed(self.frames[k].index)
+            if smoothed is not None:
+                self.estimates[k] = replace(
+                    self.estimates[k],
+                    T_world_imu=smoothed.T_world_imu,
+                    covariance=smoothed.covariance,
+                    velocity_world=smoothed.velocity_world,
+                    gyro_bias=smoothed.gyro_bias,
+                    accel_bias=smoothed.accel_bias,
+                )
 
 
 class _DeadReckoning:

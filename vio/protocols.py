@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Protocol, TypeAlias
 
-from vio.geometry.lie import FloatArray
 from vio.records import (
     Estimate,
     Event,
@@ -94,8 +93,8 @@ class Backend(Protocol):
     def estimate(self) -> Estimate:
         """Return the current belief."""
 
-    def pose_of(self, frame_index: int) -> FloatArray | None:
-        """Return `T_world_imu` (4, 4) of a past frame as it is known now; None where it is not kept."""
+    def smoothed(self, frame_index: int) -> Estimate | None:
+        """Return the estimate at a past frame with all frames since taken into account; None where it is not kept."""
 
     def landmarks(self) -> Landmarks:
         """Return the current map."""

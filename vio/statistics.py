@@ -1,10 +1,10 @@
-"""Chi-square quantiles for gates and consistency tests."""
+"""Chi-square quantiles and probabilities for gates and consistency tests."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import gammaincinv
+from scipy.special import gammainc, gammaincinv
 
 from vio.geometry.lie import FloatArray
 
@@ -17,3 +17,8 @@ def chi_square_quantile(probability: npt.ArrayLike, dof: npt.ArrayLike) -> Float
     """
     quantile: FloatArray = 2 * np.asarray(gammaincinv(np.asarray(dof) / 2, probability))
     return quantile
+
+
+def chi_square_cdf(x: float, dof: int) -> float:
+    """Probability that a chi-square variable of `dof` degrees of freedom is below x."""
+    return float(gammainc(0.5 * dof, 0.5 * x))

@@ -113,11 +113,11 @@ def _window(
         T_start_cam.append(T)
     poses = np.array(T_start_cam)
     s = _integrals(t, t_imu, gyro, force, R_cam0_imu)
-    since = t[1:] - t[0]
+    elapsed = t[1:] - t[0]
     rows = np.concatenate([poses[:, :3, :3] - np.eye(3), s[:, :, 1:]], axis=2).reshape(3 * n, 6)
     right = (s[:, :, 0] - poses[:, :3, 3]).reshape(3 * n)
     nuisance = np.concatenate(
-        [since[:, None, None] * np.eye(3), since[:, None, None] ** 2 / 2 * np.eye(3)], axis=2
+        [elapsed[:, None, None] * np.eye(3), elapsed[:, None, None] ** 2 / 2 * np.eye(3)], axis=2
     ).reshape(3 * n, 6)
     Q = np.linalg.qr(nuisance, mode="complete")[0][:, 6:]
     return Q.T @ rows, Q.T @ right
@@ -214,7 +214,7 @@ def judge_lever_arms(
 
 
 def _fit_place(y: FloatArray, signal: FloatArray, nuisance: FloatArray) -> float:
-    """Fit `y = place * signal + nuisance c` (N, 3) robustly, c apart for each axis; the axes share `place`."""
+    """Fit `y = place * signal + nuisance c` (N, 3) robustly, with c per axis and a common `place`."""
     top = bottom = 0.0
     for axis in range(3):
         X = np.concatenate([signal[:, axis : axis + 1], nuisance], axis=1)

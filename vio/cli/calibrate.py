@@ -24,8 +24,8 @@ def add_parser(commands: Any) -> None:
         help="measure and check a calibration",
         description="Measure from a recording itself: left-right rotation and baseline direction (the length is taken "
         "as given), IMU-camera rotation, time offset and lever arm where the motion makes them observable; compare "
-        "with the given calibration and report its faults. Writes a Kalibr-style and EuRoC-style YAML. Intrinsics are taken "
-        "as given.",
+        "with the given calibration and report its faults. Writes a Kalibr-style and EuRoC-style YAML. "
+        "Intrinsics are taken as given.",
     )
     parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
     parser.add_argument(

@@ -182,7 +182,7 @@ def _explain(verdict: LeverArmVerdict, t: FloatArray) -> str:
     x, y, z = t
     return (
         f"the translation of cam_T_imu ({x:.2f}, {y:.2f}, {z:.2f}) is the camera's position in the IMU frame, not the "
-        f"IMU's in the camera frame as its rotation demands: velocities and features place it at {verdict.place:+.2f} "
-        f"+- {verdict.place_sigma:.2f} between literal (-1) and corrected (+1); corrected to t = -R t "
-        "(dataset.extrinsics=literal keeps it)"
+        "IMU's in the camera frame as its rotation demands: velocities and features estimate it at "
+        f"{verdict.place:+.2f} +- {verdict.place_sigma:.2f} between literal (-1) and corrected (+1); "
+        "corrected to t = -R t (dataset.extrinsics=literal keeps it)"
     )

@@ -178,7 +178,7 @@ def read_observation_log(path: Path) -> FeatureDataset:
 
 def _check_format(arrays: Mapping[str, np.ndarray], path: Path) -> None:
     if "format" not in arrays or str(arrays["format"]) != FORMAT:
-        raise DataError(f"{path}: no observation log; make one with `vio run SOURCE --save-observations`")
+        raise DataError(f"{path}: no observation log; create one with `vio run SOURCE --save-observations`")
     if "version" in arrays and int(arrays["version"]) > VERSION:
         raise DataError(
             f"{path}: an observation log of version {int(arrays['version'])}, this program reads up to {VERSION}; "

@@ -20,7 +20,7 @@ class DatasetSettings(Section):
 
     colour: bool | None = setting(
         None,
-        "KITTI folders: take image_2/image_3 (true) or image_0/image_1 (false); null: gray where there is any",
+        "KITTI folders: use image_2/image_3 (true) or image_0/image_1 (false); null: gray where there is any",
     )
     extrinsics: ExtrinsicsMode = setting(
         "auto",

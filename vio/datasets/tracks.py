@@ -74,7 +74,7 @@ def moving_frames(linear: FloatArray, angular: FloatArray) -> BoolArray:
     return _differs_from_zero(linear, _STATIONARY_MPS) | _differs_from_zero(angular, _STATIONARY_RADPS)
 
 
-def _differs_from_zero(values: FloatArray, stationary: float) -> BoolArray:
+def _differs_from_zero(values: FloatArray, min_speed: float) -> BoolArray:
     count = len(values)
     k = np.arange(count)
     low, high = np.maximum(k - _HALF_WINDOW, 0), np.minimum(k + _HALF_WINDOW + 1, count)
@@ -83,7 +83,7 @@ def _differs_from_zero(values: FloatArray, stationary: float) -> BoolArray:
     mean = (total[high] - total[low]) / n
     scatter = np.maximum((squares[high] - squares[low]) / n - mean**2, 0.0)
     error = np.sqrt(scatter / n)
-    out: BoolArray = (np.abs(mean) > np.maximum(stationary, _SIGNIFICANCE * error)).any(axis=1)
+    out: BoolArray = (np.abs(mean) > np.maximum(min_speed, _SIGNIFICANCE * error)).any(axis=1)
     return out
 
 

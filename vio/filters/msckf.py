@@ -17,13 +17,15 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vio.errors import ConfigError, EstimationError
-from vio.filters.multiview import MIN_DEPTH, Views, eliminate_points, landmark_information
+from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
+from vio.filters.multiview import MIN_DEPTH, Views, eliminate_points, landmark_residuals
 from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, Transition, TwistMotion
 from vio.filters.noise import MotionNoise, StepErrors
 from vio.filters.online_calibration import first_calibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.tracks import latest_pixels
 from vio.filters.window import Window, posterior
+from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, project
@@ -93,11 +95,12 @@ class Msckf:
         self._blind = False  # the last frame showed nothing
         self._output: FloatArray = np.zeros((DIM, DIM))  # covariance (15 + C, 15 + C) with all that is seen
         self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
+        self._landmark_gate = LandmarkGate(settings.gate_probability)
+        self._smoothed: WindowPosterior | None = None  # after the last frame
+        self._stationary_ns = -(2**62)  # newest frame of the last zero-velocity measurement
         self._gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._since_frame = NO_STEP  # how the error has grown since the last frame
-        self._predicted_step: tuple[int, Transition] | None = (
-            None  # integrated by `predict`, with its end
-        )
+        self._predicted_step: tuple[int, Transition] | None = None  # integrated by `predict`, with its end
         self._map: list[Landmarks] = []
         self._points_stored = 0  # points in the map since it was merged
 
@@ -214,10 +217,9 @@ class Msckf:
         out[:DIM, :DIM] += self._since_frame.Q
         return out
 
-    def pose_of(self, frame_index: int) -> FloatArray | None:
-        """Return `T_world_imu` (4, 4) of a past frame as the window has it now; None where it has left the window."""
-        clones = [] if self._window is None else self._window.clones
-        return next((clone.T_world_imu for clone in clones if clone.frame_index == frame_index), None)
+    def smoothed(self, frame_index: int) -> Estimate | None:
+        """Return the estimate at a past frame with all frames since; None where it has left the window."""
+        return None if self._smoothed is None else self._smoothed.estimate(frame_index)
 
     def landmarks(self) -> Landmarks:
         """Return the points of all tracks that have been used, with their covariance given the poses.
@@ -231,11 +233,13 @@ class Msckf:
             [*self._map, Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))]
         )
 
-    def _store_landmarks(self, window: Window, chosen: BoolArray) -> None:
-        first = window.first_landmark
-        rows = [slice(first + 3 * k, first + 3 * k + 3) for k in np.flatnonzero(chosen).tolist()]
+    def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:
+        """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
+        first, gone = window.first_landmark, ~kept
+        rows = [slice(first + 3 * k, first + 3 * k + 3) for k in np.flatnonzero(gone).tolist()]
         blocks = np.array([window.P[r, r] for r in rows]).reshape(-1, 3, 3)
-        self._store_points(window.landmark_ids[chosen], window.landmarks[chosen], blocks)
+        self._store_points(window.landmark_ids[gone], window.landmarks[gone], blocks)
+        window.keep_landmarks(kept)
 
     def _store_points(self, ids: IntArray, p_world: FloatArray, covariance: FloatArray) -> None:
         """Add points to the map that is only told, never used."""
@@ -315,18 +319,13 @@ class Msckf:
             window.absorb_measurement(measurement)
 
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
-        """Everything that a frame's observations do."""
+        """Update with everything that a frame shows."""
         z, weight, found = latest_pixels(seen, window.landmark_ids)
-        self._store_landmarks(window, ~found)
-        window.keep_landmarks(found)
+        self._keep_landmarks(window, found)
         pixels = Views(z[found], weight[found])
         self._tracks.table.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
 
-        if self._tracks.is_stationary(len(window.clones)):
-            rest = self._motion.zero_velocity(window.nav, self._gyro)
-            if rest is not None:
-                window.absorb_measurement(rest)
-        predicted, expected = window.last_move(), self._expected_error(self._since_frame)
+        predicted, expected = self._predicted_move(window)
         tracks = self._tracks.linearise(window.T_cam0_world(), self._tracks.choose(len(window.clones)), _FIRST_STEPS)
         innovation = tracks.newest_innovation()
         tracks, P = self._fit(window, tracks, pixels, innovation)
@@ -335,22 +334,64 @@ class Msckf:
             missing = step.missing_noise()
             if missing.any() and self._tracks.agree(tracks.at):
                 window.inflate_process_noise(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
-                tracks, _ = self._fit(window, tracks, pixels, innovation)
-            self._noise.follow(step)
+                tracks, P = self._fit(window, tracks, pixels, innovation)
+            self._noise.update(step)
         self._since_frame = NO_STEP
 
         tracks = self._tracks.without_wrong_views(tracks)
-        good, nis = self._tracks.gate(tracks.at)
-        self._tracks.update_pixel_noise(nis)
-        report = self._commit(window, tracks, good, pixels)
+        good, nis, dof = self._tracks.gate(tracks.at)
+        self._tracks.update_pixel_noise(nis, dof)
+        pixels, rejected = self._gate_landmarks(window, pixels, P)
+        created = self._marginalise(window, tracks, good, pixels)
+        self._apply_zero_velocity(window)
         return UpdateReport(
-            used=int(good.sum()) + len(pixels.z),
-            gated=int((~good).sum()),
-            initialised=report,
+            used=int(good.sum()) + int((pixels.weight[:, 0] > 0).sum()),
+            gated=int((~good).sum()) + rejected,
+            initialised=created,
             landmarks=len(window.landmarks),
             innovation_median_px=innovation,
-            nis_per_dof=float(np.median(nis)) if len(nis) else None,
+            nis_per_dof=float(np.median(nis / dof)) if len(nis) else None,
         )
+
+    def _gate_landmarks(self, window: Window, pixels: Views, P: FloatArray) -> tuple[Views, int]:
+        """Test the landmarks' pixels after a fit of covariance P (D, D); drop the landmarks that keep failing.
+
+        Returns:
+            The pixels of the landmarks left, without weight where rejected, and how many observations were rejected.
+        """
+        if not len(pixels.z):
+            return pixels, 0
+        variance, T = self._tracks.variance, window.T_cam0_world()[-1]
+        at = landmark_residuals(self._camera, T, window.landmarks, pixels, variance)
+        covariance = window.landmark_covariance(P)
+        nis = leave_one_out_nis(at.r, at.J, covariance, at.weight, variance)
+        dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
+        used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
+        self._keep_landmarks(window, ~dropped)
+        weight = pixels.weight * used[:, None]
+        return Views(pixels.z[~dropped], weight[~dropped]), int((~used).sum())
+
+    def _apply_zero_velocity(self, window: Window) -> None:
+        """Absorb a zero-velocity measurement where the whole window is indistinguishable from standstill.
+
+        One measurement per window of frames: what two overlapping windows say of a slow motion is the same.
+        """
+        if not self._settings.zero_velocity or len(window.clones) < self._settings.clones:
+            return
+        if window.clones[0].time_ns <= self._stationary_ns:
+            return
+        limits = self._settings.zero_velocity_sigma_mps, self._settings.zero_rate_sigma_radps
+        if self._smoothed is None or not self._smoothed.is_stationary(*limits):
+            return
+        measurement = self._motion.zero_velocity(window.nav, self._gyro)
+        if measurement is not None:
+            window.absorb_measurement(measurement)
+            self._stationary_ns = window.clones[-1].time_ns
+
+    def _predicted_move(self, window: Window) -> tuple[FloatArray | None, FloatArray]:
+        """The motion since the last frame as predicted (4, 4), None in the first frame, and its covariance (6, 6)."""
+        moved = window.move_since(-2) if len(window.clones) > 1 else None
+        return moved, self._expected_error(self._since_frame)
 
     def _fit(
         self, window: Window, tracks: LinearTracks, pixels: Views, innovation: float | None
@@ -384,10 +425,10 @@ class Msckf:
 
         None where too few tracks tell.
         """
-        moved = window.last_move()
-        if predicted is None or moved is None or len(tracks.rows) < MIN_TRACKS_FOR_NOISE:
+        if predicted is None or len(tracks.rows) < MIN_TRACKS_FOR_NOISE:
             return None
-        remaining = window.last_move_covariance(P)
+        moved = window.move_since(-2)
+        remaining = window.move_covariance(len(window.clones) - 2, P)
         A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
         process = A @ self._since_frame.Q[:6, :6] @ A.T
         correction = se3_log(se3_inverse(predicted) @ moved)
@@ -403,33 +444,39 @@ class Msckf:
             A[:poses, :poses], b[:poses] = eliminate_points(tracks.information, chosen)
         if pixels is not None and len(pixels.z):
             T = window.T_cam0_world()[-1]
-            C, g = landmark_information(self._camera, T, window.landmarks, pixels, variance)
-            window.add_landmark_information(A, b, C, g)
+            at = landmark_residuals(self._camera, T, window.landmarks, pixels, variance)
+            window.add_landmark_information(A, b, *at.information())
         return window.lift_information(A / variance, b / variance)
 
-    def _commit(self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views) -> int:
-        """Commit what ends in this frame, keep the output covariance, make room; return how many landmarks are new."""
+    def _marginalise(self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views) -> int:
+        """Absorb what ends in this frame into the prior, estimate with all that is good, and make room.
+
+        Only tracks and landmarks that passed their gates steer the estimate: the means move to the optimum of the
+        prior, the landmarks' pixels and the good tracks, also those that go on.
+
+        Returns:
+            How many landmarks are new.
+        """
         table, newest = self._tracks.table, len(window.clones) - 1
         full = len(window.clones) > self._settings.clones
         seen = table.seen(tracks.rows)
         lost, leaving = ~seen[:, newest], seen[:, 0] & full
         ending = lost | leaving
-        A, b = self._information(window, tracks, ending & good, pixels)
-        window.absorb(A, b)
+        window.absorb(*self._information(window, tracks, ending & good, pixels))
+        promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
+
+        A, b = self._information(window, tracks, good & ~ending, None)
+        P, shift = posterior(window.P, A, b + A @ window.prior_delta)
+        error = shift - window.prior_delta
+        self._tracks.move_points(tracks, window.exposure_errors(error))
+        window.relinearise(error)
+        own = slice(0, window.first_clone)
+        self._output = P[own, own]
+        self._smoothed = WindowPosterior.of(window, P)
 
         done = ending & good
-        told = np.asarray(self._tracks.variance * np.linalg.inv(tracks.information.C[done]), dtype=np.float64)
-        self._store_points(table.ids(tracks.rows[done]), tracks.p_world[done], told)
-
-        going_on = good & ~ending
-        own = slice(0, window.first_clone)
-        if going_on.any():
-            A_on = self._information(window, tracks, going_on, None)[0]
-            self._output = posterior(window.P, A_on, np.zeros(len(A)))[0][own, own]
-        else:
-            self._output = window.P[own, own].copy()
-
-        promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
+        covariance = np.asarray(self._tracks.variance * np.linalg.inv(tracks.information.C[done]), dtype=np.float64)
+        self._store_points(table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
         spent = leaving & ~lost
         spent[promoted] = False
         self._tracks.end_frame(spent=tracks.rows[spent], promoted=tracks.rows[promoted], newest=newest)

@@ -17,7 +17,7 @@ from vio.records import BoolArray
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
-_MEDIAN = 3.36  # of chi-square with 4 degrees of freedom
+_MEDIAN = 2.37  # of chi-square with 3 degrees of freedom, those of a stereo view
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,17 +130,31 @@ def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
     return weights
 
 
-def landmark_information(
+@dataclass(frozen=True, slots=True)
+class LandmarkResiduals:
+    """Residuals of landmarks in one camera, their Jacobians `dz = J dp`, and the weights that they enter a fit with."""
+
+    r: FloatArray  # (K, 4) pixels, zero where not measured
+    J: FloatArray  # (K, 4, 3) with respect to the point in the world frame, zero where not measured
+    weight: FloatArray  # (K,) robust weights
+
+    def information(self) -> tuple[FloatArray, FloatArray]:
+        """Information (K, 3, 3) and vector (K, 3) about `dp`, for one pixel of noise."""
+        J, w = self.J, self.weight
+        return np.einsum("k,kai,kaj->kij", w, J, J), np.einsum("k,kai,ka->ki", w, J, self.r)
+
+
+def landmark_residuals(
     camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, sigma2: float
-) -> tuple[FloatArray, FloatArray]:
-    """Information (K, 3, 3) and vector (K, 3) of landmarks' pixels in one camera about `dp` in `dz = J dp`.
+) -> LandmarkResiduals:
+    """Compare landmarks' predicted pixels in one camera with what was seen.
 
     Args:
         camera: rectified pair.
         T_cam0_world: (4, 4).
         p_world: (K, 3).
         views: what was seen, (K, 4) each.
-        sigma2: the pixel noise's variance, for the robust weights; the information is that of one pixel of noise.
+        sigma2: the pixel noise's variance, for the robust weights.
     """
     p_cam = transform_points(T_cam0_world, p_world)
     ahead = p_cam[:, 2] > MIN_DEPTH * camera.baseline_m
@@ -148,9 +162,9 @@ def landmark_information(
     usable = views.weight * ahead[:, None]
     r = np.where(usable > 0, views.z - project(camera, p_cam), 0.0)
     J = (z_D_p_cam(camera, p_cam) @ T_cam0_world[:3, :3]) * usable[..., None]
-    scale2 = max(sigma2, float(np.median(np.sum(r**2, axis=1))) / _MEDIAN)
-    w = 1 / (1 + np.sum(r**2, axis=1) / (4 * scale2 * CAUCHY**2))
-    return np.einsum("k,kai,kaj->kij", w, J, J), np.einsum("k,kai,ka->ki", w, J, r)
+    squares, seen = np.sum(r**2, axis=1), usable[:, 1] > 0
+    scale2 = max(sigma2, float(np.median(squares[seen])) / _MEDIAN) if seen.any() else sigma2
+    return LandmarkResiduals(r, J, seen / (1 + squares / (4 * scale2 * CAUCHY**2)))
 
 
 @dataclass(frozen=True, slots=True)

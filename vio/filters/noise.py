@@ -1,4 +1,4 @@
-"""How noisy the motion model really is, learned from how far each prediction was off once the images had spoken."""
+"""The motion model's process noise, learned from how much the images correct each predicted motion."""
 
 from __future__ import annotations
 
@@ -7,54 +7,89 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.statistics import chi_square_cdf, chi_square_quantile
 
-_STEPS = 10  # over which corrections are added up: errors that last show only in their sum
-_GAIN = 0.5  # how fast the factors follow, per sum
-_MEDIAN = 0.79  # of chi-square with 3 degrees of freedom, over 3
-_SURPRISE = 9.0  # squared correction over its variance, from which a step is taken for an exception
+_STEPS = 10  # over which corrections are summed: errors that last, such as a gyro's scale, show only in the sum
+_INFORMED = 0.3  # share of its predicted variance that the images must have removed for a direction to count
+_LOG_VARIANCE_SIGMA = 1.5  # initial standard deviation of the logarithm of the squared factor
+_LOG_VARIANCE_WALK = 0.15  # its random walk per sum of steps
+_SURPRISE = 0.9999  # chi-square probability beyond which a single step is an exception
 _MOST = 1e6
 _PARTS = slice(0, 3), slice(3, 6)  # translation, rotation
-_TELLING = 0.3  # share of the predicted variance that the images must have removed for a step to count
+_SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)  # d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
 
 
 @dataclass(frozen=True, slots=True)
 class StepErrors:
-    """One predicted step beside what the images made of it, in the body frame, `[rho; phi]`, m and rad."""
+    """One predicted step, or the sum of several, and its correction by the images; body frame, `[rho; phi]`, m, rad."""
 
     correction: FloatArray  # (6,) what the images added to the predicted motion
     expected: FloatArray  # (6, 6) covariance of the predicted motion
     process: FloatArray  # (6, 6) the part of it that the motion model's noise added in this step
     remaining: FloatArray  # (6, 6) covariance of the motion after the update
 
-    def traces(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Variances (2,) of translation and rotation: expected, remaining, process."""
-        expected, remaining, process = (
-            np.array([np.trace(C[p, p]) for p in _PARTS]) for C in (self.expected, self.remaining, self.process)
+    def __add__(self, other: StepErrors) -> StepErrors:
+        """Sum the corrections of two steps; those of a filter with the right noise are uncorrelated."""
+        return StepErrors(
+            self.correction + other.correction,
+            self.expected + other.expected,
+            self.process + other.process,
+            self.remaining + other.remaining,
         )
-        return expected, remaining, process
 
     def missing_noise(self) -> FloatArray:
         """By how many times (2,) its own the process noise was too small to explain the correction; 0 where it was not.
 
         A shock, a saturated sensor, or a step of the vehicle that its model cannot make.
         """
-        before, after, added = self.traces()
         out = np.zeros(2)
         for k, part in enumerate(_PARTS):
-            removed = before[k] - after[k]
-            ratio = float(self.correction[part] @ self.correction[part]) / max(removed, 1e-30)
-            if removed > _TELLING * before[k] and ratio > _SURPRISE:
-                out[k] = min((ratio - 1) * before[k] / max(added[k], 1e-30), _MOST)
+            test = whitened_correction(self, part)
+            if test.dof and test.squared > chi_square_quantile(_SURPRISE, test.dof):
+                out[k] = min((test.squared / test.dof - 1) / max(test.share, 1e-12), _MOST)
         return out
+
+
+@dataclass(frozen=True, slots=True)
+class WhitenedCorrection:
+    """A correction in units of its own standard deviation, in the directions that the images inform."""
+
+    squared: float  # chi-square distributed with `dof` degrees of freedom if the noise is right
+    dof: int  # 0 to 3
+    share: float  # of the predicted variance in these directions, what the process noise of the steps brought
+
+
+def whitened_correction(step: StepErrors, part: slice) -> WhitenedCorrection:
+    """Test one part (translation or rotation) of a correction against its covariance, `expected - remaining`.
+
+    Directions are the eigenvectors of the removed share of the predicted covariance; those in which the images removed
+    little say nothing about the motion model and are left out.
+    """
+    B = step.expected[part, part]
+    scale = float(np.trace(B))
+    if not scale > 0:
+        return WhitenedCorrection(0.0, 0, 0.0)
+    L = np.linalg.cholesky(B + 1e-12 * scale * np.eye(3))
+    inverse = np.linalg.inv(L)
+    removed, V = np.linalg.eigh(inverse @ (B - step.remaining[part, part]) @ inverse.T)
+    chosen = removed > _INFORMED
+    if not chosen.any():
+        return WhitenedCorrection(0.0, 0, 0.0)
+    whiten = V[:, chosen].T @ inverse
+    y = whiten @ step.correction[part]
+    share = float(np.mean(np.einsum("ij,jk,ik->i", whiten, step.process[part, part], whiten)))
+    return WhitenedCorrection(float(y @ (y / removed[chosen])), int(chosen.sum()), min(share, 1.0))
 
 
 class MotionNoise:
     """Factors on the motion model's noise densities, one for translation and one for rotation.
 
-    A data sheet knows the sensor on the bench; vibration, misalignment and sampling add to it, by a factor that differs
-    from rig to rig. The corrections that the images made to the predicted motion are compared with their covariance,
-    the predicted minus the remaining one, which moves the factor a little. Corrections are added up over some steps:
-    those of a filter whose noise is right are white, and errors that last, such as a gyro's scale, add up.
+    A data sheet describes the sensor on the bench; vibration, misalignment and sampling add to it, by a factor that
+    differs from rig to rig. The corrections that the images make to the predicted motion are compared with their
+    covariance: the squared whitened sum of ten of them is chi-square distributed if the factor is right. Its
+    probability `F_k`, mapped to `y = 2 F_k - 1`, has mean zero and variance 1/3 then, whatever the degrees of freedom
+    k, and is bounded, so that a few wild steps do no harm. A scalar Kalman filter on the logarithm of the squared
+    factor takes `y` as its innovation: equation (N8).
     Reference: Mehra, Approaches to adaptive filtering, IEEE TAC (1972), for matching the innovations' covariance.
     """
 
@@ -62,22 +97,26 @@ class MotionNoise:
         """Start both factors at the same value and keep them between two bounds; all on standard deviations."""
         self.factors: FloatArray = np.array([start, start])  # translation, rotation
         self._bounds = smallest, largest
-        self._sum: FloatArray = np.zeros(6)
-        self._removed, self._share, self._steps = np.zeros(2), np.zeros(2), 0
+        self._variance: FloatArray = np.full(2, _LOG_VARIANCE_SIGMA**2)
+        self._sum: StepErrors | None = None
+        self._steps = 0
 
-    def follow(self, step: StepErrors) -> None:
+    def update(self, step: StepErrors) -> None:
         """Learn from one step."""
-        before, after, added = step.traces()
-        if np.any(before - after < _TELLING * before):
-            return
-        self._removed += before - after
-        self._share += added / before
-        self._sum += step.correction
+        self._sum = step if self._sum is None else self._sum + step
         self._steps += 1
         if self._steps < _STEPS:
             return
         for k, part in enumerate(_PARTS):
-            ratio = float(np.clip(self._sum[part] @ self._sum[part] / self._removed[k] / _MEDIAN, 0.25, 4.0))
-            share = self._share[k] / self._steps
-            self.factors[k] = np.clip(self.factors[k] * ratio ** (0.5 * _GAIN * share), *self._bounds)
-        self._sum[:], self._removed[:], self._share[:], self._steps = 0, 0, 0, 0
+            self._update_factor(k, whitened_correction(self._sum, part))
+        self._sum, self._steps = None, 0
+
+    def _update_factor(self, k: int, test: WhitenedCorrection) -> None:
+        self._variance[k] += _LOG_VARIANCE_WALK**2
+        if not test.dof:
+            return
+        H = _SENSITIVITY[test.dof] * test.share
+        gain = self._variance[k] * H / (H * self._variance[k] * H + 1 / 3)
+        innovation = 2 * chi_square_cdf(test.squared, test.dof) - 1
+        self._variance[k] *= 1 - gain * H
+        self.factors[k] = np.clip(self.factors[k] * np.exp(0.5 * gain * innovation), *self._bounds)

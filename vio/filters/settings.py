@@ -54,7 +54,8 @@ class VislamSettings(Section):
         below=1,
     )
     landmark_uncertainty: bool = setting(
-        True, "let the landmarks' covariance widen the innovation of the pose update; the paper takes them as known"
+        True,
+        "add the landmarks' covariance to the innovation covariance of the pose update; the paper takes them as known",
     )
     landmark_prior: Literal["stereo", "isotropic"] = setting(
         "stereo", "covariance of a new landmark: propagated from its first pixels and pose, or the same for all"
@@ -94,22 +95,27 @@ class MsckfSettings(Section):
     accel_noise_density: float = setting(1.2e-2, "accelerometer white noise, likewise", unit="m/s^2/sqrt(Hz)", above=0)
     gyro_bias_walk: float = setting(2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)", at_least=0)
     accel_bias_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)", at_least=0)
-    start_tilt_sigma_deg: float = setting(8.0, "doubt of the first roll and pitch", unit="deg", at_least=0)
-    start_velocity_sigma_mps: float = setting(10.0, "doubt of the first velocity", unit="m/s", at_least=0)
-    gyro_bias_sigma_radps: float = setting(0.1, "doubt of the first gyro bias", unit="rad/s", at_least=0)
-    accel_bias_sigma_mps2: float = setting(0.3, "doubt of the first accelerometer bias", unit="m/s^2", at_least=0)
-    still_px: float = setting(
-        0.25,
-        "the body is taken to stand where the median feature moves by less in a frame; 0: never",
-        unit="px",
-        at_least=0,
+    start_tilt_sigma_deg: float = setting(8.0, "initial standard deviation of roll and pitch", unit="deg", at_least=0)
+    start_velocity_sigma_mps: float = setting(
+        10.0, "initial standard deviation of the velocity", unit="m/s", at_least=0
     )
-    zero_velocity_sigma_mps: float = setting(0.02, "doubt of the velocity where it stands", unit="m/s", above=0)
-    zero_rate_sigma_radps: float = setting(0.01, "doubt of the angular rate where it stands", unit="rad/s", above=0)
+    gyro_bias_sigma_radps: float = setting(0.1, "initial standard deviation of the gyro bias", unit="rad/s", at_least=0)
+    accel_bias_sigma_mps2: float = setting(
+        0.3, "initial standard deviation of the accelerometer bias", unit="m/s^2", at_least=0
+    )
+    zero_velocity: bool = setting(
+        True, "measure zero velocity where the motion over the window is indistinguishable from none"
+    )
+    zero_velocity_sigma_mps: float = setting(
+        0.02, "standard deviation of a zero-velocity measurement", unit="m/s", above=0
+    )
+    zero_rate_sigma_radps: float = setting(
+        0.01, "standard deviation of the rate in a zero-velocity measurement", unit="rad/s", above=0
+    )
     linear_velocity_sigma_mps: float = setting(0.5, "noise of a measured body velocity", unit="m/s", above=0)
     angular_rate_sigma_radps: float = setting(0.05, "noise of a measured angular rate", unit="rad/s", above=0)
     rate_bias_sigma_radps: float = setting(
-        0.02, "doubt of the bias of a measured angular rate", unit="rad/s", at_least=0
+        0.02, "initial standard deviation of the bias of a measured angular rate", unit="rad/s", at_least=0
     )
     rate_bias_walk: float = setting(1.0e-4, "random walk of that bias", unit="rad/s/sqrt(s)", at_least=0)
     acceleration_density: float = setting(
@@ -119,16 +125,16 @@ class MsckfSettings(Section):
         0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
     )
     calibrate: Literal["none", "extrinsics", "time_offset", "both"] = setting(
-        "none", "what is estimated besides the motion, with IMU only: T_cam0_imu, the clocks' difference, or both"
+        "none", "what is estimated besides the motion, with IMU only: T_cam0_imu, the time offset, or both"
     )
     extrinsic_rotation_sigma_deg: float = setting(
-        1.0, "calibrate: doubt of T_cam0_imu's rotation", unit="deg", at_least=0
+        1.0, "calibrate: initial standard deviation of T_cam0_imu's rotation", unit="deg", at_least=0
     )
     extrinsic_translation_sigma_m: float = setting(
-        0.03, "calibrate: doubt of T_cam0_imu's translation", unit="m", at_least=0
+        0.03, "calibrate: initial standard deviation of T_cam0_imu's translation", unit="m", at_least=0
     )
     time_offset_sigma_s: float = setting(
-        0.01, "calibrate: doubt that the clocks agree at the start", unit="s", at_least=0
+        0.01, "calibrate: initial standard deviation of the time offset", unit="s", at_least=0
     )
     calibrate_after_s: float = setting(
         3.0, "calibrate: time from the start until the motion is known enough", unit="s", at_least=0

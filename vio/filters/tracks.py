@@ -28,8 +28,7 @@ class TrackTable:
         rows = np.array([self._row(i) for i in seen.ids.tolist()], dtype=np.int64)
         if len(rows):
             self._z[rows, column] = seen.z
-            self._weight[rows, column, :2] = 1.0
-            self._weight[rows, column, 2:] = seen.has_right[:, None]
+            self._weight[rows, column] = measured(seen.has_right)
 
     def rows(self) -> IntArray:
         """Rows (F,) of all tracks, in order of their ids, so that no result depends on the table's history."""
@@ -47,12 +46,6 @@ class TrackTable:
     def seen(self, rows: IntArray) -> BoolArray:
         """Which columns (F, N) rows were seen in."""
         return self._weight[rows, :, 0] > 0
-
-    def moved_px(self, column: int) -> FloatArray:
-        """How far (K,) the tracks seen in a column and in the one before moved in the left image between them."""
-        both = (self._weight[:, column, 0] > 0) & (self._weight[:, column - 1, 0] > 0)
-        out: FloatArray = np.linalg.norm(self._z[both, column, :2] - self._z[both, column - 1, :2], axis=1)
-        return out
 
     def shift(self) -> None:
         """Forget the oldest column; tracks that were seen there alone are removed."""
@@ -99,6 +92,18 @@ class TrackTable:
         self._free += range(size - 1, old - 1, -1)
 
 
+def measured(has_right: BoolArray) -> FloatArray:
+    """Weights (N, 4) of `[ul vl ur vr]`: 1 for what is a measurement of its own, 0 else.
+
+    The right row is none. It is fitted near the row that the left pixel and the learned rows of the pair predict, so
+    its error is that of `vl` and of the pair's calibration; as a fourth pixel it would make the filter overconfident.
+    """
+    weight = np.zeros((len(has_right), 4))
+    weight[:, :2] = 1.0
+    weight[:, 2] = has_right
+    return weight
+
+
 def latest_pixels(seen: Observations, ids: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Pixels (K, 4), weights (K, 4) and a mask (K,) of given ids in one frame; the mask tells which are there."""
     order = np.argsort(seen.ids)
@@ -108,6 +113,4 @@ def latest_pixels(seen: Observations, ids: IntArray) -> tuple[FloatArray, FloatA
         return np.zeros((len(ids), 4)), np.zeros((len(ids), 4)), np.zeros(len(ids), dtype=np.bool_)
     rows = order[at]
     found = seen.ids[rows] == ids
-    weight = np.ones((len(ids), 4))
-    weight[:, 2:] = seen.has_right[rows][:, None]
-    return seen.z[rows], weight * found[:, None], found
+    return seen.z[rows], measured(seen.has_right[rows]) * found[:, None], found

@@ -216,7 +216,7 @@ class Vislam:
         remedy = "" if self._settings.motion_model == "input" else "; give it velocities, or stop before that frame"
         return f"vislam diverged at frame {frame_index}: too few features for too long, or too many wrong ones{remedy}"
 
-    def pose_of(self, frame_index: int) -> FloatArray | None:
+    def smoothed(self, frame_index: int) -> Estimate | None:
         """Return nothing: the paper's filter keeps no past pose."""
         return None
 

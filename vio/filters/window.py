@@ -158,17 +158,23 @@ class Window:
         out[DIM:, DIM:], vector[DIM:] = A, b
         return out, vector
 
-    def last_move(self) -> FloatArray | None:
-        """Motion (4, 4) `T_prev_newest` of the body between the two newest clones; None with one clone."""
-        if len(self.clones) < 2:
-            return None
-        out: FloatArray = se3_inverse(self.clones[-2].T_world_imu) @ self.clones[-1].T_world_imu
+    def move_since(self, index: int) -> FloatArray:
+        """Motion (4, 4) `T_clone_newest` of the body from a clone to the newest one."""
+        out: FloatArray = se3_inverse(self.clones[index].T_world_imu) @ self.clones[-1].T_world_imu
         return out
 
-    def last_move_covariance(self, P: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of `xi_newest - xi_prev` where all errors have the covariance P (D, D)."""
-        a, b = self.clone_rows(len(self.clones) - 2), self.clone_rows(len(self.clones) - 1)
+    def move_covariance(self, index: int, P: FloatArray) -> FloatArray:
+        """Covariance (6, 6) of `xi_newest - xi_clone` where all errors have the covariance P (D, D)."""
+        a, b = self.clone_rows(index), self.clone_rows(len(self.clones) - 1)
         out: FloatArray = P[a, a] + P[b, b] - P[a, b] - P[b, a]
+        return out
+
+    def landmark_covariance(self, P: FloatArray) -> FloatArray:
+        """Covariance (M, 3, 3) of `xi_f - xi_rho`, landmarks relative to the newest exposure, for errors P (D, D)."""
+        D, M, first = len(P), len(self.landmarks), self.first_landmark
+        exposure = self.chain(np.eye(6 * len(self.clones))[-6:-3])  # (3, D)
+        E = np.eye(D)[first : first + 3 * M].reshape(M, 3, D) - exposure
+        out: FloatArray = E @ P @ np.swapaxes(E, 1, 2)
         return out
 
     def propagate(self, step: Transition) -> None:
@@ -317,14 +323,14 @@ class Window:
         ]
         if self.calibration.dim:
             self.calibration = self.calibration.corrected(error[DIM : self.first_clone])
-            self._correct_twists(error[:DIM])
+        if isinstance(self.motion, ImuMotion):
+            self._correct_twists(self.motion, error[:DIM])
         self.prior_delta = self.prior_delta + error
 
-    def _correct_twists(self, error: FloatArray) -> None:
+    def _correct_twists(self, motion: ImuMotion, error: FloatArray) -> None:
         """Let the clones' velocities and rates follow the navigation state's error (15,)."""
-        assert isinstance(self.motion, ImuMotion)  # nothing else is calibrated
         ages = np.array([self.clones[-1].time_ns - c.time_ns for c in self.clones]) * 1e-9
-        velocities = self.motion.corrected_earlier(np.array([c.velocity for c in self.clones]), ages, error)
+        velocities = motion.corrected_earlier(np.array([c.velocity for c in self.clones]), ages, error)
         self.clones = [
             replace(c, velocity=v, rate=c.rate - error[9:12]) for c, v in zip(self.clones, velocities, strict=True)
         ]

@@ -28,11 +28,9 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray
 from vio.statistics import chi_square_quantile
 
-MIN_TRACKS_FOR_NOISE = 15  # fewer tracks say nothing of how noisy pixels, or the motion model, are
-_MIN_TRACKS_TO_STAND = 15
+MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
-_MEDIAN = 0.85  # of chi-square over its degrees of freedom, right for 4 to 8 of them
-_VIEW_LIMIT = 23.5  # chi-square with 4 degrees of freedom, probability 0.9999
+_VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 _MOST_DOF = 199
 
@@ -59,14 +57,6 @@ class WindowTracks:
         self._camera, self._settings = camera, settings
         self.table = TrackTable(settings.clones + 1)
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
-
-    def is_stationary(self, clones: int) -> bool:
-        """Whether the image stands still: the median track, and nine tenths of all within twice its limit."""
-        limit = self._settings.still_px
-        moved = self.table.moved_px(clones - 1) if clones > 1 and limit > 0 else np.zeros(0)
-        if len(moved) < _MIN_TRACKS_TO_STAND:
-            return False
-        return bool(np.median(moved) < limit and np.quantile(moved, 0.9) < 2 * limit)
 
     def choose(self, clones: int) -> IntArray:
         """Rows of the tracks that say something of the poses: two views or more, the most telling first if too many."""
@@ -105,7 +95,8 @@ class WindowTracks:
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track, for good, and linearise what is left."""
-        wrong: BoolArray = np.sum(tracks.at.r**2, axis=2) / self.variance > _VIEW_LIMIT
+        limits = chi_square_table(_VIEW_PROBABILITY)[measured_pixels(tracks.at).sum(axis=2)]
+        wrong: BoolArray = np.sum(tracks.at.r**2, axis=2) > self.variance * limits
         if not wrong.any():
             return tracks
         self.table.drop_views(tracks.rows, wrong)
@@ -128,24 +119,27 @@ class WindowTracks:
 
     def agree(self, at: Residuals) -> bool:
         """Whether nearly all views of the newest clone fit: only then may they contradict the motion model."""
-        squares, used = np.sum(at.r[:, -1] ** 2, axis=1), np.any(at.z_D_p[:, -1] != 0, axis=(1, 2))
-        return bool(used.any() and np.mean(squares[used] < _VIEW_LIMIT * self.variance) > _AGREEMENT)
+        squares, pixels = np.sum(at.r[:, -1] ** 2, axis=1), measured_pixels(at)[:, -1].sum(axis=1)
+        used, limits = pixels > 0, chi_square_table(_VIEW_PROBABILITY)[pixels]
+        return bool(used.any() and np.mean(squares[used] < self.variance * limits[used]) > _AGREEMENT)
 
-    def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
-        """Which tracks (F,) pass the chi-square gate, and their squared residual over its degrees of freedom (F,)."""
-        pairs: BoolArray = np.any(at.z_D_p[:, :, 1::2, :], axis=3)  # (F, N, 2): seen left, seen right
-        dof = np.maximum(2 * pairs.sum(axis=(1, 2)) - 3, 1)
+    def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray, IntArray]:
+        """Test the tracks against the chi-square quantile of the settings.
+
+        Returns:
+            Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees of freedom (F,).
+        """
+        dof = np.clip(measured_pixels(at).sum(axis=(1, 2)) - 3, 1, _MOST_DOF)
         squares = np.sum(at.r**2, axis=(1, 2)) / self.variance
-        limit = _chi2_table(self._settings.gate_probability)[np.minimum(dof, _MOST_DOF)]
-        passed: BoolArray = squares <= limit
-        return passed, squares / dof
+        passed: BoolArray = squares <= chi_square_table(self._settings.gate_probability)[dof]
+        return passed, squares, dof
 
-    def update_pixel_noise(self, nis_per_dof: FloatArray) -> None:
-        """Let the pixel noise follow the median of the squared residuals (F,), robustly and slowly."""
-        if len(nis_per_dof) < MIN_TRACKS_FOR_NOISE:
+    def update_pixel_noise(self, squares: FloatArray, dof: IntArray) -> None:
+        """Let the pixel noise follow the median of squared residuals (F,) over that of chi-square, robustly, slowly."""
+        if len(squares) < MIN_TRACKS_FOR_NOISE:
             return
         s = self._settings
-        ratio = float(np.clip(np.median(nis_per_dof) / _MEDIAN, 0.25, 4.0))
+        ratio = float(np.clip(np.median(squares / chi_square_table(0.5)[dof]), 0.25, 4.0))
         self.variance = float(
             np.clip(self.variance * ratio**_NOISE_GAIN, s.pixel_sigma_min_px**2, s.pixel_sigma_max_px**2)
         )
@@ -165,7 +159,13 @@ class WindowTracks:
         self.table.remove(ended)
 
 
+def measured_pixels(at: Residuals) -> BoolArray:
+    """Which pixel coordinates (F, N, 4) of tracks were measured."""
+    out: BoolArray = np.any(at.z_D_p, axis=3)
+    return out
+
+
 @lru_cache(maxsize=8)
-def _chi2_table(probability: float) -> FloatArray:
+def chi_square_table(probability: float) -> FloatArray:
     """Quantiles of chi-square for 0 to 199 degrees of freedom."""
     return np.concatenate([[0.0], chi_square_quantile(probability, np.arange(1, _MOST_DOF + 1))])

@@ -105,8 +105,8 @@ def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[
         alignment = align_poses(T_other, T_own, "sim3")
     except EvaluationError:
         return None, None, "the camera does not move (pure rotation or standstill)"
-    rest = apply_alignment(alignment, T_other)[:, :3, 3] - p
-    sigma = float(np.sqrt(np.mean(np.sum(rest**2, axis=1)))) / (extent * np.sqrt(len(p)))
+    residual = apply_alignment(alignment, T_other)[:, :3, 3] - p
+    sigma = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) / (extent * np.sqrt(len(p)))
     if sigma > _SCALE_SIGMA:
         return None, None, f"the camera moves over {extent:.3g} m only, against differences of {ate_m:.2g} m"
     return 1 / alignment.scale, sigma, None

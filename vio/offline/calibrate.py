@@ -105,7 +105,7 @@ def measure(
     Raises:
         VioError: the recording cannot be read.
     """
-    notes = () if source.refused is None else (f"the reader refuses this calibration: {source.refused}",)
+    notes = () if source.rejection is None else (f"the reader rejects this calibration: {source.rejection}",)
     if source.raw_pairs:
         matches, tracked = _match_images(source, pairs, progress), None
     else:

@@ -91,13 +91,13 @@ def _write_images(
     """Write the images of the keyframes; return the colours (M, 3) of the points, as the left camera sees them."""
     total, count = np.zeros(len(tracks.ids)), np.zeros(len(tracks.ids))
 
-    def look(keyframe: int, left: Image) -> None:
+    def sample_colours(keyframe: int, left: Image) -> None:
         rows = tracks.keyframe == keyframe
         np.add.at(total, tracks.point[rows], _sample_gray(left, tracks.z[rows, :2]))
         np.add.at(count, tracks.point[rows], 1)
         progress(keyframe + 1, len(keyframes))
 
-    write_images(run, source, keyframes, names, folder, look)
+    write_images(run, source, keyframes, names, folder, sample_colours)
     gray = np.rint(total / np.maximum(count, 1)).astype(np.uint8)
     return np.repeat(gray[:, None], 3, axis=1)
 

@@ -29,7 +29,7 @@ class CalibrationSource:
     rig: StereoRig | None  # as calibrated; None: features without an image size
     raw_pairs: tuple[tuple[Path, Path], ...]  # image files, unrectified where the cameras are; empty: features only
     dataset: Dataset | None  # None: images cannot be rectified with this calibration
-    refused: str | None  # why not
+    rejection: str | None  # the reader's error, if the images cannot be rectified
 
     @property
     def T_cam0_cam1(self) -> FloatArray:
@@ -42,7 +42,7 @@ class CalibrationSource:
         return out
 
     def rectifying(self) -> tuple[FloatArray, FloatArray] | None:
-        """Rotations (3, 3) of the raw cameras into the rectified ones; None: they are rectified, or cannot be."""
+        """Return the rotations (3, 3) from raw to rectified cameras; None: already rectified, or not possible."""
         if not isinstance(self.dataset, RectifiedDataset) or self.dataset.rectifier.maps is None:
             return None
         return rectifying_rotations(self.dataset.rectifier.rig)[:2]
@@ -56,7 +56,7 @@ class CalibrationSource:
 
 
 def open_source(text: str) -> CalibrationSource:
-    """Open a recording with its calibration taken literally, even one that cannot be rectified with it.
+    """Open a recording with its calibration unchanged, even if it cannot be rectified with it.
 
     Raises:
         DataError: no known recording, or it cannot be read.
@@ -79,14 +79,14 @@ def open_source(text: str) -> CalibrationSource:
     return CalibrationSource(recording.path, rig, pairs, dataset, None)
 
 
-def _raw_euroc(path: Path, refused: str) -> CalibrationSource | None:
+def _raw_euroc(path: Path, rejection: str) -> CalibrationSource | None:
     """Return rig and raw images of an EuRoC folder whose cameras cannot be rectified; None: another format."""
     mav = path / "mav0" if (path / "mav0").is_dir() else path
     if not all((mav / name / "sensor.yaml").is_file() and (mav / name / "data").is_dir() for name in ("cam0", "cam1")):
         return None
     (cam0, T0), (cam1, T1) = (read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1"))
     pairs = pair_images(mav / "cam0" / "data", mav / "cam1" / "data")
-    return CalibrationSource(path, StereoRig(cam0, cam1, T0, T1), pairs, None, refused)
+    return CalibrationSource(path, StereoRig(cam0, cam1, T0, T1), pairs, None, rejection)
 
 
 def track(

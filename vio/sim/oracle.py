@@ -32,7 +32,7 @@ class OracleSettings:
     outlier_px: float = setting(30.0, "outliers are off by 5 px to this much, in both images alike or not", unit="px")
     left_only_fraction: float = setting(0.0, "share of rows without a right match", unit="0..1")
     max_track_length: int | None = setting(None, "frames after which a feature is dropped; None: never")
-    max_depth_m: float = setting(80.0, "features farther away are not taken", unit="m")
+    max_depth_m: float = setting(80.0, "features farther away are not used", unit="m")
     margin_px: float = setting(4.0, "features this close to the border are not seen", unit="px")
 
     def __post_init__(self) -> None:
@@ -66,7 +66,7 @@ class OracleFrontend:
         self._seed = seed
         # All features created so far, by id, and those now in view.
         self._surface: IntArray = np.zeros(0, dtype=np.int64)
-        self._place: FloatArray = np.zeros((0, 2))
+        self._coordinates: FloatArray = np.zeros((0, 2))
         self._age: IntArray = np.zeros(0, dtype=np.int64)
         self._live: IntArray = np.zeros(0, dtype=np.int64)
         self._outliers: dict[int, BoolArray] = {}
@@ -107,11 +107,11 @@ class OracleFrontend:
         """True world positions (N, 3) of features (N,) at a true time; points on moving boxes move with it."""
         index = np.asarray(ids, dtype=np.int64)
         surfaces = surfaces_at(self._simulation.world, time_ns)
-        return surface_points(surfaces, self._surface[index], self._place[index])
+        return surface_points(surfaces, self._surface[index], self._coordinates[index])
 
     def _observe(self, surfaces: Surfaces, left: View, right: View, ids: IntArray) -> tuple[FloatArray, BoolArray]:
         """Exact pixels (N, 4) of features and a mask (N,) of those that both cameras see."""
-        p_world = surface_points(surfaces, self._surface[ids], self._place[ids])
+        p_world = surface_points(surfaces, self._surface[ids], self._coordinates[ids])
         uv_left, seen_left = observe(surfaces, left, p_world)
         uv_right, seen_right = observe(surfaces, right, p_world)
         z = np.concatenate([uv_left, uv_right], axis=1)
@@ -126,7 +126,7 @@ class OracleFrontend:
         surfaces: Surfaces,
         left: View,
         right: View,
-        taken: FloatArray,
+        occupied: FloatArray,
         wanted: int,
         rng: np.random.Generator,
     ) -> tuple[IntArray, FloatArray]:
@@ -134,7 +134,7 @@ class OracleFrontend:
         if wanted <= 0:
             return np.zeros(0, dtype=np.int64), np.zeros((0, 4))
         columns, rows = -(-left.camera.width // _CELL_PX), -(-left.camera.height // _CELL_PX)
-        cell = np.minimum(taken // _CELL_PX, (columns - 1, rows - 1)).astype(np.int64)
+        cell = np.minimum(occupied // _CELL_PX, (columns - 1, rows - 1)).astype(np.int64)
         count = np.bincount(cell[:, 1] * columns + cell[:, 0], minlength=rows * columns)
         rounds = 1 + 2 * wanted // (rows * columns)
         load = (count[None] + np.arange(rounds)[:, None]).ravel() + 0.9 * rng.random(rounds * rows * columns)
@@ -145,13 +145,13 @@ class OracleFrontend:
         hits = cast(surfaces, left.T_world_cam, rays)
         first = len(self._surface)
         self._surface = np.concatenate([self._surface, hits.surface])
-        self._place = np.concatenate([self._place, hits.place])
+        self._coordinates = np.concatenate([self._coordinates, hits.coordinates])
         ids = first + np.arange(len(uv))
         z, seen = self._observe(surfaces, left, right, ids)
         good = np.flatnonzero(seen & hits.found)[:wanted]
         # Discard the rejected points, so that ids count the features created.
         self._surface = np.concatenate([self._surface[:first], hits.surface[good]])
-        self._place = np.concatenate([self._place[:first], hits.place[good]])
+        self._coordinates = np.concatenate([self._coordinates[:first], hits.coordinates[good]])
         self._age = np.concatenate([self._age, np.zeros(len(good), dtype=np.int64)])
         return first + np.arange(len(good)), z[good]
 

@@ -66,7 +66,7 @@ class Hits:
 
     surface: IntArray  # (N,) index of the surface; arbitrary where nothing is hit
     distance: FloatArray  # (N,) along the unit ray, m
-    place: FloatArray  # (N, 2) coordinates s, t on the surface, m
+    coordinates: FloatArray  # (N, 2) s, t on the surface, m
     found: BoolArray  # (N,)
 
 
@@ -177,13 +177,17 @@ def _cast_block(
     nearest = nearness[best, each]
     found = nearest > 0
     scale = 1 / np.where(found, nearest, 1.0)
-    place = np.stack([a[best, each], b[best, each]], axis=1) * scale[:, None]
-    return index[best], scale, place, found
+    coordinates = np.stack([a[best, each], b[best, each]], axis=1) * scale[:, None]
+    return index[best], scale, coordinates, found
 
 
-def surface_points(surfaces: Surfaces, surface: IntArray, place: FloatArray) -> FloatArray:
-    """World points (N, 3) of places (N, 2) on surfaces (N,)."""
-    return surfaces.origin[surface] + place[:, :1] * surfaces.axis_s[surface] + place[:, 1:] * surfaces.axis_t[surface]
+def surface_points(surfaces: Surfaces, surface: IntArray, coordinates: FloatArray) -> FloatArray:
+    """World points (N, 3) at surface coordinates (N, 2) of surfaces (N,)."""
+    return (
+        surfaces.origin[surface]
+        + coordinates[:, :1] * surfaces.axis_s[surface]
+        + coordinates[:, 1:] * surfaces.axis_t[surface]
+    )
 
 
 def correspondence(world: World, frame_a: View, frame_b: View, uv: npt.ArrayLike) -> tuple[FloatArray, BoolArray]:
@@ -199,7 +203,7 @@ def correspondence(world: World, frame_a: View, frame_b: View, uv: npt.ArrayLike
     rays, has_ray = unproject_pixel(frame_a.camera, uv)
     hits = cast(surfaces_at(world, frame_a.time_ns), frame_a.T_world_cam, rays)
     later = surfaces_at(world, frame_b.time_ns)
-    p_world = surface_points(later, hits.surface, hits.place)
+    p_world = surface_points(later, hits.surface, hits.coordinates)
     uv_b, visible = observe(later, frame_b, p_world)
     return uv_b, visible & hits.found & has_ray
 
@@ -382,7 +386,7 @@ def _runs(seen: npt.NDArray[np.intp], longest: int) -> Iterator[tuple[int, int]]
 def _samples(across: int, down: int) -> npt.NDArray[np.float32]:
     """Sample positions (N, 2) within a pixel, one colour of a chessboard after the other.
 
-    The halves take their texture from neighbouring mip levels where the level of detail lies between two; each half
+    The halves take their texture from neighbouring mip levels where the level of detail is between two; each half
     is symmetric about the pixel's centre, so the blend shifts nothing.
     """
     i, j = np.meshgrid(np.arange(down), np.arange(across), indexing="ij")
@@ -484,9 +488,9 @@ def _shade_edges(scene: _Scene, candidates: BoolArray, rays: CameraRays, pixels:
         winner[:, mine] = np.where(hit, np.int16(k), winner[:, mine])
     values = np.full((n, len(v)), _EMPTY, dtype=np.float32)
     for k, mine in columns.items():
-        sample, place = np.nonzero(winner[:, mine] == k)
+        sample, column = np.nonzero(winner[:, mine] == k)
         if len(sample):
-            pixel = mine[place]
+            pixel = mine[column]
             values[sample, pixel] = _sample_points(scene, k, d[:, sample, pixel], du[:, pixel], dv[:, pixel])
     image[v, u] = values.mean(axis=0)
 

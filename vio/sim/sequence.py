@@ -101,7 +101,7 @@ def simulate(
         rig: cameras, mounted on the body that `motion` moves.
         motion: motion of the body.
         rate_hz: frames per second.
-        frame_times_ns: true times (F,) of the frames in place of a fixed rate; those outside the motion are left out.
+        frame_times_ns: true times (F,) of the frames instead of a fixed rate; those outside the motion are left out.
         imu: noise of a simulated IMU, or a recorded IMU to use with the images; None: no IMU.
         imu_rate_hz: rate of the simulated IMU.
         velocity: noise of the paper's velocity sensor; None: no such sensor.
@@ -170,7 +170,7 @@ def true_state(simulation: Simulation, time_ns: int) -> TrueState:
     """Return the true state at any time within the motion.
 
     Raises:
-        SimulationError: the time lies outside the motion.
+        SimulationError: the time is outside the motion.
     """
     state = evaluate(simulation.motion, time_ns)
     biases: list[FloatArray | None] = [None, None]

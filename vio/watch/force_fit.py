@@ -18,9 +18,7 @@ _LEAST_WINDOWS = 3
 _BIAS_PRIOR_MPS2 = 0.3
 _LEVER_ARM_PRIOR_M = 1.0
 _MISFIT_M = 0.02  # standard deviation of a window's positions, to weight the priors
-_PRIOR = (
-    _MISFIT_M**2 / np.repeat([_BIAS_PRIOR_MPS2, _LEVER_ARM_PRIOR_M], 3) ** 2
-)  # information on bias and lever arm, (6,)
+_PRIOR = _MISFIT_M**2 / np.repeat([_BIAS_PRIOR_MPS2, _LEVER_ARM_PRIOR_M], 3) ** 2  # information, (6,)
 _MAP_PRIOR = np.full(9, _MISFIT_M**2 / 400)  # information on the map's entries, (9,): keeps the fit solvable
 _REWEIGHTINGS = 4
 
@@ -108,12 +106,12 @@ def _normal_equations(window: _Window, lever_arm: FloatArray) -> tuple[FloatArra
     """Return normal equations N (15, 15), h (15,), c of one window; start velocity and gravity are projected out."""
     n, dt = len(window.dt), window.dt
     R = _rotations(window)
-    place = np.cumsum(np.einsum("nij,nj->ni", R[:-1], se3_exp(dt[:, None] * window.twists)[:, :3, 3]), axis=0)
+    position = np.cumsum(np.einsum("nij,nj->ni", R[:-1], se3_exp(dt[:, None] * window.twists)[:, :3, 3]), axis=0)
     swing = R[1:] - np.eye(3)
     X = np.concatenate([_double_integrals(window, R[:-1]), -swing], axis=2)
-    y = place + swing @ lever_arm  # the correction to the given lever arm is fitted
-    since = np.cumsum(dt)
-    Q = np.linalg.qr(np.stack([since, since**2], axis=1))[0]
+    y = position + swing @ lever_arm  # the correction to the given lever arm is fitted
+    elapsed = np.cumsum(dt)
+    Q = np.linalg.qr(np.stack([elapsed, elapsed**2], axis=1))[0]
     X = X - np.tensordot(Q, np.tensordot(Q, X, (0, 0)), (1, 0))
     y = y - Q @ (Q.T @ y)
     X, flat = X.reshape(3 * n, 15), y.reshape(3 * n)

@@ -90,11 +90,11 @@ def _contradiction(gyro_fit: GyroFit, R: FloatArray) -> str:
 
 def _disagreement(gyro_fit: GyroFit) -> InertialFinding:
     rate = np.degrees(float(np.sqrt(np.trace(gyro_fit.S_cc))))
-    felt = float(np.sqrt(np.trace(gyro_fit.S_gg)))
+    gyro_rms = float(np.sqrt(np.trace(gyro_fit.S_gg)))
     return InertialFinding(
         "gyro disagrees",
         f"the camera rotates at {rate:.1f} deg/s (RMS) and the gyro explains {100 * (1 - gyro_fit.unexplained):.0f} % "
-        f"of it at the best clock offset within {FAR_OFFSETS_S[-1]:g} s (the gyro's own RMS is {felt:.3g})",
+        f"of it at the best clock offset within {FAR_OFFSETS_S[-1]:g} s (the gyro's own RMS is {gyro_rms:.3g})",
         "the IMU's file may belong to another recording, the clocks may be further apart, the gyro may be dead, or the "
         "images may show something that moves with the camera",
     )

@@ -1,0 +1,71 @@
+"""Which landmarks of the state may be used: a moving point, or a track that slipped, must not steer the pose.
+
+A landmark stays in the state for many frames and is believed to millimetres, so a slow mover passes a test of single
+frames against the pixel noise. Two tests are made: its newest pixels against what all *other* measurements predict, and
+a running sum of these tests.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.filters.window_tracks import chi_square_table
+from vio.geometry.lie import FloatArray
+from vio.records import BoolArray, IntArray
+
+_MEMORY = 0.8  # weight of the past in the running sum
+_DROP = 4.5 / np.sqrt(1 - _MEMORY**2)  # running sum above which a landmark is dropped: 4.5 standard deviations of it
+
+
+def leave_one_out_nis(
+    r: FloatArray, J: FloatArray, point_covariance: FloatArray, weight: FloatArray, variance: float
+) -> FloatArray:
+    """Normalised innovations squared (K,) of landmarks' pixels, predicted without these very pixels.
+
+    With `R` the variance that a pixel entered the fit with, and `C` the posterior covariance of the point relative to
+    the camera, the residual of the prediction without it is `R (R I - J C J')^-1 r`, and its covariance
+    `R^2 (R I - J C J')^-1 - R I + variance I`, exactly in a linear problem.
+
+    Args:
+        r: residuals after the fit (K, 4), pixels, zero where not measured.
+        J: their Jacobians by the point (K, 4, 3), zero where not measured.
+        point_covariance: of the points relative to the camera after the fit (K, 3, 3), m^2.
+        weight: robust weights (K,) that the pixels entered the fit with.
+        variance: of one pixel coordinate, px^2.
+    """
+    R = (variance / np.maximum(weight, 1e-6))[:, None, None]
+    inner = R * np.eye(4) - J @ point_covariance @ np.swapaxes(J, 1, 2)
+    # Rounding, and noise that was re-estimated since, must not make a variance negative.
+    values, vectors = np.linalg.eigh(0.5 * (inner + np.swapaxes(inner, 1, 2)))
+    values = np.maximum(values, 1e-3 * R[:, 0])
+    y = (np.swapaxes(vectors, 1, 2) @ r[..., None])[..., 0]
+    predicted = R[:, 0] / values * y
+    covariance = R[:, 0] ** 2 / values - R[:, 0] + variance
+    out: FloatArray = np.sum(predicted**2 / covariance, axis=1)
+    return out
+
+
+class LandmarkGate:
+    """Remembers how well each landmark has agreed with everything else."""
+
+    def __init__(self, probability: float) -> None:
+        self._limits = chi_square_table(probability)
+        self._score: dict[int, float] = {}
+
+    def check(self, ids: IntArray, nis: FloatArray, dof: IntArray) -> tuple[BoolArray, BoolArray]:
+        """Judge the landmarks of a frame.
+
+        Args:
+            ids: all landmarks that the frame shows (K,).
+            nis: their normalised innovations squared (K,).
+            dof: degrees of freedom (K,), 2 or 3.
+
+        Returns:
+            Masks (K,): pixels that may be used, and landmarks to be dropped.
+        """
+        before = np.array([self._score.get(i, 0.0) for i in ids.tolist()])
+        score = _MEMORY * before + (nis - dof) / np.sqrt(2.0 * dof)
+        dropped: BoolArray = score > _DROP
+        self._score = dict(zip(ids[~dropped].tolist(), score[~dropped].tolist(), strict=True))
+        used: BoolArray = (nis <= self._limits[dof]) & ~dropped
+        return used, dropped

@@ -1,0 +1,81 @@
+"""The window after a frame: its poses with the covariance of everything that has been seen, until the next frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.filters.navigation import ImuMotion
+from vio.filters.window import Clone, Window
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
+from vio.records import Estimate
+from vio.statistics import chi_square_quantile
+
+_STATIONARY_PROBABILITY = 0.95  # chi-square limit of the motion over the window
+
+
+@dataclass(frozen=True, slots=True)
+class WindowPosterior:
+    """Smoothed poses: each has seen the frames after it, up to the newest."""
+
+    clones: tuple[Clone, ...]  # oldest first
+    P: FloatArray  # (6N, 6N) covariance of their right-invariant errors
+    gyro_bias: FloatArray  # (3,) rad/s, of the newest frame
+    accel_bias: FloatArray  # (3,) m/s^2, of the newest frame
+
+    @classmethod
+    def of(cls, window: Window, P: FloatArray) -> WindowPosterior:
+        """Take over the window's clones at their present means, with the covariance P (D, D) of all errors."""
+        rows = slice(window.first_clone, window.first_landmark)
+        clones = tuple(window.clones)
+        if not isinstance(window.motion, ImuMotion):
+            clones = _with_velocities(clones)
+        return cls(clones, P[rows, rows], window.nav.gyro_bias, window.nav.accel_bias)
+
+    def estimate(self, frame_index: int) -> Estimate | None:
+        """Return the smoothed estimate at a frame of the window; None where the frame is not in it."""
+        index = next((k for k, c in enumerate(self.clones) if c.frame_index == frame_index), None)
+        if index is None:
+            return None
+        clone, rows = self.clones[index], slice(6 * index, 6 * index + 6)
+        A = se3_adjoint(se3_inverse(clone.T_world_imu))
+        return Estimate(
+            clone.time_ns,
+            clone.T_world_imu,
+            A @ self.P[rows, rows] @ A.T,
+            velocity_world=clone.velocity,
+            gyro_bias=self.gyro_bias,
+            accel_bias=self.accel_bias,
+        )
+
+    def is_stationary(self, velocity_sigma_mps: float, rate_sigma_radps: float) -> bool:
+        """Test whether the motion from the oldest to the newest clone is indistinguishable from none.
+
+        The displacement, with its covariance, knows depth, frame rate and motion sensor. The test concludes only where
+        it has the power to: the mean velocity and rate over the window must be known to better than the given standard
+        deviations, those of the zero-velocity measurement that may follow.
+        """
+        old, new = self.clones[0], self.clones[-1]
+        seconds = (new.time_ns - old.time_ns) * 1e-9
+        if seconds <= 0:
+            return False
+        a, b = slice(0, 6), slice(len(self.P) - 6, None)
+        A = se3_adjoint(se3_inverse(old.T_world_imu))
+        C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
+        largest = np.sqrt([np.linalg.eigvalsh(C[p, p])[-1] for p in (slice(0, 3), slice(3, 6))]) / seconds
+        if largest[0] > velocity_sigma_mps or largest[1] > rate_sigma_radps:
+            return False
+        xi = se3_log(se3_inverse(old.T_world_imu) @ new.T_world_imu)
+        squared = float(xi @ np.linalg.solve(C + 1e-18 * np.eye(6), xi))
+        return squared < float(chi_square_quantile(_STATIONARY_PROBABILITY, 6))
+
+
+def _with_velocities(clones: tuple[Clone, ...]) -> tuple[Clone, ...]:
+    """Give clones world velocities from the smoothed poses around each: a drifting twist keeps only its newest."""
+    if len(clones) < 2:
+        return clones
+    t = np.array([c.time_ns - clones[0].time_ns for c in clones]) * 1e-9
+    p = np.array([c.T_world_imu[:3, 3] for c in clones])
+    v = np.gradient(p, t, axis=0)
+    return tuple(replace(c, velocity=v[k]) for k, c in enumerate(clones))
