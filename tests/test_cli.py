@@ -120,6 +120,56 @@ def test_saved_observations_replay_bit_identically(
     assert (first / "trajectory.tum").read_bytes() == (third / "trajectory.tum").read_bytes()
 
 
+def test_run_and_its_kitti_file_are_compared_in_one_world(
+    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run describes the IMU in a world of its own, poses.txt and trajectory.kitti the first cam0."""
+    out = str(tmp_path / "out")
+    _json(capsys, "run", str(recording), "--out", out)
+    kitti = _json(capsys, "eval", f"{out}/trajectory.kitti", str(truth), "--align", "none")
+    first = _json(capsys, "eval", out, str(truth), "--align", "first")
+    assert first["ate_m"] == pytest.approx(kitti["ate_m"], abs=1e-6)
+    assert main(["eval", out, str(truth), "--align", "none"]) == 1
+    assert (
+        "describes imu and the reference cam0, whose world frames differ; take align first" in capsys.readouterr().err
+    )
+
+
+def test_reference_of_another_recording_is_noted(
+    recording: Path, truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    poses = np.loadtxt(truth)
+    poses[:, 3::4] *= 3
+    np.savetxt(tmp_path / "other.txt", poses)
+    out = str(tmp_path / "out")
+    metrics = _json(capsys, "run", str(recording), "--reference", str(tmp_path / "other.txt"), "--out", out)
+    assert "is it the reference of this recording?" in metrics["evaluation"]["notes"][0]
+    _json(capsys, "eval", out, str(tmp_path / "other.txt"))
+    assert caplog.text.count("is it the reference of this recording?") == 2
+
+
+def test_log_replays_the_motion_of_its_run(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A log holds the velocities even of a run on images alone."""
+    first, again, other = (tmp_path / name for name in ("first", "again", "other"))
+    _json(capsys, "run", str(recording), "--motion", "none", "--save-observations", "--out", str(first))
+    log = str(first / "observations.npz")
+    assert _json(capsys, "run", log, "--out", str(again))["motion"] == "none"
+    assert (first / "trajectory.tum").read_bytes() == (again / "trajectory.tum").read_bytes()
+    assert _json(capsys, "run", log, "--motion", "velocity", "--out", str(other))["motion"] == "velocity"
+
+
+def test_log_of_unknown_motion_takes_its_sensor_and_says_so(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """As logs of version 1 are."""
+    _json(capsys, "run", str(recording), "--motion", "none", "--save-observations", "--out", str(tmp_path / "first"))
+    arrays = dict(np.load(tmp_path / "first" / "observations.npz"))
+    del arrays["run_motion"]
+    np.savez(tmp_path / "old.npz", **(arrays | {"version": np.array(1)}))
+    assert _json(capsys, "run", str(tmp_path / "old.npz"), "--out", str(tmp_path / "again"))["motion"] == "velocity"
+    assert caplog.text.count("the log does not say which motion its run used; motion auto takes its velocity") == 1
+
+
 def test_effective_configuration_reproduces_the_run(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,6 +21,7 @@ from vio.records import (
     MotionSample,
     Observations,
     Recording,
+    RunMotion,
     StereoFrame,
     Trajectory,
     VelocitySample,
@@ -193,7 +194,7 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
     ("changes", "message"),
     [
         ({"format": "else"}, "no observation log"),
-        ({"version": 2}, "an observation log of version 2, this program reads up to 1; upgrade"),
+        ({"version": 3}, "an observation log of version 3, this program reads up to 2; upgrade"),
         ({"z": None}, "the observation log lacks z"),
         ({"z": np.zeros((2, 4), dtype=np.int64)}, "z of the observation log has type int64"),
         ({"z": np.zeros((3, 4))}, "inconsistent: 2 ids, but z is"),
@@ -202,6 +203,7 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
         ({"frame_times_ns": [0, 0, 200]}, "a clock does not increase"),
         ({"motion_values": np.zeros((1, 6))}, "0 motion times"),
         ({"image_size": [640]}, "the camera is incomplete"),
+        ({"run_motion": "wheels"}, "run_motion is 'wheels', none of imu, velocity, none"),
         ({"landmark_ids": [1]}, "landmark_ids lacks landmark_p_world"),
         ({"reference_T_world_body": np.zeros((2, 4)), "reference_body": "imu"}, "reference poses"),
     ],
@@ -227,4 +229,11 @@ def test_rejects_a_log_with_corrupt_calibration(changes: dict[str, object], mess
 def test_format_name_is_what_is_written(tmp_path: Path) -> None:
     write_observation_log(tmp_path / "a.npz", _recording(), [], [])
     arrays = read_npz(tmp_path / "a.npz")
-    assert (str(arrays["format"]), int(arrays["version"])) == (FORMAT, 1)
+    assert (str(arrays["format"]), int(arrays["version"])) == (FORMAT, 2)
+
+
+@pytest.mark.parametrize("run_motion", [None, "none", "velocity", "imu"])
+def test_log_keeps_the_motion_of_its_run(run_motion: RunMotion | None, tmp_path: Path) -> None:
+    write_observation_log(tmp_path / "a.npz", _recording(), [], [], run_motion=run_motion)
+    assert read_observation_log(tmp_path / "a.npz").recording.run_motion == run_motion
+    assert ("run_motion" in read_npz(tmp_path / "a.npz")) == (run_motion is not None)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from vio.config import Config, load_config
 from vio.errors import ConfigError, DataError, VioError
+from vio.filters.msckf import Msckf
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.pipeline import resolve_motion, run
@@ -24,6 +27,7 @@ from vio.records import (
     Landmarks,
     Observations,
     Recording,
+    RunMotion,
     StereoFrame,
     Trajectory,
     UpdateReport,
@@ -191,6 +195,31 @@ def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
     assert growth < 4096, f"{growth:.0f} bytes a frame"
 
 
+def _blas_threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_run_uses_one_blas_thread_and_restores_the_callers_number(fails: bool) -> None:
+    inside: list[set[int]] = []
+
+    class Watched(Msckf):
+        def update(self, seen: Observations) -> UpdateReport:
+            inside.append(_blas_threads())
+            if fails:
+                raise DataError("enough")
+            return super().update(seen)
+
+    drive = FakeDrive(frames=3)
+    backend = Watched(CAMERA, T_CAM0_IMU, Config().msckf, motion="velocity")
+    with threadpool_limits(limits=2, user_api="blas"):
+        assert _blas_threads() == {2}
+        with pytest.raises(DataError, match="enough") if fails else nullcontext():
+            run(drive, Config(), backend=backend)
+        assert _blas_threads() == {2}
+    assert inside == [{1}] * (1 if fails else 3)
+
+
 @pytest.mark.parametrize(
     ("overrides", "velocity", "message"),
     [
@@ -202,6 +231,20 @@ def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
 def test_motion_that_cannot_be_had_is_an_error(overrides: list[str], velocity: bool, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         resolve_motion(FakeDrive(velocity=velocity).recording, load_config(None, overrides))
+
+
+@pytest.mark.parametrize(
+    ("run_motion", "backend", "expected"),
+    [
+        ("none", "msckf", None),
+        ("velocity", "msckf", "velocity"),
+        ("imu", "msckf", "imu"),
+        ("imu", "vislam", "velocity"),
+    ],
+)
+def test_motion_auto_takes_that_of_the_logged_run(run_motion: RunMotion, backend: str, expected: str | None) -> None:
+    both = replace(FakeDrive().recording, kind="log", motion=frozenset({"imu", "velocity"}), run_motion=run_motion)
+    assert resolve_motion(both, load_config(None, [f"backend={backend}"])) == expected
 
 
 @pytest.mark.parametrize(("start", "stop"), [(-1, None), (5, 5), (30, None)])

@@ -34,6 +34,8 @@ _CALIBRATE = ("tests/test_online_calibration.py",)
 _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
 _SCORE = ("tests/test_evaluation.py",)
+_PIPELINE = ("tests/test_pipeline.py",)
+_REPRODUCE = ("tests/test_reproduce.py",)
 _RANSAC = ("tests/test_frontend_outliers.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
@@ -511,6 +513,62 @@ MUTATIONS = (
         "(survival**step *",
         "(1.0 *",
         _SELECT,
+    ),
+    Mutation(
+        "pipeline: BLAS left with all of its threads",
+        "vio/pipeline.py",
+        "@one_blas_thread()",
+        "",
+        _PIPELINE,
+    ),
+    Mutation(
+        "the paper's experiment: repeated tracks renamed",
+        "vio/reproduce.py",
+        'AS_FILED = DatasetSettings(repeated_tracks="literal")',
+        "AS_FILED = DatasetSettings()",
+        _REPRODUCE,
+    ),
+    Mutation(
+        "observation log: replay takes whatever sensor it holds",
+        "vio/pipeline.py",
+        'if recording.run_motion == "none":',
+        "if False:",
+        _PIPELINE,
+    ),
+    Mutation(
+        "alignment: rotation about a straight path left open",
+        "vio/evaluation.py",
+        "alignment = settle_rotation(closest, T_est, T_ref)",
+        "alignment = closest",
+        _SCORE,
+    ),
+    Mutation(
+        "alignment: orientations taken against the positions",
+        "vio/evaluation.py",
+        "if not precise or angle > _CONTRADICTION * sigma:",
+        "if not precise:",
+        _SCORE,
+    ),
+    Mutation(
+        "alignment: worlds of different bodies taken for one",
+        "vio/evaluation.py",
+        'if align == "none" and estimate.body != reference.body:',
+        "if False:",
+        _SCORE,
+    ),
+    Mutation(
+        "evaluation: another path length goes unnoticed",
+        "vio/evaluation.py",
+        "if long > _PATH_LEAST_M and long > _PATH_RATIO * short:",
+        "if False:",
+        _SCORE,
+    ),
+    Mutation(
+        "picture: a straight road seen from beside",
+        "vio/plotting.py",
+        "if len(points) and spread[second] < _STRAIGHT * spread[along]:",
+        "if False:",
+        ("tests/test_plotting.py",),
     ),
     Mutation(
         "alignment: scale missing in the translation",

@@ -18,13 +18,20 @@ from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_i
 from vio.records import NS_PER_S, BodyFrame, IntArray, Trajectory
 from vio.statistics import chi_square_quantile
 
-AlignMode: TypeAlias = Literal["se3", "sim3", "none"]
+AlignMode: TypeAlias = Literal["se3", "sim3", "first", "none"]
+RotationSource: TypeAlias = Literal["positions", "direction and orientations", "orientations", "first pose", "none"]
 AssociationMode: TypeAlias = Literal["time", "frame"]
 
 KITTI_LENGTHS_M: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_STEP_FRAMES = 10
 RPE_DISTANCE_TOLERANCE = 0.1  # relative tolerance of a pair's path length
 _COLLINEAR = 1e-13  # ratio of squared extents below which points are collinear, to rounding
+_LOOSE_RAD = 0.05  # positions determine the rotation about the path if its standard deviation is below 3 degrees
+_ORIENTATION_GAIN = 10.0  # ratio of standard deviations above which the orientations replace the positions in it
+_CONTRADICTION = 5.0  # standard deviations by which they may differ; more: they do not describe the same body
+_PATH_RATIO = 1.5  # ratio of path lengths above which the reference may be another recording's
+_PATH_LEAST_M = 1.0  # paths below this may consist of noise
+_MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
 _STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points coincide, to rounding
 
 
@@ -85,6 +92,7 @@ class Alignment:
     R: FloatArray  # (3, 3)
     t: FloatArray  # (3,) metres
     scale: float
+    rotation_from: RotationSource = "positions"  # direction and orientations: of the path, and of the poses about it
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,17 +108,19 @@ class Evaluation:
     matched_path_length_m: float  # of the estimate's matched poses, before any scaling
     reference_path_length_m: float  # of the reference's matched poses
     scale: float  # factor applied to the estimate; 1 unless align is sim3
+    rotation_from: RotationSource  # what determined the rotation of T_ref_est, see `Alignment`
     ate_m: ErrorStatistics
     ate_deg: ErrorStatistics
     rpe: RelativeError | None  # over frames
     rpe_distance: RelativeError | None  # over metres, if requested
     kitti: KittiError | None  # None: the record is shorter than every length
-    T_ref_est: FloatArray  # (4, 4) alignment; under sim3 the estimate is scaled first
+    T_ref_est: FloatArray  # (4, 4) alignment of `settle_rotation`; under sim3 the estimate is scaled first
     rows: IntArray  # (M,) matched rows of the estimate
-    errors_m: FloatArray  # (M,) distance to the reference after alignment
-    errors_deg: FloatArray  # (M,) rotation angle to the reference after alignment
-    aligned: Trajectory  # the whole estimate (N) in the reference's world and body frame
+    errors_m: FloatArray  # (M,) distance to the reference after the alignment of `align_poses`, the least squares
+    errors_deg: FloatArray  # (M,) rotation angle to the reference after alignment by T_ref_est
+    aligned: Trajectory  # the whole estimate (N) in the reference's world and body frame, by T_ref_est
     reference: Trajectory  # the matched poses (M) of the reference; row k matches row rows[k] of the estimate
+    notes: tuple[str, ...] = ()  # signs that the reference is not of this recording
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON: `ate_m` is the RMSE, undefined metrics are None, arrays are omitted."""
@@ -124,6 +134,7 @@ class Evaluation:
             "matched_path_length_m": self.matched_path_length_m,
             "reference_path_length_m": self.reference_path_length_m,
             "scale": self.scale,
+            "rotation_from": self.rotation_from,
             "ate_m": self.ate_m.rmse,
             "ate_deg": self.ate_deg.rmse,
             "ate_statistics_m": _as_plain_dict(self.ate_m),
@@ -134,6 +145,7 @@ class Evaluation:
             "r_err_deg_per_100m": None if self.kitti is None else self.kitti.r_err_deg_per_100m,
             "kitti_segments": 0 if self.kitti is None else self.kitti.segments,
             "kitti_per_length": [] if self.kitti is None else [_as_plain_dict(row) for row in self.kitti.per_length],
+            "notes": list(self.notes),
         }
 
 
@@ -153,8 +165,9 @@ def evaluate(
     Args:
         estimate: N poses.
         reference: associated by time where both have times, else by frame number; it may cover part of the estimate.
-        align: rigid, rigid with scale, or none (the worlds are then assumed equal). All metrics are those of the
-            aligned estimate, so `sim3` removes the scale error from the relative ones too.
+        align: rigid, rigid with scale, the first matched poses made equal, or none (both must then describe the same
+            body in the same world). All metrics are those of the aligned estimate, so `sim3` removes the scale error
+            from the relative ones too.
         lengths_m: path lengths of the KITTI metric.
         max_time_difference_s: poses further apart in time are not compared.
         T_cam0_imu: extrinsic (4, 4), needed where the two trajectories describe different frames.
@@ -162,20 +175,26 @@ def evaluate(
         rpe_delta_m: distance of the pairs of `Evaluation.rpe_distance`, in metres of the reference's path.
 
     Raises:
-        EvaluationError: nothing to compare, different frames without an extrinsic, non-finite poses, or an
-            alignment that the data do not determine (the scale of a motionless estimate).
+        EvaluationError: nothing to compare, different frames without an extrinsic or without an alignment, non-finite
+            poses, or an alignment that the data do not determine (the scale of a motionless estimate).
     """
     if align not in get_args(AlignMode):
         raise EvaluationError(f"unknown alignment {align!r}; choose one of {', '.join(get_args(AlignMode))}")
     _require_finite("estimate", estimate)
     _require_finite("reference", reference)
+    if align == "none" and estimate.body != reference.body:
+        raise EvaluationError(
+            f"align none needs both in one world, but the estimate describes {estimate.body} and the reference "
+            f"{reference.body}, whose world frames differ; take align first, or se3"
+        )
     moved = _in_frame_of(estimate, reference, T_cam0_imu)
     association, rows, reference_rows = associate(moved, reference, max_time_difference_s=max_time_difference_s)
     T_est, T_ref = moved.T_world_body[rows], reference.T_world_body[reference_rows]
-    alignment = align_poses(T_est, T_ref, align)
+    closest = align_poses(T_est, T_ref, align)
+    errors_m = np.linalg.norm(apply_alignment(closest, T_est)[:, :3, 3] - T_ref[:, :3, 3], axis=1)
+    alignment = settle_rotation(closest, T_est, T_ref)
     aligned = replace(moved, T_world_body=apply_alignment(alignment, moved.T_world_body))
     T_aligned = aligned.T_world_body[rows]
-    errors_m = np.linalg.norm(T_aligned[:, :3, 3] - T_ref[:, :3, 3], axis=1)
     errors_deg = rotation_angle_deg(se3_inverse(T_ref) @ T_aligned)
     return Evaluation(
         align=align,
@@ -187,6 +206,7 @@ def evaluate(
         matched_path_length_m=path_length_m(T_est[:, :3, 3]),
         reference_path_length_m=path_length_m(T_ref[:, :3, 3]),
         scale=alignment.scale,
+        rotation_from=alignment.rotation_from,
         ate_m=error_statistics(errors_m),
         ate_deg=error_statistics(errors_deg),
         rpe=relative_error_frames(T_aligned, T_ref, rpe_delta_frames),
@@ -198,6 +218,7 @@ def evaluate(
         errors_deg=errors_deg,
         aligned=aligned,
         reference=_take(reference, reference_rows),
+        notes=_notes(path_length_m(T_aligned[:, :3, 3]), path_length_m(T_ref[:, :3, 3]), rows, moved, reference),
     )
 
 
@@ -262,7 +283,8 @@ def associate_times(
 def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignment:
     """Find the alignment of M >= 1 paired poses (M, 4, 4) that minimises the squared distances of their positions.
 
-    Where the positions do not determine the rotation (one point, or a straight line), the orientations do.
+    Where the positions do not determine the rotation (one point, or a straight line), the orientations do. `first`
+    makes the first pair of poses equal instead, `none` is the identity.
 
     Raises:
         EvaluationError: the scale of `sim3` is undefined, because one of the two does not move.
@@ -271,7 +293,10 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
     IEEE TPAMI (1991), equations 34 to 43.
     """
     if mode == "none":
-        return Alignment(np.eye(3), np.zeros(3), 1.0)
+        return Alignment(np.eye(3), np.zeros(3), 1.0, "none")
+    if mode == "first":
+        T = T_ref[0] @ se3_inverse(T_est[0])
+        return Alignment(T[:3, :3], T[:3, 3], 1.0, "first pose")
     x, y = T_est[:, :3, 3], T_ref[:, :3, 3]
     x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
     x_extent, y_extent = _extent(x), _extent(y)
@@ -279,15 +304,44 @@ def align_poses(T_est: FloatArray, T_ref: FloatArray, mode: AlignMode) -> Alignm
     U, d, Vt = np.linalg.svd(covariance)
     sign = np.array([1.0, 1.0, 1.0 if np.linalg.det(U @ Vt) > 0 else -1.0])
     R = (U * sign) @ Vt
+    rotation_from: RotationSource = "positions"
     moving = min(x_extent, y_extent) > 0 and d[0] > _COLLINEAR * x_extent * y_extent
     if not moving:
         if mode == "sim3":
             raise EvaluationError("sim3 alignment needs two trajectories that move together; align with se3 or none")
-        R = nearest_rotation(_orientation_sum(T_est, T_ref))
+        R, rotation_from = nearest_rotation(_orientation_sum(T_est, T_ref)), "orientations"
     elif d[1] <= _COLLINEAR * d[0]:
         R = _rotate_about(U[:, 0], R, _orientation_sum(T_est, T_ref))
+        rotation_from = "direction and orientations"
     scale = float(d @ sign) / x_extent**2 if mode == "sim3" else 1.0
-    return Alignment(R, y_mean - scale * (R @ x_mean), scale)
+    return Alignment(R, y_mean - scale * (R @ x_mean), scale, rotation_from)
+
+
+def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) -> Alignment:
+    """Return the alignment of paired poses (M, 4, 4), turned about the path where positions leave that part open.
+
+    On a nearly straight path the least squares of the positions determine the rotation about the path to
+    `sigma_p` only (math.md, E1), which may be tens of degrees. There the orientations replace them, if their own errors
+    about the path are far smaller and both agree within `sigma_p`. Anywhere else the alignment is returned unchanged.
+    """
+    if alignment.rotation_from != "positions":
+        return alignment
+    x, y = alignment.scale * T_est[:, :3, 3] @ alignment.R.T, T_ref[:, :3, 3]
+    x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
+    S = (y - y_mean).T @ (x - x_mean) / len(x)  # symmetric at the least squares
+    axis = np.linalg.svd(S)[0][:, 0]
+    across = np.eye(3) - np.outer(axis, axis)
+    variance = 0.5 * float(np.mean(np.sum(((y - y_mean - x + x_mean) @ across) ** 2, axis=1)))
+    curvature = float(np.trace(across @ S))
+    sigma = np.sqrt(variance / curvature) if curvature > 0 else np.inf
+    R = _rotate_about(axis, alignment.R, _orientation_sum(T_est, T_ref))
+    scatter = so3_log(R @ T_est[:, :3, :3] @ np.swapaxes(T_ref[:, :3, :3], 1, 2)) @ axis
+    angle = np.linalg.norm(so3_log(R @ alignment.R.T))
+    precise = sigma > max(_LOOSE_RAD, _ORIENTATION_GAIN * np.sqrt(np.mean(scatter**2)))
+    if not precise or angle > _CONTRADICTION * sigma:
+        return alignment
+    t = y_mean - alignment.scale * (R @ T_est[:, :3, 3].mean(axis=0))
+    return Alignment(R, t, alignment.scale, "direction and orientations")
 
 
 def apply_alignment(alignment: Alignment, T_est: FloatArray) -> FloatArray:
@@ -516,6 +570,26 @@ def _orientation_sum(T_est: FloatArray, T_ref: FloatArray) -> FloatArray:
     """Return C (3, 3) such that the best fit R of `R_ref = R R_est` maximises trace(R^T C)."""
     out: FloatArray = np.einsum("nij,nkj->ik", T_ref[:, :3, :3], T_est[:, :3, :3])
     return out
+
+
+def _notes(
+    estimate_m: float, reference_m: float, rows: IntArray, estimate: Trajectory, reference: Trajectory
+) -> tuple[str, ...]:
+    """Name signs that the reference belongs to another recording."""
+    notes = []
+    short, long = sorted((estimate_m, reference_m))
+    if long > _PATH_LEAST_M and long > _PATH_RATIO * short:
+        notes.append(
+            f"over the same poses the estimate travels {estimate_m:.1f} m and the reference {reference_m:.1f} m; is it "
+            "the reference of this recording?"
+        )
+    shorter = min(len(estimate), len(reference))
+    if len(rows) < _MATCHED_SHARE * shorter:
+        notes.append(
+            f"only {len(rows)} poses match, of {len(estimate)} of the estimate and {len(reference)} of the reference; "
+            "is it the reference of this recording, on the same clock?"
+        )
+    return tuple(notes)
 
 
 def _rotate_about(axis: FloatArray, R: FloatArray, C: FloatArray) -> FloatArray:

@@ -29,6 +29,7 @@ from vio.records import (
     UpdateReport,
 )
 from vio.selectors import build_selector
+from vio.threads import one_blas_thread
 from vio.watch.run import RunWatch
 
 log = logging.getLogger(__name__)
@@ -101,6 +102,7 @@ class NullViewer:
         """Nothing is held."""
 
 
+@one_blas_thread()
 def run(
     dataset: Dataset,
     config: Config,
@@ -113,7 +115,7 @@ def run(
     selector: Selector | None = None,
     backend: Backend | None = None,
 ) -> RunResult:
-    """Process a recording from its frame `start` to before frame `stop`.
+    """Process a recording from its frame `start` to before frame `stop`, with BLAS pinned to one thread meanwhile.
 
     Args:
         dataset: the recording.
@@ -223,11 +225,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     if config.motion == "none":
         return None
     if config.motion == "auto":
-        found = next((source for source in taken if source in recording.motion), None)
-        if found is None and recording.motion:
-            held = ", ".join(sorted(recording.motion))
-            log.warning("%s: backend %s has no model for its %s; images alone", recording.path, config.backend, held)
-        return found
+        return _auto_motion(recording, config.backend)
     if config.motion not in taken:
         raise ConfigError(
             f"backend {config.backend} has no model for --motion {config.motion}; it takes {', '.join(taken)} or none"
@@ -236,6 +234,26 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
         held = ", ".join(sorted(recording.motion)) or "no motion sensor"
         raise ConfigError(f"{recording.path}: --motion {config.motion} asked for, but the recording holds {held}")
     return config.motion
+
+
+def _auto_motion(recording: Recording, backend: BackendName) -> MotionSource | None:
+    """Return what the run behind an observation log used, else the best that recording and back end share."""
+    taken = _BACKENDS[backend].motion_sources
+    if recording.run_motion == "none":
+        return None
+    if recording.run_motion in taken and recording.run_motion in recording.motion:
+        return recording.run_motion
+    found = next((source for source in taken if source in recording.motion), None)
+    if found is None and recording.motion:
+        held = ", ".join(sorted(recording.motion))
+        log.warning("%s: backend %s has no model for its %s; images alone", recording.path, backend, held)
+    elif found is not None and recording.kind == "log" and recording.run_motion is None:
+        log.warning(
+            "%s: the log does not say which motion its run used; motion auto takes its %s, --motion none images alone",
+            recording.path,
+            found,
+        )
+    return found
 
 
 class _StageTimer:

@@ -13,6 +13,7 @@ from vio.geometry.lie import FloatArray, transform_points
 from vio.pipeline import RunResult
 
 _ESTIMATE, _REFERENCE, _DEAD_RECKONING, _LANDMARKS = "#1f5fbf", "#111111", "#d9822b", "#9aa5b1"
+_STRAIGHT = 0.1  # extent across a path over that along it, below which it gives no plane
 
 
 def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
@@ -63,7 +64,7 @@ def _draw_map(axes: Any, result: RunResult, evaluation: Evaluation | None, dead_
             curves.insert(1, ("dead reckoning", dead_reckoning.aligned.positions, _DEAD_RECKONING, "--", 1.2))
     points = transform_points(T_ref_world, result.landmarks.p_world)
     main = curves[0][1]
-    first, second = _plane(main)
+    first, second = _plane(main, points)
     low, high = _view(np.concatenate([c[1] for c in curves]), (first, second))
     inside = np.all((points[:, (first, second)] >= low) & (points[:, (first, second)] <= high), axis=1)
     axes.scatter(
@@ -80,11 +81,17 @@ def _draw_map(axes: Any, result: RunResult, evaluation: Evaluation | None, dead_
     axes.grid(alpha=0.25)
 
 
-def _plane(positions: FloatArray) -> tuple[int, int]:
-    """Return the two axes with the largest extent of the positions, in ascending order."""
+def _plane(positions: FloatArray, points: FloatArray) -> tuple[int, int]:
+    """Return the two axes with the largest extent of the positions, in ascending order.
+
+    A straight path has only one: the landmarks then decide, so that a road is seen from above, not from beside.
+    """
     spread = np.ptp(positions, axis=0)
-    first, second = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
-    return first, second
+    along, second, last = np.argsort(-spread, kind="stable").tolist()
+    if len(points) and spread[second] < _STRAIGHT * spread[along]:
+        around = np.ptp(np.percentile(points, (10, 90), axis=0), axis=0)  # without a few triangulated far off
+        second = max((second, last), key=lambda axis: float(around[axis]))
+    return min(along, second), max(along, second)
 
 
 def _view(positions: FloatArray, axes: tuple[int, int]) -> tuple[FloatArray, FloatArray]:

@@ -23,6 +23,7 @@ IntArray: TypeAlias = npt.NDArray[np.int64]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 BodyFrame: TypeAlias = Literal["imu", "cam0"]
 MotionSource: TypeAlias = Literal["imu", "velocity"]
+RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,3 +301,4 @@ class Recording:
     reference: Trajectory | None  # ground truth lying in the recording
     landmarks_reference: Landmarks | None = None  # surveyed landmark positions, covariance zero
     notes: tuple[str, ...] = ()  # what the reader found and mended; each is logged once as a warning
+    run_motion: RunMotion | None = None  # observation logs: what the run behind the log used; None: not known

@@ -48,6 +48,17 @@ class Variant:
     motion: MotionName = "velocity"
     backend: BackendName = "vislam"
 
+    @property
+    def config(self) -> Config:
+        """The configuration of the row."""
+        return Config(
+            backend=self.backend,
+            motion=self.motion,
+            dataset=self.dataset,
+            selector=self.selector,
+            vislam=self.vislam,
+        )
+
 
 # The ids and pixels of the file unchanged, as in every published solution.
 AS_FILED = DatasetSettings(repeated_tracks="literal")
@@ -142,14 +153,7 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> Table:
     results: list[tuple[Variant, RunResult, Evaluation | None]] = []
     with one_blas_thread():
         for variant in VARIANTS:
-            config = Config(
-                backend=variant.backend,
-                motion=variant.motion,
-                dataset=variant.dataset,
-                selector=variant.selector,
-                vislam=variant.vislam,
-            )
-            result = run(open_dataset(file, variant.dataset), config)
+            result = run(open_dataset(file, variant.dataset), variant.config)
             score = None if truth is None else evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body)
             results.append((variant, result, score))
     table = Table(file.stem, out / file.stem, tuple(_row(*each) for each in results))

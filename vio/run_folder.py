@@ -93,6 +93,8 @@ def score(
     try:
         truth = _with_times(reference, result)
         own = evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
+        for note in own.notes:
+            log.warning("%s", note)
         other = result.dead_reckoning
         return own, None if other is None else evaluate(
             other, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m
@@ -228,4 +230,6 @@ def _write_observations(path: Path, result: RunResult) -> None:
 
     assert result.observations is not None
     assert result.motion_samples is not None
-    write_observation_log(path, result.recording, result.observations, result.motion_samples)
+    write_observation_log(
+        path, result.recording, result.observations, result.motion_samples, run_motion=result.motion or "none"
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,8 @@ from vio.cli.arguments import lengths
 if TYPE_CHECKING:
     from vio.geometry.lie import FloatArray
     from vio.records import Trajectory
+
+log = logging.getLogger(__name__)
 
 
 def add_parser(commands: Any) -> None:
@@ -26,7 +29,13 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "reference", type=Path, metavar="REF", help="a trajectory file, a run's folder or a COLMAP model"
     )
-    parser.add_argument("--align", choices=("se3", "sim3", "none"), default="se3", help="alignment (default se3)")
+    parser.add_argument(
+        "--align",
+        choices=("se3", "sim3", "first", "none"),
+        default="se3",
+        help="alignment: se3 (default), sim3 (scale as well), first (at the first matched pose), none (same body and "
+        "world frame only)",
+    )
     parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
     parser.add_argument(
         "--max-time-difference",
@@ -62,6 +71,8 @@ def execute(args: argparse.Namespace) -> int:
         T_cam0_imu=other if T_cam0_imu is None else T_cam0_imu,
         lengths_m=args.lengths or KITTI_LENGTHS_M,
     )
+    for note in result.notes:
+        log.warning("%s", note)
     scores = result.as_dict()
     figures = ((key, value) for key, value in scores.items() if not isinstance(value, (list, dict)))
     rows = ((k, "–" if v is None else v if isinstance(v, str) else f"{v:.6g}") for k, v in figures)

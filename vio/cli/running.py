@@ -16,7 +16,6 @@ from vio.evaluation import KITTI_LENGTHS_M
 from vio.pipeline import run
 from vio.records import Estimate, FrontendOutput, UpdateReport
 from vio.run_folder import FILES, MARKER, write_run_folder
-from vio.threads import one_blas_thread
 from vio.trajectory_io import read_trajectory
 
 log = logging.getLogger(__name__)
@@ -59,8 +58,7 @@ def process(
     total = len(recording.frame_times_ns)
     frames = max(min(total, total if stop is None else stop) - start, 0)
     viewer = ProgressViewer(frames, recording.path.name) if progress else None
-    with one_blas_thread():
-        result = run(dataset, config, start=start, stop=stop, keep_observations=save_observations, viewer=viewer)
+    result = run(dataset, config, start=start, stop=stop, keep_observations=save_observations, viewer=viewer)
     return write_run_folder(
         folder, result, truth, lengths_m=lengths_m or KITTI_LENGTHS_M, save_observations=save_observations
     )

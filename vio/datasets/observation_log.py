@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import cast
+from typing import cast, get_args
 
 import numpy as np
 
@@ -29,12 +29,13 @@ from vio.records import (
     MotionSource,
     Observations,
     Recording,
+    RunMotion,
     Trajectory,
     VelocitySample,
 )
 
 FORMAT = "stereo-vio observation log"
-VERSION = 1
+VERSION = 2  # 2 adds run_motion
 _REQUIRED: dict[str, tuple[str, int]] = {  # array kinds (numpy's letters) and dimensions
     "version": ("i", 0),
     "source": ("U", 0),
@@ -63,6 +64,7 @@ def write_observation_log(
     recording: Recording,
     observations: Sequence[Observations],
     motion_samples: Sequence[MotionSample],
+    run_motion: RunMotion | None = None,
 ) -> None:
     """Write the observations of a run and its motion samples atomically, exact to the bit.
 
@@ -71,6 +73,7 @@ def write_observation_log(
         recording: the source of the run.
         observations: one record for each processed frame, in time order.
         motion_samples: every sample that the estimator received, in time order.
+        run_motion: what carried the pose in that run, for `motion: auto` in a replay; None: not known.
 
     Raises:
         DataError: the file cannot be written.
@@ -97,6 +100,7 @@ def write_observation_log(
         "stale": _joined([o.stale for o in observations], np.zeros(0, dtype=np.bool_)),
         **_motion_arrays(motion_samples),
         **_optional_arrays(recording),
+        **({} if run_motion is None else {"run_motion": np.array(run_motion)}),
     }
     stream = io.BytesIO()
     np.savez(stream, **arrays)  # type: ignore[arg-type] # the stubs take every keyword for allow_pickle
@@ -166,6 +170,7 @@ def read_observation_log(path: Path) -> FeatureDataset:
         reference=_reference(arrays),
         landmarks_reference=_landmarks(arrays),
         notes=tuple(str(note) for note in arrays["notes"]),
+        run_motion=cast(RunMotion, str(arrays["run_motion"])) if "run_motion" in arrays else None,
     )
     stale_share = [bool(len(o) and o.mean() > 0.5) for o in np.split(tracks.stale, dense_offsets[1:-1])]
     return FeatureDataset(recording, tracks, motion, frames, np.array(stale_share, dtype=np.bool_))
@@ -207,6 +212,8 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     for first, group in _GROUPS.items():
         if first in arrays and any(key not in arrays for key in group):
             return f"{first} lacks {' '.join(key for key in group if key not in arrays)}"
+    if "run_motion" in arrays and str(arrays["run_motion"]) not in get_args(RunMotion):
+        return f"run_motion is {str(arrays['run_motion'])!r}, none of {', '.join(get_args(RunMotion))}"
     poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
     stamps = [len(arrays[key]) for key in ("reference_times_ns", "reference_frame_indices") if key in arrays]
     if poses.shape[1:] != (4, 4) or any(count != len(poses) for count in stamps):
