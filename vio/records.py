@@ -220,10 +220,10 @@ class Landmarks:
 
 
 @dataclass(frozen=True, slots=True)
-class DisparityField:
-    """What the right pixels are off by against the stereo calibration, as coefficients of equation (R1)."""
+class StereoFieldEstimate:
+    """What the stereo calibration is off by, as coefficients of equation (R3) of docs/math.md, in focal lengths."""
 
-    coefficients: FloatArray  # (6,) of 1 + x^2, x, y, x y, x^2, y^2; times f: pixels
+    coefficients: FloatArray  # (6,) a0, a1, a2 of the right columns; k, q1, q2 of both lenses
     covariance: FloatArray  # (6, 6)
 
 
@@ -242,7 +242,7 @@ class Estimate:
     T_cam0_imu_covariance: FloatArray | None = None  # (6, 6) of xi in T_cam0_imu = T_hat exp(xi), [rho; phi], m and rad
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
-    disparity_field: DisparityField | None = None
+    stereo_field: StereoFieldEstimate | None = None
 
 
 @dataclass(frozen=True, slots=True)

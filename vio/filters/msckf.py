@@ -24,10 +24,11 @@ from vio.filters.noise import MotionNoise, StepErrors
 from vio.filters.online_calibration import first_calibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
+    RowField,
+    StereoField,
     StereoInformation,
-    corrected_views,
-    disparity_basis,
     eliminate_points_from_columns,
+    field_jacobian,
     landmark_columns,
 )
 from vio.filters.tracks import latest_pixels
@@ -102,6 +103,7 @@ class Msckf:
         self._blind = False  # the last frame showed nothing
         self._output: FloatArray = np.zeros((DIM, DIM))  # covariance (15 + C, 15 + C) with all that is seen
         self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
+        self._rows = RowField(camera)
         self._landmark_gate = LandmarkGate(settings.gate_probability)
         self._smoothed: WindowPosterior | None = None  # after the last frame
         self._stationary_ns = -(2**62)  # newest frame of the last zero-velocity measurement
@@ -333,6 +335,8 @@ class Msckf:
 
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Update with everything that a frame shows."""
+        if window.calibration.stereo is not None:
+            self._rows.update(seen)
         z, weight, found = latest_pixels(seen, window.landmark_ids)
         self._keep_landmarks(window, found)
         pixels = Views(z[found], weight[found])
@@ -402,7 +406,12 @@ class Msckf:
 
     def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
         """Linearise tracks at the window's present means."""
-        return self._tracks.linearise(window.T_cam0_world(), rows, steps, window.calibration.disparity)
+        return self._tracks.linearise(window.T_cam0_world(), rows, steps, self._field(window))
+
+    def _field(self, window: Window) -> StereoField | None:
+        """The stereo field at the window's present means; None where it is not estimated."""
+        coefficients = window.calibration.stereo
+        return None if coefficients is None else StereoField(self._camera, self._rows, coefficients)
 
     def _predicted_move(self, window: Window) -> tuple[FloatArray | None, FloatArray]:
         """The motion since the last frame as predicted (4, 4), None in the first frame, and its covariance (6, 6)."""
@@ -465,15 +474,16 @@ class Msckf:
             at = self._landmark_residuals(window, pixels)
             window.add_landmark_information(A, b, *at.information())
             if stereo is not None:
-                basis = disparity_basis(self._camera, pixels.z)
-                stereo = stereo + landmark_columns(at, basis, len(window.clones))
+                H = field_jacobian(self._camera, pixels.z)
+                stereo = stereo + landmark_columns(at, H, len(window.clones))
         scaled = None if stereo is None else stereo.scaled(1 / variance)
         return window.lift_information(A / variance, b / variance, scaled)
 
     def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
         """Residuals of the landmarks' pixels in the newest exposure."""
-        if window.calibration.disparity is not None:
-            pixels = corrected_views(self._camera, pixels, window.calibration.disparity)
+        field = self._field(window)
+        if field is not None:
+            pixels = field.corrected(pixels)
         T = window.T_cam0_world()[-1]
         return landmark_residuals(self._camera, T, window.landmarks, pixels, self._tracks.variance)
 
@@ -530,7 +540,7 @@ class Msckf:
         point_D_poses = -C_inverse @ np.swapaxes(info.G[chosen], 1, 2)
         point_D_poses[:, :, -3:] += so3_hat(p)  # the anchor: rotation of the newest exposure
         columns = tracks.stereo
-        point_D_stereo = None if columns is None else -C_inverse @ np.swapaxes(columns.G[chosen], 1, 2)
+        point_D_stereo = None if columns is None else -C_inverse @ columns.G[chosen]
         A = window.chain(point_D_poses, point_D_stereo)
         covariance = np.asarray(self._tracks.variance * C_inverse, dtype=np.float64)
         window.add_landmarks(table.ids(tracks.rows[chosen]), p, A.reshape(-1, len(window.P)), covariance)

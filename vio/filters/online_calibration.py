@@ -16,12 +16,13 @@ import numpy as np
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import TERMS
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp
-from vio.records import DisparityField, Estimate, IntArray
+from vio.records import Estimate, IntArray, StereoFieldEstimate
 
-# Columns of the full error [disparity field; delta; time offset].
+# Columns of the full error [stereo field; delta; time offset].
 _STEREO, _DELTA, _OFFSET = np.arange(TERMS), TERMS + np.arange(6), np.array([TERMS + 6])
 _FULL = TERMS + 7
-_STEREO_WALK = 0.02  # random walk of the disparity field per root second, over its initial standard deviation
+_RADIAL = 5.0  # a lens is left with more radial than tangential distortion
+_STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +33,7 @@ class Calibration:
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
     extrinsics: bool = False  # whether T_cam0_imu is estimated
     timing: bool = False  # whether the offset is estimated
-    disparity: FloatArray | None = None  # (6,) coefficients of the disparity field, equation (R1); None: not estimated
+    stereo: FloatArray | None = None  # (6,) coefficients of equation (R3); None: not estimated
 
     @property
     def dim(self) -> int:
@@ -41,12 +42,12 @@ class Calibration:
 
     @property
     def stereo_dim(self) -> int:
-        """How many of the error's dimensions, the first, belong to the disparity field: 0 or 6."""
-        return 0 if self.disparity is None else TERMS
+        """How many of the error's dimensions, the first, belong to the stereo field: 0 or 6."""
+        return 0 if self.stereo is None else TERMS
 
     @property
     def columns(self) -> IntArray:
-        """Which entries (C,) of the full error `[disparity field; delta; time offset]`, m, rad and s, are estimated."""
+        """Which entries (C,) of the full error `[stereo field; delta; time offset]`, m, rad and s, are estimated."""
         return np.concatenate([_STEREO[: self.stereo_dim], _DELTA[: 6 * self.extrinsics], _OFFSET[: 1 * self.timing]])
 
     def corrected(self, error: FloatArray) -> Calibration:
@@ -56,14 +57,14 @@ class Calibration:
             self,
             T_cam0_imu=self.T_cam0_imu @ se3_exp(full[_DELTA]) if self.extrinsics else self.T_cam0_imu,
             time_offset_s=self.time_offset_s + float(full[_OFFSET[0]]),
-            disparity=None if self.disparity is None else self.disparity + full[_STEREO],
+            stereo=None if self.stereo is None else self.stereo + full[_STEREO],
         )
 
     def add_to_estimate(self, estimate: Estimate, covariance: FloatArray) -> Estimate:
         """Return an estimate with what is estimated of the calibration, whose errors have a covariance (C, C)."""
-        if self.disparity is not None:
-            field = DisparityField(self.disparity, covariance[: self.stereo_dim, : self.stereo_dim])
-            estimate = replace(estimate, disparity_field=field)
+        if self.stereo is not None:
+            field = StereoFieldEstimate(self.stereo, covariance[: self.stereo_dim, : self.stereo_dim])
+            estimate = replace(estimate, stereo_field=field)
         if self.extrinsics:
             rows = slice(self.stereo_dim, self.stereo_dim + 6)
             estimate = replace(estimate, T_cam0_imu=self.T_cam0_imu, T_cam0_imu_covariance=covariance[rows, rows])
@@ -83,14 +84,14 @@ def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings) -> tuple[
     """Return the calibration at the start, its covariance (C, C), and what a second of random walk adds (C, C)."""
     s = settings
     extrinsics, timing = s.calibrate in ("extrinsics", "both"), s.calibrate in ("time_offset", "both")
-    disparity = np.zeros(TERMS) if s.calibrate_stereo else None
-    calibration = Calibration(np.asarray(T_cam0_imu, dtype=np.float64), 0.0, extrinsics, timing, disparity)
+    stereo = np.zeros(TERMS) if s.calibrate_stereo else None
+    calibration = Calibration(np.asarray(T_cam0_imu, dtype=np.float64), 0.0, extrinsics, timing, stereo)
     rotation, rotation_walk = np.radians([s.extrinsic_rotation_sigma_deg, s.extrinsic_rotation_walk])
     yaw, field = np.radians(s.stereo_yaw_sigma_deg), s.stereo_field_sigma
-    stereo = np.array([yaw, *np.full(TERMS - 1, field)])
+    stereo_sigmas = np.array([yaw, field, field, _RADIAL * field, field, field])
     sigmas = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
     walks = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])
-    sigmas, walks = np.concatenate([stereo, sigmas]), np.concatenate([stereo * _STEREO_WALK, walks])
+    sigmas, walks = np.concatenate([stereo_sigmas, sigmas]), np.concatenate([stereo_sigmas * _STEREO_WALK, walks])
     return calibration, np.diag(sigmas[calibration.columns] ** 2), np.diag(walks[calibration.columns] ** 2)
 
 

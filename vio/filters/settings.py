@@ -128,13 +128,13 @@ class MsckfSettings(Section):
         "none", "what is estimated besides the motion, with IMU only: T_cam0_imu, the time offset, or both"
     )
     calibrate_stereo: bool = setting(
-        False, "estimate what the stereo calibration is off by: a low-order field of disparities over the image"
+        False, "estimate what the stereo calibration is off by: a low-order field over the image"
     )
     stereo_yaw_sigma_deg: float = setting(
         0.1, "initial standard deviation of the right camera's turn about its vertical axis", unit="deg", at_least=0
     )
     stereo_field_sigma: float = setting(
-        5.0e-4, "initial standard deviation of the other terms of the field, in focal lengths", at_least=0
+        2.0e-3, "initial standard deviation of the other terms of the field, in focal lengths", at_least=0
     )
     extrinsic_rotation_sigma_deg: float = setting(
         1.0, "calibrate: initial standard deviation of T_cam0_imu's rotation", unit="deg", at_least=0

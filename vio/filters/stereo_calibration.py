@@ -1,13 +1,20 @@
-"""What a stereo calibration got wrong, as states of the filter: a low-order field of disparities over the image.
+"""What a stereo calibration got wrong, as states of the filter and as a field of rows learned beside it.
 
-A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field.
-Its rows show in `vl - vr` at once and are not used here. Its columns look like depth: only motion, which gives the same
-points a second depth, separates them. The field has six terms in normalised coordinates (x, y) of the right image,
+A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field of
+normalised coordinates (x, y), pixels over the focal length f. Its rows, `dv`, show in `vl - vr` at once. Its columns,
+`du`, look like depth: only motion, which gives the same points a second depth, separates them. A turn (wx, wy, wz), a
+shift of the principal point (cx, cy), a focal ratio s and tangential distortion (p1, p2) against the left camera make
 
-    du = f (a1 (1 + x^2) + a2 x + a3 y + a4 x y + a5 x^2 + a6 y^2)      (R1)
+    du = (cx + wy) + s x - wz y + (2 p1 - wx) x y + (wy + 3 p2) x^2 + p2 y^2                       (R1)
+    dv = (cy - wx) + wz x + s y + (wy + 2 p2) x y + p1 x^2 + (3 p1 - wx) y^2                       (R2)
 
-The first is a right camera turned about its vertical axis, to first order; the others are a focal ratio, a roll, a
-pitch, and what tangential and radial distortion leave over. Equation numbers are those of docs/math.md.
+so three of the terms of du follow from the rows: those of y, of x y, and the difference of those of y^2 and x^2. The
+other three are states. Three more are what both lenses have in common, left over after rectification: radial (k) and
+tangential (q1, q2) distortion, which moves `ul`, `vl` and `ur` and shows in how points move through the image,
+
+    du = a0 + a1 x + a2 (x^2 + y^2) + rows                                                          (R3)
+    d(u, v) = k (x, y) r^2 + q1 (2 x y, r^2 + 2 y^2) + q2 (r^2 + 2 x^2, 2 x y)
+
 References: Dang, Hoffmann & Stiller, Continuous stereo self-calibration by camera parameter tracking, IEEE TIP (2009);
 Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for improved odometry accuracy, ECMR (2021).
 """
@@ -18,65 +25,126 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.filters.multiview import LandmarkResiduals, Residuals, TrackInformation, Views
+from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray
+from vio.records import BoolArray, Observations
 
-TERMS = 6
-
-
-def disparity_basis(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Evaluate the terms of (R1), times f, at stereo pixels (..., 4): what each coefficient moves `ur` by, (..., 6)."""
-    x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
-    terms = np.stack([1 + x * x, x, y, x * y, x * x, y * y], axis=-1)
-    out: FloatArray = camera.fu * terms
-    return out
+TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
+_ROW_TERMS = 6
+_MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
+_ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
+_ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
 
 
-def corrected_views(camera: StereoCamera, views: Views, coefficients: FloatArray) -> Views:
-    """Return views with the field of given coefficients (6,) taken out of their right pixels."""
-    if not coefficients.any():
-        return views
-    z = views.z.copy()
-    z[..., 2] -= np.where(views.weight[..., 2] > 0, disparity_basis(camera, views.z) @ coefficients, 0.0)
-    return Views(z, views.weight)
+def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
+    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the six coefficients of (R3), (..., 4, 6), pixels.
+
+    The row of `vr` is zero: right rows are not measured.
+    """
+    x, y = (z[..., 0] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
+    xr = (z[..., 2] - camera.cu) / camera.fu
+    out = np.zeros((*z.shape[:-1], 4, TERMS))
+    for row, u in ((0, x), (2, xr)):
+        r2 = u * u + y * y
+        out[..., row, 3], out[..., row, 4], out[..., row, 5] = u * r2, 2 * u * y, r2 + 2 * u * u
+    r2 = x * x + y * y
+    out[..., 1, 3], out[..., 1, 4], out[..., 1, 5] = y * r2, r2 + 2 * y * y, 2 * x * y
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 1.0, xr, xr * xr + y * y
+    return camera.fu * out
+
+
+class RowField:
+    """Learns how far right rows are off over the image, equation (R2), from the matches of all frames."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._camera = camera
+        self._A: FloatArray = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
+        self._b: FloatArray = np.zeros(_ROW_TERMS)
+        self.coefficients: FloatArray = np.zeros(_ROW_TERMS)  # of 1, x, y, x y, x^2, y^2, in focal lengths
+
+    def update(self, seen: Observations) -> None:
+        """Take in the rows of a frame's matches, with Cauchy weights against mismatches."""
+        z = seen.z[seen.has_right]
+        if len(z) < _MIN_ROWS:
+            return
+        camera = self._camera
+        x, y = (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
+        basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
+        rows = z[:, 3] - z[:, 1]
+        residual = rows - camera.fv * (basis @ self.coefficients)
+        residual = residual - np.median(residual)  # in the first frames the field itself is not yet known
+        scale = max(1.48 * float(np.median(np.abs(residual))), 1e-3)
+        weight = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
+        self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
+        self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
+        prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
+        self.coefficients = np.linalg.solve(self._A + prior, self._b) / camera.fv
+
+    def columns(self, z: FloatArray) -> FloatArray:
+        """Return the part of `du` (...) that follows from the rows at stereo pixels (..., 4), pixels."""
+        camera, c = self._camera, self.coefficients
+        x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
+        out: FloatArray = camera.fu * (-c[1] * y + (c[5] - c[4]) * x * y - c[3] * y * y)
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class StereoField:
+    """The field at the present estimate: what is taken out of the pixels."""
+
+    camera: StereoCamera
+    rows: RowField
+    coefficients: FloatArray  # (6,) of (R3)
+
+    def corrected(self, views: Views) -> Views:
+        """Return views (..., 4) without the field."""
+        z = views.z - field_jacobian(self.camera, views.z) @ self.coefficients
+        z[..., 2] -= self.rows.columns(views.z)
+        return Views(np.where(views.weight > 0, z, views.z), views.weight)
 
 
 @dataclass(frozen=True, slots=True)
 class StereoColumns:
     """The part of the tracks' normal equations that concerns the field's S coefficients; pixel noise is one pixel."""
 
-    G: FloatArray  # (F, S, 3) cross information of coefficients and point
-    D: FloatArray  # (F, S, S) information of the coefficients before the point is eliminated
-    cross: FloatArray  # (F, N, 6, S) cross information of clones and coefficients
-    gradient: FloatArray  # (F, S)
+    by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view
+    H: FloatArray  # (F, 4N, S) derivatives of the pixels by the coefficients, zero where not measured
+    WH: FloatArray  # (F, 4N, S) the same times the robust weights
+    r: FloatArray  # (F, 4N) residuals
+    point_D_pose: FloatArray  # (F, 3, 6)
+
+    @property
+    def G(self) -> FloatArray:
+        """Cross information (F, 3, S) of point and coefficients."""
+        out: FloatArray = self.by_point.sum(axis=1)
+        return out
 
 
-def stereo_columns(at: Residuals, basis: FloatArray, point_D_pose: FloatArray, weight: FloatArray) -> StereoColumns:
-    """Collect the normal equations of `r = J (B xi_i + dp) + H s`, where H is the basis in the row of `ur`.
+def stereo_columns(at: Residuals, H: FloatArray, point_D_pose: FloatArray, weight: FloatArray) -> StereoColumns:
+    """Collect the normal equations of `r = J (B xi_i + dp) + H s`.
 
     Args:
         at: residuals and Jacobians of F tracks in N clones.
-        basis: what the coefficients move the right pixel of each view by (F, N, S).
+        H: derivatives of each view's pixels by the coefficients (F, N, 4, S).
         point_D_pose: `B` (F, 3, 6).
         weight: robust weights (F, N).
     """
-    J, r = at.z_D_p[:, :, 2], at.r[:, :, 2]  # (F, N, 3), (F, N)
-    H = basis * np.any(J, axis=2)[..., None]
-    WH = H * weight[..., None]
-    HJ = np.swapaxes(WH, 1, 2) @ J  # (F, S, 3)
-    JB = J @ point_D_pose  # (F, N, 6)
-    cross = JB[..., :, None] * WH[..., None, :]
-    return StereoColumns(HJ, np.swapaxes(WH, 1, 2) @ H, cross, (np.swapaxes(WH, 1, 2) @ r[..., None])[..., 0])
+    F, N, _, S = H.shape
+    J = at.z_D_p
+    H = H * np.any(J, axis=3)[..., None]
+    WH = H * weight[..., None, None]
+    by_point = sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3))
+    flat = (F, 4 * N, S)
+    return StereoColumns(np.asarray(by_point), H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N), point_D_pose)
 
 
 @dataclass(frozen=True, slots=True)
 class StereoInformation:
-    """Information about the field's coefficients, beside that about poses and landmarks (n)."""
+    """Information about the field's S coefficients, beside that about n entries of poses and landmarks."""
 
     A: FloatArray  # (S, S)
-    cross: FloatArray  # (S, n) with poses and landmarks
+    cross: FloatArray  # (S, n)
     b: FloatArray  # (S,)
 
     @classmethod
@@ -95,33 +163,38 @@ class StereoInformation:
         return StereoInformation(self.A * factor, self.cross * factor, self.b * factor)
 
 
-def landmark_columns(at: LandmarkResiduals, basis: FloatArray, clones: int) -> StereoInformation:
-    """Collect what the landmarks' pixels in the newest exposure say of the coefficients, `dp = xi_f - xi_rho`.
-
-    Args:
-        at: residuals of all M landmarks.
-        basis: what the coefficients move the right pixel of each by (M, S).
-        clones: N, how many exposures there are.
-    """
-    M, S = basis.shape
-    J = at.J[:, 2]
-    H = basis * np.any(J, axis=1)[:, None]
-    WH = H * at.weight[:, None]
-    by_point = WH[:, :, None] * J[:, None, :]  # (M, S, 3)
-    cross = np.zeros((S, 6 * clones + 3 * M))
-    cross[:, 6 * clones :] = np.swapaxes(by_point, 0, 1).reshape(S, 3 * M)
-    cross[:, 6 * clones - 6 : 6 * clones - 3] = -by_point.sum(axis=0)
-    return StereoInformation(WH.T @ H, cross, WH.T @ at.r[:, 2])
-
-
 def eliminate_points_from_columns(
     columns: StereoColumns, info: TrackInformation, chosen: BoolArray
 ) -> StereoInformation:
     """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does."""
-    G = columns.G[chosen]
-    GC = np.linalg.solve(info.C[chosen], np.swapaxes(G, 1, 2))  # (F, 3, S)
-    A = columns.D[chosen].sum(axis=0) - np.einsum("fsk,fkt->st", G, GC)
-    N, S = columns.cross.shape[1], G.shape[1]
-    cross = columns.cross[chosen].sum(axis=0).reshape(6 * N, S) - np.einsum("fik,fks->is", info.G[chosen], GC)
-    b = columns.gradient[chosen].sum(axis=0) - np.einsum("fks,fk->s", GC, info.point_gradient[chosen])
+    by_point = columns.by_point[chosen]
+    F, N, _, S = by_point.shape
+    H, WH, r = (a[chosen] for a in (columns.H, columns.WH, columns.r))
+    G = by_point.sum(axis=1)  # (F, 3, S)
+    CG = np.linalg.solve(info.C[chosen], G)  # (F, 3, S)
+    flat_G, flat_CG = G.reshape(3 * F, S), CG.reshape(3 * F, S)
+    A = WH.reshape(-1, S).T @ H.reshape(-1, S) - flat_G.T @ flat_CG
+    B = columns.point_D_pose[chosen].reshape(3 * F, 6)
+    per_view = np.swapaxes(by_point, 1, 2).reshape(3 * F, N * S)
+    cross = (B.T @ per_view).reshape(6, N, S).transpose(1, 0, 2).reshape(6 * N, S)
+    cross = cross - np.swapaxes(info.G[chosen], 1, 2).reshape(3 * F, 6 * N).T @ flat_CG
+    b = WH.reshape(-1, S).T @ r.reshape(-1) - flat_CG.T @ info.point_gradient[chosen].reshape(-1)
     return StereoInformation(A, cross.T, b)
+
+
+def landmark_columns(at: LandmarkResiduals, H: FloatArray, clones: int) -> StereoInformation:
+    """Collect what the landmarks' pixels in the newest exposure say of the coefficients, `dp = xi_f - xi_rho`.
+
+    Args:
+        at: residuals of all M landmarks.
+        H: derivatives of their pixels by the coefficients (M, 4, S).
+        clones: N, how many exposures there are.
+    """
+    M, _, S = H.shape
+    H = H * np.any(at.J, axis=2)[..., None]
+    WH = H * at.weight[:, None, None]
+    by_point = np.swapaxes(WH, 1, 2) @ at.J  # (M, S, 3)
+    cross = np.zeros((S, 6 * clones + 3 * M))
+    cross[:, 6 * clones :] = np.swapaxes(by_point, 0, 1).reshape(S, 3 * M)
+    cross[:, 6 * clones - 6 : 6 * clones - 3] = -by_point.sum(axis=0)
+    return StereoInformation(WH.reshape(-1, S).T @ H.reshape(-1, S), cross, np.einsum("mas,ma->s", WH, at.r))

@@ -125,7 +125,7 @@ class Window:
 
     @property
     def stereo_rows(self) -> slice:
-        """Rows of the disparity field's coefficients, empty where they are not estimated."""
+        """Rows of the stereo field's coefficients, empty where they are not estimated."""
         return slice(DIM, DIM + self.calibration.stereo_dim)
 
     def chain(self, out_D_exposures: FloatArray, out_D_stereo: FloatArray | None = None) -> FloatArray:
@@ -133,7 +133,7 @@ class Window:
 
         Args:
             out_D_exposures: by the exposures' poses (..., 6N).
-            out_D_stereo: by the disparity field's coefficients (..., S), where they are estimated.
+            out_D_stereo: by the stereo field's coefficients (..., S), where they are estimated.
         """
         out = np.zeros((*out_D_exposures.shape[:-1], len(self.P)))
         out[..., self.first_clone : self.first_landmark] = out_D_exposures
@@ -171,7 +171,7 @@ class Window:
         Args:
             A: information matrix (6N + 3M, 6N + 3M).
             b: information vector (6N + 3M,).
-            stereo: the part that concerns the disparity field, where it is estimated.
+            stereo: the part that concerns the stereo field, where it is estimated.
         """
         out, vector = np.zeros_like(self.P), np.zeros(len(self.P))
         M = self._pose_D_calibration()

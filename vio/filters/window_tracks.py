@@ -24,7 +24,7 @@ from vio.filters.multiview import (
     within,
 )
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import StereoColumns, corrected_views, disparity_basis, stereo_columns
+from vio.filters.stereo_calibration import StereoColumns, StereoField, field_jacobian, stereo_columns
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -46,7 +46,7 @@ class LinearTracks:
     p_world: FloatArray  # (F, 3)
     at: Residuals
     information: TrackInformation
-    stereo: StereoColumns | None  # where the disparity field is estimated
+    stereo: StereoColumns | None  # where the stereo field is estimated
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
@@ -60,7 +60,7 @@ class WindowTracks:
     def __init__(self, camera: StereoCamera, settings: MsckfSettings) -> None:
         self._camera, self._settings = camera, settings
         self.table = TrackTable(settings.clones + 1)
-        self._disparity: FloatArray | None = None  # the field at the last linearisation
+        self._field: StereoField | None = None  # at the last linearisation
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
 
     def choose(self, clones: int) -> IntArray:
@@ -77,7 +77,7 @@ class WindowTracks:
         return rows
 
     def linearise(
-        self, T_cam0_world: FloatArray, rows: IntArray, steps: int, disparity: FloatArray | None = None
+        self, T_cam0_world: FloatArray, rows: IntArray, steps: int, field: StereoField | None = None
     ) -> LinearTracks:
         """Triangulate tracks, from where their points were last, and linearise them.
 
@@ -85,10 +85,10 @@ class WindowTracks:
             T_cam0_world: camera poses (N, 4, 4) at the clones.
             rows: tracks; those without a usable point are left out.
             steps: Gauss-Newton steps on each point.
-            disparity: coefficients (6,) of the disparity field, taken out of the right pixels; None: not estimated.
+            field: what is taken out of the pixels where the stereo field is estimated.
         """
         camera, table, T, clones = self._camera, self.table, T_cam0_world, len(T_cam0_world)
-        self._disparity = disparity
+        self._field = field
         views = self._views(rows, clones)
         fresh = ~table.has_point[rows]
         if fresh.any():
@@ -119,22 +119,22 @@ class WindowTracks:
     def _linear(self, rows: IntArray, p_world: FloatArray, at: Residuals) -> LinearTracks:
         weight = robust_weights(at, self.variance)
         information = track_information(at, p_world, weight)
-        if self._disparity is None:
+        if self._field is None:
             return LinearTracks(rows, p_world, at, information, None)
-        basis = disparity_basis(self._camera, self.table.views(rows, at.r.shape[1]).z)
-        return LinearTracks(rows, p_world, at, information, stereo_columns(at, basis, point_D_pose(p_world), weight))
+        H = field_jacobian(self._camera, self.table.views(rows, at.r.shape[1]).z)
+        return LinearTracks(rows, p_world, at, information, stereo_columns(at, H, point_D_pose(p_world), weight))
 
     def _views(self, rows: IntArray, clones: int) -> Views:
-        """What rows showed, less the disparity field."""
+        """What rows showed, without the stereo field."""
         views = self.table.views(rows, clones)
-        return views if self._disparity is None else corrected_views(self._camera, views, self._disparity)
+        return views if self._field is None else self._field.corrected(views)
 
     def move_points(self, tracks: LinearTracks, exposure_errors: FloatArray, stereo_errors: FloatArray) -> None:
         """Move each point as its own normal equations say once the clones (6N,) and the field (S,) have moved."""
         info = tracks.information
         right = info.point_gradient - np.einsum("fik,i->fk", info.G, exposure_errors)
         if tracks.stereo is not None:
-            right = right - np.einsum("fsk,s->fk", tracks.stereo.G, stereo_errors)
+            right = right - np.einsum("fks,s->fk", tracks.stereo.G, stereo_errors)
         step = np.linalg.solve(info.C, right[..., None])[..., 0]
         self.table.points[tracks.rows] = tracks.p_world + step
 
