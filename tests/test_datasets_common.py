@@ -27,7 +27,7 @@ from vio.datasets import READERS, DatasetSettings, open_dataset
 from vio.datasets.common import checked_transform, clock_ns, merge_events, read_npz, seconds_to_ns
 from vio.datasets.observation_log import write_observation_log
 from vio.errors import CalibrationError, ConfigError, DataError
-from vio.records import Recording, StereoFrame, VelocitySample
+from vio.records import ImuSample, Recording, StereoFrame, VelocitySample
 
 SOURCES = ("kitti", "ece276a", "ece276a_new", "utias", "log")
 
@@ -111,6 +111,20 @@ def test_events_are_in_time_order_at_any_rates(ticks: list[int], start: int, sto
     assert [event for event in events if isinstance(event, VelocitySample)] == inside
     for event, following in pairwise(events):
         assert not (isinstance(event, StereoFrame) and event.time_ns == following.time_ns)
+
+
+def test_imu_samples_end_with_the_first_at_or_after_the_last_frame() -> None:
+    """Readings are interpolated to the last exposure; frames stand at 0, 60, … ms."""
+    recording, zero = _recording(), np.zeros(3)
+
+    def last(times_ms: list[int], stop: int) -> int:
+        frames = (StereoFrame(k, int(recording.frame_times_ns[k]), None, None) for k in range(stop))
+        motion = [ImuSample(1_000_000 * t, zero, zero) for t in times_ms]
+        return max(e.time_ns for e in merge_events(recording, range(stop), motion, frames) if isinstance(e, ImuSample))
+
+    assert last([-5, 5, 115, 125, 135], 3) == 125_000_000
+    assert last([-5, 5, 120, 125, 135], 3) == 120_000_000
+    assert last([-5, 5, 115], 3) == 115_000_000
 
 
 def _recording() -> Recording:

@@ -713,28 +713,6 @@ def test_samples_of_another_kind_are_refused() -> None:
         filt.propagate(VelocitySample(0, np.zeros(3), np.zeros(3)))
 
 
-def test_frames_before_the_first_imu_sample_wait_but_not_for_ever() -> None:
-    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion="imu")
-    flight = Flight()
-    rng = np.random.default_rng(0)
-    assert filt.update(flight.observe(0, 0.5, rng)).used == 0
-    np.testing.assert_array_equal(filt.estimate().T_world_imu, np.eye(4))
-    for k in range(1, 20):
-        filt.update(flight.observe(k, 0.5, rng))
-    with pytest.raises(EstimationError, match="without an IMU sample"):
-        filt.update(flight.observe(20, 0.5, rng))
-
-
-def test_a_silent_imu_is_named() -> None:
-    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion="imu")
-    flight, rng = Flight(), np.random.default_rng(0)
-    filt.propagate(ImuSample(0, np.zeros(3), np.array([0, 0, 9.81])))
-    filt.update(flight.observe(0, 0.5, rng))
-    assert filt.predict(20 * STEP_NS) is None
-    with pytest.raises(EstimationError, match="silent"):
-        filt.update(flight.observe(20, 0.5, rng))
-
-
 def test_before_the_first_frame_there_is_no_map() -> None:
     filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion=None)
     assert filt.predict(0) is None

@@ -30,6 +30,8 @@ _WINDOW = (
     "tests/test_online_calibration.py",
     "tests/test_consistency.py",
 )
+_IMU_GAPS = ("tests/test_imu_gaps.py",)
+_IMU_START = ("tests/test_imu_start.py",)
 _CALIBRATE = ("tests/test_online_calibration.py",)
 _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
@@ -235,8 +237,8 @@ MUTATIONS = (
     Mutation(
         "IMU: white noise grows with the time instead of its root",
         "vio/filters/navigation.py",
-        "density * np.sqrt(dt)",
-        "density * dt",
+        "densities[k] * np.sqrt(dt)",
+        "densities[k] * dt",
         _WINDOW,
     ),
     Mutation(
@@ -245,6 +247,55 @@ MUTATIONS = (
         "** 2 * total",
         "** 2 * np.sqrt(total)",
         _WINDOW,
+    ),
+    Mutation(
+        "IMU: a frame does not wait for the sample after it",
+        "vio/pipeline.py",
+        "latest_ns >= held.time_ns",
+        "latest_ns >= 0",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "IMU: a gap hides nothing",
+        "vio/filters/navigation.py",
+        "sigmas**2 + hidden.variance[k]",
+        "sigmas**2",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "IMU: a held sample is as good as a bridge",
+        "vio/filters/imu_gaps.py",
+        "np.minimum(age, _LONGEST_LAG_S)",
+        "0.25 * np.minimum(age, _LONGEST_LAG_S)",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "IMU: a gap is not told",
+        "vio/watch/silence.py",
+        "length_s <= max(",
+        "length_s <= 10 * max(",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "start: a steady acceleration is no evidence against the tilt",
+        "vio/filters/imu_start.py",
+        "np.sqrt(max(level, 0.0))",
+        "0.0",
+        _IMU_START,
+    ),
+    Mutation(
+        "start: the gyro's mean is a bias for sure",
+        "vio/filters/imu_start.py",
+        "np.hypot(turn, _NOISE_FACTOR * rate_noise)",
+        "_NOISE_FACTOR * rate_noise",
+        _IMU_START,
+    ),
+    Mutation(
+        "start: the world's yaw turns with the tilt's corrections",
+        "vio/filters/msckf.py",
+        "self._keep_first_yaw(window, before)",
+        "pass",
+        _IMU_START,
     ),
     Mutation(
         "IMU: half dropped in gravity's flow",

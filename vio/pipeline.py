@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -17,7 +18,9 @@ from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
 from vio.records import (
     BodyFrame,
     Estimate,
+    Event,
     FrontendOutput,
+    ImuSample,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -147,7 +150,8 @@ def run(
     recorder = _RunRecorder(backend, config.lag_frames, keep_observations=keep_observations)
     timer = _StageTimer()
     try:
-        for event in dataset.events(start, stop, images=_needs_images(dataset, config)):
+        events = dataset.events(start, stop, images=_needs_images(dataset, config))
+        for event in frames_after_imu(events) if motion == "imu" else events:
             if not isinstance(event, StereoFrame):
                 watch.sample(event)
                 recorder.sample(event)
@@ -199,6 +203,29 @@ def run(
         warnings=tuple(watch.lines),
         wall_s=timer.since_start(),
     )
+
+
+def frames_after_imu(events: Iterable[Event]) -> Iterator[Event]:
+    """Yield events with each frame after the first IMU sample at or after its exposure, as interpolation needs it.
+
+    Where none has come, the frame waits no longer than to the next frame or the end of the stream.
+    """
+    held: StereoFrame | None = None
+    latest_ns: int | None = None  # of the IMU samples
+    for event in events:
+        if isinstance(event, StereoFrame):
+            if held is not None:
+                yield held
+            held = event
+        else:
+            yield event
+            if isinstance(event, ImuSample):
+                latest_ns = event.time_ns
+        if held is not None and latest_ns is not None and latest_ns >= held.time_ns:
+            yield held
+            held = None
+    if held is not None:
+        yield held
 
 
 def _check(recording: Recording, config: Config, start: int, stop: int | None) -> None:

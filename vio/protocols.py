@@ -35,7 +35,8 @@ class Dataset(Protocol):
         """Yield events of the frames `start <= index < stop` in time order.
 
         A motion sample with the time of a frame comes before it. Motion samples from the time of frame `start` (raw
-        IMU: from a second before it) to the time of frame `stop - 1` are included. With `images=False` frames carry
+        IMU: from a second before it) to the time of frame `stop - 1` (raw IMU: to the first sample at or after it) are
+        included. With `images=False` frames carry
         None for both images.
 
         Raises:

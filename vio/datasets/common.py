@@ -191,7 +191,8 @@ def merge_events(
 ) -> Iterator[Event]:
     """Yield the motion samples and frames of a range in time order, a sample before a frame of the same time.
 
-    Raw IMU begins a second before the first frame, so that an estimator can determine gravity before the first image.
+    Raw IMU begins a second before the first frame, so that an estimator can determine gravity before the first image, and
+    ends with the first sample at or after the last frame, so that readings can be interpolated to its exposure.
 
     Args:
         recording: the frame times.
@@ -201,7 +202,9 @@ def merge_events(
     """
     first_ns, last_ns = (int(recording.frame_times_ns[k]) for k in (chosen[0], chosen[-1]))
     begins = {ImuSample: first_ns - NS_PER_S, VelocitySample: first_ns}
-    samples = iter([sample for sample in motion if begins[type(sample)] <= sample.time_ns <= last_ns])
+    inertial_end_ns = next((x.time_ns for x in motion if isinstance(x, ImuSample) and x.time_ns >= last_ns), last_ns)
+    ends = {ImuSample: inertial_end_ns, VelocitySample: last_ns}
+    samples = iter([x for x in motion if begins[type(x)] <= x.time_ns <= ends[type(x)]])
     waiting = next(samples, None)
     with contextlib.closing(frames):
         for frame in frames:

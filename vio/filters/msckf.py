@@ -32,10 +32,10 @@ from vio.filters.stereo_calibration import (
     landmark_columns,
 )
 from vio.filters.tracks import latest_pixels
-from vio.filters.window import Window, posterior
+from vio.filters.window import Clone, Window, posterior
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat, transform_points
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import (
     BoolArray,
@@ -53,7 +53,6 @@ from vio.records import (
     VelocitySample,
 )
 
-_MAX_WAIT_FRAMES = 20
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 # Factors on the motion model's densities: at the start, at least, at most.
 _IMU_FACTORS = (5.0, 1.0, 50.0)
@@ -99,7 +98,6 @@ class Msckf:
         self._time_ns = 0
         self._began_ns = 0
         self._body_ns = 0  # time of the navigation state, on the IMU's clock
-        self._waited = 0
         self._blind = False  # the last frame showed nothing
         self._output: FloatArray = np.zeros((DIM, DIM))  # covariance (15 + C, 15 + C) with all that is seen
         self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
@@ -110,6 +108,7 @@ class Msckf:
         self._gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._since_frame = NO_STEP  # how the error has grown since the last frame
         self._predicted_step: tuple[int, Transition] | None = None  # integrated by `predict`, with its end
+        self._tilted: FloatArray = np.eye(3)  # (3, 3) how the first attitude has been corrected, on the world's side
         self._map: list[Landmarks] = []
         self._points_stored = 0  # points in the map since it was merged
 
@@ -189,8 +188,10 @@ class Msckf:
         self._blind = False
         late_s = (self._body_ns - observations.time_ns) * 1e-9
         window.add_clone(observations.frame_index, observations.time_ns, late_s)
+        before = window.clones[len(window.clones) > self._settings.clones]  # the oldest that stays
         try:
             report = self._use(window, seen)
+            self._keep_first_yaw(window, before)
         except np.linalg.LinAlgError as error:
             raise EstimationError(self._lost(observations.frame_index)) from error
         if not np.isfinite(window.P).all() or not np.isfinite(window.nav.T_world_imu).all():
@@ -260,16 +261,7 @@ class Msckf:
                 self._map, self._points_stored = [_newest(self._map)], 0
 
     def _wait(self, observations: Observations) -> UpdateReport:
-        """Let a frame pass that comes before the first motion sample.
-
-        Raises:
-            EstimationError: too many frames have passed.
-        """
-        self._waited += 1
-        if self._waited > _MAX_WAIT_FRAMES:
-            raise EstimationError(
-                f"{self._waited} frames without an IMU sample; check the clocks, or use --motion none"
-            )
+        """Let a frame pass that comes before the first motion sample; the run's watch says so."""
         self._time_ns = observations.time_ns
         return UpdateReport(0, 0, 0, 0, None, None)
 
@@ -323,6 +315,35 @@ class Msckf:
             return time_ns
         return self._motion.covered(time_ns + round(1e9 * calibration.time_offset_s))
 
+    def _keep_first_yaw(self, window: Window, before: Clone) -> None:
+        """Keep the world's yaw that of the start while the first tilt is corrected, equation (N13).
+
+        Corrections of roll and pitch by tens of degrees one after the other make a yaw, to second order, that no
+        linear filter sees. The start knew no yaw but that of the shortest turn from its first attitude to the true one.
+
+        Args:
+            window: after the frame's update.
+            before: one of its clones before it, which stays.
+        """
+        if self._source != "imu" or before.time_ns != self._began_ns:
+            return
+        after = next((c for c in window.clones if c.frame_index == before.frame_index), None)
+        if after is None:
+            return
+        old = self._tilted
+        phi, t = so3_log(after.T_world_imu[:3, :3] @ before.T_world_imu[:3, :3].T), _half_tangent(old)
+        moved = so3_exp(phi) @ old
+        yaw = -float(np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1]))
+        self._tilted = so3_exp([0.0, 0.0, yaw]) @ moved
+        tilt = _half_tangent(self._tilted) - t
+        R, M = window.turn_world(yaw, np.array([-tilt[1], tilt[0], 0.0]))
+        own = slice(0, window.first_clone)
+        self._output = M[own, own] @ self._output @ M[own, own].T
+        self._tracks.table.points = self._tracks.table.points @ R.T
+        if self._smoothed is not None:
+            self._smoothed = self._smoothed.rotated(R)
+        self._map = [Landmarks(m.ids, m.p_world @ R.T, R @ m.covariance @ R.T) for m in self._map]
+
     def _measure(self) -> None:
         window = self._started()
         measurement = self._motion.measurement(window.nav)
@@ -352,7 +373,8 @@ class Msckf:
             if missing.any() and self._tracks.agree(tracks.at):
                 window.inflate_process_noise(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
                 tracks, P = self._fit(window, tracks, pixels, innovation)
-            self._noise.update(step)
+            if not self._since_frame.bridged:
+                self._noise.update(step)
         self._since_frame = NO_STEP
 
         tracks = self._tracks.without_wrong_views(tracks)
@@ -545,6 +567,14 @@ class Msckf:
         covariance = np.asarray(self._tracks.variance * C_inverse, dtype=np.float64)
         window.add_landmarks(table.ids(tracks.rows[chosen]), p, A.reshape(-1, len(window.P)), covariance)
         return chosen
+
+
+def _half_tangent(R: FloatArray) -> FloatArray:
+    """Rotation vector (3,) of R (3, 3), rescaled to the length `tan(angle / 2)`."""
+    phi = so3_log(R)
+    half = 0.5 * float(np.linalg.norm(phi))
+    out: FloatArray = phi * (0.5 * np.tan(half) / half if half > 1e-6 else 0.5)
+    return out
 
 
 def _newest(parts: list[Landmarks]) -> Landmarks:

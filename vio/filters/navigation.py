@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.errors import EstimationError
+from vio.filters.imu_gaps import Hidden, ImuHistory
+from vio.filters.imu_start import imu_start
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import (
     FloatArray,
@@ -31,7 +33,6 @@ DIM = 15  # error dimensions of the navigation state
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
 _START_RATE_SIGMA_RADPS = 1.0  # doubt of the first angular rate without an IMU; the next image settles it
-_MAX_GAP_S = 0.5  # a longer silence of the IMU is an error, not an interval to integrate over
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,8 @@ class Transition:
     Phi: FloatArray  # (15, 15)
     Q: FloatArray  # (15, 15)
     Q_parts: FloatArray  # (2, 15, 15) of Q, what the translation's and what the rotation's noise brought
-    gyro: FloatArray | None = None  # (3,) mean rate that the gyro measured over the step, rad/s; None without an IMU
+    gyro: FloatArray | None = None  # (3,) mean rate that the gyro measured over the step, rad/s; None: it did not
+    bridged: bool = False  # whether IMU samples were missing, so that Q says nothing of the sensors' noise
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,11 +65,13 @@ class Growth:
     Phi: FloatArray  # (15, 15)
     Q: FloatArray  # (15, 15)
     Q_parts: FloatArray  # (2, 15, 15) as in Transition
+    bridged: bool = False  # in one of the steps
 
     def then(self, step: Transition) -> Growth:
         """Append a step."""
         Phi = step.Phi
-        return Growth(Phi @ self.Phi, Phi @ self.Q @ Phi.T + step.Q, Phi @ self.Q_parts @ Phi.T + step.Q_parts)
+        Q, Q_parts = Phi @ self.Q @ Phi.T + step.Q, Phi @ self.Q_parts @ Phi.T + step.Q_parts
+        return Growth(Phi @ self.Phi, Q, Q_parts, self.bridged or step.bridged)
 
 
 NO_STEP = Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
@@ -89,53 +93,62 @@ class ImuMotion:
         self._settings = settings
         self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
         self._samples: list[ImuSample] = []
+        self._history = ImuHistory()
 
     def take(self, sample: MotionSample) -> None:
         """Keep a sample until the interval that needs it."""
         assert isinstance(sample, ImuSample)
         self._samples.append(sample)
+        self._history.take(sample)
 
     @property
     def ready(self) -> bool:
-        """Whether enough is known to start."""
+        """Whether there is a sample to start with."""
         return bool(self._samples)
 
     def start(self, time_ns: int) -> tuple[NavState, FloatArray]:
-        """Return the state at the first frame and its covariance (15, 15): gravity from the accelerometer.
+        """Return the state at the first frame and its covariance (15, 15), from the last half second of samples.
 
-        The samples before the frame are taken for a rest if they scatter little, which also gives the gyro bias;
-        else attitude and velocity start with honest doubt, and the images settle them.
+        Roll and pitch from the mean specific force, whose acceleration has the standard deviation that the readings
+        suggest; a gyro bias where they show a standstill (`imu_start`). Tilt and accelerometer bias are correlated, as
+        either explains the same reading: equation (N10). Position and yaw are the world's; the velocity is unknown.
 
         Raises:
             EstimationError: the accelerometer reads nothing.
         """
         s = self._settings
-        recent = [x for x in self._samples if x.time_ns >= self._samples[-1].time_ns - 500_000_000]
-        accel = np.mean([x.accel for x in recent], axis=0)
-        if np.linalg.norm(accel) < 1e-3:
-            raise EstimationError("the accelerometer reads zero; is it in m/s^2, with gravity in it?")
-        up = accel / np.linalg.norm(accel)
-        T = se3_from_parts(_rotation_to_up(up), np.zeros(3))
-        nav = NavState(T, np.zeros(3), recent[-1].gyro, np.zeros(3), np.zeros(3))
+        begin = imu_start(self._samples, time_ns, s)
+        R = _rotation_to_up(begin.force / np.linalg.norm(begin.force))
+        T = se3_from_parts(R, np.zeros(3))
+        nav = NavState(T, np.zeros(3), begin.rate - begin.gyro_bias, begin.gyro_bias, np.zeros(3))
+        known = s.accel_bias_sigma_mps2 / s.gravity_mps2  # tilt that the first second leaves, rad
         sigmas = np.concatenate(
             [
-                np.zeros(3),
-                [np.radians(s.start_tilt_sigma_deg)] * 2,
-                [1e-6],
+                np.zeros(5),
+                [_yaw_sigma(np.hypot(begin.accel_sigma_mps2, s.accel_bias_sigma_mps2) / s.gravity_mps2, known)],
                 np.full(3, s.start_velocity_sigma_mps),
-                np.full(3, s.gyro_bias_sigma_radps),
+                np.full(3, begin.gyro_bias_sigma_radps),
                 np.full(3, s.accel_bias_sigma_mps2),
             ]
         )
-        return nav, np.diag(sigmas**2)
+        P = np.diag(sigmas**2)
+        tilt_D_accel = -so3_hat(self._gravity) / s.gravity_mps2**2  # g^ phi = R db_a + acceleration, solved for phi
+        tilt_D_bias = tilt_D_accel @ R
+        P[3:6, 12:15] = tilt_D_bias * s.accel_bias_sigma_mps2**2
+        P[12:15, 3:6] = P[3:6, 12:15].T
+        P[3:6, 3:6] += tilt_D_accel @ tilt_D_accel.T * (begin.accel_sigma_mps2**2 + s.accel_bias_sigma_mps2**2)
+        return nav, P
 
     def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
         """Integrate from one time to another, equations (N1) to (N4); factors (2,) scale accelerometer and gyro noise.
 
+        Where samples are missing, it interpolates, or holds the last one, and adds what that may hide to the noise:
+        equations (N11) and (N12).
+
         Raises:
-            EstimationError: the IMU is silent for too long.
+            EstimationError: there is no sample at all.
         """
-        times, gyro, accel = self._interval(start_ns, end_ns)
+        times, gyro, accel, hidden = self._interval(start_ns, end_ns)
         dt = np.diff(times) * 1e-9
         gyro, accel = gyro - nav.gyro_bias, accel - nav.accel_bias
         steps = so3_exp(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None])
@@ -148,9 +161,11 @@ class ImuMotion:
         v = nav.velocity + np.concatenate([np.zeros((1, 3)), np.cumsum(a * dt[:, None], axis=0)])
         moves = v[:-1] * dt[:, None] + 0.5 * a * (dt**2)[:, None]
         p = nav.T_world_imu[:3, 3] + np.concatenate([np.zeros((1, 3)), np.cumsum(moves, axis=0)])
-        Phi, Q, Q_parts = self._linearise(times, dt, R, v, p, factors)
+        Phi, Q, Q_parts = self._linearise(times, dt, R, v, p, factors, hidden)
         turned = np.sum(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None], axis=0) / max(dt.sum(), 1e-9)
         moved = replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1], rate=gyro[-1])
+        if hidden is not None and hidden.gap:
+            return Transition(moved, Phi, Q, Q_parts, bridged=True)
         return Transition(moved, Phi, Q, Q_parts, turned + nav.gyro_bias)
 
     def forget_before(self, time_ns: int) -> None:
@@ -209,28 +224,37 @@ class ImuMotion:
         latest = self._samples[-1].time_ns
         return time_ns if time_ns - latest > _EXTRAPOLATE_NS else min(time_ns, latest)
 
-    def _interval(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Times relative to the start (K,) in ns, gyro (K, 3), accel (K, 3), interpolated at both ends."""
+    def _interval(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, FloatArray, Hidden | None]:
+        """Times relative to the start (K,) in ns, gyro (K, 3), accel (K, 3), and what gaps hide.
+
+        Values are interpolated between samples and held beyond the first and the last; None: no sample is missing.
+        """
         samples = self._samples
+        if not samples:
+            raise EstimationError(f"no IMU sample before {end_ns} ns; check that IMU and camera share a clock")
         all_times = np.array([x.time_ns for x in samples], dtype=np.int64)
-        if not len(samples) or all_times[0] > start_ns + _MAX_GAP_S * 1e9 or all_times[-1] < end_ns - _MAX_GAP_S * 1e9:
-            raise EstimationError(
-                f"the IMU is silent between {start_ns} and {end_ns} ns; check that IMU and camera share a clock"
-            )
         t = (all_times - start_ns).astype(np.float64)
         end = float(end_ns - start_ns)
         inside = t[(t > 0) & (t < end)]
         cuts = np.concatenate([[0.0], inside, [end]])
-        if np.diff(cuts).max() > _MAX_GAP_S * 1e9:
-            raise EstimationError(f"the IMU is silent for {np.diff(cuts).max() * 1e-9:.2f} s before {end_ns} ns")
+        hidden = self._history.hidden(cuts, t)
+        if hidden is not None:
+            cuts = hidden.cuts_ns
         values = np.array([np.concatenate([x.gyro, x.accel]) for x in samples])
         at = np.stack([np.interp(cuts, t, column) for column in values.T], axis=1)
-        return cuts, at[:, :3], at[:, 3:]
+        return cuts, at[:, :3], at[:, 3:], hidden
 
     def _linearise(
-        self, times: FloatArray, dt: FloatArray, R: FloatArray, v: FloatArray, p: FloatArray, factors: FloatArray
+        self,
+        times: FloatArray,
+        dt: FloatArray,
+        R: FloatArray,
+        v: FloatArray,
+        p: FloatArray,
+        factors: FloatArray,
+        hidden: Hidden | None,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Transition (15, 15), noise (15, 15) and its parts (2, 15, 15) over the interval.
+        """Transition (15, 15), noise (15, 15) and its parts (2, 15, 15) over the interval, hidden signals included.
 
         The transition of the navigation part depends on gravity alone.
         """
@@ -250,8 +274,11 @@ class ImuMotion:
         Phi[:9, 9:] = np.einsum("kij,k->ij", moved, dt)
         densities = factors * [s.accel_noise_density, s.gyro_noise_density]
         Q_parts = np.zeros((2, DIM, DIM))
-        for part, columns, density in zip(Q_parts, (slice(3, 6), slice(0, 3)), densities, strict=True):
-            out_D_noise = moved[:, :, columns] * (density * np.sqrt(dt))[:, None, None]
+        for k, (part, columns) in enumerate(zip(Q_parts, (slice(3, 6), slice(0, 3)), strict=True)):
+            sigmas = densities[k] * np.sqrt(dt)
+            if hidden is not None:
+                sigmas = np.sqrt(sigmas**2 + hidden.variance[k])
+            out_D_noise = moved[:, :, columns] * sigmas[:, None, None]
             part[:9, :9] = np.einsum("kij,klj->il", out_D_noise, out_D_noise)
         Q = Q_parts.sum(axis=0)
         walks = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * total
@@ -366,6 +393,16 @@ def _free_flow(s: FloatArray, gravity: FloatArray) -> FloatArray:
     out[:, 0:3, 3:6] = (0.5 * s**2)[:, None, None] * G
     out[:, 6:9, 3:6] = s[:, None, None] * G
     return out
+
+
+def _yaw_sigma(tilt_sigma: float, known_sigma: float) -> float:
+    """What corrections of the first tilt leave of yaw, rad: two turns about level axes make a turn about the vertical.
+
+    The filter takes out the second order, (N13), for as long as the first frame is in its window; the third vanishes
+    about the vertical, and of the fourth `x^4 / 24` remains (Baker, Campbell & Hausdorff). Later corrections are of the
+    size of the tilt that is known by then, and their second order `x^2 / 2` stays.
+    """
+    return float(np.hypot(tilt_sigma**4 / 24, known_sigma**2 / 2))
 
 
 def _rotation_to_up(up_imu: FloatArray) -> FloatArray:

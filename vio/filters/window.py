@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.filters.online_calibration import Calibration, body_twists, pose_D_calibration, with_calibration
 from vio.filters.stereo_calibration import TERMS, StereoInformation
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
 from vio.records import BoolArray, IntArray
 
 
@@ -360,6 +360,33 @@ class Window:
         if isinstance(self.motion, ImuMotion):
             self._correct_twists(self.motion, error[:DIM])
         self.prior_delta = self.prior_delta + error
+
+    def turn_world(self, yaw: float, yaw_D_tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Turn the whole world about its z axis, and let the errors' yaw hang on the present tilt, equation (N13).
+
+        Args:
+            yaw: rad; no residual changes by it.
+            yaw_D_tilt: (3,) by the navigation state's phi, for the yaw of all poses alike.
+
+        Returns:
+            R (3, 3), which takes points of the old world to the new one, and M (D, D), which does so with errors.
+        """
+        R, D = so3_exp([0.0, 0.0, yaw]), len(self.P)
+        yaws = np.concatenate([[5], np.arange(self.first_clone + 5, self.first_landmark, 6)])
+        M = np.eye(D)
+        M[yaws, 3:6] += yaw_D_tilt
+        in_world = [*range(0, 9, 3), *range(self.first_clone, D, 3)]
+        turn = np.eye(D)
+        for k in in_world:
+            turn[k : k + 3, k : k + 3] = R
+        M = turn @ M
+        T = se3_from_parts(R, np.zeros(3))
+        self.nav = replace(self.nav, T_world_imu=T @ self.nav.T_world_imu, velocity=R @ self.nav.velocity)
+        self.clones = [replace(c, T_world_imu=T @ c.T_world_imu, velocity=R @ c.velocity) for c in self.clones]
+        self.landmarks = self.landmarks @ R.T
+        P = M @ self.P @ M.T
+        self.P, self.prior_delta = 0.5 * (P + P.T), turn @ self.prior_delta
+        return R, M
 
     def _correct_twists(self, motion: ImuMotion, error: FloatArray) -> None:
         """Let the clones' velocities and rates follow the navigation state's error (15,)."""

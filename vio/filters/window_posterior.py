@@ -8,7 +8,7 @@ import numpy as np
 
 from vio.filters.navigation import ImuMotion
 from vio.filters.window import Clone, Window
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log
 from vio.records import Estimate
 from vio.statistics import chi_square_quantile
 
@@ -32,6 +32,13 @@ class WindowPosterior:
         if not isinstance(window.motion, ImuMotion):
             clones = _with_velocities(clones)
         return cls(clones, P[rows, rows], window.nav.gyro_bias, window.nav.accel_bias)
+
+    def rotated(self, R: FloatArray) -> WindowPosterior:
+        """Return the same in a world that is turned by R (3, 3)."""
+        T = se3_from_parts(R, np.zeros(3))
+        clones = tuple(replace(c, T_world_imu=T @ c.T_world_imu, velocity=R @ c.velocity) for c in self.clones)
+        turn = np.kron(np.eye(2 * len(clones)), R)
+        return replace(self, clones=clones, P=turn @ self.P @ turn.T)
 
     def estimate(self, frame_index: int) -> Estimate | None:
         """Return the smoothed estimate at a frame of the window; None where the frame is not in it."""

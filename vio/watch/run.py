@@ -10,8 +10,10 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, ImuSample, MotionSample, Observations, UpdateReport
 from vio.watch.health import RunHealth
+from vio.watch.silence import ImuSilence
 
 if TYPE_CHECKING:
+    from vio.watch.finding import InertialFinding
     from vio.watch.inertial import InertialCheck
 
 log = logging.getLogger(__name__)
@@ -30,6 +32,7 @@ class RunWatch:
         """
         self._health = RunHealth()
         self._inertial: InertialCheck | None = None
+        self._silence = ImuSilence() if imu else None
         if imu:
             from vio.watch.inertial import InertialCheck  # it loads scipy.optimize
 
@@ -39,15 +42,20 @@ class RunWatch:
 
     def sample(self, sample: MotionSample) -> None:
         """Add one motion sample."""
-        if self._inertial is not None and isinstance(sample, ImuSample):
-            self._inertial.imu(sample)
+        if isinstance(sample, ImuSample):
+            if self._silence is not None:
+                self._report(self._silence.sample(sample.time_ns))
+            if self._inertial is not None:
+                self._inertial.imu(sample)
 
     def observations(self, seen: Observations) -> None:
         """Add the front end's observations, before feature selection."""
         self._frames += 1
         self._features += len(seen)
+        if self._silence is not None:
+            self._report(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._inertial is not None:
-            self._report(finding.message for finding in self._inertial.frame(seen))
+            self._report_findings(self._inertial.frame(seen))
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
@@ -59,8 +67,14 @@ class RunWatch:
             self._report(
                 [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
             )
+        if self._silence is not None:
+            self._report(self._silence.finish())
         if self._inertial is not None:
-            self._report(finding.message for finding in self._inertial.finish())
+            self._report_findings(self._inertial.finish())
+
+    def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
+        """Log findings; gaps are reported one by one by `ImuSilence`."""
+        self._report(finding.message for finding in findings if finding.fault != "IMU gap")
 
     def _report(self, lines: Iterable[str]) -> None:
         for line in lines:

@@ -13,7 +13,7 @@ from vio.robust import robust_sigma
 from vio.watch.finding import InertialFinding
 
 GAP_S = 0.1  # readings further apart are a gap …
-_GAP_STEPS = 8.0  # … if that is so many times their usual interval
+GAP_STEPS = 8.0  # … if that is so many times their usual interval
 MEMORY_S = 60.0  # older readings and motions are dropped
 
 _LEAST_RUN = 5  # equal readings at the extreme in a row
@@ -85,7 +85,7 @@ class Samples:
 
 def _gap(times_ns: IntArray, steps: FloatArray, usual_s: float) -> Iterator[InertialFinding]:
     """Yield the longest gap before readings at times (S,), if any; steps (S or S - 1,) in seconds end there."""
-    if not len(steps) or steps.max() <= max(GAP_S, _GAP_STEPS * usual_s):
+    if not len(steps) or steps.max() <= max(GAP_S, GAP_STEPS * usual_s):
         return
     k = len(times_ns) - len(steps) + int(np.argmax(steps))
     yield InertialFinding(

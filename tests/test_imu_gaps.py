@@ -1,0 +1,230 @@
+"""Samples that are late, lost, or have not come: asynchronous frames, gaps, an IMU that begins late or ends early."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
+from vio.evaluation import nees, nees_bounds
+from vio.filters.msckf import Msckf
+from vio.filters.navigation import ImuMotion, NavState
+from vio.filters.settings import MsckfSettings
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
+from vio.pipeline import frames_after_imu
+from vio.records import Event, ImuSample, StereoFrame, UpdateReport, VelocitySample
+from vio.watch.run import RunWatch
+
+QUIET = MsckfSettings()
+FLIGHT = Flight(frames=200)
+
+
+def _sample(time_ns: int) -> ImuSample:
+    return ImuSample(time_ns, np.zeros(3), np.array([0.0, 0.0, 9.81]))
+
+
+def _frame(index: int, time_ns: int) -> StereoFrame:
+    return StereoFrame(index, time_ns, None, None)
+
+
+def _order(events: list[Event]) -> list[int]:
+    """Times of samples and, negative, numbers of frames."""
+    return [-e.index if isinstance(e, StereoFrame) else e.time_ns for e in frames_after_imu(events)]
+
+
+def test_a_frame_waits_for_the_sample_after_it() -> None:
+    assert _order([_sample(10), _frame(1, 15), _sample(20), _sample(30), _frame(2, 35), _sample(40)]) == [
+        *(10, 20, -1, 30, 40, -2)
+    ]
+
+
+def test_a_frame_waits_no_longer_than_to_the_next_frame_or_the_end() -> None:
+    assert _order([_frame(1, 5), _frame(2, 15), _sample(20), _frame(3, 25)]) == [-1, 20, -2, -3]
+
+
+def test_a_frame_with_a_sample_at_its_own_time_does_not_wait() -> None:
+    events: Iterator[Event] = iter([_sample(10), _frame(1, 10)])
+    ordered = frames_after_imu(events)
+    assert [type(next(ordered)), type(next(ordered))] == [ImuSample, StereoFrame]
+
+
+def test_velocities_hold_no_frame_up_for_imu_samples_alone_release_it() -> None:
+    velocity = VelocitySample(20, np.zeros(3), np.zeros(3))
+    assert _order([_frame(1, 15), velocity, _sample(20)]) == [20, 20, -1]
+
+
+# The step in units of its noise
+
+
+def _brisk(t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """The flight five times as fast: R, p, v, a, omega, with angular accelerations of 8 rad/s^2."""
+    R, p, v, a, omega = FLIGHT.state(5 * t)
+    return R, p, 5 * v, 25 * a, 5 * omega
+
+
+def _step_error(phase: float, *, wait: bool, start_s: float, seed: int) -> FloatArray:
+    """NEES of rotation, velocity and position (9 numbers, standardised) of a step that ends between two samples.
+
+    100 Hz, white noise as in the data sheet; the frame lies `phase` of a period after a sample.
+    """
+    rate, motion = 100.0, ImuMotion(QUIET)
+    rng = np.random.default_rng(seed)
+    first = round(start_s * rate) - 200
+    last = round(start_s * rate) + 5
+    for k in range(first, last + 1 + wait):
+        R, _, _, a, omega = _brisk(k / rate)
+        gyro = omega + rng.normal(0, QUIET.gyro_noise_density * np.sqrt(rate), 3)
+        accel = R.T @ (a + np.array([0, 0, 9.81])) + rng.normal(0, QUIET.accel_noise_density * np.sqrt(rate), 3)
+        motion.take(ImuSample(k * 10_000_000, gyro, accel))
+    t0, t1 = (last - 5) / rate, (last + phase) / rate
+    R, p, v, *_ = _brisk(t0)
+    zero = np.zeros(3)
+    step = motion.advance(NavState(se3_from_parts(R, p), v, zero, zero, zero), round(t0 * 1e9), round(t1 * 1e9))
+    R, p, v, *_ = _brisk(t1)
+    xi = se3_log(se3_from_parts(R, p) @ se3_inverse(step.nav.T_world_imu))
+    error = np.concatenate([xi, v - step.nav.velocity])
+    root = np.linalg.cholesky(step.Q[:9, :9] + 1e-18 * np.eye(9))
+    whitened: FloatArray = np.linalg.solve(root, error)
+    return whitened
+
+
+@pytest.mark.parametrize("wait", [True, False])
+@pytest.mark.parametrize("phase", [0.1, 0.5, 0.9])
+def test_a_step_that_ends_between_two_samples_is_as_good_as_its_noise(phase: float, wait: bool) -> None:
+    """Interpolated, or held with the noise grown: the squared error stays below the 95 % bound of its Q."""
+    values = [
+        np.sum(_step_error(phase, wait=wait, start_s=start, seed=seed) ** 2)
+        for start in (2.2, 3.1, 4.7, 6.3)
+        for seed in range(20)
+    ]
+    assert np.mean(values) < 9 * 1.25, np.mean(values)  # without, 15 and 40 at the later two phases
+
+
+# Gaps
+
+
+def _without(first_s: float, length_s: float) -> type[Flight]:
+    """A flight whose IMU is silent for a while."""
+
+    class Gappy(Flight):
+        def imu(self, noise: np.random.Generator, settings: MsckfSettings, bias: FloatArray) -> list[ImuSample]:
+            samples = super().imu(noise, settings, bias)
+            return [x for x in samples if not first_s < x.time_ns * 1e-9 < first_s + length_s]
+
+    return Gappy
+
+
+@pytest.mark.parametrize("length_s", [0.1, 0.4, 1.0, 3.0, 100.0])
+def test_images_carry_a_gap_while_turning_and_accelerating(length_s: float) -> None:
+    """Errors stay those of images, and the NEES of the motion since before the gap stays within its bound."""
+    seeds, first = 5, 40
+    errors, covariances = [], []
+    frames = first + 10 + min(round(20 * length_s), 60)
+    for seed in range(seeds):
+        e, C, _ = _without(0.05 * first + 0.012, length_s)(frames).run(MsckfSettings(), "imu", seed)
+        errors.append(e)
+        covariances.append(C)
+    e, C = np.array(errors), np.array(covariances)
+    assert np.linalg.norm(e[..., :3], axis=-1).max() < 0.05
+    values = np.array([nees(e[s, first:], C[s, first:]) for s in range(seeds)]).mean(axis=0)
+    assert np.mean(values < nees_bounds(6, seeds)[1]) >= 0.9, values
+
+
+def test_a_clean_imu_is_integrated_as_ever() -> None:
+    """No sample is missing: nothing is cut, and nothing is added to the noise."""
+    motion = ImuMotion(QUIET)
+    for k in range(100):
+        motion.take(_sample(5_000_000 * k + (k % 3) * 500_000))  # a jittering clock
+    zero = np.zeros(3)
+    step = motion.advance(NavState(np.eye(4), zero, zero, zero, zero), 100_000_000, 150_000_000)
+    assert not step.bridged
+    np.testing.assert_allclose(np.diag(step.Q)[3:6], QUIET.gyro_noise_density**2 * 0.05, rtol=1e-9)
+
+
+def test_a_gap_hides_what_a_brownian_bridge_hides_and_a_hold_what_brownian_motion_does() -> None:
+    """Signals that are random walks of known diffusion: q T^3 / 12 between samples, q T^3 / 3 after the last."""
+    rng, q, T = np.random.default_rng(1), 4.0, 0.08
+    settings = replace(QUIET, gyro_noise_density=1e-9, accel_noise_density=1e-9)
+    zero = np.zeros(3)
+    ratios = []
+    for _ in range(30):
+        motion = ImuMotion(settings)
+        walk = np.cumsum(rng.normal(0, np.sqrt(q * 0.005), (400, 3)), axis=0)
+        for k in [*range(384), 399]:
+            motion.take(ImuSample(5_000_000 * k, zero, walk[k]))
+        held = round(1.995e9 + 1e9 * T)
+        found = []
+        for a, b in ((1_915_000_000, 1_995_000_000), (1_995_000_000, held)):
+            step = motion.advance(NavState(np.eye(4), zero, zero, zero, zero), a, b)
+            assert step.bridged
+            found.append(step.Q[6, 6])
+        ratios.append(np.array(found) / [q * T**3 / 12, q * T**3 / 3])
+    mean = np.mean(ratios, axis=0)  # of the worst of three axes, so somewhat above one
+    assert np.all((mean > 1.0) & (mean < 1.6)), mean
+
+
+# What the run says
+
+
+def _lines(times_s: list[float], frames_s: list[float]) -> list[str]:
+    watch = RunWatch(CAMERA, T_CAM0_IMU, imu=True)
+    flight, rng = Flight(), np.random.default_rng(0)
+    events: list[Event] = [_sample(round(1e9 * t)) for t in times_s]
+    events += [_frame(k, round(1e9 * t)) for k, t in enumerate(frames_s)]
+    for event in frames_after_imu(sorted(events, key=lambda e: e.time_ns)):
+        if isinstance(event, StereoFrame):
+            watch.observations(replace(flight.observe(0, 0.5, rng), frame_index=event.index, time_ns=event.time_ns))
+        else:
+            watch.sample(event)
+    watch.close()
+    return [line for line in watch.lines if line.startswith(("frame", "no IMU"))]
+
+
+FRAMES_S = [0.05 * k for k in range(100)]
+
+
+def _imu_s(*silences: tuple[float, float]) -> list[float]:
+    times = np.arange(-100, 1020) * 0.005
+    return [float(t) for t in times if not any(a < t < b for a, b in silences)]
+
+
+def test_a_clean_imu_is_not_talked_of() -> None:
+    assert _lines(_imu_s(), FRAMES_S) == []
+
+
+@pytest.mark.parametrize("length_s", [0.12, 0.4, 1.0, 3.0])
+def test_every_gap_is_told_once_with_its_length(length_s: float) -> None:
+    lines = _lines(_imu_s((1.0, 1.0 + length_s), (4.2, 4.4)), FRAMES_S)
+    assert len(lines) == 2
+    assert f"no IMU sample for {length_s:.2f} s from 1000000000 ns; carried by images" in lines[0]
+    assert "no IMU sample for 0.20 s from 4200000000 ns" in lines[1]
+
+
+def test_an_imu_that_ends_early_is_told() -> None:
+    lines = _lines(_imu_s((3.0, 99.0)), FRAMES_S)
+    assert lines == ["frame 99: no IMU sample for 1.95 s from 3000000000 ns to the end of the run; carried by images"]
+
+
+def test_an_imu_that_begins_late_or_never_is_told() -> None:
+    lines = _lines(_imu_s((-1.0, 2.02)), FRAMES_S)
+    assert lines == ["frame 40: the first IMU sample came 2.02 s after frame 0; 40 frames have no pose of their own"]
+    lines = _lines([], FRAMES_S)
+    assert lines == ["no IMU sample in any of 100 frames: no frame has a pose; use --motion none"]
+
+
+def test_frames_wait_for_an_imu_that_begins_late() -> None:
+    """Sixty frames pass without a pose, and without an error."""
+    settings, flight = MsckfSettings(), Flight(100)
+    filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion="imu")
+    rng = np.random.default_rng(0)
+    reports = [filt.update(flight.observe(k, 0.5, rng)) for k in range(60)]
+    assert reports == [UpdateReport(0, 0, 0, 0, None, None)] * 60
+    assert filt.estimate().time_ns == 59 * STEP_NS
+    for sample in flight.imu(rng, settings, np.zeros(6)):
+        if 59 * STEP_NS < sample.time_ns <= 60 * STEP_NS:
+            filt.propagate(sample)
+    filt.update(flight.observe(60, 0.5, rng))
+    assert filt.update(flight.observe(61, 0.5, rng)).used > 30  # a filter that has started, on a held sample

@@ -1,0 +1,130 @@
+"""What an interval without IMU samples may hide: process noise for interpolation over a gap, and for a held sample.
+
+Between samples the signal is a straight line, after the last one it is held. What the true signal does beside that is
+a Brownian motion: pinned at both ends over a gap (a bridge), at one end where a sample is held. Its size is learned
+from the samples before: the mean squared change over a lag, the structure function D. Equations (N11) and (N12) of
+docs/math.md. Reference: Kolmogorov's structure function, as in Monin & Yaglom, Statistical fluid mechanics (1975).
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.records import ImuSample, IntArray
+
+_NS = 1e-9
+_MEMORY_S = 2.0  # samples that the structure function is learned from
+_LONGEST_LAG_S = 1.0  # half of it; beyond, the signal is taken to have changed as much as it ever does
+_LEAST_SAMPLES = 10  # fewer tell nothing about a signal
+_UNKNOWN = np.array([3.0, 1.0]) ** 2  # D then: accelerometer (m/s^2)^2, gyro (rad/s)^2, of a vehicle that manoeuvres
+_LONG_PERIODS = 1.5  # an interval longer than so many median periods lacks a sample; jitter of the clock stays below
+_SHORTEST_CUT_NS, _MOST_CUTS = 1e6, 1000  # of a gap, for the integration
+
+
+@dataclass(frozen=True, slots=True)
+class Hidden:
+    """An interval that lacks samples, cut finely, and what it may hide."""
+
+    cuts_ns: FloatArray  # (K,) increasing
+    variance: FloatArray  # (2, K - 1) of the integrals of accelerometer and gyro over each step, m^2/s^2 and rad^2
+    gap: bool  # whether samples are missing; False: the last one is held for less than the time to the next
+
+
+class ImuHistory:
+    """The samples of the last two seconds, and how much their signals change in a given time."""
+
+    def __init__(self) -> None:
+        self._samples: deque[ImuSample] = deque()
+
+    def take(self, sample: ImuSample) -> None:
+        """Take a sample and drop what is too old."""
+        self._samples.append(sample)
+        while sample.time_ns - self._samples[0].time_ns > _MEMORY_S / _NS:
+            self._samples.popleft()
+
+    def hidden(self, cuts_ns: FloatArray, times_ns: FloatArray) -> Hidden | None:
+        """Cut the parts of an interval that lack samples finely, and say what they hide; None: none are missing.
+
+        Args:
+            cuts_ns: (K,) where an integration would step: its ends and the samples between.
+            times_ns: (S,) of the samples at hand, on the same scale, increasing.
+        """
+        period_ns = self._period_ns()
+        after = np.searchsorted(times_ns, 0.5 * (cuts_ns[1:] + cuts_ns[:-1]))
+        left = np.concatenate([[-np.inf], times_ns])[after]  # the samples around each step
+        right = np.concatenate([times_ns, [np.inf]])[after]
+        held = np.isinf(right - left)
+        silent = np.where(held, np.minimum(cuts_ns[1:] - left, right - cuts_ns[:-1]), right - left)
+        gap = silent > _LONG_PERIODS * period_ns
+        uncertain = gap | held
+        if not uncertain.any():
+            return None
+        counts = np.where(uncertain, np.ceil(np.diff(cuts_ns) / max(period_ns, _SHORTEST_CUT_NS)), 1)
+        parts = np.clip(counts, 1, _MOST_CUTS).astype(np.int64)
+        ends = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(cuts_ns[:-1], cuts_ns[1:], parts, strict=True)]
+        cuts = np.concatenate([*ends, cuts_ns[-1:]])
+        left, right, uncertain = (np.repeat(x, parts) for x in (left, right, uncertain))
+        variance = np.where(uncertain, self._hidden_variance(cuts * _NS, left * _NS, right * _NS), 0.0)
+        return Hidden(cuts, variance, bool(gap.any()))
+
+    def _period_ns(self) -> float:
+        """Median distance of the samples; 0 where there are not two."""
+        times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
+        return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+
+    def _hidden_variance(self, cuts: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+        """Variance (2, K - 1) that each step adds to the integrals, equations (N11) and (N12), by Simpson's rule."""
+        lags, change = self._structure()
+
+        def rate(t: FloatArray) -> FloatArray:
+            held = np.isinf(left) | np.isinf(right)
+            age = np.minimum(np.abs(t - left), np.abs(right - t))  # of a held sample
+            T = np.where(held, 1.0, right - left)
+            bridge = np.maximum(t - left, 0) ** 2 * np.maximum(right - t, 0) / T**2
+            out = [
+                np.where(
+                    held, np.interp(age, lags, D) * np.minimum(age, _LONGEST_LAG_S), np.interp(T, lags, D) * bridge
+                )
+                for D in change
+            ]
+            return np.array(out)
+
+        with np.errstate(invalid="ignore"):  # a bridge that has no end, which `held` leaves out
+            a, b = cuts[:-1], cuts[1:]
+            total: FloatArray = (rate(a) + 4 * rate(0.5 * (a + b)) + rate(b)) / 6 * (b - a)
+        return total
+
+    def _structure(self) -> tuple[FloatArray, FloatArray]:
+        """Lags (L,) in s and the mean squared change (2, L) of accelerometer and gyro over them, of the worst axis."""
+        if len(self._samples) < _LEAST_SAMPLES:
+            return np.array([0.0, 1.0]), np.stack([_UNKNOWN, _UNKNOWN], axis=1)
+        times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
+        period = self._period_ns()
+        lags, change = [0.0], [np.zeros(2)]
+        lag = period
+        while lag <= _LONGEST_LAG_S / _NS and times[-1] - times[0] >= lag:
+            pairs = _pairs(times, lag, 0.5 * period)
+            if len(pairs):
+                lags.append(lag * _NS)
+                change.append(np.array([self._change(pairs, "accel"), self._change(pairs, "gyro")]))
+            lag *= 2**0.5
+        return np.array(lags), np.array(change).T
+
+    def _change(self, pairs: IntArray, name: str) -> float:
+        values = np.array([getattr(x, name) for x in self._samples])
+        squares = (values[pairs[:, 1]] - values[pairs[:, 0]]) ** 2
+        return float(squares.mean(axis=0).max())
+
+
+def _pairs(times_ns: IntArray, lag_ns: float, tolerance_ns: float) -> IntArray:
+    """Indices (P, 2) of samples that lie a lag apart, to a tolerance."""
+    wanted = times_ns + lag_ns
+    later = np.searchsorted(times_ns, wanted - tolerance_ns)
+    first = np.flatnonzero(later < len(times_ns))
+    later = later[first]
+    near = np.abs(times_ns[later] - wanted[first]) <= tolerance_ns
+    return np.stack([first[near], later[near]], axis=1)
