@@ -191,8 +191,8 @@ def merge_events(
 ) -> Iterator[Event]:
     """Yield the motion samples and frames of a range in time order, a sample before a frame of the same time.
 
-    Raw IMU begins a second before the first frame, so that an estimator can determine gravity before the first image, and
-    ends with the first sample at or after the last frame, so that readings can be interpolated to its exposure.
+    Raw IMU begins a second before the first frame, so that an estimator can determine gravity before the first image,
+    and ends with the first sample at or after the last frame, so that readings can be interpolated to its exposure.
 
     Args:
         recording: the frame times.

@@ -72,7 +72,7 @@ class RowField:
         x, y = (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
         basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
         rows = z[:, 3] - z[:, 1]
-        residual = rows - camera.fv * (basis @ self.coefficients)
+        residual: FloatArray = rows - camera.fv * (basis @ self.coefficients)
         residual = residual - np.median(residual)  # in the first frames the field itself is not yet known
         scale = max(1.48 * float(np.median(np.abs(residual))), 1e-3)
         weight = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
