@@ -126,8 +126,8 @@ def test_every_number_has_a_range_and_leaving_it_is_refused_by_name(info: Settin
 
 
 def test_numbers_must_be_finite_and_ranges_hold_in_code_too() -> None:
-    with pytest.raises(ConfigError, match=r"msckf\.max_distance must be finite"):
-        load_config(None, ["msckf.max_distance=.inf"])
+    with pytest.raises(ConfigError, match=r"msckf\.gravity_mps2 must be finite"):
+        load_config(None, ["msckf.gravity_mps2=.inf"])
     with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3, got 2"):
         MsckfSettings(clones=2)
     with pytest.raises(ConfigError, match=r"pixel_sigma_min_px, 3, must not be above"):

@@ -191,8 +191,8 @@ MUTATIONS = (
     Mutation(
         "tracks: first point on the wrong side of the camera",
         "vio/filters/multiview.py",
-        "p_cam - T[:, :3, 3]",
-        "p_cam + T[:, :3, 3]",
+        "p_cam - T_cam0_world[:, :3, 3]",
+        "p_cam + T_cam0_world[:, :3, 3]",
         _WINDOW,
     ),
     Mutation(
@@ -205,8 +205,8 @@ MUTATIONS = (
     Mutation(
         "robust weights: distant views weigh more",
         "vio/filters/multiview.py",
-        "used[:, n] / (1 + squares",
-        "used[:, n] * (1 + squares",
+        "used / (1 + squares",
+        "used * (1 + squares",
         _WINDOW,
     ),
     Mutation(

@@ -15,11 +15,11 @@ from vio.filters.multiview import (
     Residuals,
     TrackInformation,
     first_points,
+    has_parallax,
     refine_points,
     residuals,
     robust_weights,
     track_information,
-    within,
 )
 from vio.filters.settings import MsckfSettings
 from vio.filters.tracks import TrackTable
@@ -41,6 +41,7 @@ _MOST_DOF = 199
 class LinearTracks:
     """Tracks linearised at one estimate of the window."""
 
+    T_cam0_world: FloatArray  # (N, 4, 4) camera poses
     rows: IntArray  # (F,) in the table
     p_world: FloatArray  # (F, 3)
     at: Residuals
@@ -99,9 +100,10 @@ class WindowTracks:
             views = table.views(rows, clones)
         p = refine_points(camera, T, table.points[rows], views, steps, CAUCHY * float(np.sqrt(self.variance)))
         at = residuals(camera, T, p, views)
-        keep = at.ahead & within(camera, T, p, self._settings.max_distance * camera.baseline_m)
+        keep = at.ahead & np.isfinite(p).all(axis=1)
+        keep[keep] = has_parallax(camera, T, p[keep], views.take(keep), at.take(keep))
         table.points[rows], table.has_point[rows] = p, keep
-        return self._linear(rows[keep], p[keep], at.take(keep))
+        return self._linear(T, rows[keep], p[keep], at.take(keep))
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track, for good, and linearise what is left."""
@@ -114,17 +116,17 @@ class WindowTracks:
             tracks.at.r * kept[..., None], tracks.at.z_D_p * kept[..., None, None], np.ones(len(wrong), dtype=np.bool_)
         )
         enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
-        return self._linear(tracks.rows[enough], tracks.p_world[enough], at.take(enough))
+        T = tracks.T_cam0_world
+        return self._linear(T, tracks.rows[enough], tracks.p_world[enough], at.take(enough))
 
-    def _linear(self, rows: IntArray, p_world: FloatArray, at: Residuals) -> LinearTracks:
-        return LinearTracks(rows, p_world, at, track_information(at, p_world, robust_weights(at, self.variance)))
+    def _linear(self, T_cam0_world: FloatArray, rows: IntArray, p_world: FloatArray, at: Residuals) -> LinearTracks:
+        weight = robust_weights(at, self.variance)
+        information = track_information(self._camera, T_cam0_world, at, p_world, weight)
+        return LinearTracks(T_cam0_world, rows, p_world, at, information)
 
     def move_points(self, tracks: LinearTracks, exposure_errors: FloatArray) -> None:
         """Move each point as its own normal equations say once the clones have moved (6N,): back-substitution."""
-        info = tracks.information
-        right = info.point_gradient - np.einsum("fik,i->fk", info.G, exposure_errors)
-        step = np.linalg.solve(info.C, right[..., None])[..., 0]
-        self.table.points[tracks.rows] = tracks.p_world + step
+        self.table.points[tracks.rows] = tracks.information.moved_points(exposure_errors)
 
     def agree(self, at: Residuals) -> bool:
         """Whether nearly all views of the newest clone fit: only then may they contradict the motion model."""
