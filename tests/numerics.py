@@ -13,6 +13,8 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 # Every public function `*_D_*` of vio and frontend, as 'module.name'. Add a name here together with the test that
 # compares it with `numeric_jacobian`; tests/test_jacobian_registry.py holds this set complete and honest.
 TESTED_JACOBIANS = {
+    "vio.filters.multiview.point_D_clones",
+    "vio.filters.multiview.point_D_pose",
     "vio.filters.online_calibration.pose_D_calibration",
     "vio.filters.vislam.z_D_landmark",
     "vio.filters.vislam.z_D_xi",

@@ -37,7 +37,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import ImuSample, IntArray, Observations, VelocitySample, observations
+from vio.records import ImuSample, IntArray, Observations, UpdateReport, VelocitySample, observations
 
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
@@ -132,7 +132,7 @@ def test_elimination_equals_the_left_null_space() -> None:
     T = _poses(5)
     p = _world_points(T, 8)
     at = residuals(CAMERA, T, p, _views(T, p, noise=0.5))
-    A, b = eliminate_points(track_information(at, p, np.ones((8, 5))), np.ones(8, dtype=np.bool_))
+    A, b = eliminate_points(track_information(CAMERA, T, at, p, np.ones((8, 5))), np.ones(8, dtype=np.bool_))
     A_null, b_null = np.zeros_like(A), np.zeros_like(b)
     for H, H_point, r in _stacked(at, p):
         Q, _ = np.linalg.qr(H_point, mode="complete")
@@ -152,7 +152,7 @@ def test_elimination_equals_a_marginalised_landmark() -> None:
     H, H_point, r = _stacked(at, p)[0]
     root = np.random.default_rng(4).normal(size=(24, 24)) * 0.02
     P = root @ root.T
-    A, b = eliminate_points(track_information(at, p, np.ones((1, 4))), np.ones(1, dtype=np.bool_))
+    A, b = eliminate_points(track_information(CAMERA, T, at, p, np.ones((1, 4))), np.ones(1, dtype=np.bool_))
     P_new, shift = posterior(P, A, b)
     J = np.concatenate([H, H_point], axis=1)
     flat = np.linalg.inv(P)
@@ -168,7 +168,7 @@ def test_batch_equals_sequential() -> None:
     T = _poses(4)
     p = _world_points(T, 6)
     at = residuals(CAMERA, T, p, _views(T, p, noise=0.5))
-    info = track_information(at, p, np.ones((6, 4)))
+    info = track_information(CAMERA, T, at, p, np.ones((6, 4)))
     root = np.random.default_rng(5).normal(size=(24, 24)) * 0.02
     P = root @ root.T
     batch = posterior(P, *eliminate_points(info, np.ones(6, dtype=np.bool_)))
@@ -199,7 +199,7 @@ def test_unobservable_directions_gain_nothing_whatever_the_estimate(seed: int) -
     p = _world_points(T, 20, seed)
     estimate = p + np.random.default_rng(seed + 50).normal(0, 0.3, p.shape)
     at = residuals(CAMERA, T, estimate, _views(T, p, noise=2.0))
-    A, _ = eliminate_points(track_information(at, estimate, np.ones((20, 5))), np.ones(20, dtype=np.bool_))
+    A, _ = eliminate_points(track_information(CAMERA, T, at, estimate, np.ones((20, 5))), np.ones(20, dtype=np.bool_))
     for direction in np.eye(6):
         world_moves = np.tile(direction, 5)
         assert abs(world_moves @ A @ world_moves) < 1e-6 * np.abs(A).max()
@@ -412,6 +412,7 @@ class Flight:
 
     def __init__(self, frames: int = 60, *, still: bool = False) -> None:
         self.frames, self.still = frames, still
+        self.farthest = 12.0  # m, of the points that are seen
         self.points = np.random.default_rng(0).uniform([-6, -6, -1], [12, 6, 4], (1500, 3))
 
     def state(self, t: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -450,7 +451,7 @@ class Flight:
 
     def observe(self, k: int, sigma: float, noise: np.random.Generator, limit: int = 60) -> Observations:
         p = transform_points(T_CAM0_IMU @ se3_inverse(self.T_world_imu(k)), self.points)
-        near = (p[:, 2] > 1.0) & (p[:, 2] < 12)
+        near = (p[:, 2] > 1.0) & (p[:, 2] < self.farthest)
         z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
         ok = near & (z[:, 2] > 5) & (z[:, 0] < 747) & (z[:, 1] > 5) & (z[:, 1] < 475)
         ids = np.flatnonzero(ok)[:limit]
@@ -699,6 +700,116 @@ def test_left_only_views_count() -> None:
 
     with_left, _, _ = Flight(frames=40).run(MsckfSettings(), None, spoil=spoil)
     assert np.linalg.norm(with_left[:, :3], axis=1).max() < 0.05
+
+
+def _without_right(seen: Observations, chosen: np.ndarray) -> Observations:
+    z = np.where(chosen[:, None], [1, 1, 0, 0] * seen.z, seen.z)
+    return replace(seen, has_right=seen.has_right & ~chosen, z=z)
+
+
+class FarFlight(Flight):
+    """The same flight among points 20 to 500 m away."""
+
+    def __init__(self, frames: int) -> None:
+        super().__init__(frames)
+        rng = np.random.default_rng(0)
+        directions = rng.normal(size=(6000, 3))
+        distances = np.exp(rng.uniform(np.log(20), np.log(500), 6000))
+        self.points = directions / np.linalg.norm(directions, axis=1)[:, None] * distances[:, None]
+        self.farthest = 500.0
+
+
+_START_SIGMA_MPS = 0.05
+
+
+def _start_in_flight(monkeypatch: pytest.MonkeyPatch, flight: Flight, seed: int) -> None:
+    """Let the IMU's start know the velocity within 5 cm/s, which gives left images their scale."""
+    start = ImuMotion.start
+
+    def moving(motion: ImuMotion, time_ns: int) -> tuple[NavState, FloatArray]:
+        nav, P = start(motion, time_ns)
+        R, _, v, _, _ = flight.state(0.0)
+        error = np.random.default_rng(seed).normal(0, _START_SIGMA_MPS, 3)
+        P[6:9], P[:, 6:9], P[6:9, 6:9] = 0.0, 0.0, np.eye(3) * _START_SIGMA_MPS**2
+        return replace(nav, velocity=nav.T_world_imu[:3, :3] @ R.T @ v + error), P
+
+    monkeypatch.setattr(ImuMotion, "start", moving)
+
+
+@pytest.mark.parametrize("world", ["left images alone", "far away, 5 cm baseline"])
+def test_covariance_can_be_believed_where_depth_is_hard_to_tell(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NEES over 20 runs of 1.5 s with an IMU: parallax alone gives depth, or most points have none."""
+    runs, frames, left = 20, 30, world == "left images alone"
+    flight = Flight(frames) if left else FarFlight(frames)
+    if not left:
+        monkeypatch.setattr("tests.test_msckf.CAMERA", replace(CAMERA, baseline_m=0.05))
+
+    def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
+        return _without_right(seen, np.full(len(seen), left))
+
+    values = []
+    for seed in range(runs):
+        with monkeypatch.context() as patch:
+            _start_in_flight(patch, flight, seed)
+            bias = np.random.default_rng(1000 + seed).normal(0, [0.02] * 3 + [0.05] * 3)
+            settings = MsckfSettings(start_tilt_sigma_deg=1.0)
+            errors, covariances, _ = flight.run(settings, "imu", seed, bias=bias, limit=40, spoil=spoil)
+        values.append(nees(errors[1:], covariances[1:]))
+    mean = np.mean(values, axis=0)
+    low, high = nees_bounds(6, runs)
+    assert np.mean(mean < high) >= 0.9, f"overconfident: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+    assert mean.mean() > 0.6 * low, f"far too cautious: mean NEES {mean.mean():.2f} for 6 degrees of freedom"
+
+
+@pytest.mark.parametrize("world", ["left images alone", "far away, 5 cm baseline"])
+def test_tracks_without_disparity_are_used(world: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    left = world == "left images alone"
+    flight = Flight(20) if left else FarFlight(20)
+    if not left:
+        monkeypatch.setattr("tests.test_msckf.CAMERA", replace(CAMERA, baseline_m=0.05))
+    _start_in_flight(monkeypatch, flight, 0)
+    used, update = [], Msckf.update
+
+    def spy(filt: Msckf, seen: Observations) -> UpdateReport:
+        report = update(filt, seen)
+        used.append(report.used)
+        return report
+
+    def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
+        return _without_right(seen, np.full(len(seen), left))
+
+    monkeypatch.setattr(Msckf, "update", spy)
+    flight.run(MsckfSettings(), "imu", spoil=spoil)
+    assert np.median(used[5:]) > (20 if left else 50)
+
+
+def test_left_only_tracks_improve_what_few_stereo_tracks_tell() -> None:
+    """Images alone, eight stereo tracks in forty: with the left-only ones the error is less than without them."""
+    rms = []
+    for keep_left in (True, False):
+        squares = []
+        for seed in range(5):
+
+            def spoil(k: int, seen: Observations, noise: np.random.Generator, keep: bool = keep_left) -> Observations:
+                left_only = seen.ids % 100 < 80
+                return _without_right(seen, left_only) if keep else seen.take(~left_only)
+
+            errors, _, _ = Flight(30).run(MsckfSettings(), None, seed, limit=40, spoil=spoil)
+            squares.append(np.sum(errors[:, :3] ** 2, axis=1))
+        rms.append(np.sqrt(np.mean(squares)))
+    assert rms[0] < 0.75 * rms[1]
+
+
+def test_no_landmark_without_a_well_determined_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.test_msckf.CAMERA", replace(CAMERA, baseline_m=0.05))
+    flight = FarFlight(30)
+    _start_in_flight(monkeypatch, flight, 0)
+    _, _, filt = flight.run(MsckfSettings(), "imu", sigma=0.5)
+    assert filt._window is not None
+    assert len(filt._window.landmarks) == 0
+    _, _, near = Flight(30).run(MsckfSettings(), "imu", sigma=0.1)
+    assert near._window is not None
+    assert len(near._window.landmarks) > 10
 
 
 @pytest.mark.parametrize("change", [{"clones": 2}, {"max_features": 0}, {"max_landmarks": -1}])

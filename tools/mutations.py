@@ -195,8 +195,8 @@ MUTATIONS = (
     Mutation(
         "tracks: first point on the wrong side of the camera",
         "vio/filters/multiview.py",
-        "p_cam - T[:, :3, 3]",
-        "p_cam + T[:, :3, 3]",
+        "p_cam - T_cam0_world[:, :3, 3]",
+        "p_cam + T_cam0_world[:, :3, 3]",
         _WINDOW,
     ),
     Mutation(
@@ -209,8 +209,50 @@ MUTATIONS = (
     Mutation(
         "robust weights: distant views weigh more",
         "vio/filters/multiview.py",
-        "used[:, n] / (1 + squares",
-        "used[:, n] * (1 + squares",
+        "used / (1 + squares",
+        "used * (1 + squares",
+        _WINDOW,
+    ),
+    Mutation(
+        "many views: no prior on the disparity of a point",
+        "vio/filters/multiview.py",
+        "2, 2] += _PRIOR",
+        "2, 2] += 0 * _PRIOR",
+        _WINDOW,
+    ),
+    Mutation(
+        "many views: the prior on a disparity hangs on another camera",
+        "vio/filters/multiview.py",
+        "C_i[np.arange(F), q.anchor,",
+        "C_i[np.arange(F), q.anchor - 1,",
+        _WINDOW,
+    ),
+    Mutation(
+        "many views: parallax of the wrong sign",
+        "vio/filters/multiview.py",
+        "xy * m_i[..., 2:] - m_i[..., :2]",
+        "m_i[..., :2] - xy * m_i[..., 2:]",
+        _WINDOW,
+    ),
+    Mutation(
+        "many views: a step may end behind the cameras",
+        "vio/filters/multiview.py",
+        "limits.min(axis=1)",
+        "limits.max(axis=1)",
+        _WINDOW,
+    ),
+    Mutation(
+        "many views: any parallax is enough",
+        "vio/filters/multiview.py",
+        "[:, 2, 2] < _STEREO_VARIANCE",
+        "[:, 2, 2] < np.inf",
+        _WINDOW,
+    ),
+    Mutation(
+        "window: landmarks of uncertain depth",
+        "vio/filters/msckf.py",
+        "_LANDMARK_DEPTH_SIGMA = 0.01",
+        "_LANDMARK_DEPTH_SIGMA = 10.0",
         _WINDOW,
     ),
     Mutation(

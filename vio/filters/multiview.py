@@ -2,7 +2,8 @@
 
 Shapes: F tracks, N clones. A track's landmark is a point of the world; its error is taken out of the problem exactly
 (Schur complement, the same as projecting onto the left null space of its Jacobian, a test shows), so tracks need no
-place in the state. Equation numbers (M1) … are those of docs/math.md.
+place in the state. All steps and eliminations of points happen in inverse depth (M5), whose equations stay well
+conditioned however far the point is. Equation numbers (M1) … are those of docs/math.md.
 """
 
 from __future__ import annotations
@@ -12,12 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.geometry.lie import FloatArray, so3_hat, transform_points
-from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
-from vio.records import BoolArray
+from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
+from vio.records import BoolArray, IntArray
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
 _MEDIAN = 2.37  # of chi-square with 3 degrees of freedom, those of a stereo view
+LEAST_DISPARITY_PX = 1e-3  # of a point at infinity: ten baselines of motion move it by a hundredth of a pixel
+_PRIOR = 1e-6  # per px^2, information on the disparity: its standard deviation is 1000 px, half of what MIN_DEPTH shows
+_STEREO_VARIANCE = 2.0  # px^2, of the disparity of one stereo view, for one pixel of noise
+_TINY = 1e-12  # keeps what nothing was seen of invertible
+_PARALLAX_STEPS = 3  # Gauss-Newton steps on a new point without a stereo view, before any pose has moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,49 +73,145 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
     return Residuals(r, J, ahead)
 
 
-def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -> tuple[FloatArray, BoolArray]:
-    """Points (F, 3) in the world from each track's stereo view of largest disparity; False (F,) where there is none.
+@dataclass(frozen=True, slots=True)
+class InverseDepth:
+    """Coordinates of F points as one of their cameras sees them, equation (M5).
 
-    The newest clone's view counts only where it is the only one, as its pose has yet to be corrected.
+    `q = fu [x/z, y/z, b/z]`, pixels: the place in the left image, and the disparity, measured or not.
     """
-    disparity = np.where(views.weight[..., 2] > 0, views.z[..., 0] - views.z[..., 2], -np.inf)
-    disparity[:, -1] = np.where(np.isfinite(disparity[:, :-1]).any(axis=1), -np.inf, disparity[:, -1])
-    best = np.argmax(disparity, axis=1)
-    rows = np.arange(len(best))
-    usable = disparity[rows, best] > 0
-    p_cam, valid = triangulate(camera, np.where(usable[:, None], views.z[rows, best], 0.0))
-    T = T_cam0_world[best]
-    p = ((p_cam - T[:, :3, 3])[:, None, :] @ T[:, :3, :3])[:, 0]
-    return p, usable & valid
+
+    anchor: IntArray  # (F,) the clone whose camera it is: the first that saw the point
+    centre: FloatArray  # (F, 3) of that camera, world
+    disparity: FloatArray  # (F,) the third coordinate
+    p_D_q: FloatArray  # (F, 3, 3) metres in the world per pixel; the third column points from the point to the camera
+    q_D_p: FloatArray  # (F, 3, 3) its inverse
+
+    def moved(self, dq: FloatArray, most: FloatArray | float) -> FloatArray:
+        """Points (F, 3) in the world after steps (F, 3); the disparity stays between its least value and `most`."""
+        disparity = np.maximum(np.minimum(self.disparity + dq[:, 2], most), LEAST_DISPARITY_PX)
+        across = np.squeeze(self.p_D_q[:, :, :2] @ dq[:, :2, None], axis=2)
+        ray = across - self.p_D_q[:, :, 2] * self.disparity[:, None]
+        out: FloatArray = self.centre + ray * (self.disparity / disparity)[:, None]
+        return out
+
+
+def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, seen: BoolArray) -> InverseDepth:
+    """Return the coordinates (M5) of points (F, 3) that lie ahead of the first camera that saw them.
+
+    Args:
+        camera: rectified pair.
+        T_cam0_world: (N, 4, 4).
+        p_world: (F, 3).
+        seen: (F, N) which camera saw which point.
+    """
+    anchor = np.argmax(seen, axis=1)
+    R, t = T_cam0_world[anchor, :3, :3], T_cam0_world[anchor, :3, 3]
+    centre = -np.einsum("nji,nj->ni", T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3])[anchor]
+    p_cam = np.einsum("fij,fj->fi", R, p_world) + t
+    z = np.maximum(p_cam[:, 2], MIN_DEPTH * camera.baseline_m)
+    disparity = camera.fu * camera.baseline_m / z
+    p_D_q, q_D_p = np.empty((len(z), 3, 3)), np.empty((len(z), 3, 3))
+    p_D_q[:, :, :2] = np.swapaxes(R[:, :2], 1, 2) * (z / camera.fu)[:, None, None]
+    p_D_q[:, :, 2] = (centre - p_world) / disparity[:, None]
+    q_D_p[:, :2] = (R[:, :2] - (p_cam[:, :2] / z[:, None])[:, :, None] * R[:, 2:]) * (camera.fu / z)[:, None, None]
+    q_D_p[:, 2] = R[:, 2] * (-disparity / z)[:, None]
+    return InverseDepth(anchor, centre, disparity, p_D_q, q_D_p)
+
+
+def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -> tuple[FloatArray, BoolArray]:
+    """Points (F, 3) in the world from each track's stereo view of largest disparity, or else from parallax.
+
+    The mask (F,) is False where neither is there. The newest clone's view counts only where it is the only stereo view,
+    and never for parallax, as its pose has yet to be corrected. A disparity not above zero is a point at infinity.
+    """
+    stereo = np.where(views.weight[..., 2] > 0, views.z[..., 0] - views.z[..., 2], -np.inf)
+    stereo[:, -1] = np.where(np.isfinite(stereo[:, :-1]).any(axis=1), -np.inf, stereo[:, -1])
+    best, rows = np.argmax(stereo, axis=1), np.arange(len(stereo))
+    known: BoolArray = np.isfinite(stereo[rows, best])
+    z = np.where(known[:, None], views.z[rows, best], 0.0)
+    p = _on_rays(camera, T_cam0_world[best], z[:, :2], z[:, 0] - z[:, 2])
+    earlier = views.weight.copy()
+    earlier[:, -1] = 0.0
+    left_only: BoolArray = ~known & (np.sum(earlier[..., 0] > 0, axis=1) >= 2)
+    if left_only.any():
+        left = Views(views.z[left_only], earlier[left_only])
+        start = _by_parallax(camera, T_cam0_world, left)
+        p[left_only] = refine_points(camera, T_cam0_world, start, left, _PARALLAX_STEPS, CAUCHY)
+    return p, known | left_only
+
+
+def _on_rays(camera: StereoCamera, T_cam0_world: FloatArray, pixels: FloatArray, disparity: FloatArray) -> FloatArray:
+    """Points (F, 3) in the world that cameras (F, 4, 4) see at left pixels (F, 2), at disparities (F,) made valid."""
+    disparity = np.clip(disparity, LEAST_DISPARITY_PX, camera.fu / MIN_DEPTH)
+    p_cam = left_rays(camera, pixels) * (camera.fu * camera.baseline_m / disparity)[:, None]
+    out: FloatArray = np.einsum("fji,fj->fi", T_cam0_world[:, :3, :3], p_cam - T_cam0_world[:, :3, 3])
+    return out
+
+
+def _by_parallax(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -> FloatArray:
+    """Points (F, 3) on the ray of each track's first left view, at the inverse depth that fits its others best.
+
+    With m that ray, and c its camera seen from camera i, view i shows `(m_i + rho c_i)`, up to scale; times its third
+    component this is linear in the inverse depth rho.
+    """
+    seen = views.weight[..., 0] > 0
+    first, rows = np.argmax(seen, axis=1), np.arange(len(seen))
+    R, t = T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]
+    m = np.einsum("fji,fj->fi", R[first], left_rays(camera, views.z[rows, first, :2]))
+    m_i = np.einsum("nij,fj->fni", R, m)
+    centre = -np.einsum("nji,nj->ni", R, t)
+    c_i = np.einsum("nij,fj->fni", R, centre[first]) + t
+    xy = left_rays(camera, np.where(seen[..., None], views.z[..., :2], 0.0))[..., :2]
+    lever = (c_i[..., :2] - xy * c_i[..., 2:]) * seen[..., None]
+    rho = np.sum(lever * (xy * m_i[..., 2:] - m_i[..., :2]), axis=(1, 2)) / (np.sum(lever**2, axis=(1, 2)) + _TINY)
+    return _on_rays(camera, T_cam0_world[first], views.z[rows, first, :2], rho * camera.fu * camera.baseline_m)
 
 
 def refine_points(
     camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, steps: int, scale_px: float
 ) -> FloatArray:
-    """Move points (F, 3) by damped Gauss-Newton steps on all their pixels, with Cauchy weights of a scale in pixels.
+    """Move points (F, 3) by Gauss-Newton steps on all their pixels, with Cauchy weights of a scale in pixels.
 
-    A step is cut to half the distance from the nearest camera that saw the point, so that a bad start cannot throw it
-    behind the cameras.
+    Steps are taken in the coordinates (M5), damped by their prior, and end ahead of all cameras that saw the point.
     """
-    p = p_world
-    centre = -np.einsum("nji,nj->ni", T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]).mean(axis=0)
+    p, seen = p_world, views.weight[..., 0] > 0
+    shape = (len(p), 4 * len(T_cam0_world))
     for _ in range(steps):
-        at = residuals(camera, T_cam0_world, p, views)
+        p = _ahead_of_first(camera, T_cam0_world, p, views, seen)
+        at, q = residuals(camera, T_cam0_world, p, views), inverse_depth(camera, T_cam0_world, p, seen)
         weight = 1 / (1 + np.sum(at.r**2, axis=2) / (4 * scale_px**2))
-        J = at.z_D_p.reshape(len(p), 4 * len(T_cam0_world), 3)
-        Jt = np.swapaxes((at.z_D_p * weight[..., None, None]).reshape(J.shape), 1, 2)
-        C = Jt @ J
-        C += (1e-9 + 1e-6 * np.trace(C, axis1=1, axis2=2))[:, None, None] * np.eye(3)
-        step = np.linalg.solve(C, Jt @ at.r.reshape(len(p), 4 * len(T_cam0_world), 1))[..., 0]
-        reach = np.linalg.norm(step, axis=1) / (0.5 * np.maximum(np.linalg.norm(p - centre, axis=1), 1e-6))
-        p = p + step / np.maximum(reach, 1.0)[:, None]
+        J = at.z_D_p.reshape(*shape, 3) @ q.p_D_q
+        Jt = np.swapaxes(J * np.repeat(weight, 4, axis=1)[..., None], 1, 2)
+        C = Jt @ J + np.diag([_TINY, _TINY, _PRIOR])
+        dq = np.linalg.solve(C, Jt @ at.r.reshape(*shape, 1))[..., 0]
+        p = q.moved(dq, _most_disparity(camera, T_cam0_world, q, p, seen))
     return p
 
 
-def within(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, max_distance_m: float) -> BoolArray:
-    """Which points (F,) lie ahead of the newest clone's camera plane by no more than a distance, and are finite."""
-    depth = p_world @ T_cam0_world[-1, 2, :3] + T_cam0_world[-1, 2, 3]
-    return np.isfinite(p_world).all(axis=1) & (np.abs(depth) < max_distance_m)
+def _ahead_of_first(
+    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, seen: BoolArray
+) -> FloatArray:
+    """Points (F, 3) with those behind the first camera that saw them put far away on its ray."""
+    first = np.argmax(seen, axis=1)
+    depth = np.einsum("fi,fi->f", T_cam0_world[first, 2, :3], p_world) + T_cam0_world[first, 2, 3]
+    behind = ~(depth > MIN_DEPTH * camera.baseline_m)
+    if not behind.any():
+        return p_world
+    p, k = p_world.copy(), first[behind]
+    p[behind] = _on_rays(camera, T_cam0_world[k], views.z[behind, k, :2], np.full(len(k), LEAST_DISPARITY_PX))
+    return p
+
+
+def _most_disparity(
+    camera: StereoCamera, T_cam0_world: FloatArray, q: InverseDepth, p_world: FloatArray, seen: BoolArray
+) -> FloatArray:
+    """Disparity (F,) beyond which a point would come nearer to one of its cameras than the least depth."""
+    least = 1.01 * MIN_DEPTH * camera.baseline_m
+    ray_z = (p_world - q.centre) @ T_cam0_world[:, 2, :3].T * q.disparity[:, None]
+    room = least - (q.centre @ T_cam0_world[:, 2, :3].T + T_cam0_world[:, 2, 3])
+    limits = np.divide(ray_z, room, out=np.full(room.shape, np.inf), where=seen & (room > 0) & (ray_z > 0))
+    out: FloatArray = limits.min(axis=1)
+    return out
 
 
 def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
@@ -121,12 +223,13 @@ def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
     """
     squares = np.sum(at.r**2, axis=2)
     used: BoolArray = np.any(at.z_D_p[:, :, 1, :], axis=2)  # the row of vl is measured in every view
-    weights = np.zeros(squares.shape)
-    for n in range(squares.shape[1]):
-        of_clone = squares[used[:, n], n]
-        if len(of_clone):
-            scale2 = max(sigma2, float(np.median(of_clone)) / _MEDIAN)
-            weights[:, n] = used[:, n] / (1 + squares[:, n] / (4 * scale2 * CAUCHY**2))
+    if not used.any():
+        return np.zeros(squares.shape)
+    count, clones = used.sum(axis=0), np.arange(used.shape[1])
+    ordered = np.sort(np.where(used, squares, np.inf), axis=0)
+    median = 0.5 * (ordered[(count - 1) // 2, clones] + ordered[count // 2, clones])
+    scale2 = np.maximum(sigma2, median / _MEDIAN)  # infinite where nothing was seen
+    weights: FloatArray = used / (1 + squares / (4 * scale2 * CAUCHY**2))
     return weights
 
 
@@ -171,36 +274,100 @@ def landmark_residuals(
 class TrackInformation:
     """What tracks say of the clones once their points are eliminated; pixel noise is one pixel here."""
 
+    q: InverseDepth  # the points' coordinates, pixels
     G: FloatArray  # (F, 6N, 3) cross information of clones and point
     C: FloatArray  # (F, 3, 3) information of the point
-    diagonal: FloatArray  # (F, N, 6, 6) information of each clone before the point is eliminated
+    q_D_clone: FloatArray  # (F, 3, 6) how a clone's error moves a point as that clone sees it: S^-1 B
     gradient: FloatArray  # (F, 6N) before the point is eliminated
     point_gradient: FloatArray  # (F, 3)
 
+    def moved_points(self, clone_errors: FloatArray, other: FloatArray | float = 0.0) -> FloatArray:
+        """Solve each point's own equations once the clones have moved: back-substitution.
 
-def track_information(at: Residuals, p_world: FloatArray, weight: FloatArray) -> TrackInformation:
-    """Collect the normal equations of tracks, equations (M2) and (M3).
+        Args:
+            clone_errors: (6N,).
+            other: what else has moved, as a gradient of the points' equations (F, 3).
+
+        Returns:
+            Points (F, 3) in the world.
+        """
+        right = self.point_gradient - np.einsum("fik,i->fk", self.G, clone_errors) - other
+        dq = np.linalg.solve(self.C, right[..., None])[..., 0]
+        return self.q.moved(dq, np.inf)
+
+    def point_D_clones(self) -> FloatArray:
+        """How the estimated points follow errors of the clones (F, 3, 6N), world: `-C^-1 G'`."""
+        out: FloatArray = -self.q.p_D_q @ np.linalg.solve(self.C, np.swapaxes(self.G, 1, 2))
+        return out
+
+    def point_covariance(self) -> FloatArray:
+        """Covariance (F, 3, 3) of the points given the clones, world, for one pixel of noise."""
+        out: FloatArray = self.q.p_D_q @ np.linalg.inv(self.C) @ np.swapaxes(self.q.p_D_q, 1, 2)
+        return out
+
+    def relative_depth_sigma(self) -> FloatArray:
+        """Standard deviation (F,) of the inverse depth given the clones over itself, for one pixel of noise."""
+        out: FloatArray = np.sqrt(np.linalg.inv(self.C)[:, 2, 2]) / self.q.disparity
+        return out
+
+
+def track_information(
+    camera: StereoCamera, T_cam0_world: FloatArray, at: Residuals, p_world: FloatArray, weight: FloatArray
+) -> TrackInformation:
+    """Collect the normal equations of tracks, equations (M2), (M3), (M5) and (M6).
 
     With the right-invariant error of clone i, `dz_i = J_i B xi_i + J_i dp`, where `B = [-I, p^]` is the same for all
     clones: the error of the point is measured from the rotated estimate, so a common rotation of all clones about
     the world's axes leaves every residual alone, whatever the estimates.
 
     Args:
+        camera: rectified pair.
+        T_cam0_world: (N, 4, 4).
         at: residuals and Jacobians.
         p_world: points (F, 3).
         weight: (F, N) robust weight of each view.
     """
-    J = at.z_D_p
-    F, N = J.shape[:2]
+    F, N = at.r.shape[:2]
+    q = inverse_depth(camera, T_cam0_world, p_world, np.any(at.z_D_p[:, :, 1, :], axis=2))
+    J = (at.z_D_p.reshape(F, 4 * N, 3) @ q.p_D_q).reshape(F, N, 4, 3)
     Jt = np.swapaxes(J * weight[..., None, None], 2, 3)
     C_i = Jt @ J
+    C_i[np.arange(F), q.anchor, 2, 2] += _PRIOR
     g_i = (Jt @ at.r[..., None])[..., 0]
-    B = point_D_pose(p_world)
+    B = q.q_D_p @ point_D_pose(p_world)
     Bt = np.swapaxes(B, 1, 2)
     G_i = Bt[:, None] @ C_i
-    diagonal = G_i @ B[:, None]
     gradient = (Bt[:, None] @ g_i[..., None]).reshape(F, 6 * N)
-    return TrackInformation(G_i.reshape(F, 6 * N, 3), C_i.sum(axis=1), diagonal, gradient, g_i.sum(axis=1))
+    return TrackInformation(q, G_i.reshape(F, 6 * N, 3), C_i.sum(axis=1), B, gradient, g_i.sum(axis=1))
+
+
+def relative_stereo_sigma(at: Residuals, q: InverseDepth) -> FloatArray:
+    """Standard deviation (F,) of the inverse depth by the right views alone, over itself, for one pixel of noise.
+
+    Infinite without a right view.
+    """
+    views = np.any(at.z_D_p[:, :, 2, :], axis=2).sum(axis=1)
+    out: FloatArray = np.sqrt(np.divide(_STEREO_VARIANCE, views, out=np.full(len(views), np.inf), where=views > 0))
+    return out / q.disparity
+
+
+def has_parallax(
+    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, at: Residuals
+) -> BoolArray:
+    """Which tracks (F,) have a right view, or a parallax that fixes the depth as well as one stereo view would.
+
+    With less, the estimated depth follows the noise, and its Jacobian by the clones' translations with it: information
+    that is not there, and a scale that shrinks.
+    """
+    out: BoolArray = np.any(views.weight[..., 2] > 0, axis=1)
+    left_only = ~out
+    if left_only.any():
+        seen = views.weight[left_only, :, 0] > 0
+        q = inverse_depth(camera, T_cam0_world, p_world[left_only], seen)
+        J = at.z_D_p[left_only].reshape(len(seen), -1, 3) @ q.p_D_q
+        C = np.swapaxes(J, 1, 2) @ J + np.diag([_TINY, _TINY, _PRIOR])
+        out[left_only] = np.linalg.inv(C)[:, 2, 2] < _STEREO_VARIANCE
+    return out
 
 
 def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
@@ -208,15 +375,14 @@ def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatAr
 
     `sum_f blkdiag(D_f) - G_f C_f^-1 G_f'`: exact elimination of each point.
     """
-    N = info.diagonal.shape[1]
-    C = info.C[chosen]
-    L = np.linalg.cholesky(np.linalg.inv(C))
-    V = info.G[chosen] @ L  # (F, 6N, 3)
+    G, N = info.G[chosen], info.G.shape[1] // 6
+    L = np.linalg.cholesky(np.linalg.inv(info.C[chosen]))
+    V = G @ L  # (F, 6N, 3)
     flat = np.swapaxes(V, 1, 2).reshape(-1, 6 * N)
     A = -flat.T @ flat
-    blocks = info.diagonal[chosen].sum(axis=0)
+    blocks = np.swapaxes(G, 0, 1).reshape(6 * N, -1) @ info.q_D_clone[chosen].reshape(-1, 6)  # sum of G_i B
     for i in range(N):
-        A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += blocks[i]
+        A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += blocks[6 * i : 6 * i + 6]
     b = info.gradient[chosen].sum(axis=0)
     b -= flat.T @ (np.swapaxes(L, 1, 2) @ info.point_gradient[chosen][..., None]).reshape(-1)
     return A, b

@@ -87,7 +87,6 @@ class MsckfSettings(Section):
     pixel_sigma_min_px: float = setting(0.03, "the estimated noise stays above this", unit="px", above=0)
     pixel_sigma_max_px: float = setting(2.0, "the estimated noise stays below this", unit="px", above=0)
     gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected", above=0, below=1)
-    max_distance: float = setting(400.0, "tracks farther away than this many baselines are not used", above=0)
     gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2", above=0)
     gyro_noise_density: float = setting(
         2.0e-4, "gyro white noise by its data sheet; what a rig adds to it is learned", unit="rad/s/sqrt(Hz)", above=0

@@ -72,8 +72,8 @@ class RowField:
         x, y = (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
         basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
         rows = z[:, 3] - z[:, 1]
-        residual: FloatArray = rows - camera.fv * (basis @ self.coefficients)
-        residual = residual - np.median(residual)  # in the first frames the field itself is not yet known
+        # The median is taken out, as in the first frames the field itself is not yet known.
+        residual = _centred(rows - camera.fv * (basis @ self.coefficients))
         scale = max(1.48 * float(np.median(np.abs(residual))), 1e-3)
         weight = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
         self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
@@ -87,6 +87,10 @@ class RowField:
         x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
         out: FloatArray = camera.fu * (-c[1] * y + (c[5] - c[4]) * x * y - c[3] * y * y)
         return out
+
+
+def _centred(values: FloatArray) -> FloatArray:
+    return np.asarray(values - np.median(values), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +112,10 @@ class StereoField:
 class StereoColumns:
     """The part of the tracks' normal equations that concerns the field's S coefficients; pixel noise is one pixel."""
 
-    by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view
+    by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view, the point in the coordinates (M5)
     H: FloatArray  # (F, 4N, S) derivatives of the pixels by the coefficients, zero where not measured
     WH: FloatArray  # (F, 4N, S) the same times the robust weights
     r: FloatArray  # (F, 4N) residuals
-    point_D_pose: FloatArray  # (F, 3, 6)
 
     @property
     def G(self) -> FloatArray:
@@ -120,23 +123,31 @@ class StereoColumns:
         out: FloatArray = self.by_point.sum(axis=1)
         return out
 
+    def point_D_stereo(self, info: TrackInformation) -> FloatArray:
+        """How the estimated points follow errors of the coefficients (F, 3, S), world: `-C^-1 G`."""
+        out: FloatArray = -info.q.p_D_q @ np.linalg.solve(info.C, self.G)
+        return out
 
-def stereo_columns(at: Residuals, H: FloatArray, point_D_pose: FloatArray, weight: FloatArray) -> StereoColumns:
+
+def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: FloatArray) -> StereoColumns:
     """Collect the normal equations of `r = J (B xi_i + dp) + H s`.
 
     Args:
         at: residuals and Jacobians of F tracks in N clones.
         H: derivatives of each view's pixels by the coefficients (F, N, 4, S).
-        point_D_pose: `B` (F, 3, 6).
+        p_D_q: the points' coordinates (F, 3, 3), equation (M5).
         weight: robust weights (F, N).
     """
     F, N, _, S = H.shape
     J = at.z_D_p
     H = H * np.any(J, axis=3)[..., None]
     WH = H * weight[..., None, None]
-    by_point = sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3))
+    by_point = np.asarray(sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3)))
+    by_q = np.swapaxes(p_D_q, 1, 2) @ np.swapaxes(by_point, 1, 2).reshape(F, 3, N * S)
     flat = (F, 4 * N, S)
-    return StereoColumns(np.asarray(by_point), H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N), point_D_pose)
+    return StereoColumns(
+        np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2), H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +185,7 @@ def eliminate_points_from_columns(
     CG = np.linalg.solve(info.C[chosen], G)  # (F, 3, S)
     flat_G, flat_CG = G.reshape(3 * F, S), CG.reshape(3 * F, S)
     A = WH.reshape(-1, S).T @ H.reshape(-1, S) - flat_G.T @ flat_CG
-    B = columns.point_D_pose[chosen].reshape(3 * F, 6)
+    B = info.q_D_clone[chosen].reshape(3 * F, 6)
     per_view = np.swapaxes(by_point, 1, 2).reshape(3 * F, N * S)
     cross = (B.T @ per_view).reshape(6, N, S).transpose(1, 0, 2).reshape(6 * N, S)
     cross = cross - np.swapaxes(info.G[chosen], 1, 2).reshape(3 * F, 6 * N).T @ flat_CG

@@ -16,12 +16,11 @@ from vio.filters.multiview import (
     TrackInformation,
     Views,
     first_points,
-    point_D_pose,
+    has_parallax,
     refine_points,
     residuals,
     robust_weights,
     track_information,
-    within,
 )
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import StereoColumns, StereoField, field_jacobian, stereo_columns
@@ -42,6 +41,7 @@ _MOST_DOF = 199
 class LinearTracks:
     """Tracks linearised at one estimate of the window."""
 
+    T_cam0_world: FloatArray  # (N, 4, 4) camera poses
     rows: IntArray  # (F,) in the table
     p_world: FloatArray  # (F, 3)
     at: Residuals
@@ -98,9 +98,10 @@ class WindowTracks:
             views = self._views(rows, clones)
         p = refine_points(camera, T, table.points[rows], views, steps, CAUCHY * float(np.sqrt(self.variance)))
         at = residuals(camera, T, p, views)
-        keep = at.ahead & within(camera, T, p, self._settings.max_distance * camera.baseline_m)
+        keep = at.ahead & np.isfinite(p).all(axis=1)
+        keep[keep] = has_parallax(camera, T, p[keep], views.take(keep), at.take(keep))
         table.points[rows], table.has_point[rows] = p, keep
-        return self._linear(rows[keep], p[keep], at.take(keep))
+        return self._linear(T, rows[keep], p[keep], at.take(keep))
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track, for good, and linearise what is left."""
@@ -114,15 +115,17 @@ class WindowTracks:
             tracks.at.r * kept[..., None], tracks.at.z_D_p * kept[..., None, None], np.ones(len(wrong), dtype=np.bool_)
         )
         enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
-        return self._linear(tracks.rows[enough], tracks.p_world[enough], at.take(enough))
+        T = tracks.T_cam0_world
+        return self._linear(T, tracks.rows[enough], tracks.p_world[enough], at.take(enough))
 
-    def _linear(self, rows: IntArray, p_world: FloatArray, at: Residuals) -> LinearTracks:
+    def _linear(self, T_cam0_world: FloatArray, rows: IntArray, p_world: FloatArray, at: Residuals) -> LinearTracks:
         weight = robust_weights(at, self.variance)
-        information = track_information(at, p_world, weight)
-        if self._field is None:
-            return LinearTracks(rows, p_world, at, information, None)
-        H = field_jacobian(self._camera, self.table.views(rows, at.r.shape[1]).z)
-        return LinearTracks(rows, p_world, at, information, stereo_columns(at, H, point_D_pose(p_world), weight))
+        information = track_information(self._camera, T_cam0_world, at, p_world, weight)
+        columns = None
+        if self._field is not None:
+            H = field_jacobian(self._camera, self.table.views(rows, at.r.shape[1]).z)
+            columns = stereo_columns(at, H, information.q.p_D_q, weight)
+        return LinearTracks(T_cam0_world, rows, p_world, at, information, columns)
 
     def _views(self, rows: IntArray, clones: int) -> Views:
         """What rows showed, without the stereo field."""
@@ -131,12 +134,8 @@ class WindowTracks:
 
     def move_points(self, tracks: LinearTracks, exposure_errors: FloatArray, stereo_errors: FloatArray) -> None:
         """Move each point as its own normal equations say once the clones (6N,) and the field (S,) have moved."""
-        info = tracks.information
-        right = info.point_gradient - np.einsum("fik,i->fk", info.G, exposure_errors)
-        if tracks.stereo is not None:
-            right = right - np.einsum("fks,s->fk", tracks.stereo.G, stereo_errors)
-        step = np.linalg.solve(info.C, right[..., None])[..., 0]
-        self.table.points[tracks.rows] = tracks.p_world + step
+        other = 0.0 if tracks.stereo is None else np.einsum("fks,s->fk", tracks.stereo.G, stereo_errors)
+        self.table.points[tracks.rows] = tracks.information.moved_points(exposure_errors, other)
 
     def agree(self, at: Residuals) -> bool:
         """Whether nearly all views of the newest clone fit: only then may they contradict the motion model."""
