@@ -77,7 +77,8 @@ def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -
     best = np.argmax(disparity, axis=1)
     rows = np.arange(len(best))
     usable = disparity[rows, best] > 0
-    p_cam, valid = triangulate(camera, np.where(usable[:, None], views.z[rows, best], 0.0))
+    z = views.z[rows, best][:, [0, 1, 2, 1]]  # the right row is no measurement, so the left one stands for both
+    p_cam, valid = triangulate(camera, np.where(usable[:, None], z, 0.0))
     T = T_cam0_world[best]
     p = ((p_cam - T[:, :3, 3])[:, None, :] @ T[:, :3, :3])[:, 0]
     return p, usable & valid
