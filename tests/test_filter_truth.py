@@ -185,9 +185,9 @@ def test_slow_motion_before_a_far_scene_is_no_standstill(
 
 
 def test_a_motion_that_images_cannot_tell_is_no_standstill_either(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half a pixel of noise: the motion over a window is smaller than its standard deviation, and yet 0.2 m/s."""
+    """Two pixels of noise: the motion over a window is smaller than its standard deviation, and yet 0.2 m/s."""
     applied = zero_velocities(monkeypatch)
-    run = fly(replace(FAR, pixel_sigma_px=0.5, features=25), None)
+    run = fly(replace(FAR, pixel_sigma_px=2.0, features=20), None, replace(SETTINGS, pixel_sigma_px=2.0))
     assert not applied
     last = FAR.frames - 1
     assert squared(run.velocity_error(last), run.navigation[last][6:9, 6:9]) < chi2.ppf(0.999, 3)
