@@ -33,66 +33,69 @@ def _tracks(p: FloatArray, frames: int = 4, noise_px: float = 0.0, settings: Msc
     return tracks
 
 
-def _moving_by(pixels: FloatArray, settings: MsckfSettings = SETTINGS) -> WindowTracks:
-    """Tracks whose left pixels move by (K,) between two frames."""
-    tracks, ids = WindowTracks(CAMERA, settings), np.arange(len(pixels))
-    z = np.tile([300.0, 200, 280, 200], (len(ids), 1))
-    tracks.table.add_frame(0, observations(0, 0, ids, z))
-    tracks.table.add_frame(1, observations(1, 1, ids, z + np.outer(pixels, [0.6, 0.8, 0.6, 0.8])))
-    return tracks
-
-
 def test_the_gate_knows_how_many_pixels_were_seen() -> None:
-    """Three views of two pairs each, less the three of the point: 9 degrees of freedom; left views alone: 3."""
+    """Three stereo views of three pixels each, less the three of the point: 6 degrees of freedom; left views alone: 3.
+
+    The right row is measured in none.
+    """
     tracks = WindowTracks(CAMERA, SETTINGS)
     J = np.ones((4, 3, 4, 3))
-    J[2:, :, 2:] = 0.0  # seen left only
+    J[:, :, 3] = 0.0
+    J[2:, :, 2] = 0.0  # seen left only
     r = np.zeros((4, 3, 4))
-    limits = tracks.variance * np.repeat(chi2.ppf(SETTINGS.gate_probability, [9, 3]), 2)
+    limits = tracks.variance * np.repeat(chi2.ppf(SETTINGS.gate_probability, [6, 3]), 2)
     r[:, 1, 0] = np.sqrt(limits * [0.999, 1.001, 0.999, 1.001])
-    passed, nis_per_dof = tracks.gate(Residuals(r, J, np.ones(4, dtype=np.bool_)))
+    passed, squares, dof = tracks.gate(Residuals(r, J, np.ones(4, dtype=np.bool_)))
     assert passed.tolist() == [True, False, True, False]
-    np.testing.assert_allclose(nis_per_dof, r[:, 1, 0] ** 2 / tracks.variance / [9, 9, 3, 3])
+    assert dof.tolist() == [6, 6, 3, 3]
+    np.testing.assert_allclose(squares, r[:, 1, 0] ** 2 / tracks.variance)
 
 
+def test_the_gate_of_a_track_as_long_as_the_table_of_quantiles_or_longer() -> None:
+    tracks = WindowTracks(CAMERA, SETTINGS)
+    J = np.ones((1, 80, 4, 3))
+    assert tracks.gate(Residuals(np.zeros((1, 80, 4)), J, np.ones(1, dtype=np.bool_)))[2].tolist() == [199]
+
+
+@pytest.mark.parametrize("dof", [1, 3, 6, 45, 199])
 @pytest.mark.parametrize(
-    ("nis", "count", "change"),
-    [(0.85, 15, 1.0), (1.7, 15, 2.0), (0.425, 15, 0.5), (9e9, 15, 4.0), (0.0, 15, 0.25), (9.0, 14, 1.0)],
+    ("ratio", "count", "change"),
+    [(1.0, 15, 1.0), (2.0, 15, 2.0), (0.5, 15, 0.5), (9e9, 15, 4.0), (0.0, 15, 0.25), (9.0, 14, 1.0)],
 )
-def test_pixel_noise_follows_the_median_slowly(nis: float, count: int, change: float) -> None:
-    """By the twentieth root of its ratio, at most four; not where few tracks tell."""
+def test_pixel_noise_follows_the_median_slowly(ratio: float, count: int, change: float, dof: int) -> None:
+    """By the twentieth root of its ratio to the median of chi-square, at most four; not where few tracks tell."""
     tracks = WindowTracks(CAMERA, SETTINGS)
     before = tracks.variance
-    values = np.full(count, nis)
+    values = np.full(count, ratio * chi2.ppf(0.5, dof))
     values[:6] = 1e6  # wrong tracks below half
-    tracks.update_pixel_noise(np.append(values, np.full(6, 0.0)) if count >= 15 else values)
+    values = np.append(values, np.full(6, 0.0)) if count >= 15 else values
+    tracks.update_pixel_noise(values, np.full(len(values), dof))
     np.testing.assert_allclose(tracks.variance, before * change**0.05)
+
+
+@pytest.mark.parametrize("dofs", [(3, 3), (4, 8), (45, 45), (3, 45)])
+def test_pixel_noise_is_learned_without_bias_whatever_the_degrees_of_freedom(dofs: tuple[int, int]) -> None:
+    """Squared residuals of tracks of 3 to 45 degrees of freedom, drawn from chi-square for a noise of 0.4 px.
+
+    The median of 60 ratios has a standard deviation of 14 % at 3 degrees of freedom. The gain of 0.05 makes 2.3 % of
+    it, and the mean over 600 frames, of which about 40 count as one, 0.6 %: the bound is three standard deviations.
+    """
+    tracks, rng, values = WindowTracks(CAMERA, SETTINGS), np.random.default_rng(0), []
+    for _ in range(800):
+        dof = rng.integers(dofs[0], dofs[1] + 1, 60)
+        tracks.update_pixel_noise(0.4**2 * rng.chisquare(dof) / tracks.variance, dof)
+        values.append(tracks.variance)
+    np.testing.assert_allclose(np.mean(values[200:]), 0.4**2, rtol=0.02)
 
 
 def test_pixel_noise_stays_in_its_bounds() -> None:
     tracks = WindowTracks(CAMERA, SETTINGS)
     for _ in range(200):
-        tracks.update_pixel_noise(np.full(20, 100.0))
+        tracks.update_pixel_noise(np.full(20, 100.0), np.full(20, 5))
     assert tracks.variance == SETTINGS.pixel_sigma_max_px**2
     for _ in range(500):
-        tracks.update_pixel_noise(np.zeros(20))
+        tracks.update_pixel_noise(np.zeros(20), np.full(20, 5))
     assert tracks.variance == SETTINGS.pixel_sigma_min_px**2
-
-
-@pytest.mark.parametrize(
-    ("pixels", "still"),
-    [
-        (np.full(15, 0.24), True),
-        (np.full(15, 0.26), False),
-        (np.full(14, 0.0), False),  # too few to tell
-        (np.append(np.full(17, 0.1), np.full(3, 0.6)), False),  # more than a tenth moves
-        (np.append(np.full(19, 0.1), 5.0), True),  # one that passes by
-    ],
-)
-def test_the_image_stands_still_where_nearly_all_of_it_does(pixels: FloatArray, still: bool) -> None:
-    assert _moving_by(pixels).is_stationary(2) is still
-    assert not _moving_by(pixels).is_stationary(1)
-    assert not _moving_by(pixels, replace(SETTINGS, still_px=0.0)).is_stationary(2)
 
 
 def test_tracks_that_end_come_first_then_the_longest() -> None:
@@ -168,7 +171,7 @@ def test_points_follow_the_poses_as_the_joint_problem_says() -> None:
 
 def _scales(at: Residuals, variance: float) -> FloatArray:
     """The robust weights' squared scale of each clone (N,)."""
-    return np.maximum(variance, np.median(np.sum(at.r**2, axis=2), axis=0) / 3.36)
+    return np.maximum(variance, np.median(np.sum(at.r**2, axis=2), axis=0) / 2.37)
 
 
 def test_images_agree_where_four_fifths_of_the_newest_views_fit() -> None:

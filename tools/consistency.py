@@ -241,11 +241,11 @@ class JudgedTracks(WindowTracks):
         super().__init__(camera, settings)
         self.nis: list[float] = []
 
-    def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray]:
+    def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray, IntArray]:
         """Gate as always, and note the mean."""
-        good, nis = super().gate(at)
-        self.nis.append(float(nis.mean()) if len(nis) else float("nan"))
-        return good, nis
+        good, nis, dof = super().gate(at)
+        self.nis.append(float(np.mean(nis / dof)) if len(nis) else float("nan"))
+        return good, nis, dof
 
 
 class Ablation(Msckf):
@@ -293,8 +293,8 @@ class Ablation(Msckf):
         """Covariance (15, 15) of the navigation state's right-invariant error."""
         return self._output
 
-    def _commit(self, window: Window, *rest: Any) -> int:
-        new = super()._commit(window, *rest)
+    def _marginalise(self, window: Window, *rest: Any) -> int:
+        new = super()._marginalise(window, *rest)
         if isinstance(window, StandardErrors):
             self._output = window.right_invariant(self._output)
         return new

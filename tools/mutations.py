@@ -32,6 +32,7 @@ _WINDOW = (
 )
 _IMU_GAPS = ("tests/test_imu_gaps.py",)
 _IMU_START = ("tests/test_imu_start.py",)
+_TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
 _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
@@ -447,8 +448,8 @@ MUTATIONS = (
     Mutation(
         "filter: chi-square gate inverted",
         "vio/filters/window_tracks.py",
-        "passed: BoolArray = squares <= limit",
-        "passed: BoolArray = squares >= limit",
+        "passed: BoolArray = squares <= chi",
+        "passed: BoolArray = squares >= chi",
         _WINDOW,
     ),
     Mutation(
@@ -489,23 +490,114 @@ MUTATIONS = (
     Mutation(
         "motion noise: factors run away from the corrections",
         "vio/filters/noise.py",
-        "(0.5 * _GAIN * share)",
-        "(-0.5 * _GAIN * share)",
+        "np.exp(0.5 * gain * innovation)",
+        "np.exp(-0.5 * gain * innovation)",
         _WINDOW,
     ),
     Mutation(
         "motion noise: a shock is not told",
         "vio/filters/noise.py",
-        "ratio > _SURPRISE",
-        "ratio < -_SURPRISE",
+        "test.squared > chi_square_quantile(_SURPRISE, test.dof)",
+        "test.squared < -chi_square_quantile(_SURPRISE, test.dof)",
         _WINDOW,
     ),
     Mutation(
-        "track table: motion from two frames before",
-        "vio/filters/tracks.py",
-        "self._z[both, column - 1, :2]",
-        "self._z[both, column - 2, :2]",
+        "motion noise: three degrees of freedom whatever the images inform",
+        "vio/filters/noise.py",
+        "int(chosen.sum())",
+        "3",
         _WINDOW,
+    ),
+    Mutation(
+        "motion noise: directions not whitened",
+        "vio/filters/noise.py",
+        "V[:, chosen].T @ inverse",
+        "V[:, chosen].T / np.sqrt(scale / 3)",
+        _WINDOW,
+    ),
+    Mutation(
+        "pixel noise: median of the wrong degrees of freedom",
+        "vio/filters/window_tracks.py",
+        "chi_square_table(0.5)[dof]",
+        "(0.85 * dof)",
+        _WINDOW,
+    ),
+    Mutation(
+        "standstill: concluded where the images could not tell a motion",
+        "vio/filters/window_posterior.py",
+        "if largest[0] > velocity_sigma_mps or",
+        "if 0 * largest[0] > velocity_sigma_mps or",
+        _TRUTH,
+    ),
+    Mutation(
+        "standstill: every motion passes for none",
+        "vio/filters/window_posterior.py",
+        "return squared < float(",
+        "return squared < 1e9 * float(",
+        _TRUTH,
+    ),
+    Mutation(
+        "standstill: measured again in every frame",
+        "vio/filters/msckf.py",
+        "self._stationary_ns = window.clones[-1].time_ns",
+        "self._stationary_ns = window.clones[0].time_ns - 1",
+        _TRUTH,
+    ),
+    Mutation(
+        "rows: the right row is a measurement of its own",
+        "vio/filters/tracks.py",
+        "weight[:, 2] = has_right",
+        "weight[:, 2:] = has_right[:, None]",
+        _WINDOW,
+    ),
+    Mutation(
+        "rows: the right row moves the first point",
+        "vio/filters/multiview.py",
+        "views.z[rows, best][:, [0, 1, 2, 1]]",
+        "views.z[rows, best]",
+        _TRUTH,
+    ),
+    Mutation(
+        "landmarks: pass no gate",
+        "vio/filters/landmark_gate.py",
+        "used: BoolArray = (nis <= self._limits[dof]) & ~dropped",
+        "used: BoolArray = nis < np.inf",
+        _TRUTH,
+    ),
+    Mutation(
+        "landmarks: slow movers are never dropped",
+        "vio/filters/landmark_gate.py",
+        "dropped: BoolArray = score > _DROP",
+        "dropped: BoolArray = score > np.inf",
+        _TRUTH,
+    ),
+    Mutation(
+        "landmarks: judged by a prediction that their own pixels made",
+        "vio/filters/landmark_gate.py",
+        "predicted = R[:, 0] / values * y",
+        "predicted = y",
+        _TRUTH,
+    ),
+    Mutation(
+        "tracks: those that failed the gate steer the estimate",
+        "vio/filters/msckf.py",
+        "self._information(window, tracks, good & ~ending, None)",
+        "self._information(window, tracks, ~(good & ending), None)",
+        _TRUTH,
+    ),
+    Mutation(
+        "smoothed estimates: covariance of the wrong rows",
+        "vio/filters/window_posterior.py",
+        "slice(6 * index, 6 * index + 6)",
+        "slice(len(self.P) - 6, len(self.P))",
+        _TRUTH,
+    ),
+    Mutation(
+        "smoothed estimates: velocity of the newest clone",
+        "vio/filters/window_posterior.py",
+        "replace(c, velocity=v[k])",
+        "replace(c, velocity=v[-1])",
+        _TRUTH,
     ),
     Mutation(
         "track table: views not shifted with the clones",

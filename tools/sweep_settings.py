@@ -161,7 +161,6 @@ _CONTEXTS_OF: dict[str, str | tuple[str, ...]] = {
     "msckf.calibrate_*": "calibrating",
     "msckf.extrinsic_*": "calibrating",
     "msckf.time_offset_*": "calibrating",
-    "msckf.still_px": "at rest",
     "msckf.zero_*": "at rest",
     "msckf.rate_bias_*": "velocities",
     "msckf.linear_velocity_*": "velocities",
@@ -180,7 +179,6 @@ _TRIED: dict[str, tuple[Any, ...]] = {
     "frontend.consensus.seed": (1, 2),
     "selector.budget": (30, 120),
     "selector.seed": (1, 2),
-    "msckf.still_px": (0.125, 0.5, 0.0),
     "dataset.prefetch_frames": (2, 8, 0),
 }
 _NOT_SWEPT = {
