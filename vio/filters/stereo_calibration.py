@@ -75,11 +75,12 @@ class RowField:
         # The median is taken out, as in the first frames the field itself is not yet known.
         residual = _centred(rows - camera.fv * (basis @ self.coefficients))
         scale = max(1.48 * float(np.median(np.abs(residual))), 1e-3)
-        weight = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
+        weight: FloatArray = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
         self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
         self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
         prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
-        self.coefficients = np.linalg.solve(self._A + prior, self._b) / camera.fv
+        solution: FloatArray = np.linalg.solve(self._A + prior, self._b)
+        self.coefficients = np.asarray(solution / camera.fv, dtype=np.float64)
 
     def columns(self, z: FloatArray) -> FloatArray:
         """Return the part of `du` (...) that follows from the rows at stereo pixels (..., 4), pixels."""
