@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.draw_structure import floors, read_rooms
+from tools.draw_structure import layers, read_packages
 
 ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
@@ -88,9 +88,9 @@ def test_imports_go_one_way(file: Path) -> None:
 
 
 def test_packages_have_no_import_cycle() -> None:
-    packages = read_rooms(ROOT)
+    packages = read_packages(ROOT)
     assert {"vio.filters", "vio.datasets", "frontend", "vio.pipeline"} <= set(packages)
-    assert floors(packages)[1] == []
+    assert layers(packages)[1] == []
 
 
 def test_detects_an_import_cycle(tmp_path: Path) -> None:
@@ -102,9 +102,9 @@ def test_detects_an_import_cycle(tmp_path: Path) -> None:
     ):
         (tmp_path / "vio").mkdir(exist_ok=True)
         (tmp_path / "vio" / f"{name}.py").write_text(text)
-    floor, closing = floors(read_rooms(tmp_path))
+    layer, closing = layers(read_packages(tmp_path))
     assert closing == [("vio.c", "vio.a")]
-    assert floor == {"vio.a": 2, "vio.b": 1, "vio.c": 0}
+    assert layer == {"vio.a": 2, "vio.b": 1, "vio.c": 0}
 
 
 def test_pycolmap_stays_in_its_package() -> None:

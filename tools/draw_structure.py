@@ -1,11 +1,11 @@
-"""The figure of docs/architecture.md: every room of the house, what it imports, and on which floor it stands.
+"""The figure of docs/architecture.md: every package, what it imports, and in which layer it stands.
 
     python tools/draw_structure.py docs/images/structure.png [--root CHECKOUT]
 
-A room is a package or a single module directly in `vio/`, or `frontend/`. It stands one floor above the highest room
-that it imports. Arrows point at what is imported; those that a longer way implies are left out, and so are those to the
-foundation (records, protocols, geometry, errors, setting), on which nearly everything stands. Imports inside functions
-count. An import that closes a circle is red.
+A package here is a package or a single module directly in `vio/`, or `frontend/`. It stands one layer above the
+highest one that it imports. Arrows point at what is imported; those that a longer way implies are left out, and so are
+those to the foundation (records, protocols, geometry, errors, setting), on which nearly everything stands. Imports
+inside functions count. An import that closes a cycle is red.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _WIDTH, _HEIGHT = 1.0, 0.62
 
 
 @dataclass(frozen=True, slots=True)
-class Room:
+class Package:
     """A package or a module, and what it imports of the others."""
 
     name: str
@@ -47,23 +47,25 @@ class Room:
     imports: frozenset[str]
 
 
-def read_rooms(root: Path) -> dict[str, Room]:
-    """Return all rooms of a checkout by name."""
+def read_packages(root: Path) -> dict[str, Package]:
+    """Return all packages of a checkout by name."""
     files: dict[str, list[Path]] = {}
     for path in sorted([*(root / "vio").rglob("*.py"), *(root / "frontend").rglob("*.py")]):
-        name = _room_of(".".join(path.relative_to(root).with_suffix("").parts))
+        name = _package_of(".".join(path.relative_to(root).with_suffix("").parts))
         if name not in ("vio.__init__", "vio.__main__", "vio._version"):
             files.setdefault(name, []).append(path)
-    rooms = {}
+    packages = {}
     for name, paths in files.items():
         texts = [path.read_text(encoding="utf-8") for path in paths]
-        imported = {_room_of(module) for text in texts for module in _imports(text)} & set(files)
-        rooms[name] = Room(name, sum(len(t.splitlines()) for t in texts), len(paths), frozenset(imported - {name}))
-    return rooms
+        imported = {_package_of(module) for text in texts for module in _imports(text)} & set(files)
+        packages[name] = Package(
+            name, sum(len(t.splitlines()) for t in texts), len(paths), frozenset(imported - {name})
+        )
+    return packages
 
 
-def _room_of(module: str) -> str:
-    """`vio.filters.window` lies in the room `vio.filters`, `frontend.klt` in `frontend`."""
+def _package_of(module: str) -> str:
+    """`vio.filters.window` lies in the package `vio.filters`, `frontend.klt` in `frontend`."""
     parts = module.split(".")
     return "frontend" if parts[0] == "frontend" else ".".join(parts[:2])
 
@@ -78,52 +80,52 @@ def _imports(text: str) -> Iterator[str]:
         elif id(node) not in skipped and isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif id(node) not in skipped and isinstance(node, ast.ImportFrom) and node.module:
-            # `from vio import calibration` names a room, `from vio.records import Image` something in one.
+            # `from vio import calibration` names a package, `from vio.records import Image` something in one.
             yield from (f"vio.{alias.name}" for alias in node.names) if node.module == "vio" else [node.module]
 
 
-def floors(rooms: Mapping[str, Room]) -> tuple[dict[str, int], list[tuple[str, str]]]:
-    """Return the floor of each room, 0 at the ground, and the imports (from, to) that close a circle."""
-    floor: dict[str, int] = {}
+def layers(packages: Mapping[str, Package]) -> tuple[dict[str, int], list[tuple[str, str]]]:
+    """Return the layer of each package, 0 the lowest, and the imports (from, to) that close a cycle."""
+    layer: dict[str, int] = {}
     closing: list[tuple[str, str]] = []
 
     def visit(name: str, above: tuple[str, ...]) -> int:
-        if name not in floor:
+        if name not in layer:
             below = []
-            for other in sorted(rooms[name].imports):
+            for other in sorted(packages[name].imports):
                 if other in (*above, name):
                     closing.append((name, other))
                 else:
                     below.append(visit(other, (*above, name)))
-            floor[name] = 1 + max(below, default=-1)
-        return floor[name]
+            layer[name] = 1 + max(below, default=-1)
+        return layer[name]
 
-    for name in sorted(rooms):
+    for name in sorted(packages):
         visit(name, ())
-    return floor, closing
+    return layer, closing
 
 
-def drawn_arrows(rooms: Mapping[str, Room]) -> list[tuple[str, str]]:
-    """Imports between rooms without circles that no longer way implies."""
+def drawn_arrows(packages: Mapping[str, Package]) -> list[tuple[str, str]]:
+    """Imports between packages without cycles that no longer way implies."""
 
     @cache
     def reached(name: str) -> frozenset[str]:
-        return rooms[name].imports.union(*(reached(n) for n in rooms[name].imports))
+        return packages[name].imports.union(*(reached(n) for n in packages[name].imports))
 
     return [
         (name, other)
-        for name, room in rooms.items()
-        for other in sorted(room.imports)
-        if not any(other in reached(via) for via in room.imports - {other})
+        for name, package in packages.items()
+        for other in sorted(package.imports)
+        if not any(other in reached(via) for via in package.imports - {other})
     ]
 
 
-def draw(rooms: Mapping[str, Room], path: Path) -> None:
+def draw(packages: Mapping[str, Package], path: Path) -> None:
     """Write the figure as PNG."""
-    upper = {n: replace(r, imports=r.imports - set(FOUNDATION)) for n, r in rooms.items() if n not in FOUNDATION}
-    level, closing = floors(upper)
+    upper = {n: replace(r, imports=r.imports - set(FOUNDATION)) for n, r in packages.items() if n not in FOUNDATION}
+    level, closing = layers(upper)
     straight = {n: replace(r, imports=r.imports - {b for a, b in closing if a == n}) for n, r in upper.items()}
-    place = _places(straight, level, [n for n in FOUNDATION if n in rooms])
+    place = _places(straight, level, [n for n in FOUNDATION if n in packages])
     across = max(x for x, _ in place.values()) + 1.3
     up = max(y for _, y in place.values()) + 1.0
     figure = Figure(figsize=(1.45 * across, 0.95 * up), dpi=100)
@@ -138,7 +140,7 @@ def draw(rooms: Mapping[str, Room], path: Path) -> None:
             "",
             xy=(x1 + _WIDTH / 2, y1 + _HEIGHT),
             xytext=(x0 + _WIDTH / 2, y0),
-            # A long way goes around the rooms between.
+            # A long way goes around the packages between.
             arrowprops={
                 "connectionstyle": f"arc3,rad={0.12 if y0 - y1 > 1.5 else 0}",
                 "arrowstyle": "-|>",
@@ -155,20 +157,22 @@ def draw(rooms: Mapping[str, Room], path: Path) -> None:
             (x, y), _WIDTH, _HEIGHT, boxstyle="round,pad=0,rounding_size=0.06", fc=colour, ec="#55606e"
         )
         axes.add_patch(box)
-        room = rooms[name]
-        label = name.removeprefix("vio.") + ("/" if room.files > 1 else "")
+        package = packages[name]
+        label = name.removeprefix("vio.") + ("/" if package.files > 1 else "")
         axes.text(x + _WIDTH / 2, y + 0.39, label, ha="center", va="center", fontsize=9, weight="bold")
-        files = f", {room.files} files" if room.files > 1 else ""
-        axes.text(x + _WIDTH / 2, y + 0.17, f"{room.lines} lines{files}", ha="center", va="center", fontsize=6.5)
+        files = f", {package.files} files" if package.files > 1 else ""
+        axes.text(x + _WIDTH / 2, y + 0.17, f"{package.lines} lines{files}", ha="center", va="center", fontsize=6.5)
     figure.savefig(path)
 
 
-def _places(rooms: Mapping[str, Room], level: Mapping[str, int], ground: list[str]) -> dict[str, tuple[float, float]]:
-    """Lower left corners: the foundation as one row, above it a row a floor, rooms near those they have to do with."""
-    rows = [[n for n in sorted(rooms) if level[n] == k] for k in range(max(level.values()) + 1)]
+def _places(
+    packages: Mapping[str, Package], level: Mapping[str, int], ground: list[str]
+) -> dict[str, tuple[float, float]]:
+    """Lower left corners: the foundation as one row, above it a row a layer, packages near those they are tied to."""
+    rows = [[n for n in sorted(packages) if level[n] == k] for k in range(max(level.values()) + 1)]
     across = 1.25 * max(len(row) for row in [ground, *rows])
-    arrows = drawn_arrows(rooms)
-    tied = {n: [b for a, b in arrows if a == n] + [a for a, b in arrows if b == n] for n in rooms}
+    arrows = drawn_arrows(packages)
+    tied = {n: [b for a, b in arrows if a == n] + [a for a, b in arrows if b == n] for n in packages}
 
     def spread(row: list[str]) -> dict[str, float]:
         return {name: across / len(row) * (i + 0.5) - _WIDTH / 2 for i, name in enumerate(row)}
@@ -188,9 +192,9 @@ def main() -> int:
     parser.add_argument("out", type=Path, help="PNG to write")
     parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent, help="the checkout")
     args = parser.parse_args()
-    rooms = read_rooms(args.root)
-    draw(rooms, args.out)
-    sys.stdout.write(f"{len(rooms)} rooms, {sum(r.lines for r in rooms.values())} lines: {args.out}\n")
+    packages = read_packages(args.root)
+    draw(packages, args.out)
+    sys.stdout.write(f"{len(packages)} packages, {sum(r.lines for r in packages.values())} lines: {args.out}\n")
     return 0
 
 
