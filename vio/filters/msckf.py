@@ -62,7 +62,7 @@ from vio.records import (
 
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 # Factors on the motion model's densities: at the start, at least, at most.
-_IMU_FACTORS = (5.0, 1.0, 50.0)
+_IMU_FACTORS = (1.0, 1.0, 50.0)
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
 # Standard deviations of a point's inverse depth over itself, at most. A landmark is linearised and marginalised frame
 # by frame as a Cartesian point, which biases scale in second order of it where the depth comes from motion. With left

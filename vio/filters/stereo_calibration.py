@@ -79,8 +79,8 @@ class RowField:
         self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
         self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
         prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
-        solution: FloatArray = np.linalg.solve(self._A + prior, self._b)
-        self.coefficients = np.asarray(solution / camera.fv, dtype=np.float64)
+        solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
+        self.coefficients = solution / camera.fv
 
     def columns(self, z: FloatArray) -> FloatArray:
         """Return the part of `du` (...) that follows from the rows at stereo pixels (..., 4), pixels."""
