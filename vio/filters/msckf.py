@@ -509,7 +509,7 @@ class Msckf:
             at = self._landmark_residuals(window, pixels)
             window.add_landmark_information(A, b, *at.information())
             if stereo is not None:
-                H = field_jacobian(self._camera, pixels.z)
+                H = field_jacobian(self._camera, pixels.z - at.r)  # at the predicted pixels
                 stereo = stereo + landmark_columns(at, H, len(window.clones))
         scaled = None if stereo is None else stereo.scaled(1 / variance)
         return window.lift_information(A / variance, b / variance, scaled)

@@ -34,6 +34,9 @@ TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
 _ROW_TERMS = 6
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
+_DECIDING_FRAMES = 3  # before the rows decide whether the calibration is off
+_LEAST_ROWS_PX = 0.2  # root mean square of the field over the matches; a good calibration leaves half of it
+_ROW_SIGNIFICANCE = 25.0  # squared standard deviations of the field by noise alone
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
 
 
@@ -51,7 +54,7 @@ def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
     r2 = x * x + y * y
     out[..., 1, 3], out[..., 1, 4], out[..., 1, 5] = y * r2, r2 + 2 * y * y, 2 * x * y
     out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 1.0, xr, xr * xr + y * y
-    return camera.fu * out
+    return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
 
 
 class RowField:
@@ -61,6 +64,9 @@ class RowField:
         self._camera = camera
         self._A: FloatArray = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         self._b: FloatArray = np.zeros(_ROW_TERMS)
+        self._squares = self._count = 0.0  # of the rows' residuals, in the same memory
+        self._frames = 0
+        self.rms_px = 0.0  # of the field over the matches
         self.coefficients: FloatArray = np.zeros(_ROW_TERMS)  # of 1, x, y, x y, x^2, y^2, in focal lengths
 
     def update(self, seen: Observations) -> None:
@@ -81,6 +87,19 @@ class RowField:
         prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
         self.coefficients = solution / camera.fv
+        self._frames += 1
+        field = basis @ solution
+        self._squares = _ROW_MEMORY * self._squares + float(weight @ (rows - field) ** 2)
+        self._count = _ROW_MEMORY * self._count + float(weight.sum())
+        self.rms_px = float(np.sqrt(np.mean(field**2)))
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the rows show that the calibration is off: a field beyond its own uncertainty, and beyond harm."""
+        if self._frames < _DECIDING_FRAMES:
+            return False
+        uncertainty = _ROW_TERMS * self._squares / max(self._count, 1.0) ** 2
+        return self.rms_px**2 > _LEAST_ROWS_PX**2 + _ROW_SIGNIFICANCE * uncertainty
 
     def columns(self, z: FloatArray) -> FloatArray:
         """Return the part of `du` (...) that follows from the rows at stereo pixels (..., 4), pixels."""

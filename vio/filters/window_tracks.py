@@ -123,7 +123,8 @@ class WindowTracks:
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
         columns = None
         if self._field is not None:
-            H = field_jacobian(self._camera, self.table.views(rows, at.r.shape[1]).z)
+            # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
+            H = field_jacobian(self._camera, self._views(rows, at.r.shape[1]).z - at.r)
             columns = stereo_columns(at, H, information.q.p_D_q, weight)
         return LinearTracks(T_cam0_world, rows, p_world, at, information, columns)
 
