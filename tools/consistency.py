@@ -1,7 +1,8 @@
 """Consistency of the sliding-window filter, beside the two it is compared with: standard errors, first estimates.
 
     python tools/consistency.py --out FOLDER [--motions imu none velocity] [--variants VARIANT …] [--runs 20]
-        [--seconds 7.5] [--pixel-sigma 1.0] [--features 60] [--landmarks 30] [--jobs 2]
+        [--seconds 7.5] [--pixel-sigma 1.0] [--features 60] [--landmarks 30]
+        [--outliers 0.0] [--imu-offset-ms 0.0] [--jobs 2]
 
 Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
 yaw of the start are drawn from the very distributions that the filter is told. Each flight is flown once by every
@@ -311,6 +312,8 @@ class Scenario:
     pixel_sigma_px: float = 1.0
     features: int = 60
     landmarks: int = 30
+    outliers: float = 0.0  # share of the features that are mismatched by up to 40 px in every frame
+    imu_offset_s: float = 0.0  # of the IMU's samples against the frames, less than one sample
 
     @property
     def frames(self) -> int:
@@ -367,7 +370,9 @@ class Flight:
         a = (v1 - v0) / (2 * h) + [0.0, 0.0, 9.81]
         return omega, (np.swapaxes(R, 1, 2) @ a[..., None])[..., 0]
 
-    def imu(self, frames: int, noise: np.random.Generator, s: MsckfSettings) -> tuple[list[ImuSample], FloatArray]:
+    def imu(
+        self, frames: int, noise: np.random.Generator, s: MsckfSettings, offset_s: float = 0.0
+    ) -> tuple[list[ImuSample], FloatArray]:
         """Samples at 200 Hz, and the biases (K, 6) in them: drawn from the prior, then walking."""
         n, dt = frames * (_FRAME_NS // _IMU_NS) + 1, _IMU_NS * 1e-9
         walk = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) * np.sqrt(dt)
@@ -376,11 +381,12 @@ class Flight:
         bias = np.cumsum(steps, axis=0)
         white = np.repeat([s.gyro_noise_density, s.accel_noise_density], 3) / np.sqrt(dt)
         read = (
-            np.concatenate(self.rates(np.arange(n, dtype=np.float64) * dt), axis=1)
+            np.concatenate(self.rates(np.arange(n, dtype=np.float64) * dt + offset_s), axis=1)
             + bias
             + noise.normal(0, 1, (n, 6)) * white
         )
-        return [ImuSample(k * _IMU_NS, x[:3], x[3:]) for k, x in enumerate(read)], bias
+        offset_ns = round(offset_s * 1e9)
+        return [ImuSample(k * _IMU_NS + offset_ns, x[:3], x[3:]) for k, x in enumerate(read)], bias
 
     def velocities(self, frames: int, noise: np.random.Generator, s: MsckfSettings) -> list[VelocitySample]:
         """Samples at the frames, with white noise and a constant bias of the rate."""
@@ -398,7 +404,11 @@ class Flight:
         z = project(CAMERA, np.where(near[:, None], p, [0.0, 0.0, 10.0]))
         inside = near & (z[:, 2] > 5) & (z[:, 0] < 747) & (z[:, 1] > 5) & (z[:, 1] < 475)
         ids = np.flatnonzero(inside)[: scenario.features]
-        return observations(k, k * _FRAME_NS, ids, z[ids] + noise.normal(0, scenario.pixel_sigma_px, (len(ids), 4)))
+        seen = z[ids] + noise.normal(0, scenario.pixel_sigma_px, (len(ids), 4))
+        if scenario.outliers:
+            wrong = noise.random(len(ids)) < scenario.outliers
+            seen += wrong[:, None] * noise.uniform(-40, 40, (len(ids), 2))[:, [0, 1, 0, 1]]
+        return observations(k, k * _FRAME_NS, ids, seen)
 
 
 def _times(frames: int) -> FloatArray:
@@ -445,7 +455,7 @@ def fly(job: Job) -> Record:
     samples: list[MotionSample] = []
     bias: FloatArray = np.zeros((scenario.frames, 6))
     if job.motion == "imu":
-        imu, walked = flight.imu(scenario.frames, noise, settings)
+        imu, walked = flight.imu(scenario.frames, noise, settings, scenario.imu_offset_s)
         samples, bias = list(imu), walked[:: _FRAME_NS // _IMU_NS][: scenario.frames]
     elif job.motion == "velocity":
         samples = list(flight.velocities(scenario.frames, noise, settings))
@@ -453,9 +463,11 @@ def fly(job: Job) -> Record:
     position_sigma, yaw_sigma = _START[job.start]
     start[:3], start[5] = noise.normal(0, position_sigma, 3), noise.normal(0, yaw_sigma)
 
-    navs, covariances, poses = [], [], []
+    navs, covariances, poses, fed_ns = [], [], [], -1
     for k in range(scenario.frames):
-        while samples and samples[0].time_ns <= k * _FRAME_NS:
+        # As in the pipeline, a frame waits for the first IMU sample at or after its exposure.
+        while samples and fed_ns < k * _FRAME_NS:
+            fed_ns = samples[0].time_ns
             filt.propagate(samples.pop(0))
         filt.update(flight.frame(k, T[k], scenario, noise))
         navs.append(filt.nav)
@@ -531,9 +543,13 @@ def main() -> int:
     parser.add_argument("--pixel-sigma", type=float, default=usual.pixel_sigma_px, help="noise of a pixel")
     parser.add_argument("--features", type=int, default=usual.features, help="points seen in a frame")
     parser.add_argument("--landmarks", type=int, default=usual.landmarks, help="most landmarks in the state")
+    parser.add_argument("--outliers", type=float, default=0.0, help="share of mismatched features")
+    parser.add_argument("--imu-offset-ms", type=float, default=0.0, help="of the IMU's samples against the frames")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     args = parser.parse_args()
-    scenario = Scenario(args.seconds, args.pixel_sigma, args.features, args.landmarks)
+    scenario = Scenario(
+        args.seconds, args.pixel_sigma, args.features, args.landmarks, args.outliers, args.imu_offset_ms * 1e-3
+    )
     groups = list(_groups(args.motions, args.variants))
     jobs = [Job(scenario, *group, seed) for seed, group in product(range(args.runs), groups)]
     try:

@@ -225,6 +225,7 @@ class StereoFieldEstimate:
 
     coefficients: FloatArray  # (6,) a0, a1, a2 of the right columns; k, q1, q2 of both lenses
     covariance: FloatArray  # (6, 6)
+    rows_rms_px: float = 0.0  # root mean square over the features of what the rows of left and right differ by
 
 
 @dataclass(frozen=True, slots=True)

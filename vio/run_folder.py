@@ -138,7 +138,24 @@ def metrics_of(
         "dead_reckoning": None if dead_reckoning is None else dead_reckoning.as_dict(),
         "landmark_error": landmark_error(result, evaluation),
         "warnings": list(result.warnings),
+        "stereo_field": stereo_field(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
+    }
+
+
+def stereo_field(result: RunResult) -> dict[str, Any] | None:
+    """Return what the stereo calibration was found to be off by at the end of the run; None: it was not estimated.
+
+    Coefficients of equation (R3) of docs/math.md and their standard deviations, times the focal length.
+    """
+    field = result.estimates[-1].stereo_field
+    if field is None:
+        return None
+    f = result.recording.camera.fu
+    return {
+        "rows_rms_px": field.rows_rms_px,
+        "coefficients_px": (f * field.coefficients).tolist(),
+        "sigma_px": (f * np.sqrt(np.diag(field.covariance))).tolist(),
     }
 
 

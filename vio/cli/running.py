@@ -93,6 +93,12 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         ("time", f"{metrics['ms_per_frame']:.1f} ms a frame ({stages})"),
         ("back end", f"{metrics['backend']}, motion {metrics['motion']}"),
     ]
+    if metrics["stereo_field"] is not None:
+        field = metrics["stereo_field"]
+        off, sigma = field["coefficients_px"][0], field["sigma_px"][0]
+        rows.append(
+            ("stereo", f"rows off by {field['rows_rms_px']:.2f} px (rms), disparities by {-off:+.2f} ± {sigma:.2f} px")
+        )
     if metrics["ate_m"] is None:
         rows.append(("ATE", "no reference"))
     else:

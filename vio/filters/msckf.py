@@ -11,6 +11,7 @@ consistency (2017); Barrau & Bonnabel (2017).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
@@ -28,9 +29,10 @@ from vio.filters.multiview import (
 )
 from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, Transition, TwistMotion
 from vio.filters.noise import MotionNoise, StepErrors
-from vio.filters.online_calibration import first_calibration
+from vio.filters.online_calibration import calibration_covariance, first_calibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
+    TERMS,
     RowField,
     StereoField,
     StereoInformation,
@@ -187,7 +189,8 @@ class Msckf:
             if not self._motion.ready:
                 return self._wait(observations)
             nav, P = self._motion.start(observations.time_ns)
-            calibration, P_calibration, _ = self._calibration
+            calibration = self._calibration
+            P_calibration, _ = calibration_covariance(calibration, self._settings)
             self._window = Window(self._motion, nav, np.asarray(block_diag(P, P_calibration)), calibration)
             self._time_ns = self._body_ns = self._began_ns = observations.time_ns
             self._measure()
@@ -228,7 +231,11 @@ class Msckf:
             gyro_bias=window.nav.gyro_bias,
             accel_bias=window.nav.accel_bias,
         )
-        return window.calibration.add_to_estimate(estimate, output[DIM:, DIM:])
+        estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:])
+        if estimate.stereo_field is not None:
+            field = replace(estimate.stereo_field, rows_rms_px=self._rows.rms_px)
+            estimate = replace(estimate, stereo_field=field)
+        return estimate
 
     def _grown_output(self) -> FloatArray:
         """Covariance of navigation state and calibration at the time of the last event."""
@@ -319,7 +326,8 @@ class Msckf:
             and after_s >= self._settings.calibrate_after_s
         ):
             window.start_calibration()
-        window.add_calibration_noise(self._calibration[2] * step_s)
+        walk = calibration_covariance(calibration, self._settings)[1]
+        window.add_calibration_noise(walk * step_s)
 
     def _body_time(self, time_ns: int) -> int:
         """The time on the IMU's clock to which the navigation state is carried for a frame."""
@@ -369,8 +377,7 @@ class Msckf:
 
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Update with everything that a frame shows."""
-        if window.calibration.stereo is not None:
-            self._rows.update(seen)
+        self._calibrate_stereo(window, seen)
         z, weight, found = latest_pixels(seen, window.landmark_ids)
         self._keep_landmarks(window, found)
         pixels = Views(z[found], weight[found])
@@ -438,6 +445,16 @@ class Msckf:
         if measurement is not None:
             window.absorb_measurement(measurement)
             self._stationary_ns = window.clones[-1].time_ns
+
+    def _calibrate_stereo(self, window: Window, seen: Observations) -> None:
+        """Learn the rows of a frame; begin to estimate the stereo field where they show that it is needed."""
+        if self._settings.calibrate_stereo == "off":
+            return
+        self._rows.update(seen)
+        if window.calibration.stereo is None and self._rows.is_significant:
+            calibration = replace(window.calibration, stereo=np.zeros(TERMS))
+            P, _ = calibration_covariance(calibration, self._settings)
+            window.start_stereo_field(calibration, P[:TERMS, :TERMS])
 
     def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
         """Linearise tracks at the window's present means."""

@@ -212,10 +212,20 @@ class ImuMotion:
             nav.accel_bias + error[12:15],
         )
 
-    def corrected_earlier(self, velocities: FloatArray, ages_s: FloatArray, error: FloatArray) -> FloatArray:
-        """Return velocities (N, 3), some seconds old, as an error (15,) of the present state moves them: (N2) back."""
+    def corrected_earlier(
+        self, velocities: FloatArray, R_world_imu: FloatArray, ages_s: FloatArray, error: FloatArray
+    ) -> FloatArray:
+        """Return velocities as a present error (15,) moves them: (N2) back, with the accelerometer's bias.
+
+        Args:
+            velocities: (N, 3) of the past, world.
+            R_world_imu: (N, 3, 3) mean attitudes from then to now.
+            ages_s: (N,) seconds from then to now.
+            error: (15,) of the present state.
+        """
         phi = error[3:6]
         xi_v = (_free_flow(-ages_s, self._gravity) @ error[:9])[:, 6:9]
+        xi_v = xi_v + ages_s[:, None] * (R_world_imu @ error[12:15])
         out: FloatArray = velocities @ so3_exp(phi).T + xi_v @ so3_left_jacobian(phi).T
         return out
 

@@ -80,19 +80,23 @@ class Calibration:
         return out
 
 
-def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings) -> tuple[Calibration, FloatArray, FloatArray]:
-    """Return the calibration at the start, its covariance (C, C), and what a second of random walk adds (C, C)."""
+def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings) -> Calibration:
+    """Return the calibration at the start."""
+    extrinsics, timing = (settings.calibrate in (kind, "both") for kind in ("extrinsics", "time_offset"))
+    stereo = np.zeros(TERMS) if settings.calibrate_stereo == "on" else None
+    return Calibration(np.asarray(T_cam0_imu, dtype=np.float64), 0.0, extrinsics, timing, stereo)
+
+
+def calibration_covariance(calibration: Calibration, settings: MsckfSettings) -> tuple[FloatArray, FloatArray]:
+    """Return the initial covariance (C, C) of what is estimated, and what a second of random walk adds to it (C, C)."""
     s = settings
-    extrinsics, timing = s.calibrate in ("extrinsics", "both"), s.calibrate in ("time_offset", "both")
-    stereo = np.zeros(TERMS) if s.calibrate_stereo else None
-    calibration = Calibration(np.asarray(T_cam0_imu, dtype=np.float64), 0.0, extrinsics, timing, stereo)
-    rotation, rotation_walk = np.radians([s.extrinsic_rotation_sigma_deg, s.extrinsic_rotation_walk])
     yaw, field = np.radians(s.stereo_yaw_sigma_deg), s.stereo_field_sigma
-    stereo_sigmas = np.array([yaw, field, field, _RADIAL * field, field, field])
-    sigmas = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
-    walks = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])
-    sigmas, walks = np.concatenate([stereo_sigmas, sigmas]), np.concatenate([stereo_sigmas * _STEREO_WALK, walks])
-    return calibration, np.diag(sigmas[calibration.columns] ** 2), np.diag(walks[calibration.columns] ** 2)
+    stereo = np.array([yaw, field, field, _RADIAL * field, field, field])
+    rotation, rotation_walk = np.radians([s.extrinsic_rotation_sigma_deg, s.extrinsic_rotation_walk])
+    pose = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
+    pose_walk = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])
+    sigmas, walks = np.concatenate([stereo, pose]), np.concatenate([stereo * _STEREO_WALK, pose_walk])
+    return np.diag(sigmas[calibration.columns] ** 2), np.diag(walks[calibration.columns] ** 2)
 
 
 def body_twists(T_world_imu: FloatArray, velocity_world: FloatArray, rate: FloatArray) -> FloatArray:

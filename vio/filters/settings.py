@@ -126,8 +126,10 @@ class MsckfSettings(Section):
     calibrate: Literal["none", "extrinsics", "time_offset", "both"] = setting(
         "none", "what is estimated besides the motion, with IMU only: T_cam0_imu, the time offset, or both"
     )
-    calibrate_stereo: bool = setting(
-        False, "estimate what the stereo calibration is off by: a low-order field over the image"
+    calibrate_stereo: Literal["auto", "on", "off"] = setting(
+        "auto",
+        "estimate what the stereo calibration is off by, a low-order field over the image: always, never, or where the "
+        "rows of left and right images show that it is off",
     )
     stereo_yaw_sigma_deg: float = setting(
         0.1, "initial standard deviation of the right camera's turn about its vertical axis", unit="deg", at_least=0

@@ -34,7 +34,6 @@ TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
 _ROW_TERMS = 6
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
-_DECIDING_FRAMES = 3  # before the rows decide whether the calibration is off
 _LEAST_ROWS_PX = 0.2  # root mean square of the field over the matches; a good calibration leaves half of it
 _ROW_SIGNIFICANCE = 25.0  # squared standard deviations of the field by noise alone
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
@@ -65,7 +64,6 @@ class RowField:
         self._A: FloatArray = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         self._b: FloatArray = np.zeros(_ROW_TERMS)
         self._squares = self._count = 0.0  # of the rows' residuals, in the same memory
-        self._frames = 0
         self.rms_px = 0.0  # of the field over the matches
         self.coefficients: FloatArray = np.zeros(_ROW_TERMS)  # of 1, x, y, x y, x^2, y^2, in focal lengths
 
@@ -87,7 +85,6 @@ class RowField:
         prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
         self.coefficients = solution / camera.fv
-        self._frames += 1
         field = basis @ solution
         self._squares = _ROW_MEMORY * self._squares + float(weight @ (rows - field) ** 2)
         self._count = _ROW_MEMORY * self._count + float(weight.sum())
@@ -96,8 +93,6 @@ class RowField:
     @property
     def is_significant(self) -> bool:
         """Whether the rows show that the calibration is off: a field beyond its own uncertainty, and beyond harm."""
-        if self._frames < _DECIDING_FRAMES:
-            return False
         uncertainty = _ROW_TERMS * self._squares / max(self._count, 1.0) ** 2
         return self.rms_px**2 > _LEAST_ROWS_PX**2 + _ROW_SIGNIFICANCE * uncertainty
 

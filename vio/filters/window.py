@@ -237,6 +237,20 @@ class Window:
         P[6:9, 6:9] += np.eye(3) * _VELOCITY_SIGMA_MPS**2
         self.P, self.prior_delta = 0.5 * (P + P.T), S @ self.prior_delta
 
+    def start_stereo_field(self, calibration: Calibration, covariance: FloatArray) -> None:
+        """Add the stereo field's coefficients to the state.
+
+        Args:
+            calibration: with the coefficients' first estimate.
+            covariance: of their errors (S, S).
+        """
+        D, S = len(self.P), len(covariance)
+        old = np.concatenate([np.arange(DIM), np.arange(DIM + S, D + S)])
+        P, prior_delta = np.zeros((D + S, D + S)), np.zeros(D + S)
+        P[np.ix_(old, old)], prior_delta[old] = self.P, self.prior_delta
+        P[DIM : DIM + S, DIM : DIM + S] = covariance
+        self.P, self.prior_delta, self.calibration = P, prior_delta, calibration
+
     def add_calibration_noise(self, extra: FloatArray) -> None:
         """Add noise (C, C) to the errors of what is being calibrated."""
         size = self.calibration.dim if self.calibrating else self.calibration.stereo_dim
@@ -391,7 +405,9 @@ class Window:
     def _correct_twists(self, motion: ImuMotion, error: FloatArray) -> None:
         """Let the clones' velocities and rates follow the navigation state's error (15,)."""
         ages = np.array([self.clones[-1].time_ns - c.time_ns for c in self.clones]) * 1e-9
-        velocities = motion.corrected_earlier(np.array([c.velocity for c in self.clones]), ages, error)
+        R = np.array([c.T_world_imu[:3, :3] for c in self.clones])
+        earlier = np.array([c.velocity for c in self.clones])
+        velocities = motion.corrected_earlier(earlier, 0.5 * (R + R[-1]), ages, error)
         self.clones = [
             replace(c, velocity=v, rate=c.rate - error[9:12]) for c, v in zip(self.clones, velocities, strict=True)
         ]

@@ -9,6 +9,7 @@ from vio.records import Estimate, UpdateReport
 
 _NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
 _REJECTING_FRAMES = 20
+_ROWS_OFF_PX = 0.2
 _MAX_SPEED_MPS = 100.0
 _MAX_GYRO_BIAS_RADPS = 0.5
 _MAX_ACCEL_BIAS_MPS2 = 3.0
@@ -33,8 +34,21 @@ class RunHealth:
             estimate: the state estimate after it.
         """
         lines = [*self._features(index, report, estimate), *self._rejections(index, report)]
+        lines += self._stereo(index, estimate)
         lines += self._implausible(index, estimate)
         return tuple(lines)
+
+    def _stereo(self, index: int, estimate: Estimate) -> list[str]:
+        """Report once that the filter estimates the stereo calibration, as the rows show that it is off."""
+        field = estimate.stereo_field
+        if field is None or field.rows_rms_px < _ROWS_OFF_PX or "stereo" in self._reported:
+            return []
+        self._reported.add("stereo")
+        return [
+            f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms) in a smooth "
+            "pattern: the stereo calibration is off; what it is off by is estimated while running "
+            "(msckf.calibrate_stereo)"
+        ]
 
     def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[str]:
         """Report when features have been missing for long, and when they are back."""
