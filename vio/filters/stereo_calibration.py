@@ -1,20 +1,9 @@
 """What a stereo calibration got wrong, as states of the filter and as a field of rows learned beside it.
 
-A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field of
-normalised coordinates (x, y), pixels over the focal length f. Its rows, `dv`, show in `vl - vr` at once. Its columns,
-`du`, look like depth: only motion, which gives the same points a second depth, separates them. A turn (wx, wy, wz), a
-shift of the principal point (cx, cy), a focal ratio s and tangential distortion (p1, p2) against the left camera make
-
-    du = (cx + wy) + s x - wz y + (2 p1 - wx) x y + (wy + 3 p2) x^2 + p2 y^2                       (R1)
-    dv = (cy - wx) + wz x + s y + (wy + 2 p2) x y + p1 x^2 + (3 p1 - wx) y^2                       (R2)
-
-so three of the terms of du follow from the rows: those of y, of x y, and the difference of those of y^2 and x^2. The
-other three are states. Three more are what both lenses have in common, left over after rectification: radial (k) and
-tangential (q1, q2) distortion, which moves `ul`, `vl` and `ur` and shows in how points move through the image,
-
-    du = a0 + a1 x + a2 (x^2 + y^2) + rows                                                          (R3)
-    d(u, v) = k (x, y) r^2 + q1 (2 x y, r^2 + 2 y^2) + q2 (r^2 + 2 x^2, 2 x y)
-
+A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field over
+the image. Its rows show in `vl - vr` at once. Its columns look like depth: only motion, which gives the same points a
+second depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three of the six terms of the columns; the
+other three are states, and so are three terms of distortion that both lenses have in common.
 References: Dang, Hoffmann & Stiller, Continuous stereo self-calibration by camera parameter tracking, IEEE TIP (2009);
 Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for improved odometry accuracy, ECMR (2021).
 """

@@ -26,12 +26,16 @@ class WindowPosterior:
 
     @classmethod
     def of(cls, window: Window, P: FloatArray) -> WindowPosterior:
-        """Take over the window's clones at their present means, with the covariance P (D, D) of all errors."""
+        """Take over the body's poses at the window's exposures, with the covariance P (D, D) of all errors."""
         rows = slice(window.first_clone, window.first_landmark)
-        clones = tuple(window.clones)
+        clones, own = tuple(window.clones), P[rows, rows]
+        if window.calibration.timing:
+            clones = tuple(replace(c, T_world_imu=T) for c, T in zip(clones, window.exposures(), strict=True))
+            exposures_D_error = window.chain(np.eye(6 * len(clones)))
+            own = exposures_D_error @ P @ exposures_D_error.T
         if not isinstance(window.motion, ImuMotion):
             clones = _with_velocities(clones)
-        return cls(clones, P[rows, rows], window.nav.gyro_bias, window.nav.accel_bias)
+        return cls(clones, own, window.nav.gyro_bias, window.nav.accel_bias)
 
     def rotated(self, R: FloatArray) -> WindowPosterior:
         """Return the same in a world that is turned by R (3, 3)."""
