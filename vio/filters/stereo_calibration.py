@@ -1,8 +1,8 @@
 """What a stereo calibration got wrong, as states of the filter and as a field of rows learned beside it.
 
-A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field over
-the image. Its rows show in `vl - vr` at once. Its columns look like depth: only motion, which gives the same points a
-second depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three of the six terms of the columns; the
+A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field.
+Its rows show in `vl - vr` at once. Its columns look like depth: only motion, which gives the same points a second
+depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three of the six terms of the columns; the
 other three are states, and so are three terms of distortion that both lenses have in common.
 References: Dang, Hoffmann & Stiller, Continuous stereo self-calibration by camera parameter tracking, IEEE TIP (2009);
 Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for improved odometry accuracy, ECMR (2021).
