@@ -16,6 +16,7 @@ TESTED_JACOBIANS = {
     "vio.filters.multiview.point_D_clones",
     "vio.filters.multiview.point_D_pose",
     "vio.filters.online_calibration.pose_D_calibration",
+    "vio.filters.stereo_calibration.point_D_stereo",
     "vio.filters.vislam.z_D_landmark",
     "vio.filters.vislam.z_D_xi",
     "vio.geometry.distortion.uv_D_p_cam",

@@ -34,6 +34,7 @@ _IMU_GAPS = ("tests/test_imu_gaps.py",)
 _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
+_STEREO_FIELD = ("tests/test_stereo_calibration.py",)
 _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
 _SCORE = ("tests/test_evaluation.py",)
@@ -553,8 +554,8 @@ MUTATIONS = (
     Mutation(
         "rows: the right row moves the first point",
         "vio/filters/multiview.py",
-        "views.z[rows, best][:, [0, 1, 2, 1]]",
-        "views.z[rows, best]",
+        "_on_rays(camera, T_cam0_world[best], z[:, :2], z[:, 0] - z[:, 2])",
+        "_on_rays(camera, T_cam0_world[best], z[:, [0, 3]], z[:, 0] - z[:, 2])",
         _TRUTH,
     ),
     Mutation(
@@ -609,8 +610,8 @@ MUTATIONS = (
     Mutation(
         "calibration: correction on the camera's side",
         "vio/filters/online_calibration.py",
-        "self.T_cam0_imu @ se3_exp(full[:6])",
-        "se3_exp(full[:6]) @ self.T_cam0_imu",
+        "self.T_cam0_imu @ se3_exp(full[_DELTA])",
+        "se3_exp(full[_DELTA]) @ self.T_cam0_imu",
         _CALIBRATE,
     ),
     Mutation(
@@ -621,6 +622,41 @@ MUTATIONS = (
         _CALIBRATE,
     ),
     # --- vio/filters: the paper's filter ---
+    Mutation(
+        "time offset: velocities of the past do not follow the accelerometer's bias",
+        "vio/filters/navigation.py",
+        "ages_s[:, None] * (R_world_imu @ error[12:15])",
+        "0 * ages_s[:, None] * (R_world_imu @ error[12:15])",
+        _CALIBRATE,
+    ),
+    Mutation(
+        "stereo field: linearised at the pixels that were seen",
+        "vio/filters/window_tracks.py",
+        "self._views(rows, at.r.shape[1]).z - at.r)",
+        "self._views(rows, at.r.shape[1]).z)",
+        _STEREO_FIELD,
+    ),
+    Mutation(
+        "stereo field: sign of a term that follows from the rows",
+        "vio/filters/stereo_calibration.py",
+        "(-c[1] * y + (c[5] - c[4]) * x * y - c[3] * y * y)",
+        "(-c[1] * y + (c[4] - c[5]) * x * y - c[3] * y * y)",
+        _STEREO_FIELD,
+    ),
+    Mutation(
+        "stereo field: eliminated points still count",
+        "vio/filters/stereo_calibration.py",
+        "H.reshape(-1, S) - flat_G.T @ flat_CG",
+        "H.reshape(-1, S)",
+        _STEREO_FIELD,
+    ),
+    Mutation(
+        "stereo field: rows believe every mismatch",
+        "vio/filters/stereo_calibration.py",
+        "1 / (1 + (residual / (CAUCHY * scale)) ** 2)",
+        "1 / (1 + 0 * (residual / (CAUCHY * scale)) ** 2)",
+        _STEREO_FIELD,
+    ),
     Mutation(
         "paper: right Jacobian for the left in the twist's step",
         "vio/filters/vislam_motion.py",

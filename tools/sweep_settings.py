@@ -193,6 +193,9 @@ _NOT_SWEPT = {
     "frontend.learned.matcher_weights": "names a file",
     "frontend.learned.aliked_model": "needs weights",
     "frontend.learned.device": "needs a GPU",
+    "msckf.calibrate_stereo": "newer than the sweep",
+    "msckf.stereo_yaw_sigma_deg": "newer than the sweep",
+    "msckf.stereo_field_sigma": "newer than the sweep",
 }
 _ONLY = {"frontend.learned.detector": ("harris",), "frontend.name": ("orb", "sift")}
 _TAILS = ("msckf.gate_probability", "vislam.gate_probability")  # 1 - p is halved and doubled
