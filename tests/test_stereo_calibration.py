@@ -1,0 +1,335 @@
+"""Self-calibration of the stereo pair: its model, the learned rows, the elimination, and runs in an exact world.
+
+A right camera that is turned by a known angle, lenses with known distortion, and dense normal equations are the
+references.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tests import test_filter_truth
+from tests.numerics import numeric_jacobian
+from tests.test_filter_truth import SETTINGS, Course, Run, Spoil, fly
+from tests.test_multiview import T_CAM0_WORLD
+from vio.filters.multiview import (
+    _PRIOR,
+    Residuals,
+    TrackInformation,
+    Views,
+    landmark_residuals,
+    point_D_pose,
+    refine_points,
+    residuals,
+    track_information,
+)
+from vio.filters.stereo_calibration import (
+    TERMS,
+    RowField,
+    StereoColumns,
+    StereoField,
+    eliminate_points_from_columns,
+    field_jacobian,
+    landmark_columns,
+    stereo_columns,
+)
+from vio.geometry.distortion import CameraModel, project_point
+from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, transform_points
+from vio.geometry.stereo import StereoCamera, project
+from vio.records import MotionSource, Observations, StereoFieldEstimate, observations
+
+CAMERA = StereoCamera(460.0, 440.0, 370.0, 240.0, 0.11, 752, 480)  # fu and fv differ, so that neither passes for both
+CLONES = len(T_CAM0_WORLD)
+
+
+# The model
+
+
+def _distorted(rays: FloatArray, radial: float, tangential: tuple[float, float]) -> FloatArray:
+    """Pixels (..., 2) of rays through a lens with OpenCV's k1 and p1, p2."""
+    c = CAMERA
+    lens = CameraModel(c.fu, c.fv, c.cu, c.cv, 752, 480, "radtan", (radial, 0.0, *tangential))
+    return project_point(lens, rays)[0]
+
+
+def _rays(camera: StereoCamera, uv: FloatArray) -> FloatArray:
+    xy = (uv - [camera.cu, camera.cv]) / [camera.fu, camera.fv]
+    return np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+
+
+def _grid() -> FloatArray:
+    """Stereo pixels (N, 4) over the image at several disparities."""
+    u, v, d = np.meshgrid(np.linspace(60, 700, 7), np.linspace(30, 450, 5), [2.0, 20.0, 50.0])
+    return np.stack([u, v, u - d, v], axis=-1).reshape(-1, 4)
+
+
+def test_field_jacobian_equals_central_differences_of_distorted_projections() -> None:
+    """Both lenses distorted alike, and columns of the right camera moved as (R3) says."""
+    z = _grid()
+
+    def seen(s: FloatArray) -> FloatArray:
+        left, right = (_distorted(_rays(CAMERA, z[:, c]), s[3], (s[4], s[5])) for c in (slice(0, 2), slice(2, 4)))
+        x, y = _rays(CAMERA, z[:, 2:])[:, :2].T
+        right[:, 0] += CAMERA.fu * (s[0] + s[1] * x + s[2] * (x * x + y * y))
+        right[:, 1] = z[:, 3]  # right rows are not measured
+        return np.concatenate([left, right], axis=1)
+
+    numeric = numeric_jacobian(seen, np.zeros(TERMS), eps=1e-6).reshape(-1, 4, TERMS)
+    np.testing.assert_allclose(field_jacobian(CAMERA, z), numeric, atol=1e-4)
+
+
+def _turned_right(z: FloatArray, camera: StereoCamera, w: FloatArray) -> FloatArray:
+    """Stereo pixels (N, 4) where the right camera is turned: its points p are seen as `exp(w) p`."""
+    p = _rays(camera, z[:, 2:]) @ so3_exp(w).T
+    out = z.copy()
+    out[:, 2] = camera.fu * p[:, 0] / p[:, 2] + camera.cu
+    out[:, 3] = camera.fv * p[:, 1] / p[:, 2] + camera.cv
+    return out
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_rows_and_three_states_describe_a_turn_of_the_right_camera(axis: int) -> None:
+    """0.01 deg about each axis: (R1) and (R2) as printed, and columns by (R3) from rows learned of (R2)."""
+    w = np.radians(0.01) * np.eye(3)[axis]
+    z = _grid()
+    moved = _turned_right(z, CAMERA, w) - z
+    x, y = _rays(CAMERA, z[:, 2:])[:, :2].T
+    du = w[1] - w[2] * y - w[0] * x * y + w[1] * x * x  # (R1)
+    dv = -w[0] + w[2] * x + w[1] * x * y - w[0] * y * y  # (R2)
+    np.testing.assert_allclose(moved[:, 2], CAMERA.fu * du, atol=1e-4)
+    np.testing.assert_allclose(moved[:, 3], CAMERA.fv * dv, atol=1e-4)
+    assert np.abs(moved[:, 2:]).max() > 0.05
+
+    rows = _learned(z + moved)
+    states = np.array([w[1], 0, w[1], 0, 0, 0])
+    field = field_jacobian(CAMERA, z)[:, 2] @ states + rows.columns(z)
+    np.testing.assert_allclose(field, moved[:, 2], atol=1e-3)
+
+
+def test_rows_and_three_states_describe_tangential_distortion_of_the_right_lens() -> None:
+    p1, p2 = 2e-4, -1e-4
+    z = _grid()
+    moved = z.copy()
+    moved[:, 2:] = _distorted(_rays(CAMERA, z[:, 2:]), 0.0, (p1, p2))
+    states = np.array([0, 0, 3 * p2, 0, 0, 0])
+    field = field_jacobian(CAMERA, z)[:, 2] @ states + _learned(moved).columns(z)
+    np.testing.assert_allclose(field, (moved - z)[:, 2], atol=1e-3)
+    assert np.abs((moved - z)[:, 2]).max() > 0.1
+
+
+# Rows
+
+
+def _learned(z: FloatArray, camera: StereoCamera = CAMERA, frames: int = 50) -> RowField:
+    rows = RowField(camera)
+    for k in range(frames):
+        rows.update(observations(k, k, np.arange(len(z)), z))
+    return rows
+
+
+def test_rows_are_learned_among_mismatches() -> None:
+    """200 frames of 100 matches, 0.3 px of noise, one match in five wrong by up to 20 px: the field to 0.02 px."""
+    true, rng = np.array([2e-3, -3e-3, 1e-3, 4e-3, -2e-3, 3e-3]), np.random.default_rng(5)
+    rows, grid = RowField(CAMERA), _grid()
+
+    def field(z: FloatArray) -> FloatArray:
+        x, y = _rays(CAMERA, z[:, 2:])[:, :2].T
+        out: FloatArray = CAMERA.fv * np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1) @ true
+        return out
+
+    for k in range(200):
+        u, v = rng.uniform([20, 20], [730, 460], (100, 2)).T
+        z = np.stack([u, v, u - rng.uniform(2, 15, 100), v], axis=1)
+        z[:, 3] += field(z) + rng.normal(0, 0.3, 100) + (rng.random(100) < 0.2) * rng.uniform(-20, 20, 100)
+        rows.update(observations(k, k, np.arange(100), z))
+    x, y = _rays(CAMERA, grid[:, 2:])[:, :2].T
+    found = CAMERA.fv * np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1) @ rows.coefficients
+    error = found - field(grid)
+    assert np.sqrt(np.mean(error**2)) < 0.02
+    assert np.abs(field(grid)).max() > 1.0
+
+
+def test_rows_are_not_learned_from_few_matches_or_left_views() -> None:
+    z = _grid()
+    z[:, 3] += 2.0
+    rows = RowField(CAMERA)
+    rows.update(observations(0, 0, np.arange(29), z[:29]))
+    seen = observations(1, 1, np.arange(len(z)), z)
+    rows.update(replace(seen, has_right=np.zeros(len(z), dtype=np.bool_)))
+    np.testing.assert_array_equal(rows.coefficients, 0.0)
+
+
+# Elimination
+
+
+def _tracks() -> tuple[FloatArray, Views]:
+    """Points (n, 3) and noisy views of them; some without right view, some not seen."""
+    rng, n = np.random.default_rng(4), 6
+    p_cam = rng.uniform([-1.0, -0.8, 3.0], [1.0, 0.8, 6.0], (n, 3))
+    p = transform_points(se3_inverse(T_CAM0_WORLD[0]), p_cam)
+    z = np.array([[project(CAMERA, transform_points(T, q)) for T in T_CAM0_WORLD] for q in p])
+    weight = np.tile([1.0, 1.0, 1.0, 0.0], (n, CLONES, 1))
+    weight[0, :, 2] = 0.0
+    weight[1, 0] = 0.0
+    weight[2, 2, 2] = 0.0
+    return p, Views(z + rng.normal(0, 0.3, z.shape), weight)
+
+
+def _linear() -> tuple[FloatArray, Residuals, TrackInformation, StereoColumns, FloatArray, FloatArray]:
+    p, views = _tracks()
+    p = refine_points(CAMERA, T_CAM0_WORLD, p, views, 3, 10.0)
+    at = residuals(CAMERA, T_CAM0_WORLD, p, views)
+    weight = np.random.default_rng(8).uniform(0.3, 1.0, (len(p), CLONES))
+    info = track_information(CAMERA, T_CAM0_WORLD, at, p, weight)
+    H = field_jacobian(CAMERA, views.z - at.r)
+    return p, at, info, stereo_columns(at, H, info.q.p_D_q, weight), H, weight
+
+
+def test_elimination_equals_the_schur_complement_with_the_coefficients_as_columns() -> None:
+    """Dense normal equations in clones, coefficients and points, with the prior (M6) on each point's disparity."""
+    p, at, info, columns, H, weight = _linear()
+    F, clones, S = len(p), 6 * CLONES, TERMS
+    first = clones + S  # of the points
+    N, b = np.zeros((first + 3 * F, first + 3 * F)), np.zeros(first + 3 * F)
+    chosen = np.arange(F) != 3
+    for f in np.flatnonzero(chosen):
+        B = point_D_pose(p[f : f + 1])[0]
+        for n in range(CLONES):
+            J = at.z_D_p[f, n]
+            row = np.zeros((4, len(b)))
+            row[:, 6 * n : 6 * n + 6], row[:, first + 3 * f : first + 3 * f + 3] = J @ B, J
+            row[:, clones:first] = H[f, n] * np.any(J, axis=1)[:, None]
+            N += weight[f, n] * row.T @ row
+            b += weight[f, n] * row.T @ at.r[f, n]
+            if n == info.q.anchor[f]:
+                row = np.zeros((1, len(b)))
+                row[0, 6 * n : 6 * n + 6] = info.q.q_D_p[f, 2] @ B
+                row[0, first + 3 * f : first + 3 * f + 3] = info.q.q_D_p[f, 2]
+                N += _PRIOR * row.T @ row
+    points = np.flatnonzero(np.diag(N) > 0)
+    points = points[points >= first]
+    K = np.linalg.solve(N[np.ix_(points, points)], N[points, :first]).T
+    A, g = N[:first, :first] - K @ N[points, :first], b[:first] - K @ b[points]
+
+    out = eliminate_points_from_columns(columns, info, chosen)
+    scale = np.sqrt(np.abs(np.outer(np.diag(N)[:first], np.diag(N)[:first])))
+    np.testing.assert_allclose(
+        out.A / scale[clones:, clones:], A[clones:, clones:] / scale[clones:, clones:], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        out.cross / scale[clones:, :clones], A[clones:, :clones] / scale[clones:, :clones], atol=1e-9
+    )
+    np.testing.assert_allclose(out.b, g[clones:], rtol=1e-6, atol=1e-6)
+    assert np.abs(out.cross).max() > 1.0
+
+
+def test_points_follow_the_coefficients_as_their_triangulation_does() -> None:
+    p, weight = _tracks()[0][:1], np.tile([1.0, 1.0, 1.0, 0.0], (1, CLONES, 1))
+    z = np.array([[project(CAMERA, transform_points(T, p[0])) for T in T_CAM0_WORLD]])
+    at = residuals(CAMERA, T_CAM0_WORLD, p, Views(z, weight))
+    info = track_information(CAMERA, T_CAM0_WORLD, at, p, np.ones((1, CLONES)))
+    columns = stereo_columns(at, field_jacobian(CAMERA, z), info.q.p_D_q, np.ones((1, CLONES)))
+
+    def triangulated(s: FloatArray) -> FloatArray:
+        field = StereoField(CAMERA, RowField(CAMERA), s)
+        return refine_points(CAMERA, T_CAM0_WORLD, p, field.corrected(Views(z, weight)), 10, 1e6)[0]
+
+    numeric = numeric_jacobian(triangulated, np.zeros(TERMS), eps=1e-6)
+    np.testing.assert_allclose(columns.point_D_stereo(info)[0], numeric, atol=1e-4 * np.abs(numeric).max())
+
+
+def test_landmarks_tell_of_the_coefficients_as_dense_equations_do() -> None:
+    """`r = J (xi_f - xi_rho) + H s`, the landmarks' anchor the newest exposure."""
+    p, views = _tracks()
+    newest = Views(views.z[:, -1], views.weight[:, -1])
+    at = landmark_residuals(CAMERA, T_CAM0_WORLD[-1], p, newest, 0.25)
+    H = field_jacobian(CAMERA, newest.z - at.r)
+    out = landmark_columns(at, H, CLONES)
+    size, rho = 6 * CLONES + 3 * len(p), 6 * CLONES - 6
+    A, cross, b = np.zeros((TERMS, TERMS)), np.zeros((TERMS, size)), np.zeros(TERMS)
+    for f in range(len(p)):
+        row = np.zeros((4, size))
+        row[:, rho : rho + 3], row[:, 6 * CLONES + 3 * f : 6 * CLONES + 3 * f + 3] = -at.J[f], at.J[f]
+        h = H[f] * np.any(at.J[f], axis=1)[:, None]
+        A += at.weight[f] * h.T @ h
+        cross += at.weight[f] * h.T @ row
+        b += at.weight[f] * h.T @ at.r[f]
+    np.testing.assert_allclose(out.A, A)
+    np.testing.assert_allclose(out.cross, cross, atol=1e-9)
+    np.testing.assert_allclose(out.b, b)
+
+
+# Runs
+
+ON = replace(SETTINGS, calibrate_stereo="on")
+TURN = np.radians(0.1)
+STRAIGHT = Course(20, 5.0, velocity=(0.5, 0.3, 0.0), depth=(3.0, 12.0), pixel_sigma_px=0.3, features=100)
+ROUND = replace(STRAIGHT, velocity=(0.4, 0.5, 0.0), yaw_rate=0.2)
+
+
+def _turn(angle: float) -> Spoil:
+    """Turn the right camera of the exact world about its vertical axis."""
+
+    def spoil(k: int, seen: Observations) -> Observations:
+        return replace(seen, z=_turned_right(seen.z, test_filter_truth.CAMERA, np.array([0.0, angle, 0.0])))
+
+    return spoil
+
+
+def _field(run: Run, k: int = -1) -> tuple[FloatArray, FloatArray]:
+    """Coefficients (6,) and their standard deviations (6,) at a frame."""
+    field = run.estimates[k].stereo_field
+    assert isinstance(field, StereoFieldEstimate)
+    return field.coefficients, np.sqrt(np.diag(field.covariance))
+
+
+def _rms_m(run: Run) -> float:
+    return float(np.sqrt(np.mean([np.sum(run.error(k)[:3] ** 2) for k in range(run.course.frames)])))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", [None, "imu"])
+def test_a_turned_right_camera_is_found_and_its_harm_undone(motion: MotionSource | None) -> None:
+    """0.1 deg about the vertical axis: 0.8 px of disparity, which without calibration costs 3 % of the way."""
+    level = fly(STRAIGHT, motion, ON)
+    turned = fly(STRAIGHT, motion, ON, spoil=_turn(TURN))
+    ignored = fly(STRAIGHT, motion, replace(SETTINGS, calibrate_stereo="off"), spoil=_turn(TURN))
+    found, sigma = _field(turned)
+    assert abs(found[0] - TURN) < 3 * sigma[0]
+    assert found[0] > 10 * sigma[0]
+    assert _rms_m(turned) < 2 * _rms_m(level)
+    assert _rms_m(turned) < 0.2 * _rms_m(ignored)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("course", [STRAIGHT, ROUND], ids=["straight", "round"])
+def test_a_calibrated_rig_stays_calibrated(course: Course) -> None:
+    """All coefficients within three standard deviations of zero.
+
+    Linearised at the pixels that were seen, whose noise the residuals share, radial distortion ended 42 of them off.
+    """
+    for seed in range(2):
+        found, sigma = _field(fly(course, None, ON, seed))
+        assert np.all(np.abs(found) < 3 * sigma)
+
+
+@pytest.fixture(scope="module", params=[None, "imu"])
+def still(request: pytest.FixtureRequest) -> Run:
+    """Five seconds without motion."""
+    return fly(replace(STRAIGHT, velocity=(0.0, 0.0, 0.0)), request.param, ON)
+
+
+def test_standstill_tells_nothing_of_the_lenses_and_shifts_no_coefficient(still: Run) -> None:
+    (_, before), (found, sigma) = _field(still, 0), _field(still)
+    assert np.all(sigma[3:] > 0.98 * before[3:])
+    assert np.all(np.abs(found) < 3 * sigma)
+
+
+@pytest.mark.xfail(reason="known fault: the scatter of the estimated poses passes for parallax")
+def test_standstill_tells_nothing_of_the_right_columns(still: Run) -> None:
+    """Without motion every point has a depth that explains its disparity; a0 loses 22 to 24 % of its sigma in 5 s."""
+    (_, before), (_, sigma) = _field(still, 0), _field(still)
+    assert np.all(sigma[:3] > 0.98 * before[:3])
