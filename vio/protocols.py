@@ -21,7 +21,7 @@ from vio.records import (
     UpdateReport,
 )
 
-Progress: TypeAlias = Callable[[int, int], None]  # told after each frame: frames done, frames in all
+Progress: TypeAlias = Callable[[int, int], None]  # called after each frame: frames done, frames in all
 
 
 class Dataset(Protocol):
@@ -71,7 +71,7 @@ class Selector(Protocol):
 
         Args:
             observations: all that the front end saw in the frame.
-            motion: what the back end expects of the motion since the last frame, where it can tell.
+            motion: what the back end expects of the motion since the last frame, where it can predict it.
         """
 
 
@@ -86,13 +86,13 @@ class Backend(Protocol):
         """Take one motion sample; samples come in time order."""
 
     def predict(self, time_ns: int) -> Prediction | None:
-        """Tell what a frame at a coming time should show, without changing anything; None where it cannot be told."""
+        """Predict a frame at a coming time, without changing anything; None where no prediction is possible."""
 
     def update(self, observations: Observations) -> UpdateReport:
         """Move to the time of the observations and take them in."""
 
     def estimate(self) -> Estimate:
-        """Return the current belief."""
+        """Return the current estimate."""
 
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since taken into account; None where it is not kept."""

@@ -19,7 +19,7 @@ from vio.records import ImuSample, IntArray
 _NS = 1e-9
 _MEMORY_S = 2.0  # samples that the structure function is learned from
 _LONGEST_LAG_S = 1.0  # half of it; beyond, the signal is taken to have changed as much as it ever does
-_LEAST_SAMPLES = 10  # fewer tell nothing about a signal
+_LEAST_SAMPLES = 10  # with fewer the signal is not characterised
 _UNKNOWN = np.array([3.0, 1.0]) ** 2  # D then: accelerometer (m/s^2)^2, gyro (rad/s)^2, of a vehicle that manoeuvres
 _LONG_PERIODS = 1.5  # an interval longer than so many median periods lacks a sample; jitter of the clock stays below
 _SHORTEST_CUT_NS, _MOST_CUTS = 1e6, 1000  # of a gap, for the integration

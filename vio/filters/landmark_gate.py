@@ -1,6 +1,6 @@
 """Which landmarks of the state may be used: a moving point, or a track that slipped, must not steer the pose.
 
-A landmark stays in the state for many frames and is believed to millimetres, so a slow mover passes a test of single
+A landmark stays in the state for many frames and is known to millimetres, so a slow mover passes a test of single
 frames against the pixel noise. Two tests are made: its newest pixels against what all *other* measurements predict, and
 a running sum of these tests.
 """

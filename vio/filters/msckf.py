@@ -1,10 +1,10 @@
 """The sliding-window filter: right-invariant, multi-state constrained, with long-lived landmarks.
 
-A frame's work: predict; clone the pose; Gauss-Newton over the whole window with all that is seen, which gives the
-estimate; then commit for good what ends here (tracks that were lost, tracks that leave the window) and forget the
-oldest clone. Tracks that go on are linearised anew in every frame and committed once. The prior is kept in
-right-invariant errors, whose unobservable directions (global position and yaw) are the same whatever the estimate, so
-relinearising gains no information along them.
+For each frame: propagate; clone the pose; Gauss-Newton over the whole window with everything that is observed; gate
+tracks and landmarks; marginalise what ends here (tracks that were lost, tracks that leave the window); estimate with
+what passed its gate; drop the oldest clone. Tracks that continue are linearised anew in every frame and absorbed into
+the prior once. The prior is kept in right-invariant errors, whose unobservable directions (global position and yaw) do
+not depend on the estimate, so relinearisation adds no information along them.
 References: Mourikis & Roumeliotis (2007); Sun et al. (2018); Wu et al., An invariant-EKF VINS algorithm for improving
 consistency (2017); Barrau & Bonnabel (2017).
 """
@@ -72,7 +72,7 @@ _TWIST_FACTORS = (1.0, 0.1, 10.0)
 _LANDMARK_DEPTH_SIGMA = 0.01  # by all views
 _LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scale
 _MAP_DEPTH_SIGMA = 0.2  # by all views; a point of the map is reported with its covariance, and not used
-_LEAST_MERGE = 1000  # points told again beside which merging the map costs nothing
+_LEAST_MERGE = 1000  # stored points up to which the map is not merged
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 _MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
 
@@ -91,7 +91,7 @@ class Msckf:
         *,
         motion: MotionSource | None,
     ) -> None:
-        """Start without any belief; the first frame begins it.
+        """Prepare; the first frame initialises the state.
 
         Args:
             camera: the rectified stereo camera.
@@ -143,7 +143,7 @@ class Msckf:
             self._measure()
 
     def predict(self, time_ns: int) -> Prediction | None:
-        """Tell what a coming frame should show: the pixels of all tracks with a point, and the camera's motion."""
+        """Predict a coming frame: the pixels of all tracks with a point, and the camera's motion."""
         window = self._window
         if window is None or not window.clones or time_ns < self._time_ns:
             return None
@@ -179,7 +179,7 @@ class Msckf:
         return TrackPrior(ids[ahead], project(self._camera, p_cam[ahead]), R_cam_prev)
 
     def update(self, observations: Observations) -> UpdateReport:
-        """Predict to the time of the frame and take in its observations.
+        """Propagate to the time of the frame and update with its observations.
 
         Raises:
             EstimationError: the motion samples do not cover the step, or the filter diverged.
@@ -215,7 +215,7 @@ class Msckf:
         return report
 
     def estimate(self) -> Estimate:
-        """Return the belief at the time of the last event."""
+        """Return the estimate at the time of the last event."""
         if self._window is None:
             return Estimate(self._time_ns, np.eye(4), np.eye(6))
         window = self._window
@@ -272,11 +272,11 @@ class Msckf:
         window.keep_landmarks(kept)
 
     def _store_points(self, ids: IntArray, p_world: FloatArray, covariance: FloatArray) -> None:
-        """Add points to the map that is only told, never used."""
+        """Add points to the output map, which the filter does not use."""
         if len(ids):
             self._map.append(Landmarks(ids, p_world, covariance))
             self._points_stored += len(ids)
-            # Features that stay in view are told again and again.
+            # Features that stay in view are stored again and again.
             if self._points_stored > _LEAST_MERGE + len(self._map[0].ids):
                 self._map, self._points_stored = [_newest(self._map)], 0
 
@@ -500,7 +500,7 @@ class Msckf:
     ) -> StepErrors | None:
         """The predicted and the corrected motion since the last frame, whose fit left the covariance P (D, D).
 
-        None where too few tracks tell.
+        None with too few tracks.
         """
         if predicted is None or len(tracks.rows) < MIN_TRACKS_FOR_NOISE:
             return None

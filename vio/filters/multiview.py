@@ -162,8 +162,9 @@ def _by_parallax(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -
     centre = -np.einsum("nji,nj->ni", R, t)
     c_i = np.einsum("nij,fj->fni", R, centre[first]) + t
     xy = left_rays(camera, np.where(seen[..., None], views.z[..., :2], 0.0))[..., :2]
-    lever = (c_i[..., :2] - xy * c_i[..., 2:]) * seen[..., None]
-    rho = np.sum(lever * (xy * m_i[..., 2:] - m_i[..., :2]), axis=(1, 2)) / (np.sum(lever**2, axis=(1, 2)) + _TINY)
+    parallax = (c_i[..., :2] - xy * c_i[..., 2:]) * seen[..., None]
+    rho = np.sum(parallax * (xy * m_i[..., 2:] - m_i[..., :2]), axis=(1, 2))
+    rho = rho / (np.sum(parallax**2, axis=(1, 2)) + _TINY)
     return _on_rays(camera, T_cam0_world[first], views.z[rows, first, :2], rho * camera.fu * camera.baseline_m)
 
 

@@ -32,7 +32,7 @@ from vio.records import ImuSample, MotionSample, VelocitySample
 DIM = 15  # error dimensions of the navigation state
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
-_START_RATE_SIGMA_RADPS = 1.0  # doubt of the first angular rate without an IMU; the next image settles it
+_START_RATE_SIGMA_RADPS = 1.0  # initial standard deviation of the angular rate without an IMU
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ _STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What the filter believes of the rig, and which of it is estimated."""
+    """The estimate of the rig's calibration, and which of it is estimated."""
 
     T_cam0_imu: FloatArray  # (4, 4)
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock

@@ -60,7 +60,7 @@ class TrackTable:
         self.has_point[rows] = False
 
     def drop_views(self, rows: IntArray, views: BoolArray) -> None:
-        """Forget single views (F, N) of rows for good."""
+        """Remove single views (F, N) of rows permanently."""
         self._weight[rows, : views.shape[1]] *= ~views[..., None]
 
     def remove(self, rows: IntArray) -> None:
@@ -105,7 +105,7 @@ def measured(has_right: BoolArray) -> FloatArray:
 
 
 def latest_pixels(seen: Observations, ids: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Pixels (K, 4), weights (K, 4) and a mask (K,) of given ids in one frame; the mask tells which are there."""
+    """Pixels (K, 4), weights (K, 4) and a mask (K,) of given ids in one frame; the mask marks those that are there."""
     order = np.argsort(seen.ids)
     at = np.searchsorted(seen.ids[order], ids)
     at = np.minimum(at, max(len(order) - 1, 0))

@@ -174,7 +174,7 @@ class Vislam:
         self._time_ns = time_ns
 
     def predict(self, time_ns: int) -> Prediction | None:
-        """Tell nothing: the paper's filter takes observations as they come."""
+        """Return nothing: the paper's filter makes no prediction for the front end."""
         return None
 
     def update(self, observations: Observations) -> UpdateReport:

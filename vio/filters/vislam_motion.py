@@ -155,10 +155,10 @@ class DriftingTwist:
         return state.corrected(K @ residual, IKH @ Sigma @ IKH.T + K @ self._sensor @ K.T)
 
     def with_inflated_covariance(self, state: PoseState, tau_s: float) -> PoseState:
-        """Return the state with at least as much doubt about the last step's twist as at the start."""
+        """Return the state with the last step's twist at least as uncertain as at the start."""
         start = np.diag(np.maximum(self._start - np.diag(state.Sigma)[6:], 0.0))
-        doubt = np.block([[start * tau_s**2, -start * tau_s], [-start * tau_s, start]])
-        return replace(state, Sigma=state.Sigma + doubt)
+        inflation = np.block([[start * tau_s**2, -start * tau_s], [-start * tau_s, start]])
+        return replace(state, Sigma=state.Sigma + inflation)
 
     def predict(self, state: PoseState, start_ns: int, end_ns: int) -> PoseState:
         """Carry the state over the time between two events."""

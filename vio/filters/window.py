@@ -2,8 +2,8 @@
 
 Layout of an error vector of length D: navigation state (15), calibration (C = 0, 1, 6 or 7), clones (6 each, oldest
 first), landmarks (3 each). Only this module knows it. The means are the newest estimates, at which everything is
-linearised; `P` and `offset` describe the prior: what has been committed says that the true error of the means has mean
-`-offset` and covariance `P`.
+linearised; `P` and `prior_delta` describe the prior: by all absorbed measurements, the true error of the means has mean
+`-prior_delta` and covariance `P`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vio.records import BoolArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class Clone:
-    """The body at the time of a frame, as the IMU's clock was thought to tell it."""
+    """The body at the time of a frame on the IMU's clock, by the time offset estimated then."""
 
     frame_index: int
     time_ns: int  # the frame's stamp
@@ -334,7 +334,7 @@ class Window:
         self.landmarks = np.concatenate([self.landmarks, p_world])
 
     def absorb(self, information: FloatArray, vector: FloatArray) -> None:
-        """Take measurements into the prior for good.
+        """Absorb measurements into the prior.
 
         Args:
             information: `H' R^-1 H` (D, D) of the residuals at the present means.
@@ -344,12 +344,12 @@ class Window:
         self.prior_delta = self.prior_delta - shift
 
     def measure(self, measurement: Measurement) -> None:
-        """Commit a measurement of the navigation state and move the means to the new prior."""
+        """Absorb a measurement of the navigation state and move the means to the new prior."""
         self.absorb_measurement(measurement)
         self.relinearise(-self.prior_delta)
 
     def absorb_measurement(self, measurement: Measurement) -> None:
-        """Commit a measurement of the navigation state; the means stay where they are."""
+        """Absorb a measurement of the navigation state; the means stay where they are."""
         RiH = np.linalg.solve(measurement.R, measurement.H)
         information = np.zeros_like(self.P)
         information[:DIM, :DIM] = measurement.H.T @ RiH

@@ -1,4 +1,4 @@
-"""The tracks of the window: which of them enter an update, what they say there, and how far they are believed.
+"""The tracks of the window: which of them enter an update, their linearisation, their gates, and the pixel noise.
 
 Everything here is about pixels and points; poses come in as camera poses and go out as information about them.
 """
@@ -55,7 +55,7 @@ class LinearTracks:
 
 
 class WindowTracks:
-    """The living tracks, and the pixel noise as their residuals tell it."""
+    """The tracks in the window, and the pixel noise estimated from their residuals."""
 
     def __init__(self, camera: StereoCamera, settings: MsckfSettings) -> None:
         self._camera, self._settings = camera, settings
@@ -104,7 +104,7 @@ class WindowTracks:
         return self._linear(T, rows[keep], p[keep], at.take(keep))
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
-        """Drop single views that contradict the rest of their track, for good, and linearise what is left."""
+        """Drop single views that contradict the rest of their track permanently, and linearise what is left."""
         limits = chi_square_table(_VIEW_PROBABILITY)[measured_pixels(tracks.at).sum(axis=2)]
         wrong: BoolArray = np.sum(tracks.at.r**2, axis=2) > self.variance * limits
         if not wrong.any():
@@ -166,7 +166,7 @@ class WindowTracks:
         )
 
     def end_frame(self, *, spent: IntArray, promoted: IntArray, newest: int) -> None:
-        """Forget what has been committed and what has ended.
+        """Remove what has been absorbed and what has ended.
 
         Args:
             spent: rows whose views have had their say; the tracks go on without them.
