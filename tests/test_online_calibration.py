@@ -146,7 +146,7 @@ def _off_by(seed: int) -> FloatArray:
 
 def _window(clones: int = 5, late_s: float = 0.0) -> Window:
     """Clones of a shaking flight, their time offset as it was thought to be."""
-    calibration, _, _ = first_calibration(T_CAM0_IMU, BOTH)
+    calibration = first_calibration(T_CAM0_IMU, BOTH)
     flight, zero = Shaking(), np.zeros(3)
     root = np.random.default_rng(0).normal(size=(DIM + 7, DIM + 7)) * 0.01
     window = Window(ImuMotion(BOTH), NavState(np.eye(4), zero, zero, zero, zero), root @ root.T, calibration)
