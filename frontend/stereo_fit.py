@@ -15,7 +15,7 @@ from frontend.columns import take
 from frontend.flow import circle_errors, match_brightness
 from frontend.patches import View
 from frontend.settings import DisparitySettings, KltSettings
-from frontend.stereo_match import RowField, match_rows
+from frontend.stereo_match import RowField, match_rows, shifted_rows
 from frontend.tracks import AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, triangulate
@@ -25,6 +25,11 @@ _ITERATIONS = 5
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
 _COARSE_SLACK = 0.2  # how much lower the correlation of the coarse search may be than that of the alignment
 _MIN_DEPTH_M = 0.05
+_FEW_MATCHES = 0.2  # share of features with a right match below which other row differences are tried
+_GOOD_MATCH = 0.9  # correlation of patches whose rows agree
+_LEAST_POINTS = 20
+_ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
+_MAX_ROWS_HALF = 16  # row difference, pixels at half resolution
 
 
 class StereoFit:
@@ -45,6 +50,7 @@ class StereoFit:
         self._settings = settings
         self._bank = bank
         self._rows = RowField(*size)
+        self._unmatched = 0  # frames in a row with hardly any match
 
     def track_right(self, tracks: Tracks, right: View, last_half: Image, moved: bool) -> Tracks:
         """Match features of known depth; with a consensus motion (`moved`), check the disparity against the depth.
@@ -72,7 +78,26 @@ class StereoFit:
 
     def search(self, left: View, right: View, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are unique."""
-        return self._search(left.half, right.half, points, self._settings.min_correlation - _COARSE_SLACK)
+        offset = round(self._rows.offset_px / 2)
+        if self._unmatched % _ROW_SEARCH_FRAMES == 1:
+            offset = self._best_offset(left, right, points, offset)
+        correlation = self._settings.min_correlation - _COARSE_SLACK
+        return self._search(left.half, shifted_rows(right.half, offset), points, correlation)
+
+    def _best_offset(self, left: View, right: View, points: FloatArray, offset: int) -> int:
+        """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.
+
+        Rows may be far apart where the right camera has been pitched since it was calibrated.
+        """
+        tried = range(-_MAX_ROWS_HALF, _MAX_ROWS_HALF + 1)
+        counts = [
+            int(self._search(left.half, shifted_rows(right.half, rows), points, _GOOD_MATCH)[1].sum()) for rows in tried
+        ]
+        best = int(np.argmax(counts))
+        if counts[best] < max(_LEAST_POINTS, 2 * counts[offset + _MAX_ROWS_HALF]):
+            return offset
+        self._rows.restart(2.0 * tried[best])
+        return tried[best]
 
     def count_mirrored(self, left: View, right: View, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that have a match with a negative disparity."""
@@ -83,6 +108,8 @@ class StereoFit:
 
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
+        few = len(tracks) >= _LEAST_POINTS and tracks.has_right.mean() < _FEW_MATCHES
+        self._unmatched = self._unmatched + 1 if few else 0
         self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
 
     def _search(

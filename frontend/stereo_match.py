@@ -42,6 +42,17 @@ class RowField:
         x, y = ((pixels - self._centre) / self._scale).T
         return np.stack([np.ones_like(x), x, y, x * y, y * y], axis=1)
 
+    @property
+    def offset_px(self) -> float:
+        """Row difference at the image's centre, pixels."""
+        return float(self._field[0])
+
+    def restart(self, offset_px: float) -> None:
+        """Begin again with the same row difference over the whole image."""
+        self._normal, self._moment = _FIELD_PRIOR * np.eye(5), np.zeros(5)
+        self._field = np.array([offset_px, 0.0, 0.0, 0.0, 0.0])
+        self._moment[0] = _FIELD_PRIOR * offset_px
+
     def rows(self, left: FloatArray) -> FloatArray:
         """Expected rows (N,) in the right image of left pixels (N, 2)."""
         return left[:, 1] + self._terms(left) @ self._field
@@ -57,6 +68,14 @@ class RowField:
             self._normal = kept + (terms * weight[:, None]).T @ terms
             self._moment = moment + terms.T @ (weight * off)
             self._field = np.asarray(np.linalg.solve(self._normal, self._moment), dtype=np.float64)
+
+
+def shifted_rows(image: Image, rows: int) -> Image:
+    """The image (H, W) moved up by a number of rows; the last one is repeated."""
+    if rows == 0:
+        return image
+    chosen = np.clip(np.arange(len(image)) + rows, 0, len(image) - 1)
+    return np.ascontiguousarray(image[chosen])
 
 
 def row_correlation(

@@ -250,9 +250,11 @@ def _starry(f: Figures) -> Iterator[str]:
     rows += [[f.tell(f"starry/{run}/velocity", name) for name in ("ate_m", "landmarks_m")] for run in STARRY]
     for label, cells in zip(("dead reckoning", *STARRY.values()), _best_of_columns(rows, 2), strict=True):
         yield _row([label, *cells])
-    for run in ("paper", "window"):
-        frame = f.tell(f"starry/{run}/none", "diverged_at_frame")
-        yield _row([f"{STARRY[run]}, images alone", f"diverges at frame {frame}", "–"])
+    frame = f.tell("starry/paper/none", "diverged_at_frame")
+    yield _row([f"{STARRY['paper']}, images alone", f"diverges at frame {frame}", "–"])
+    yield _row(
+        [f"{STARRY['window']}, images alone", *(f.tell("starry/window/none", n) for n in ("ate_m", "landmarks_m"))]
+    )
 
 
 def _speed(f: Figures) -> Iterator[str]:

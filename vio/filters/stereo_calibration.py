@@ -23,7 +23,7 @@ TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
 _ROW_TERMS = 6
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
-_LEAST_ROWS_PX = 0.2  # root mean square of the field over the matches; a good calibration leaves half of it
+_LEAST_ROWS_PX = 0.05  # root mean square of the field over the matches; smaller ones do no harm
 _ROW_SIGNIFICANCE = 25.0  # squared standard deviations of the field by noise alone
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
 
