@@ -128,7 +128,8 @@ def test_images_carry_a_gap_while_turning_and_accelerating(length_s: float) -> N
         errors.append(e)
         covariances.append(C)
     e, C = np.array(errors), np.array(covariances)
-    assert np.linalg.norm(e[..., :3], axis=-1).max() < 0.05
+    since = e[:, first:, :3] - e[:, first - 1 : first, :3]  # the start's error, before the gap, is not its doing
+    assert np.linalg.norm(since, axis=-1).max() < 0.05
     values = np.array([nees(e[s, first:], C[s, first:]) for s in range(seeds)]).mean(axis=0)
     assert np.mean(values < nees_bounds(6, seeds)[1]) >= 0.9, values
 

@@ -263,8 +263,7 @@ class Ablation(Msckf):
     ) -> None:
         super().__init__(CAMERA, T_CAM0_IMU, settings, motion=motion)
         self._kind, self._start, self._begun = kind, _START[start], False
-        if not learn_noise:
-            self._noise = MotionNoise(1.0, 1.0, 1.0)
+        self._learn_noise = learn_noise
         self._tracks = self._judged = JudgedTracks(CAMERA, settings)
 
     @property
@@ -276,6 +275,8 @@ class Ablation(Msckf):
         """Right after the start, once, doubt the place and the yaw and take the window of choice."""
         window = self._started()
         if not self._begun:
+            if not self._learn_noise:
+                self._noise = MotionNoise(1.0, 1.0, 1.0)
             position_sigma, yaw_sigma = self._start
             window.P[:3, :3] += np.eye(3) * position_sigma**2
             window.P[5, 5] += yaw_sigma**2

@@ -65,6 +65,9 @@ from vio.records import (
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 # Factors on the motion model's densities: at the start, at least, at most.
 _IMU_FACTORS = (1.0, 1.0, 50.0)
+# A start with a large uncertainty of the tilt is linearised far from the truth, which shows as process noise.
+_FACTOR_PER_TILT_SIGMA = 1 / np.radians(8.0)
+_MOST_START_FACTOR = 5.0
 _TWIST_FACTORS = (1.0, 0.1, 10.0)
 # Standard deviations of a point's inverse depth over itself, at most. A landmark is linearised and marginalised frame
 # by frame as a Cartesian point, which biases scale in second order of it where the depth comes from motion. With left
@@ -189,6 +192,10 @@ class Msckf:
             if not self._motion.ready:
                 return self._wait(observations)
             nav, P = self._motion.start(observations.time_ns)
+            if self._source == "imu":
+                tilt_sigma = float(np.sqrt(P[3:5, 3:5].diagonal().max()))
+                start = min(_IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MOST_START_FACTOR)
+                self._noise = MotionNoise(start, *_IMU_FACTORS[1:])
             calibration = self._calibration
             P_calibration, _ = calibration_covariance(calibration, self._settings)
             self._window = Window(self._motion, nav, np.asarray(block_diag(P, P_calibration)), calibration)

@@ -24,6 +24,7 @@ _ROW_TERMS = 6
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
 _LEAST_ROWS_PX = 0.05  # root mean square of the field over the matches; smaller ones do no harm
+_ROW_DOMINANCE = 4.0  # the field over the variance that it leaves: features that wander calibrate nothing
 _ROW_SIGNIFICANCE = 25.0  # squared standard deviations of the field by noise alone
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
 
@@ -53,6 +54,7 @@ class RowField:
         self._A: FloatArray = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         self._b: FloatArray = np.zeros(_ROW_TERMS)
         self._squares = self._count = 0.0  # of the rows' residuals, in the same memory
+        self._matches = 0  # of the last frame
         self.rms_px = 0.0  # of the field over the matches
         self.coefficients: FloatArray = np.zeros(_ROW_TERMS)  # of 1, x, y, x y, x^2, y^2, in focal lengths
 
@@ -74,7 +76,7 @@ class RowField:
         prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
         self.coefficients = solution / camera.fv
-        field = basis @ solution
+        field, self._matches = basis @ solution, len(z)
         self._squares = _ROW_MEMORY * self._squares + float(weight @ (rows - field) ** 2)
         self._count = _ROW_MEMORY * self._count + float(weight.sum())
         self.rms_px = float(np.sqrt(np.mean(field**2)))
@@ -82,8 +84,10 @@ class RowField:
     @property
     def is_significant(self) -> bool:
         """Whether the rows show that the calibration is off: a field beyond its own uncertainty, and beyond harm."""
-        uncertainty = _ROW_TERMS * self._squares / max(self._count, 1.0) ** 2
-        return self.rms_px**2 > _LEAST_ROWS_PX**2 + _ROW_SIGNIFICANCE * uncertainty
+        # Rows of one feature share their error from frame to frame, so only the features of one frame count as many.
+        uncertainty = _ROW_TERMS * self._squares / max(self._count, 1.0) / max(self._matches, 1)
+        noise = self._squares / max(self._count, 1.0)
+        return self.rms_px**2 > max(_LEAST_ROWS_PX**2 + _ROW_SIGNIFICANCE * uncertainty, _ROW_DOMINANCE * noise)
 
     def columns(self, z: FloatArray) -> FloatArray:
         """Return the part of `du` (...) that follows from the rows at stereo pixels (..., 4), pixels."""
