@@ -78,7 +78,7 @@ def test_standard_errors_keep_the_usual_prior_when_the_means_move() -> None:
     assert np.abs(window.P - start.P).max() > 1e-3
 
 
-def test_first_estimates_keep_their_levers_and_tell_the_same_covariance() -> None:
+def test_first_estimates_keep_their_linearisation_point_and_give_the_same_covariance() -> None:
     window = _fill(FirstEstimates, "imu")
     assert isinstance(window, FirstEstimates)
     start, M = _fill(FirstEstimates, "imu"), window.standard_D_error()
@@ -86,20 +86,20 @@ def test_first_estimates_keep_their_levers_and_tell_the_same_covariance() -> Non
     np.testing.assert_array_equal(window.P, start.P)
     np.testing.assert_array_equal(window.standard_D_error(), M)
     np.testing.assert_allclose(M @ window.prior_delta, _usual_difference(window, start), atol=1e-12)
-    # What is told are right-invariant errors at the present means: the same usual errors by another lever.
+    # The output is in right-invariant errors at the present means: the same usual errors by another Jacobian.
     present = StandardErrors(window.motion, window.nav, np.eye(DIM)).standard_D_error()
-    told = present @ window.right_invariant(window.P[:DIM, :DIM]) @ present.T
-    np.testing.assert_allclose(told, (M @ window.P @ M.T)[:DIM, :DIM], atol=1e-12)
+    output = present @ window.right_invariant(window.P[:DIM, :DIM]) @ present.T
+    np.testing.assert_allclose(output, (M @ window.P @ M.T)[:DIM, :DIM], atol=1e-12)
 
 
 def test_first_estimates_follow_clones_and_landmarks() -> None:
     window = _fill(FirstEstimates, "imu")
     assert isinstance(window, FirstEstimates)
     window.relinearise(np.full(len(window.P), 0.05))
-    _, positions, _ = window.levers()
+    _, positions, _ = window.linearisation_point()
     window.drop_oldest_clone()
     window.keep_landmarks(np.array([False, True]))
-    _, kept, landmarks = window.levers()
+    _, kept, landmarks = window.linearisation_point()
     np.testing.assert_array_equal(kept, positions[1:])
     np.testing.assert_array_equal(landmarks, LANDMARKS[1:])
     assert np.abs(window.landmarks - landmarks).max() > 0.01
@@ -129,12 +129,12 @@ def test_flight_and_its_imu_agree() -> None:
 
 @cache
 def _record(motion: Motion, variant: Variant, seed: int) -> Record:
-    return fly(Job(Scenario(seconds=1.0), motion, "doubted", variant, seed))
+    return fly(Job(Scenario(seconds=1.0), motion, "uncertain", variant, seed))
 
 
 @pytest.mark.parametrize("motion", ["imu", "none"])
 def test_standard_errors_gain_yaw_from_nothing_and_the_others_do_not(motion: Motion) -> None:
-    """No image and no IMU tells yaw: a doubt of one degree at the start must still be there at the end."""
+    """No image and no IMU observes yaw: one degree of uncertainty at the start must still be there at the end."""
     for seed in range(2):
         for variant in ("right-invariant", "first estimates"):
             sigma = _record(motion, variant, seed).yaw_sigma_deg
@@ -145,10 +145,10 @@ def test_standard_errors_gain_yaw_from_nothing_and_the_others_do_not(motion: Mot
 
 
 def test_navigation_state_is_consistent_with_known_noise() -> None:
-    """Mean NEES over 20 flights from a start drawn from its doubt: two-sided, for everything the IMU filter tells."""
+    """Mean NEES over 20 flights whose start is drawn from its covariance: two-sided, for all that is estimated."""
     runs = 20
     scenario = Scenario(seconds=0.8, features=30)
-    records = [fly(Job(scenario, "imu", "doubted", "right-invariant", seed)) for seed in range(runs)]
+    records = [fly(Job(scenario, "imu", "uncertain", "right-invariant", seed)) for seed in range(runs)]
     for measure, d in (("pose", 6), ("position", 3), ("orientation", 3), ("velocity", 3), ("gyro bias", 3)):
         mean = np.mean([r.nees[measure][1:] for r in records], axis=0)
         low, high = nees_bounds(d, runs)

@@ -5,7 +5,7 @@
         [--outliers 0.0] [--imu-offset-ms 0.0] [--jobs 2]
 
 Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
-yaw of the start are drawn from the very distributions that the filter is told. Each flight is flown once by every
+yaw of the start are drawn from the very distributions that the filter assumes. Each flight is flown once by every
 variant, with the same noise. Writes FOLDER/table.md (also printed), FOLDER/figures.json and FOLDER/consistency.png.
 docs/consistency.md says what the variants are; its equation numbers are cited here.
 """
@@ -66,14 +66,14 @@ if TYPE_CHECKING:
     from typing_extensions import Self  # in typing from Python 3.11
 
 Motion = Literal["imu", "none", "velocity"]
-Start = Literal["doubted", "known"]
+Start = Literal["uncertain", "known"]
 Variant = Literal["standard", "first estimates", "right-invariant", "right-invariant, noise learned"]
 
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
 _FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
 # Standard deviations of the first position, m, and of the first yaw, rad.
-_START: dict[Start, tuple[float, float]] = {"doubted": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
+_START: dict[Start, tuple[float, float]] = {"uncertain": (0.05, np.radians(1.0)), "known": (0.0, 0.0)}
 _MOTIONS: tuple[Motion, ...] = ("imu", "none", "velocity")
 _VARIANTS: tuple[Variant, ...] = (
     "standard",
@@ -96,8 +96,9 @@ _MEASURES = {"pose": 6, "position": 3, "orientation": 3, "yaw": 1, "velocity": 3
 class StandardErrors(Window):
     """The window with the prior in the usual errors: differences of positions, velocities and points.
 
-    The error vector, and `P` and `offset` over it, stay right-invariant *at the present levers*, equation (E1), so that
-    the rest of the filter need not know. When the means move, the prior in the usual errors stays the same (E2).
+    The error vector, and `P` and `prior_delta` over it, stay right-invariant *at the present linearisation point*,
+    equation (E1), so that the rest of the filter need not know. When the means move, the prior in the usual errors
+    stays the same (E2).
     """
 
     @classmethod
@@ -108,13 +109,13 @@ class StandardErrors(Window):
         out._begin()
         return out
 
-    def levers(self) -> tuple[NavState, FloatArray, FloatArray]:
+    def linearisation_point(self) -> tuple[NavState, FloatArray, FloatArray]:
         """The navigation state, positions (N, 3) of the clones and landmarks (M, 3) at which (E1) is taken."""
         return self.nav, _positions(self.clones), self.landmarks
 
     def standard_D_error(self) -> FloatArray:
         """Jacobian (D, D) of the usual errors with respect to the window's own, equation (E1)."""
-        nav, positions, landmarks = self.levers()
+        nav, positions, landmarks = self.linearisation_point()
         M = np.eye(len(self.P))
         M[0:3, 3:6] = -so3_hat(nav.T_world_imu[:3, 3])
         if isinstance(self.motion, ImuMotion):
@@ -152,7 +153,7 @@ class StandardErrors(Window):
         """Set up what the window has beyond a plain one."""
 
     def _follow(self, before: FloatArray) -> None:
-        """Write the prior in right-invariant errors at the new levers, equation (E2)."""
+        """Write the prior in right-invariant errors at the new linearisation point, equation (E2)."""
         # M = I + L with L L = 0, so the inverse is I - L.
         change = np.eye(len(before)) + before - self.standard_D_error()
         self.P = change @ self.P @ change.T
@@ -160,14 +161,14 @@ class StandardErrors(Window):
 
 
 class FirstEstimates(StandardErrors):
-    """The usual errors with every lever at the first estimate of what it belongs to, so the levers never change."""
+    """The usual errors linearised at the first estimate of each state, so that the point never changes."""
 
     def _begin(self) -> None:
         self._first_nav = self.nav
         self._first_clones = list(self.clones)
         self._first_landmarks = self.landmarks
 
-    def levers(self) -> tuple[NavState, FloatArray, FloatArray]:
+    def linearisation_point(self) -> tuple[NavState, FloatArray, FloatArray]:
         """As above, at the first estimates."""
         return self._first_nav, _positions(self._first_clones), self._first_landmarks
 
@@ -211,7 +212,7 @@ class FirstEstimates(StandardErrors):
         return out
 
     def _follow(self, before: FloatArray) -> None:
-        """Nothing: the levers stayed."""
+        """Do nothing: the linearisation point stayed."""
 
     @contextmanager
     def _landmarks_at_first(self) -> Iterator[None]:
@@ -221,7 +222,7 @@ class FirstEstimates(StandardErrors):
 
 
 def _at_means(window: Window) -> StandardErrors:
-    """The navigation state of a window alone, with its levers at its means."""
+    """The navigation state of a window alone, linearised at its means."""
     return StandardErrors(window.motion, window.nav, np.eye(DIM))
 
 
@@ -250,7 +251,7 @@ class JudgedTracks(WindowTracks):
 
 
 class Ablation(Msckf):
-    """The sliding-window filter over a window of choice, in doubt of its first place and yaw."""
+    """The sliding-window filter over a window of choice, uncertain of its first place and yaw."""
 
     def __init__(
         self,
@@ -272,7 +273,7 @@ class Ablation(Msckf):
         return self._judged.nis
 
     def _measure(self) -> None:
-        """Right after the start, once, doubt the place and the yaw and take the window of choice."""
+        """Right after the start, once, make place and yaw uncertain and take the window of choice."""
         window = self._started()
         if not self._begun:
             if not self._learn_noise:
@@ -322,7 +323,7 @@ class Scenario:
         return round(self.seconds * 1e9 / _FRAME_NS)
 
     def settings(self, *, learn_noise: bool) -> MsckfSettings:
-        """What the filter is told: the truth about all noise, or, to learn it, where learning starts."""
+        """Return the filter's settings: the truth about all noise, or, to learn it, where learning starts."""
         s = MsckfSettings(
             max_landmarks=self.landmarks,
             pixel_sigma_px=self.pixel_sigma_px,
@@ -589,9 +590,9 @@ class Summary:
 
 
 def _groups(motions: list[Motion], variants: list[Variant]) -> Iterator[tuple[Motion, Start, Variant]]:
-    """What is compared: every motion model from a doubted start, the IMU from a known one too."""
+    """What is compared: every motion model from an uncertain start, the IMU from a known one too."""
     for motion, variant in product(motions, variants):
-        yield motion, "doubted", variant
+        yield motion, "uncertain", variant
     for variant in variants if "imu" in motions else []:
         yield "imu", "known", variant
 
@@ -644,7 +645,7 @@ def _rms(rows: list[FloatArray]) -> FloatArray:
 
 
 def _tables(summaries: list[Summary]) -> str:
-    """Markdown: NEES by measure, then what the filter says of yaw beside the errors."""
+    """Markdown: NEES by measure, then what the filter estimates for yaw beside the errors."""
     names = list(_MEASURES)
     lines = [
         "Mean NEES ± its standard error over the runs (share of the frames inside the 95 % band)",
@@ -677,7 +678,7 @@ def _nees_cell(summary: Summary, measure: str) -> str:
 
 
 def _plot(path: Path, summaries: list[Summary]) -> None:
-    """Columns: motion and start; above the pose NEES over time, below what the filter says of yaw and its error."""
+    """Columns: motion and start; above the pose NEES over time, below yaw's estimated sigma and its error."""
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
 
@@ -711,7 +712,7 @@ def _plot(path: Path, summaries: list[Summary]) -> None:
     handles = [Line2D([], [], color=_COLOURS[v], lw=3.0 if v == "first estimates" else 1.2, label=v) for v in used]
     handles += [
         Line2D([], [], color="#cfd8e3", lw=6, label="95 % band"),
-        Line2D([], [], color="#666666", label="sigma told"),
+        Line2D([], [], color="#666666", label="estimated sigma"),
         Line2D([], [], color="#666666", ls=":", label="error, RMS"),
     ]
     figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), fontsize=8)
