@@ -632,8 +632,8 @@ MUTATIONS = (
     Mutation(
         "stereo field: linearised at the pixels that were seen",
         "vio/filters/window_tracks.py",
-        "self._views(rows, at.r.shape[1]).z - at.r)",
-        "self._views(rows, at.r.shape[1]).z)",
+        "self._views(rows, at.r.shape[1], field).z - at.r)",
+        "self._views(rows, at.r.shape[1], field).z)",
         _STEREO_FIELD,
     ),
     Mutation(

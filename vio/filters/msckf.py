@@ -485,10 +485,7 @@ class Msckf:
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
-            P, shift = posterior(window.P, A, b + A @ window.prior_delta)
-            error = shift - window.prior_delta
-            self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
-            window.relinearise(error)
+            P = self._move_to_optimum(window, tracks, A, b)
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go.
@@ -496,6 +493,24 @@ class Msckf:
                 break
             innovation = residual
         return tracks, P
+
+    def _move_to_optimum(self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray) -> FloatArray:
+        """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
+
+        Args:
+            window: moved; its prior stays.
+            tracks: whose points are moved.
+            A: information (D, D).
+            b: its vector (D,).
+
+        Returns:
+            The covariance (D, D) there.
+        """
+        P, shift = posterior(window.P, A, b + A @ window.prior_delta)
+        error = shift - window.prior_delta
+        self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
+        window.relinearise(error)
+        return P
 
     def _step_errors(
         self,
@@ -563,11 +578,7 @@ class Msckf:
         window.absorb(*self._information(window, tracks, ending & good, pixels))
         promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
 
-        A, b = self._information(window, tracks, good & ~ending, None)
-        P, shift = posterior(window.P, A, b + A @ window.prior_delta)
-        error = shift - window.prior_delta
-        self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
-        window.relinearise(error)
+        P = self._move_to_optimum(window, tracks, *self._information(window, tracks, good & ~ending, None))
         own = slice(0, window.first_clone)
         self._output = P[own, own]
         self._smoothed = WindowPosterior.of(window, P)

@@ -47,6 +47,7 @@ class LinearTracks:
     at: Residuals
     information: TrackInformation
     stereo: StereoColumns | None  # where the stereo field is estimated
+    field: StereoField | None  # what was taken out of the pixels
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
@@ -60,7 +61,6 @@ class WindowTracks:
     def __init__(self, camera: StereoCamera, settings: MsckfSettings) -> None:
         self._camera, self._settings = camera, settings
         self.table = TrackTable(settings.clones + 1)
-        self._field: StereoField | None = None  # at the last linearisation
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
 
     def choose(self, clones: int) -> IntArray:
@@ -88,20 +88,19 @@ class WindowTracks:
             field: what is taken out of the pixels where the stereo field is estimated.
         """
         camera, table, T, clones = self._camera, self.table, T_cam0_world, len(T_cam0_world)
-        self._field = field
-        views = self._views(rows, clones)
+        views = self._views(rows, clones, field)
         fresh = ~table.has_point[rows]
         if fresh.any():
             start, known = first_points(camera, T, views.take(fresh))
             table.points[rows[fresh]], table.has_point[rows[fresh]] = start, known
             rows = rows[table.has_point[rows]]
-            views = self._views(rows, clones)
+            views = self._views(rows, clones, field)
         p = refine_points(camera, T, table.points[rows], views, steps, CAUCHY * float(np.sqrt(self.variance)))
         at = residuals(camera, T, p, views)
         keep = at.ahead & np.isfinite(p).all(axis=1)
         keep[keep] = has_parallax(camera, T, p[keep], views.take(keep), at.take(keep))
         table.points[rows], table.has_point[rows] = p, keep
-        return self._linear(T, rows[keep], p[keep], at.take(keep))
+        return self._linear(T, rows[keep], p[keep], at.take(keep), field)
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track permanently, and linearise what is left."""
@@ -116,22 +115,24 @@ class WindowTracks:
         )
         enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
         T = tracks.T_cam0_world
-        return self._linear(T, tracks.rows[enough], tracks.p_world[enough], at.take(enough))
+        return self._linear(T, tracks.rows[enough], tracks.p_world[enough], at.take(enough), tracks.field)
 
-    def _linear(self, T_cam0_world: FloatArray, rows: IntArray, p_world: FloatArray, at: Residuals) -> LinearTracks:
+    def _linear(
+        self, T_cam0_world: FloatArray, rows: IntArray, p_world: FloatArray, at: Residuals, field: StereoField | None
+    ) -> LinearTracks:
         weight = robust_weights(at, self.variance)
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
         columns = None
-        if self._field is not None:
+        if field is not None:
             # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-            H = field_jacobian(self._camera, self._views(rows, at.r.shape[1]).z - at.r)
+            H = field_jacobian(self._camera, self._views(rows, at.r.shape[1], field).z - at.r)
             columns = stereo_columns(at, H, information.q.p_D_q, weight)
-        return LinearTracks(T_cam0_world, rows, p_world, at, information, columns)
+        return LinearTracks(T_cam0_world, rows, p_world, at, information, columns, field)
 
-    def _views(self, rows: IntArray, clones: int) -> Views:
+    def _views(self, rows: IntArray, clones: int, field: StereoField | None) -> Views:
         """What rows showed, without the stereo field."""
         views = self.table.views(rows, clones)
-        return views if self._field is None else self._field.corrected(views)
+        return views if field is None else field.corrected(views)
 
     def move_points(self, tracks: LinearTracks, exposure_errors: FloatArray, stereo_errors: FloatArray) -> None:
         """Move each point as its own normal equations say once the clones (6N,) and the field (S,) have moved."""
