@@ -72,10 +72,11 @@ def execute(args: argparse.Namespace) -> int:
 
 def _frontend(dataset: Dataset) -> Frontend:
     """Return the default front end."""
-    from frontend import build_frontend
-    from frontend.settings import FrontendSettings
+    from vio.frontend_package import frontend_module
 
-    return build_frontend("auto", dataset.recording.camera, FrontendSettings(), dataset)
+    package = frontend_module()
+    frontend: Frontend = package.build_frontend("auto", dataset.recording.camera, package.FrontendSettings(), dataset)
+    return frontend
 
 
 def _facts(report: CalibrationReport) -> dict[str, Any]:
