@@ -128,7 +128,7 @@ def test_every_number_has_a_range_and_other_values_are_rejected(info: SettingInf
 def test_rejects_infinite_numbers_and_checks_ranges_in_code() -> None:
     with pytest.raises(ConfigError, match=r"msckf\.gravity_mps2 must be finite"):
         load_config(None, ["msckf.gravity_mps2=.inf"])
-    with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3, got 2"):
+    with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3 and at most 100, got 2"):
         MsckfSettings(clones=2)
     with pytest.raises(ConfigError, match=r"pixel_sigma_min_px, 3, must not be above"):
         MsckfSettings(pixel_sigma_min_px=3.0)

@@ -22,6 +22,7 @@ from vio.datasets.common import checked_transform
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, transform_points
+from vio.input_files import read_input
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.printable import json_text
 from vio.records import Landmarks, Trajectory
@@ -199,9 +200,9 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
     if not path.is_file():
         raise DataError(f"{folder}: no run folder (it has no {MARKER}); give a folder that `vio run` wrote")
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
+        metrics = json.loads(read_input(path))
         T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
     return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
 

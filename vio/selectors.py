@@ -42,15 +42,16 @@ class SelectorSettings(Section):
     sticky: bool = setting(
         False, "a chosen feature stays chosen while it is tracked; new ones only fill the remaining budget"
     )
-    grid_columns: int = setting(8, "cells across the image for the grid selector", at_least=1)
-    grid_rows: int = setting(4, "cells down the image for the grid selector", at_least=1)
+    grid_columns: int = setting(8, "cells across the image for the grid selector", at_least=1, at_most=1000)
+    grid_rows: int = setting(4, "cells down the image for the grid selector", at_least=1, at_most=1000)
     horizon_frames: int = setting(
         4,
         "information: the gain is summed over the last motion, the next one and the one this many frames ahead",
         at_least=1,
+        at_most=100,
     )
     pixel_sigma_px: float = setting(0.5, "information: standard deviation of one pixel coordinate", unit="px", above=0)
-    seed: int = setting(0, "random: seed of the random choice", at_least=0)
+    seed: int = setting(0, "random: seed of the random choice", at_least=0, at_most=2**32 - 1)
 
 
 class _VisibilityCount:

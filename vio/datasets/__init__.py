@@ -10,6 +10,7 @@ from pathlib import Path
 
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
+from vio.input_files import check_regular
 from vio.protocols import Dataset
 
 __all__ = ["READERS", "DatasetSettings", "open_dataset"]
@@ -134,6 +135,7 @@ def _file_kind(path: Path) -> str | None:
     from vio.datasets.observation_log import is_observation_log
 
     try:
+        check_regular(path)
         with path.open("rb") as stream:
             start = stream.read(128)
     except OSError as error:

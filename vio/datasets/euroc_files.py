@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.errors import CalibrationError, DataError
@@ -19,6 +18,7 @@ from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 from vio.text_files import INT64_MAX, check_increasing, exact_text, text_lines
+from vio.yaml_text import read_yaml
 
 DISTORTION_MODELS: dict[str, DistortionModel] = {
     "radial-tangential": "radtan",
@@ -130,9 +130,9 @@ def _read_yaml(path: Path) -> Mapping[str, object]:
     # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
     lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
     try:
-        entries = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
-    except yaml.YAMLError as error:
-        raise CalibrationError(f"{path}: not a YAML file ({' '.join(str(error).split())}); copy it again") from error
+        entries = read_yaml("\n".join(lines).replace("!!opencv-matrix", ""))
+    except ValueError as error:
+        raise CalibrationError(f"{path}: not a YAML file ({error}); copy it again") from error
     if not isinstance(entries, dict):
         raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
     return entries

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from vio.datasets.common import frame_range, merge_events
-from vio.datasets.images import UnreadableImageError, list_images, load_gray, prefetch
+from vio.datasets.images import WHITE_16, UnreadableImageError, list_images, load_gray, prefetch, white_level
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.records import Event, Image, MotionSample, Observations, Recording, StereoFrame
@@ -66,6 +66,19 @@ def readable_frames(
             logger.warning("frame %d is skipped: %s", frame.index, frame.why)
 
 
+_WHITE_FRAMES = 8  # that tell the level of white, spread over the recording: the first may be dark
+
+
+def full_scale(pairs: ImagePairs) -> tuple[int, tuple[str, ...]]:
+    """Return the level of white of a recording's 16-bit images, for `load_gray`, with a note where it is not 65535."""
+    chosen = {(len(pairs) - 1) * k // (_WHITE_FRAMES - 1) for k in range(_WHITE_FRAMES)} if pairs else set()
+    white = white_level([path for k in sorted(chosen) for path in pairs[k]])
+    if white == WHITE_16:
+        return white, ()
+    note = f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits"
+    return white, (note,)
+
+
 def first_readable(pairs: ImagePairs, max_bad_frames: int) -> tuple[Path, Image, int]:
     """The first left image that can be read: its file, its pixels (H, W) and its bits per channel.
 
@@ -105,6 +118,7 @@ class ImageDataset:
     motion: tuple[MotionSample, ...]  # in time order
     sizes: tuple[ImageSize, ImageSize]  # of the left and the right files
     settings: DatasetSettings
+    white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
@@ -136,7 +150,7 @@ class ImageDataset:
         """Read one frame; runs in the prefetch thread."""
         paths = self.pairs[index]
         try:
-            left, right = (load_gray(path)[0] for path in paths)
+            left, right = (load_gray(path, self.white)[0] for path in paths)
         except UnreadableImageError as error:
             return BadFrame(index, str(error))
         for size, image, path in zip(self.sizes, (left, right), paths, strict=True):
