@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import CalibrationError, DataError
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts
+from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
 from vio.input_files import check_regular
 from vio.records import (
     NS_PER_S,
@@ -31,7 +31,6 @@ from vio.records import (
 )
 from vio.text_files import check_increasing
 
-_ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _MOST_ARRAY_BYTES = 2**31  # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
 # What a damaged or encrypted archive also raises: an unknown compression, a header that is no literal.
@@ -77,16 +76,10 @@ def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
     T_ = np.asarray(T, dtype=np.float64)
     if T_.shape not in ((3, 4), (4, 4)) or not np.isfinite(T_).all():
         raise CalibrationError(f"{where}: not a finite 3x4 or 4x4 transform (shape {T_.shape}); check the calibration")
-    if T_.shape == (4, 4) and not np.allclose(T_[3], [0, 0, 0, 1], atol=1e-9):
-        raise CalibrationError(f"{where}: the last row of the transform is {T_[3].tolist()}, not 0 0 0 1")
+    if fault := rigid_fault(T_):
+        raise CalibrationError(f"{where}: {fault}")
     R = T_[:3, :3]
     deviation = float(np.abs(R.T @ R - np.eye(3)).max())
-    if not deviation <= _ROTATION_TOLERANCE:
-        raise CalibrationError(
-            f"{where}: not a rotation (R^T R differs from identity by {deviation:.2g}); check the calibration"
-        )
-    if np.linalg.det(R) < 0:
-        raise CalibrationError(f"{where}: not a rotation but a reflection (determinant -1); check the axes' order")
     return se3_from_parts(R if deviation <= _EXACT else nearest_rotation(R), T_[:3, 3])
 
 
