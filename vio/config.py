@@ -34,6 +34,31 @@ else:
 
 BackendName = Literal["vislam", "msckf"]
 MotionName = Literal["auto", "imu", "velocity", "none"]
+# The settings that a user may want to change first; `vio config --show` hides the others.
+BASIC = (
+    "motion",
+    "backend",
+    "lag_frames",
+    "dataset.colour",
+    "frontend.name",
+    "frontend.features",
+    "frontend.grid.target_features",
+    "frontend.disparity.max_disparity",
+    "frontend.klt.mask",
+    "frontend.klt.equalise",
+    "selector.name",
+    "selector.budget",
+    "msckf.clones",
+    "msckf.max_landmarks",
+    "msckf.max_features",
+    "msckf.gravity_mps2",
+    "msckf.gyro_noise_density",
+    "msckf.accel_noise_density",
+    "msckf.gyro_bias_walk",
+    "msckf.accel_bias_walk",
+    "msckf.calibrate",
+    "msckf.calibrate_stereo",
+)
 _MOST_SHOWN = 200  # characters of a wrong value in a message
 
 _Section = TypeVar("_Section")
@@ -150,6 +175,7 @@ class SettingInfo:
     """One row of `vio config --show`."""
 
     key: str
+    group: str  # what the section of the setting is about
     default: Any
     unit: str
     choices: tuple[str, ...]
@@ -160,6 +186,7 @@ class SettingInfo:
 def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
     """Yield every setting with its default, unit and meaning."""
     hints = get_type_hints(type(section))
+    group = (type(section).__doc__ or "").partition("\n")[0].rstrip(".")
     for f in fields(section):
         value = getattr(section, f.name)
         if is_dataclass(value):
@@ -168,7 +195,8 @@ def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
             hint = hints[f.name]
             choices = tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else ()
             unit, doc = f.metadata.get("unit", ""), f.metadata.get("doc", "")
-            yield SettingInfo(f"{prefix}{f.name}", value, unit, choices, str(f.metadata.get("range", Range())), doc)
+            allowed = str(f.metadata.get("range", Range()))
+            yield SettingInfo(f"{prefix}{f.name}", group, value, unit, choices, allowed, doc)
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:

@@ -2,7 +2,7 @@
 
 The paper sorts features by how often they are seen and keeps the first seventh. `visibility` does that frame by
 frame with the counts so far; `visibility_whole` counts over the whole record first, as the paper does. `information`
-keeps the features that together add most information on the camera's motion. docs/selection.md compares them.
+keeps the features that together add most information on the camera's motion. docs/notes/selection.md compares them.
 """
 
 from __future__ import annotations
@@ -188,7 +188,7 @@ class RandomChoice:
 
 
 class InformationGain:
-    """The features with the largest joint information on the last and the coming motions (docs/selection.md)."""
+    """The features with the largest joint information on the last and the coming motions (docs/notes/selection.md)."""
 
     def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
         self._settings, self._budget = settings, _Budget(settings)

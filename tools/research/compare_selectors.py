@@ -1,6 +1,6 @@
 """Every selector under every budget on recordings of your own: accuracy, and what the chosen features said.
 
-    python tools/compare_selectors.py SOURCE[=REFERENCE][@START:STOP] … --out FOLDER
+    python tools/research/compare_selectors.py SOURCE[=REFERENCE][@START:STOP] … --out FOLDER
         [--backends msckf vislam] [--budgets 20 40 80] [--seeds 3] [--jobs 2]
 
 SOURCE is anything that `vio run` takes; a recording with precomputed features, such as the observations.npz that

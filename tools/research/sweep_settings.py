@@ -1,8 +1,8 @@
 """Every setting halved and doubled: what happens to the error, to the time, and whether anything happens at all.
 
-    python tools/sweep_settings.py run --drive FOLDER --flight FOLDER --second-flight FOLDER --course 0027.npz=POSES
-        --tracks DRIVE.mat --out sweep.jsonl
-    python tools/sweep_settings.py report sweep.jsonl --out docs/settings.md
+    python tools/research/sweep_settings.py run --drive FOLDER --flight FOLDER --second-flight FOLDER
+        --course 0027.npz=POSES --tracks DRIVE.mat --out sweep.jsonl
+    python tools/research/sweep_settings.py report sweep.jsonl --out docs/notes/settings_sweep.md
 
 Each setting is changed alone, in a context in which it can count (the table _CONTEXTS_OF), and the run is compared with
 that context's own base run. Settings of the filter replay features that were logged once; settings of the front end see
@@ -208,11 +208,11 @@ _RECORDINGS = {
     "tracks": "UTIAS 0005",
 }
 _NOTED_TIME, _MEANING, _NEIGHBOURS = 1.25, 110, 6
-_INTRODUCTION = """# Settings
+_INTRODUCTION = """# Settings, halved and doubled
 
 All {settings} settings, and what happens when each alone is halved and doubled: {runs} runs of
-`tools/sweep_settings.py`, which also writes this page. The drive is real; the flights are rendered along real flights
-and carry their real IMU.
+`tools/research/sweep_settings.py`, which also writes this page. The drive is real; the flights are rendered along real
+flights and carry their real IMU.
 
 **How to read it.** *Where* names the context in which the setting was changed (the table below). A figure is the ATE
 (root mean square, after SE(3) alignment) over that of the same run with the default, first recording / second
@@ -252,7 +252,7 @@ _READINGS = {
     "`tests/test_frontend_klt.py` and `test_frontend_patches.py` are there",
     "frontend.klt.max_blind_frames": "guard: no image here is black; `tests/test_frontend_klt.py` blackens some",
     "msckf.pixel_sigma_max_px": "guard: the noise here stays below a pixel; Starry Night's does not "
-    "([results](results.md)); `tests/test_window_tracks.py` reaches it",
+    "([results](../results.md)); `tests/test_window_tracks.py` reaches it",
 }
 
 
