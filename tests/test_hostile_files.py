@@ -251,3 +251,48 @@ def test_calibration_yaml_is_bounded_too(tmp_path: Path) -> None:
     (tmp_path / "sensor.yaml").write_text("a: " + "[" * 5000)
     with pytest.raises(CalibrationError, match="nested deeper than 32 levels"):
         read_camera_yaml(tmp_path / "sensor.yaml")
+
+
+# --- a stranger's command lines -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["run", "a" * 5000], "cannot use aaaa.*: File name too long"),
+        (["run", "{npz}", "--out", "x" * 300], "cannot use xxx.*: File name too long"),
+        (["run", "{tmp}/loop"], "loop is a link to .*, which leads nowhere"),
+        (["run", "utias:{tmp}"], "it is a folder"),
+        (["run", "{npz}", "--set", "msckf..clones=5"], r"and \d\d more, see vio config --all"),
+        (["run", "{far}"], "T_cam0_imu puts the camera 1e.297 km from the IMU; translations are in metres"),
+        (["run", "{fast}"], r"holds \[1000000000.0, 0.0, 0.0\] and"),
+        (["eval", "{tmp}/huge.tum", "{tmp}/huge.tum"], "is not finite"),
+        (["eval", "{tmp}/est.tum", "{tmp}/est.tum", "--max-time-difference", "1e300"], "0 to 1e.09 s, got 1e.300 s"),
+    ],
+    ids=lambda value: " ".join(value)[:30] if isinstance(value, list) else "",
+)
+def test_strange_arguments_are_one_line(
+    argv: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import re
+
+    monkeypatch.chdir(tmp_path)
+    drive = ece276a_arrays(make_drive(4))
+    far = drive["cam_T_imu"].copy()
+    far[0, 3] = 1e300
+    velocity = drive["linear_velocity"].copy()
+    velocity[0] = 1e9
+    files = {
+        "npz": make_npz(tmp_path / "d.npz", drive),
+        "far": make_npz(tmp_path / "far.npz", {**drive, "cam_T_imu": far}),
+        "fast": make_npz(tmp_path / "fast.npz", {**drive, "linear_velocity": velocity}),
+        "tmp": tmp_path,
+    }
+    (tmp_path / "loop").symlink_to("loop")
+    for name, x in (("est", "1"), ("huge", "1e308")):
+        (tmp_path / f"{name}.tum").write_text("".join(f"{k} {x} {k} 0 0 0 0 1\n" for k in range(5)))
+    assert main([part.format(**files) for part in argv]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert error.count("\n") == 1
+    assert re.search(message, error), error

@@ -59,6 +59,7 @@ BASIC = (
     "msckf.calibrate",
     "msckf.calibrate_stereo",
 )
+_MOST_NAMED = 8  # settings in the message on an unknown one
 _MOST_SHOWN = 200  # characters of a wrong value in a message
 
 _Section = TypeVar("_Section")
@@ -269,7 +270,8 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
     for found in (siblings, similar, same_name):
         if found:
             return f"; did you mean '{found[0]}'?"
-    return f"; valid here: {', '.join(prefix + name for name in names)}"
+    more = f" and {len(names) - _MOST_NAMED} more, see vio config --all" if len(names) > _MOST_NAMED else ""
+    return f"; valid here: {', '.join(prefix + name for name in names[:_MOST_NAMED])}{more}"
 
 
 def _first(section: Any) -> str:

@@ -11,7 +11,12 @@ import stat
 from pathlib import Path
 
 MOST_BYTES = 2**30  # of a text file: an hour of IMU at 1 kHz is half of that
-_OPENED_BY_SHELL = ("/dev/fd/", "/proc/self/fd/", "/dev/stdin")  # `vio eval <(command) …`: a pipe with a writer
+_READABLE = (
+    os.devnull,
+    "/dev/fd/",
+    "/proc/self/fd/",
+    "/dev/stdin",
+)  # the last: `vio eval <(command) …`, a pipe with a writer
 
 
 def check_regular(path: Path) -> None:
@@ -20,7 +25,7 @@ def check_regular(path: Path) -> None:
     Folders pass: what opens one raises its own OSError.
     """
     mode = os.stat(path).st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) and not os.fspath(path).startswith(_OPENED_BY_SHELL):
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)) and not os.fspath(path).startswith(_READABLE):
         raise OSError(errno.EINVAL, "it is a pipe, socket or device, no file", os.fspath(path))
 
 

@@ -78,6 +78,8 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
         CalibrationError: the recording's calibration is invalid.
     """
     kind, path = _parse(os.fspath(source))
+    if path.is_symlink() and not path.exists():
+        raise DataError(f"{path} is a link to {os.readlink(path)}, which leads nowhere; give {_LOOKED_FOR}")
     if not path.exists():
         raise DataError(f"{path} does not exist; give {_LOOKED_FOR}")
     return READERS[kind or _detect(path)](path, options or DatasetSettings())

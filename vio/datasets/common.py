@@ -106,8 +106,10 @@ def numbers_in(text: str, count: int, where: str) -> FloatArray:
         values = np.array([float(value) for value in text.split()])
     except ValueError as error:
         raise CalibrationError(f"{where} holds no number ({error}); copy the calibration again") from error
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise CalibrationError(f"{where} holds {len(values)} values, expected {count} finite ones; copy it again")
+    if values.shape != (count,):
+        raise CalibrationError(f"{where} holds {len(values)} values, expected {count}; copy it again")
+    if not np.isfinite(values).all():
+        raise CalibrationError(f"{where} holds values that are not finite; copy it again")
     return values
 
 

@@ -6,6 +6,7 @@ of `R_i_v`, which maps the vehicle's axes to the inertial frame.
 
 from __future__ import annotations
 
+import errno
 import math
 import zlib
 from collections.abc import Mapping
@@ -78,6 +79,8 @@ def _read_mat(path: Path) -> Mapping[str, FloatArray]:
 
     try:
         check_regular(path)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
         shapes = {name: shape for name, shape, _ in whosmat(path)}
         wanted = [name for name in (*KEYS, *OPTIONAL_KEYS) if name in shapes]
         check_array_bytes({name: 8 * math.prod(shapes[name]) for name in wanted}, path)

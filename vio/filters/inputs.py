@@ -5,7 +5,6 @@ What is refused leaves the filter as it was, so that the caller may go on with t
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +15,9 @@ from vio.geometry.lie import FloatArray, rigid_fault
 from vio.geometry.stereo import StereoCamera
 from vio.records import ImuSample, MotionSample, Observations
 from vio.setting import Section
+
+_LARGEST = 1e6  # of a pixel, m/s, rad/s or m/s^2: beyond any sensor, and no square overflows below it
+_FARTHEST_M = 1e3  # between IMU and camera
 
 
 def check_parts(name: str, camera: object, settings: object, section: type[Section]) -> None:
@@ -37,6 +39,8 @@ def checked_extrinsics(T_cam0_imu: npt.ArrayLike) -> FloatArray:
     except (ValueError, TypeError) as error:
         raise CalibrationError(f"T_cam0_imu is no matrix of numbers ({error}); give a (4, 4) array") from error
     fault = f"has the shape {T.shape} instead of (4, 4)" if T.shape != (4, 4) else rigid_fault(T)
+    if fault is None and not np.abs(T[:3, 3]).max() <= _FARTHEST_M:
+        fault = f"puts the camera {np.abs(T[:3, 3]).max() / 1e3:g} km from the IMU; translations are in metres"
     if fault is not None:
         raise CalibrationError(f"T_cam0_imu {fault}; it maps the IMU's coordinates to the left camera's")
     return T
@@ -54,14 +58,15 @@ class InputOrder:
         """Check a motion sample.
 
         Raises:
-            DataError: it is not after the last one, a velocity is before the last frame, or a value is not finite.
+            DataError: it is not after the last one, a velocity is before the last frame, or a value is not finite or
+                absurdly large.
         """
         imu = isinstance(sample, ImuSample)
         first, second = (
             (sample.gyro, sample.accel) if isinstance(sample, ImuSample) else (sample.linear, sample.angular)
         )
         kind, now = "IMU" if imu else "velocity", sample.time_ns
-        if not (math.isfinite(first @ first) and math.isfinite(second @ second)):
+        if not all(-_LARGEST < value < _LARGEST for value in (*first.tolist(), *second.tolist())):
             raise DataError(f"{self.name}: the {kind} sample at {now} ns holds {_values(first, second)}; drop it")
         if self._sample_ns is not None and now <= self._sample_ns:
             raise DataError(
@@ -100,7 +105,7 @@ class InputOrder:
         if (ids[1:] == ids[:-1]).any():
             doubled = int(ids[1:][ids[1:] == ids[:-1]][0])
             raise DataError(f"{where} observes feature {doubled} twice; an id names one feature")
-        finite = np.isfinite(seen.z)
+        finite = np.abs(seen.z) < _LARGEST
         if not finite.all() and not (finite[:, :2].all() and finite[seen.has_right].all()):
             row = int(np.argmin(finite.all(axis=1)))
             raise DataError(

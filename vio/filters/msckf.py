@@ -217,6 +217,7 @@ class Msckf:
         if window.clones and not len(seen):
             # A frame that shows nothing ends no track; what is seen next decides.
             self._blind = True
+            self._check_finite(window, observations.frame_index)
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         self._blind = False
         late_s = (self._body_ns - observations.time_ns) * 1e-9
@@ -227,9 +228,12 @@ class Msckf:
             self._keep_first_yaw(window, before)
         except np.linalg.LinAlgError as error:
             raise EstimationError(self._lost(observations.frame_index)) from error
-        if not np.isfinite(window.P).all() or not np.isfinite(window.nav.T_world_imu).all():
-            raise EstimationError(self._lost(observations.frame_index))
+        self._check_finite(window, observations.frame_index)
         return report
+
+    def _check_finite(self, window: Window, frame_index: int) -> None:
+        if not np.isfinite(window.P).all() or not np.isfinite(window.nav.T_world_imu).all():
+            raise EstimationError(self._lost(frame_index))
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last event."""

@@ -153,7 +153,7 @@ def _match_images(source: CalibrationSource, pairs: int, progress: Callable[[int
     exchanged: list[RayMatches] = []
     z: list[FloatArray] = [np.zeros((0, 4))]
     white, _ = full_scale(source.raw_pairs)
-    chosen = np.unique(np.linspace(0, len(source.raw_pairs) - 1, pairs).astype(int))
+    chosen = np.unique(np.linspace(0, len(source.raw_pairs) - 1, min(pairs, len(source.raw_pairs))).astype(int))
     for done, k in enumerate(chosen.tolist()):
         left, right = (load_gray(path, white)[0] for path in source.raw_pairs[k])
         uv0, uv1 = sift_matches(left, right)
