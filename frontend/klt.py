@@ -40,7 +40,6 @@ class _PreviousFrame:
 
     time_ns: int
     left: View
-    right_half: Image
     tracks: Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
     trusted: bool  # the last motion had a consensus
@@ -149,7 +148,7 @@ class KltFrontend:
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
-        self._previous = _PreviousFrame(frame.time_ns, left, right.half, tracks, twist, motion is not None)
+        self._previous = _PreviousFrame(frame.time_ns, left, tracks, twist, motion is not None)
 
     # --- features of the previous frame -------------------------------------------------------------------------------
 
@@ -178,7 +177,7 @@ class KltFrontend:
         watch.lap("reject")
         tracks = self._align_with_anchors(previous, left, found, seen, motion)
         watch.lap("align")
-        tracks = stereo.track_right(tracks, right, previous.right_half, motion is not None)
+        tracks = stereo.track_right(tracks, right, motion is not None)
         watch.lap("stereo")
         return tracks, motion
 

@@ -117,8 +117,6 @@ class KltSettings(Section):
     min_peak_margin: float = setting(
         0.03, "smallest lead in correlation over the second-best match in the row", at_least=0
     )
-    circle_check: bool = setting(False, "also track the right pixels in time; right matches that disagree are dropped")
-    max_circle_px: float = setting(2.0, "largest disagreement for the circle check", unit="px", above=0)
     probation_frames: int = setting(
         1,
         "frames for which a new corner must be tracked, in time and stereo, before it is output",

@@ -18,12 +18,12 @@ def _write(tmp_path: Path, text: str) -> Path:
 
 
 def test_defaults_then_file_then_command_line(tmp_path: Path) -> None:
-    path = _write(tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: grid\n")
+    path = _write(tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: information\n")
     config = load_config(path, ["vislam.iterations=5", "selector.keep_fraction=0.5"])
     assert config.vislam.pixel_sigma_px == 2.0
     assert isinstance(config.vislam.pixel_sigma_px, float)
     assert config.vislam.iterations == 5
-    assert config.selector.name == "grid"
+    assert config.selector.name == "information"
     assert config.selector.keep_fraction == 0.5
     assert config.frontend == Config().frontend
 

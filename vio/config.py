@@ -100,7 +100,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     if path is not None:
         config = merge(config, _read_yaml(path), where=str(path))
     for override in overrides:
-        config = merge_override(config, override, example="selector.name=grid")
+        config = merge_override(config, override, example="selector.budget=40")
     return config
 
 
