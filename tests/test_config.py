@@ -55,6 +55,8 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("vislam:\n  iterations: 2.5\n", r"vislam\.iterations takes a whole number, got 2\.5"),
         ("vislam:\n  iterations: true\n", r"takes a whole number, got True"),
         ("vislam:\n  pixel_sigma_px: 1e-3\n", r"to YAML 1\.1 this is text; write 0\.001"),
+        ("vislam:\n  pixel_sigma_px: 1e300\n", r"got '1e300' \(to YAML 1\.1 this is text; write 1\.0e\+300\)"),
+        ("vislam:\n  pixel_sigma_px: nan\n", r"got 'nan'$"),
         ("vislam:\n  pixel_sigma_px: .nan\n", r"must be a number, got nan"),
         ("vislam:\n  use_stale: 1\n", r"takes true or false, got 1"),
         ("vislam:\n  noise: litral\n", r"is one of consistent, literal, not 'litral'; did you mean 'literal'"),

@@ -41,6 +41,8 @@ _SCORE = ("tests/test_evaluation.py",)
 _PIPELINE = ("tests/test_pipeline.py",)
 _REPRODUCE = ("tests/test_reproduce.py",)
 _RANSAC = ("tests/test_frontend_outliers.py",)
+_INPUTS = ("tests/test_filter_inputs.py",)
+_FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
@@ -931,5 +933,41 @@ MUTATIONS = (
         "_FIELD_MEMORY * self._normal + prior",
         "self._normal + prior",
         _PATCHES,
+    ),
+    # --- input ---
+    Mutation(
+        "input: a doubled sample accepted",
+        "vio/filters/inputs.py",
+        "now <= self._sample_ns",
+        "now < self._sample_ns",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: a doubled frame accepted",
+        "vio/filters/inputs.py",
+        "now <= before",
+        "now < before",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: NaN among the right pixels accepted",
+        "vio/filters/inputs.py",
+        "finite[seen.has_right].all()",
+        "finite[~seen.has_right].all()",
+        _INPUTS,
+    ),
+    Mutation(
+        "images: the most bits that hold the levels, not the fewest",
+        "vio/datasets/images.py",
+        "_SENSOR_BITS = (10, 12, 14)",
+        "_SENSOR_BITS = (14, 12, 10)",
+        _FILES,
+    ),
+    Mutation(
+        "archives: the header believed",
+        "vio/datasets/common.py",
+        "math.prod(shape) * dtype.itemsize > info.file_size",
+        "math.prod(shape) * dtype.itemsize < 0",
+        _FILES,
     ),
 )

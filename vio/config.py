@@ -247,9 +247,12 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
 def _number_hint(value: Any, hint: Any) -> str:
     if hint is float and isinstance(value, str):
         try:
-            return f" (to YAML 1.1 this is text; write {float(value)!r} with a decimal point)"
+            number = float(value)
         except ValueError:
             return ""
+        if math.isfinite(number):
+            plain = yaml.safe_dump(number).split()[0]  # 1.0e+300, where Python writes 1e+300
+            return f" (to YAML 1.1 this is text; write {plain})"
     return ""
 
 
