@@ -218,6 +218,7 @@ class Odometry:
         """Process the frames that still wait, and let the checks say what they have not yet said."""
         with self._lock:
             results = self._process(self._order.flush())
+            self._deliver(results)
             if self._chain is not None:
                 self._chain.watch.close()
             return results
