@@ -11,6 +11,7 @@ from collections import deque
 from vio.records import Event, MotionSample, StereoFrame
 
 LONGEST_WAIT_NS = 100_000_000  # a frame waits until one that is so much newer has come: then the IMU is silent
+_MOST_SAMPLES = 100_000  # that wait: minutes in which no frame came
 
 
 class EventOrder:
@@ -24,7 +25,7 @@ class EventOrder:
         """
         self._wait = wait_for_imu
         self._frames: deque[StereoFrame] = deque()
-        self._samples: deque[MotionSample] = deque()
+        self._samples: deque[MotionSample] = deque(maxlen=_MOST_SAMPLES)
         self._newest_ns: int | None = None  # sample that has come
         self._released_ns: int | None = None  # newest sample that was released
 

@@ -280,6 +280,15 @@ class Odometry:
 
     # How
 
+    def __getstate__(self) -> dict[str, Any]:
+        """State for a checkpoint: all but locks and the caller's function."""
+        return {key: value for key, value in self.__dict__.items() if key not in ("_lock", "_blas", "_on_frame")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a checkpoint."""
+        self.__dict__.update(state)
+        self._lock, self._blas, self._on_frame = threading.RLock(), BlasLimit(), None
+
     def _expect(self, source: MotionSource) -> None:
         if self.motion != source:
             raise ConfigError(

@@ -14,6 +14,7 @@ from vio.records import Estimate, MotionSample, VelocitySample
 _NS = 1e-9
 _KEPT_NS = 2_000_000_000  # samples that a late estimate can be carried over
 _LONGEST_STEP_S = 0.5  # a motion is held no longer than this beyond the last sample or frame
+_MOST_STATES = 10_000  # after the newest estimate: beyond, older ones are forgotten
 _ZERO: FloatArray = np.zeros(3)
 
 
@@ -60,6 +61,8 @@ class PosePredictor:
         states = self._states
         if states and sample.time_ns > states[-1].time_ns:
             states.append(self._carried(states[-1], sample))
+            if len(states) > _MOST_STATES:
+                self._states = [states[0], *states[-_MOST_STATES // 2 :]]
 
     def estimate(self, estimate: Estimate) -> None:
         """Take a new estimate, and carry it over the samples that have come since."""
