@@ -4,42 +4,43 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from frontend.settings import FrontendSettings
 from vio.errors import ConfigError
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Dataset, Frontend
+
+from .settings import FrontendSettings
 
 __all__ = ["BUILDERS", "FrontendSettings", "build_frontend"]
 
 
 def _build_klt(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from frontend.klt import KltFrontend
+    from .klt import KltFrontend
 
     return KltFrontend(camera, settings)
 
 
 def _build_orb(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from frontend.descriptors import DescriptorFrontend, MutualNearest, orb_extractor
+    from .descriptors import DescriptorFrontend, MutualNearest, orb_extractor
 
     match = settings.match
     return DescriptorFrontend(camera, settings, "orb", orb_extractor(match), MutualNearest(match.ratio))
 
 
 def _build_sift(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from frontend.descriptors import DescriptorFrontend, MutualNearest, sift_extractor
+    from .descriptors import DescriptorFrontend, MutualNearest, sift_extractor
 
     match = settings.match
     return DescriptorFrontend(camera, settings, "sift", sift_extractor(match), MutualNearest(match.ratio))
 
 
 def _build_kornia(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from frontend.learned import build_learned
+    from .learned import build_learned
 
     return build_learned(camera, settings)
 
 
 def _build_precomputed(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from frontend.precomputed import PrecomputedFrontend
+    from .precomputed import PrecomputedFrontend
 
     if dataset is None:
         raise ConfigError("frontend.name: precomputed needs a recording of features")

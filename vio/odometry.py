@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from frontend import build_frontend
-from frontend.precomputed import PrecomputedFrontend
 from vio.chain import BACKENDS, Chain, FrameResult, build_backend
 from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.event_order import EventOrder
+from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.pose_prediction import PosePredictor, PredictedPose
@@ -355,10 +354,10 @@ class Odometry:
         frontend, selector, backend = self._parts
         config, camera = self._config, self.camera
         if frontend is None and self._kind == "observations":
-            frontend = PrecomputedFrontend(self._take_given)
+            frontend = frontend_module("precomputed").PrecomputedFrontend(self._take_given)
         if frontend is None:
             name = "klt" if config.frontend.name == "auto" else config.frontend.name
-            frontend = build_frontend(name, camera, config.frontend)
+            frontend = frontend_module().build_frontend(name, camera, config.frontend)
         if selector is None:
             size = None if camera.width is None or camera.height is None else (camera.width, camera.height)
             selector = build_selector(config.selector, image_size=size, whole_record=None, camera=camera)

@@ -13,6 +13,7 @@ from vio.chain import BACKENDS, STAGES, FrameLog, FrameResult, build_backend
 from vio.config import BackendName, Config
 from vio.errors import ConfigError, DataError
 from vio.filters.vislam import Vislam
+from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
 from vio.odometry import Odometry
 from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
@@ -314,8 +315,7 @@ def _feature_source(dataset: Dataset, config: Config) -> Dataset:
 
 
 def _build_frontend(features: Dataset, config: Config) -> Frontend:
-    from frontend import build_frontend
-
+    build_frontend = frontend_module().build_frontend
     name = config.frontend.name if config.frontend.features is None else "precomputed"
     return build_frontend(name, features.recording.camera, config.frontend, features)
 
