@@ -188,6 +188,13 @@ MUTATIONS = (
         _WINDOW,
     ),
     Mutation(
+        "restart: the position's variance does not grow with the time in between",
+        "vio/filters/restart.py",
+        "np.diag(np.repeat([position, rotation], 3) ** 2)",
+        "np.diag(np.repeat([0.0, rotation], 3) ** 2)",
+        _WINDOW,
+    ),
+    Mutation(
         "tracks: eliminated points still count",
         "vio/filters/multiview.py",
         "b -= flat.T @",

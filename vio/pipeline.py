@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from vio.config import BackendName, Config
-from vio.errors import ConfigError, DataError
+from vio.errors import ConfigError, DataError, DivergedError
 from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
 from vio.geometry.lie import FloatArray
@@ -172,7 +172,7 @@ def run(
             )
             selection = selector.select(seen, expected.motion if expected else None)
             timer.end("select")
-            report = backend.update(seen.take(selection.chosen))
+            report = _update(backend, seen.take(selection.chosen), watch)
             estimate = backend.estimate()
             timer.end("update")
 
@@ -203,6 +203,18 @@ def run(
         warnings=tuple(watch.lines),
         wall_s=timer.since_start(),
     )
+
+
+def _update(backend: Backend, seen: Observations, watch: RunWatch) -> UpdateReport:
+    """Update with a frame; a back end that can start again does so where it diverges."""
+    try:
+        return backend.update(seen)
+    except DivergedError as error:
+        if not isinstance(backend, Msckf):
+            raise
+        report = backend.restart(seen)
+        watch.restarted(seen.frame_index, str(error), backend.estimate())
+        return report
 
 
 def frames_after_imu(events: Iterable[Event]) -> Iterator[Event]:

@@ -57,6 +57,10 @@ class RunWatch:
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
 
+    def restarted(self, index: int, why: str, estimate: Estimate) -> None:
+        """Report that the back end diverged in a frame and was started again; repeats within a second are one event."""
+        self._report(self._health.restarted(index, why, estimate))
+
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
         self._report(self._health.frame(index, report, estimate))
