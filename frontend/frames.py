@@ -127,7 +127,9 @@ class Features(Protocol):
         """Mask (N,)."""
 
 
-def make_output(frame: StereoFrame, features: Features, tracked: int, watch: Stopwatch) -> FrontendOutput:
+def make_output(
+    frame: StereoFrame, features: Features, tracked: int, watch: Stopwatch, warnings: tuple[str, ...] = ()
+) -> FrontendOutput:
     """Return the output of a front end for a frame; `tracked` features were in the previous output, too."""
     z = np.concatenate([features.left, features.right], axis=1)
     return FrontendOutput(
@@ -136,4 +138,5 @@ def make_output(frame: StereoFrame, features: Features, tracked: int, watch: Sto
         matched=int(features.has_right.sum()),
         detected=len(features.ids) - tracked,
         stages_ms=watch.stages_ms,
+        warnings=warnings,
     )

@@ -824,7 +824,7 @@ def test_settings_out_of_range(change: dict[str, int]) -> None:
 def test_restarts_from_the_last_good_pose_after_a_divergence(motion: str | None) -> None:
     """Frame 12 leaves a state of NaN: the filter raises, restarts, and its error stays within its covariance."""
     flight = Flight(frames=40)
-    events: list[int] = []
+    events: list[str] = []
 
     class Fragile(Msckf):
         def update(self, observations: Observations) -> UpdateReport:
@@ -834,12 +834,11 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(motion: str | None)
             try:
                 return super().update(observations)
             except DivergedError as error:
-                assert "diverged at frame 12" in str(error)
-                events.append(observations.frame_index)
+                events.append(str(error))
                 return self.restart(observations)
 
     errors, covariances, filt = flight.run(MsckfSettings(start_tilt_sigma_deg=1.0), motion, filter_class=Fragile)
-    assert events == [12]
+    assert [event[:27] for event in events] == ["msckf diverged at frame 12:"]
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.15
     assert np.sqrt(covariances[12, 0, 0]) > 3 * np.sqrt(covariances[11, 0, 0])
     chi_square = np.einsum("ki,kij,kj->k", errors[12:], np.linalg.inv(covariances[12:]), errors[12:])

@@ -165,7 +165,7 @@ def run(
             timer.end("predict")
             output = frontend.process(event, expected.tracks if expected and config.frontend.prior else None)
             timer.end("frontend")
-            watch.observations(output.observations)
+            watch.observations(output.observations, output.warnings)
             timer.end("watch")
             seen = (
                 output.observations.take(output.observations.has_right) if backend.stereo_only else output.observations

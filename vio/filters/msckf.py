@@ -167,7 +167,7 @@ class Msckf:
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
         motion = MotionPrior(T_curr_prev, A @ self._expected_error(growth) @ A.T)
-        return Prediction(self._expected_tracks(window, T_cam0_world, T_curr_prev[:3, :3]), motion)
+        return Prediction(self._expected_tracks(window, T_cam0_world, motion), motion)
 
     def _expected_error(self, growth: Growth) -> FloatArray:
         """Covariance (6, 6) of `xi_curr - xi_prev` where the error at the last frame, xi_prev, has grown to xi_curr."""
@@ -175,14 +175,14 @@ class Msckf:
         out: FloatArray = M @ self._output[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
         return out
 
-    def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, R_cam_prev: FloatArray) -> TrackPrior:
+    def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
         table = self._tracks.table
         rows = table.rows()
         rows = rows[table.has_point[rows]]
         ids = np.concatenate([table.ids(rows), window.landmark_ids])
         p_cam = transform_points(T_cam0_world, np.concatenate([table.points[rows], window.landmarks]))
         ahead = p_cam[:, 2] > MIN_DEPTH * self._camera.baseline_m
-        return TrackPrior(ids[ahead], project(self._camera, p_cam[ahead]), R_cam_prev)
+        return TrackPrior(ids[ahead], project(self._camera, p_cam[ahead]), motion.T_curr_prev[:3, :3], motion)
 
     def update(self, observations: Observations) -> UpdateReport:
         """Propagate to the time of the frame and update with its observations.

@@ -48,8 +48,9 @@ class RunWatch:
             if self._inertial is not None:
                 self._inertial.imu(sample)
 
-    def observations(self, seen: Observations) -> None:
-        """Add the front end's observations, before feature selection."""
+    def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
+        """Add the front end's observations, before feature selection, and what it says of the images."""
+        self._report(warnings)
         self._frames += 1
         self._features += len(seen)
         if self._silence is not None:
