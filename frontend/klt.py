@@ -10,6 +10,7 @@ import numpy as np
 from frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
 from frontend.columns import joined, take
 from frontend.detect import detect_corners, half_mask, load_mask, min_distance_px
+from frontend.exchange import ExchangeDetector, MatchCounts
 from frontend.flow import lost_contrast, track_with_retries
 from frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
 from frontend.moving_object import ObjectReport, choose_motion
@@ -26,6 +27,7 @@ from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame,
 
 _ITERATIONS = 5
 _ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost
+_EXCHANGE_POINTS = 80  # points that matches of either sign are counted at
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
 _NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
 _FAR_M = 1e6  # depth assumed where too few features have one
@@ -73,6 +75,7 @@ class KltFrontend:
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._validator = FrameValidator(camera, "klt")
         self._swap = SwapDetector(_SWAP_FEW)
+        self._exchange = ExchangeDetector()
         self._right = RightCamera()
         self._objects = ObjectReport()
         self._lines: list[str] = []  # of the frame, for the log
@@ -94,6 +97,17 @@ class KltFrontend:
         watch.lap("prepare")
         if self._contrast_lost(left):
             return make_output(frame, no_tracks(), 0, watch)
+        order = self._exchange.order(
+            frame.index,
+            left.half,
+            right.half,
+            lambda: self._count_matches(left, right, stereo),
+            suspicious=not self._right.usable,
+        )
+        if order == "refused":
+            return make_output(frame, no_tracks(), 0, watch, self._take_lines())
+        if order == "exchanged":
+            left, right = right, left
         if self._right.left_is_frozen(frame.index, left.half, right.half):
             return make_output(frame, no_tracks(), 0, watch, self._take_lines())
         tracks, motion = self._track(frame, left, right, usable_prior(prior), stereo, watch)
@@ -116,7 +130,7 @@ class KltFrontend:
 
     def _take_lines(self) -> tuple[str, ...]:
         """Return what the frame says of the images, one line an event."""
-        lines, self._lines = (*self._right.take_lines(), *self._lines), []
+        lines, self._lines = (*self._exchange.take_lines(), *self._right.take_lines(), *self._lines), []
         return lines
 
     def _view(self, image: Image) -> View:
@@ -146,6 +160,17 @@ class KltFrontend:
         if lost_contrast(left.half, previous.left.half):
             self._skipped = before + 1
         return self._skipped > 0
+
+    def _count_matches(self, left: View, right: View, stereo: StereoFit) -> MatchCounts:
+        """Count matches of either sign, at the points that the other camera saw last."""
+        previous = self._previous
+        if previous is None:
+            return MatchCounts(0, 0, 0)
+        tracks = previous.tracks
+        points = np.where(tracks.has_right[:, None], tracks.right, tracks.left)
+        points = points[inside(left.full, points, 0.0)][:_EXCHANGE_POINTS]
+        positive = int(stereo.search(left, right, points)[1].sum())
+        return MatchCounts(len(points), positive, stereo.count_mirrored(left, right, points))
 
     def _count_tracked(self, seen: Tracks) -> int:
         """Count the features that were output in the previous frame, too."""

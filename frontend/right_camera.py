@@ -87,7 +87,7 @@ class RightCamera:
         if now.right.std() < _DARK_SHARE * now.left.std():
             self._distrust("dark", last.index, index)
             return False
-        change_left, change_right = _change(now.left, last.left), _change(now.right, last.right)
+        change_left, change_right = image_change(now.left, last.left), image_change(now.right, last.right)
         if _is_frozen(change_right / self._ratio, change_left):
             self._distrust("frozen", last.index, index)
             return False
@@ -158,7 +158,7 @@ class RightCamera:
             )
 
 
-def _change(image: Image, other: Image) -> float:
+def image_change(image: Image, other: Image) -> float:
     """Mean absolute difference of two images, in gray levels at a common mean and contrast; 0: equal to the bit."""
     if np.array_equal(image, other):
         return 0.0

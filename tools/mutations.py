@@ -43,6 +43,7 @@ _REPRODUCE = ("tests/test_reproduce.py",)
 _RANSAC = ("tests/test_frontend_outliers.py",)
 _RESTART = ("tests/test_msckf.py",)
 _RIGHT_CAMERA = ("tests/test_right_camera.py",)
+_EXCHANGE = ("tests/test_exchange.py",)
 _MOVING_OBJECT = ("tests/test_moving_object.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
@@ -850,6 +851,13 @@ MUTATIONS = (
         "return tracks, np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
         "return take(tracks, tracks.has_right), np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
         _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "exchange: frames that do not fit are put back, too",
+        "frontend/exchange.py",
+        'return "exchanged" if found.negative >= _MANY * found.points else "refused"',
+        'return "exchanged"',
+        _EXCHANGE,
     ),
     Mutation(
         "moving object: the larger group is the scene whatever is predicted",
