@@ -144,6 +144,16 @@ def _ransac(
     return best, pixel_errors(camera, best, p_prev, pixels) <= limit
 
 
+def best_motion(
+    problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, starts: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the motion (4, 4) with most inliers among points (N, 3) and pixels (N, 2), and their mask (N,).
+
+    Unlike a consensus it may have few inliers; `starts` (S, 4, 4) are tried besides minimal sets.
+    """
+    return _ransac(problem, p_prev, pixels, starts, slice(0, 6))
+
+
 def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:
     """Return the index of the start with the smallest median error; errors far beyond the limit are clipped."""
     error = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)

@@ -42,6 +42,10 @@ _SCORE = ("tests/test_evaluation.py",)
 _PIPELINE = ("tests/test_pipeline.py",)
 _REPRODUCE = ("tests/test_reproduce.py",)
 _RANSAC = ("tests/test_frontend_outliers.py",)
+_RESTART = ("tests/test_msckf.py",)
+_RIGHT_CAMERA = ("tests/test_right_camera.py",)
+_EXCHANGE = ("tests/test_exchange.py",)
+_MOVING_OBJECT = ("tests/test_moving_object.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
@@ -215,6 +219,13 @@ MUTATIONS = (
         "B[:, :, 3:] = so3_hat(p_world)",
         "B[:, :, 3:] = -so3_hat(p_world)",
         _WINDOW,
+    ),
+    Mutation(
+        "restart: the position's variance does not grow with the time in between",
+        "vio/filters/restart.py",
+        "np.diag(np.repeat([position, rotation], 3) ** 2)",
+        "np.diag(np.repeat([0.0, rotation], 3) ** 2)",
+        _RESTART,
     ),
     Mutation(
         "tracks: eliminated points still count",
@@ -856,6 +867,41 @@ MUTATIONS = (
         _SCORE,
     ),
     # --- frontend ---
+    Mutation(
+        "right camera: an image that was repeated with noise counts as new",
+        "frontend/right_camera.py",
+        "return change < _MOST_NOISE and other_change >",
+        "return change < 0 and other_change >",
+        _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "right camera: features are dropped while it cannot be used",
+        "frontend/klt.py",
+        "return tracks, np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
+        "return take(tracks, tracks.has_right), np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
+        _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "exchange: frames that do not fit are put back, too",
+        "frontend/exchange.py",
+        'return "exchanged" if found.negative >= _MANY * found.points else "refused"',
+        'return "exchanged"',
+        _EXCHANGE,
+    ),
+    Mutation(
+        "moving object: the larger group is the scene whatever is predicted",
+        "frontend/moving_object.py",
+        "if first_agrees or not (second_agrees or in_event):",
+        "if not in_event:",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
+        "moving object: a wrong prediction overrides the consensus",
+        "frontend/moving_object.py",
+        "second_agrees = large and _agrees(",
+        "second_agrees = True or _agrees(",
+        _MOVING_OBJECT,
+    ),
     Mutation(
         "RANSAC: step on the wrong side of the motion",
         "frontend/outliers.py",
