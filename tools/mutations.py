@@ -900,22 +900,22 @@ MUTATIONS = (
     Mutation(
         "alignment of patches: step not undone",
         "frontend/align.py",
-        "np.stack([d, -b, -c, a], axis=1)",
-        "np.stack([a, b, c, d], axis=1)",
+        "warp[i, 2] -= x * du + y * dv",
+        "warp[i, 2] += x * du + y * dv",
         _PATCHES,
     ),
     Mutation(
         "alignment of patches: gain ignored",
         "frontend/align.py",
-        "fit /= np.maximum(fit[:, 2:3], 0.1)",
-        "fit /= 1.0",
+        "gain = max(fit[2], 0.1)",
+        "gain = 1.0",
         _PATCHES,
     ),
     Mutation(
         "stereo search: sub-pixel offset of the wrong sign",
         "frontend/stereo_match.py",
-        "(before - after) / (2 *",
-        "(after - before) / (2 *",
+        "(before - after) / (2.0 *",
+        "(after - before) / (2.0 *",
         _PATCHES,
     ),
     Mutation(
@@ -931,5 +931,27 @@ MUTATIONS = (
         "_FIELD_MEMORY * self._normal + prior",
         "self._normal + prior",
         _PATCHES,
+    ),
+    # --- vio/compiled.py ---
+    Mutation(
+        "compiled loops: no folder for the cache ends the run",
+        "vio/compiled.py",
+        "except RuntimeError:",
+        "except KeyError:",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "compiled loops: a pixel outside the image is read from beyond its row",
+        "frontend/align.py",
+        "width - 1.001 - reach_u",
+        "width + 1.001 - reach_u",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "compiled loops: twist without the coupling of rotation and translation",
+        "vio/compiled.py",
+        "T[1, 3] += py + b * cy + c * dy",
+        "T[1, 3] += py",
+        ("tests/test_compiled.py",),
     ),
 )
