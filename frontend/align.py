@@ -157,6 +157,7 @@ def _prepare(
     side = wide.shape[1] - 2
     size, radius = side * side, side // 2
     basis, normal = np.empty(_PARAMETERS), np.empty((_PARAMETERS, _PARAMETERS))
+    on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
     for n in range(len(wide)):
         total = 0.0
         for k in range(size):
@@ -181,8 +182,11 @@ def _prepare(
         for i in range(_PARAMETERS):
             normal[i, i] += _DAMPING * normal[i, i] + 1e-6
         invert_positive(normal, inverse[n])
-        normal[1, 1] += _ROW_WEIGHT
-        invert_positive(normal[:_ROW_PARAMETERS, :_ROW_PARAMETERS], row_inverse[n])
+        for i in range(_ROW_PARAMETERS):
+            for j in range(i + 1):
+                on_row[i, j] = normal[i, j]
+        on_row[1, 1] += _ROW_WEIGHT
+        invert_positive(on_row, row_inverse[n])
 
 
 def align(

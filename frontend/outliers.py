@@ -98,7 +98,8 @@ def _gauss_newton(
     `free` selects the part of the twist `[rho; phi]` that is estimated: all of it, or the translation alone.
     """
     T = np.array(T)
-    _iterate((camera.fu, camera.fv, camera.cu, camera.cv), T, p_prev, pixels, weight, iterations, free.stop or 6)
+    points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
+    _iterate((camera.fu, camera.fv, camera.cu, camera.cv), T, points, seen, w, iterations, free.stop)
     return T
 
 

@@ -6,6 +6,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import numba
@@ -17,8 +18,10 @@ from frontend.outliers import _gauss_newton, pixel_errors
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.compiled import invert_positive, move_by_twist, solve_positive
-from vio.geometry.lie import se3_exp
-from vio.geometry.stereo import StereoCamera
+from vio.filters import multiview, stereo_calibration
+from vio.filters.multiview import Views
+from vio.geometry.lie import FloatArray, se3_exp, transform_points
+from vio.geometry.stereo import StereoCamera, project
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 
@@ -96,6 +99,68 @@ def test_small_positive_systems_are_solved_and_inverted() -> None:
     expected = np.linalg.solve(A, b)
     solve_positive(np.tril(A), b)
     np.testing.assert_allclose(b, expected, rtol=1e-10)
+
+
+def _scene() -> tuple[FloatArray, FloatArray, Views]:
+    """Forty points in five cameras, some of them unseen, without a right view, or behind a camera."""
+    rng = np.random.default_rng(11)
+    T = se3_exp(np.cumsum(rng.normal(0, 0.1, (5, 6)), axis=0))
+    p = rng.uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 6.0], (40, 3))
+    p[0, 2] = -3.0
+    z = np.stack([project(CAMERA, transform_points(T_i, p)) for T_i in T], axis=1) + rng.normal(0, 0.5, (40, 5, 4))
+    weight = np.zeros((40, 5, 4))
+    seen = rng.uniform(size=(40, 5)) < 0.8
+    seen[:, 1] = True
+    weight[seen] = [1.0, 1.0, 1.0, 0.0]
+    weight[rng.uniform(size=(40, 5)) < 0.3, 2] = 0.0
+    return T, p, Views(z, weight)
+
+
+def _same(ours: object, twin: object) -> None:
+    """Compare the arrays of two records."""
+    for field in fields(ours):  # type: ignore[arg-type]
+        a, b = getattr(ours, field.name), getattr(twin, field.name)
+        if is_dataclass(a):
+            _same(a, b)
+        else:
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max(initial=0.0), err_msg=field.name)
+
+
+def test_tracks_are_linearised_and_eliminated_as_in_numpy() -> None:
+    T, p, views = _scene()
+    at = multiview.residuals(CAMERA, T, p, views)
+    _same(at, numpy_twins.residuals(CAMERA, T, p, views))
+    assert not at.ahead.all()
+    at, p = at.take(at.ahead), p[at.ahead]
+    weight = np.random.default_rng(12).uniform(0.1, 1.0, at.r.shape[:2])
+    ours = multiview.track_information(CAMERA, T, at, p, weight)
+    _same(ours, numpy_twins.track_information(CAMERA, T, at, p, weight))
+    chosen = np.arange(len(p)) % 3 > 0
+    for a, b in zip(multiview.eliminate_points(ours, chosen), numpy_twins.eliminate_points(ours, chosen), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
+
+
+def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
+    T, p, views = _scene()
+    rng = np.random.default_rng(13)
+    rows, states = stereo_calibration.RowField(CAMERA), rng.normal(0, 0.01, 6)
+    rows.coefficients = rng.normal(0, 0.01, 6)
+    expected = numpy_twins.corrected(CAMERA, rows.coefficients, states, views.z, views.weight)
+    views = stereo_calibration.StereoField(CAMERA, rows, states).corrected(views)
+    np.testing.assert_allclose(views.z, expected, rtol=1e-12)
+    at = multiview.residuals(CAMERA, T, p, views)
+    at, p = at.take(at.ahead), p[at.ahead]
+    weight = rng.uniform(0.1, 1.0, at.r.shape[:2])
+    info = multiview.track_information(CAMERA, T, at, p, weight)
+    H = stereo_calibration.field_jacobian(CAMERA, expected[: len(p)])
+    np.testing.assert_allclose(H, numpy_twins.field_jacobian(CAMERA, expected[: len(p)]), rtol=1e-12)
+    ours = stereo_calibration.stereo_columns(at, H, info.q.p_D_q, weight)
+    _same(ours, numpy_twins.stereo_columns(at, H, info.q.p_D_q, weight))
+    chosen = np.arange(len(p)) % 3 > 0
+    _same(
+        stereo_calibration.eliminate_points_from_columns(ours, info, chosen),
+        numpy_twins.eliminate_points_from_columns(ours, info, chosen),
+    )
 
 
 MODULE = "from vio.compiled import compiled\n\n@compiled\ndef doubled(x: float) -> float:\n    return 2.0 * x\n"

@@ -119,3 +119,10 @@ def move_by_twist(xi: FloatArray, T: FloatArray) -> None:
     T[0, 3] += px + b * cx + c * dx
     T[1, 3] += py + b * cy + c * dy
     T[2, 3] += pz + b * cz + c * dz
+
+
+@compiled
+def move_poses(xi: FloatArray, T: FloatArray) -> None:
+    """Replace transforms T (N, 4, 4) by `exp(xi) T`, with twists (N, 6)."""
+    for n in range(len(T)):
+        move_by_twist(xi[n], T[n])
