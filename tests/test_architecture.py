@@ -136,7 +136,7 @@ def _loaded(code: str, suspects: set[str]) -> set[str]:
     return set(done.stderr.split())
 
 
-HEAVY = {"numpy", "scipy", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
+HEAVY = {"numpy", "scipy", "numba", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
 HELP = """
 import contextlib, vio.cli
 with contextlib.suppress(SystemExit):

@@ -42,7 +42,7 @@ from vio.filters.stereo_calibration import (
     landmark_columns,
 )
 from vio.filters.tracks import latest_pixels
-from vio.filters.window import Clone, Window, posterior
+from vio.filters.window import Clone, Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
@@ -540,7 +540,7 @@ class Msckf:
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
-            P = self._move_to_optimum(window, tracks, A, b)
+            P = self._move_to_optimum(window, tracks, A, b, len(A))
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go.
@@ -549,7 +549,9 @@ class Msckf:
             innovation = residual
         return tracks, P
 
-    def _move_to_optimum(self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray) -> FloatArray:
+    def _move_to_optimum(
+        self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int
+    ) -> FloatArray:
         """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
 
         Args:
@@ -557,12 +559,12 @@ class Msckf:
             tracks: whose points are moved.
             A: information (D, D).
             b: its vector (D,).
+            size: how many errors, the first ones, it is about.
 
         Returns:
-            The covariance (D, D) there.
+            Their covariance (size, size) there.
         """
-        P, shift = posterior(window.P, A, b + A @ window.prior_delta)
-        error = shift - window.prior_delta
+        P, error = window.optimum(A, b, size)
         self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
         window.relinearise(error)
         return P
@@ -633,7 +635,8 @@ class Msckf:
         window.absorb(*self._information(window, tracks, ending & good, pixels))
         promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
 
-        P = self._move_to_optimum(window, tracks, *self._information(window, tracks, good & ~ending, None))
+        A, b = self._information(window, tracks, good & ~ending, None)
+        P = self._move_to_optimum(window, tracks, A, b, window.first_landmark)  # no landmark is in it
         own = slice(0, window.first_clone)
         self._output = P[own, own]
         self._smoothed = WindowPosterior.of(window, P)
