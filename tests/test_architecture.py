@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
 
 # Only the configuration, the pipeline builder and the command line import both packages.
-IMPORT_BOTH = {"vio.config", "vio.pipeline", "vio.sim.oracle"}
+IMPORT_BOTH = {"vio.config", "vio.odometry", "vio.pipeline", "vio.sim.oracle"}
 # Modules of the estimator, free of images and files.
 ESTIMATOR = ("vio.filters", "vio.geometry", "vio.records", "vio.selectors", "vio.protocols", "vio.evaluation")
 # Imports forbidden to each package, lower layers first; the command line, forbidden to all, is tested separately.
@@ -136,7 +136,7 @@ def _loaded(code: str, suspects: set[str]) -> set[str]:
     return set(done.stderr.split())
 
 
-HEAVY = {"numpy", "scipy", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
+HEAVY = {"numpy", "scipy", "numba", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
 HELP = """
 import contextlib, vio.cli
 with contextlib.suppress(SystemExit):
