@@ -39,6 +39,12 @@ def _plain(path: Path, settings: DatasetSettings) -> Dataset:
     return read_plain(path, settings)
 
 
+def _bag(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.bags.reader import read_bag
+
+    return read_bag(path, settings)
+
+
 def _ece276a(path: Path, settings: DatasetSettings) -> Dataset:
     from vio.datasets.ece276a import read_ece276a
 
@@ -62,13 +68,15 @@ READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
     "kitti_raw": _kitti_raw,
     "euroc": _euroc,
     "plain": _plain,
+    "bag": _bag,
     "ece276a": _ece276a,
     "utias": _utias,
     "log": _log,
 }
 _LOOKED_FOR = (
     "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
-    "(mav0), a plain folder (left right and a calibration), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
+    "(mav0), a plain folder (left right and a calibration), a ROS bag (.bag, .db3, .mcap), an ECE276A .npz, a UTIAS "
+    ".mat or an observation log .npz"
 )
 
 
@@ -132,6 +140,7 @@ def _detect(path: Path) -> str:
 
 
 def _folder_kind(path: Path) -> str | None:
+    from vio.datasets.bags import is_bag
     from vio.datasets.euroc import is_euroc_folder
     from vio.datasets.kitti import is_kitti_folder
     from vio.datasets.kitti_raw import is_kitti_raw_folder
@@ -143,6 +152,8 @@ def _folder_kind(path: Path) -> str | None:
         raise DataError(f"cannot list {path}: {error.strerror or error}") from error
     if not names:
         raise DataError(f"{path} is empty; give {_LOOKED_FOR}")
+    if is_bag(path):
+        return "bag"
     if is_kitti_folder(path):
         return "plain" if holds_more_than_kitti(path) else "kitti"
     if is_kitti_raw_folder(path):
@@ -157,6 +168,7 @@ def _folder_kind(path: Path) -> str | None:
 
 
 def _file_kind(path: Path) -> str | None:
+    from vio.datasets.bags import is_bag
     from vio.datasets.observation_log import is_observation_log
 
     try:
@@ -166,6 +178,8 @@ def _file_kind(path: Path) -> str | None:
         raise DataError(f"cannot read {path}: {error.strerror or error}") from error
     if start.startswith(b"MATLAB"):
         return "utias"
+    if is_bag(path):
+        return "bag"
     if not start.startswith(b"PK"):
         return None
     try:

@@ -44,12 +44,17 @@ def load_gray(path: Path) -> tuple[Image, int]:
     Raises:
         UnreadableImageError: the file cannot be read, is truncated, or does not decode.
     """
-    import cv2
-
     try:
         data = path.read_bytes()
     except OSError as error:
         raise UnreadableImageError(f"cannot read {path}: {error.strerror or error}") from error
+    return decode_gray(data, path)
+
+
+def decode_gray(data: bytes, path: Path | str) -> tuple[Image, int]:
+    """Decode an image file in memory as `load_gray` does; `path` names it in messages."""
+    import cv2
+
     if problem := _damage(data):
         raise UnreadableImageError(f"{path}: {problem}; copy the image again")
     pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)

@@ -20,18 +20,17 @@ from vio.datasets.common import imu_samples, naming
 from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.kitti import read_extrinsics
+from vio.datasets.overlap import check_overlap, reference_of_body
 from vio.datasets.pairing import pair_stamps
 from vio.datasets.rectified import RectifiedDataset, make_rectifier
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import parse_stamps, read_imu_table, read_velocity_table
 from vio.errors import CalibrationError, DataError
-from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource, Recording, Trajectory
 from vio.rig import Rectifier, Rig
 from vio.text_files import text_lines
 from vio.trajectory_io import read_trajectory
-from vio.watch.clocks import judge_clocks
 
 _FOLDERS = (
     ("left", "right"),
@@ -303,13 +302,6 @@ def _read_motion(
     return tuple(sorted(samples, key=lambda s: s.time_ns)), files, notes
 
 
-def check_overlap(frame_times_ns: IntArray, times_ns: IntArray, where: Path | str) -> None:
-    """Raise DataError where no sample lies within the time of the images."""
-    if times_ns[-1] < frame_times_ns[0] or times_ns[0] > frame_times_ns[-1]:
-        (finding,) = judge_clocks(frame_times_ns, times_ns)
-        raise DataError(f"{where}: no sample is within the time of the images; {finding.message}; or remove it")
-
-
 def _sources_of(files: Sequence[Path]) -> frozenset[MotionSource]:
     return frozenset("velocity" if file.name == "velocity.csv" else "imu" for file in files)
 
@@ -329,21 +321,6 @@ def _read_reference(
         truth = replace(truth, times_ns=times_ns[: len(truth)], frame_indices=np.arange(len(truth)))
     with naming(file):
         return reference_of_body(truth, rig, rectifier), file
-
-
-def reference_of_body(truth: Trajectory, rig: Rig, rectifier: Rectifier) -> Trajectory:
-    """Return ground truth of the raw left camera or of the IMU as that of the run's body.
-
-    Raises:
-        CalibrationError: poses of the IMU cannot be used, as its place is unknown.
-    """
-    if rig.T_cam0_imu is not None:
-        return truth.in_imu(rig.T_cam0_imu)
-    if truth.body == "imu":
-        # Without extrinsics nothing tells the IMU from the camera; a TUM file without a comment is the camera's.
-        truth = replace(truth, body="cam0")
-    R_rect_cam0: FloatArray = rectifier.T_rect0_imu[:3, :3]
-    return replace(truth, T_world_body=truth.T_world_body @ se3_inverse(se3_from_parts(R_rect_cam0, np.zeros(3))))
 
 
 # --- what is not used -----------------------------------------------------------------------------------------------
