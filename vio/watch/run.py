@@ -38,6 +38,8 @@ class RunWatch:
 
             self._inertial = InertialCheck(camera, T_cam0_body)
         self._frames = self._features = 0
+        self._refused_last = -2
+        self.frames_refused = 0
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
@@ -56,6 +58,13 @@ class RunWatch:
             self._report(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
+
+    def refused(self, index: int, reason: str) -> None:
+        """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
+        if index != self._refused_last + 1:
+            self._report([f"frame skipped: {reason}"])
+        self._refused_last = index
+        self.frames_refused += 1
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
