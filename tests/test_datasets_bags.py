@@ -12,7 +12,7 @@ import pytest
 rosbags = pytest.importorskip("rosbags", reason="needs the extra bags")
 
 from tests.bag_maker import Script, noise_frames, of_stereo  # noqa: E402
-from vio.cli import main  # noqa: E402
+from tests.same_events import assert_same_events  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
 from vio.datasets.bags.pictures import raw_gray, white_of  # noqa: E402
 from vio.datasets.bags.reader import BagDataset  # noqa: E402
@@ -27,16 +27,6 @@ START_NS = 10**18
 T_CAM0_IMU = se3_exp([0.1, -0.05, 0.02, 1.2, -1.2, 1.2])
 RIG = Rig.rectified(40.0, 40.0, 31.5, 23.5, 0.11, 64, 48)
 STORAGES = ("bag", "db3", "mcap")
-
-
-@pytest.fixture(scope="module")
-def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered flight as an EuRoC folder: 16 frames of 160 pixels with an IMU."""
-    folder = tmp_path_factory.mktemp("flight") / "flight"
-    options = {"rig": "small", "width": "160", "rate": "20", "duration": "0.8", "workers": "1", "format": "euroc"}
-    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
-    assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
-    return folder
 
 
 def bag_of(dataset: Dataset, storage: str, path: Path) -> Path:
@@ -55,19 +45,6 @@ def bag_of(dataset: Dataset, storage: str, path: Path) -> Path:
     for time_ns, T in zip(truth.times_ns.tolist(), truth.T_world_body, strict=True):
         script.pose("/vicon/pose", time_ns, T)
     return script.write(path)
-
-
-def assert_same_events(a: Dataset, b: Dataset, start: int = 0, stop: int | None = None) -> None:
-    """Every frame and sample of the two recordings has the same bits."""
-    ours, theirs = list(a.events(start, stop)), list(b.events(start, stop))
-    assert [(type(x), x.time_ns) for x in ours] == [(type(x), x.time_ns) for x in theirs]
-    for x, y in zip(ours, theirs, strict=True):
-        if isinstance(x, StereoFrame) and isinstance(y, StereoFrame):
-            assert x.index == y.index
-            np.testing.assert_array_equal(x.left, y.left)
-            np.testing.assert_array_equal(x.right, y.right)
-        elif isinstance(x, ImuSample) and isinstance(y, ImuSample):
-            np.testing.assert_array_equal([x.gyro, x.accel], [y.gyro, y.accel])
 
 
 @pytest.mark.parametrize("storage", STORAGES)

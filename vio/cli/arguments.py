@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from vio.config import Config
+    from vio.datasets.span import Seconds
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,6 +24,13 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration", metavar="F", help="same as --set dataset.calibration=F")
     parser.add_argument("--topics", metavar="A=/B,…", help="topics of a bag: same as --set dataset.topics=A=/B,…")
     parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
+
+
+def bound(text: str) -> int | Seconds:
+    """Parse a frame number, or a time after the first frame such as 12.5s."""
+    from vio.datasets.span import parse_bound
+
+    return parse_bound(text)
 
 
 def lengths(text: str) -> tuple[float, ...]:

@@ -11,6 +11,7 @@ from vio.atomic import check_replaceable, check_writable
 from vio.cli.progress import ProgressBar
 from vio.config import Config
 from vio.datasets import open_dataset
+from vio.datasets.span import Seconds, frames_between
 from vio.errors import VioError
 from vio.evaluation import KITTI_LENGTHS_M
 from vio.pipeline import run
@@ -42,8 +43,8 @@ def process(
     *,
     out: Path | None,
     reference: Path | None = None,
-    start: int = 0,
-    stop: int | None = None,
+    start: int | Seconds = 0,
+    stop: int | Seconds | None = None,
     lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
     progress: bool = True,
@@ -56,9 +57,10 @@ def process(
     truth = recording.reference if reference is None else read_trajectory(reference)
     folder = check_out(out if out is not None else free_folder(recording.path))
     total = len(recording.frame_times_ns)
-    frames = max(min(total, total if stop is None else stop) - start, 0)
+    first, end = frames_between(recording, start, stop)
+    frames = max(min(total, total if end is None else end) - first, 0)
     viewer = ProgressViewer(frames, recording.path.name) if progress else None
-    result = run(dataset, config, start=start, stop=stop, keep_observations=save_observations, viewer=viewer)
+    result = run(dataset, config, start=first, stop=end, keep_observations=save_observations, viewer=viewer)
     return write_run_folder(
         folder, result, truth, lengths_m=lengths_m or KITTI_LENGTHS_M, save_observations=save_observations
     )

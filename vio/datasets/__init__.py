@@ -45,6 +45,12 @@ def _bag(path: Path, settings: DatasetSettings) -> Dataset:
     return read_bag(path, settings)
 
 
+def _video(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.videos import read_video
+
+    return read_video(path, settings)
+
+
 def _ece276a(path: Path, settings: DatasetSettings) -> Dataset:
     from vio.datasets.ece276a import read_ece276a
 
@@ -69,14 +75,15 @@ READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
     "euroc": _euroc,
     "plain": _plain,
     "bag": _bag,
+    "video": _video,
     "ece276a": _ece276a,
     "utias": _utias,
     "log": _log,
 }
 _LOOKED_FOR = (
     "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
-    "(mav0), a plain folder (left right and a calibration), a ROS bag (.bag, .db3, .mcap), an ECE276A .npz, a UTIAS "
-    ".mat or an observation log .npz"
+    "(mav0), a plain folder (left right and a calibration), a ROS bag (.bag, .db3, .mcap), two videos (left.mp4 "
+    "right.mp4), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
 )
 
 
@@ -145,6 +152,7 @@ def _folder_kind(path: Path) -> str | None:
     from vio.datasets.kitti import is_kitti_folder
     from vio.datasets.kitti_raw import is_kitti_raw_folder
     from vio.datasets.plain import holds_more_than_kitti, is_plain_folder, lacks_sensor_yaml
+    from vio.datasets.videos import video_files
 
     try:
         names = sorted(child.name for child in path.iterdir())
@@ -162,6 +170,8 @@ def _folder_kind(path: Path) -> str | None:
         return "plain" if lacks_sensor_yaml(path) else "euroc"
     if is_plain_folder(path):
         return "plain"
+    if video_files(path) is not None:
+        return "video"
     if "sequences" in names:
         raise DataError(f"{path} holds several KITTI sequences; name one of them, such as {path / 'sequences' / '00'}")
     return None
