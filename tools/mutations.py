@@ -76,6 +76,13 @@ MUTATIONS = (
         ("tests/test_datasets_plain.py",),
     ),
     Mutation(
+        "inspection: Allan deviation of neighbouring averages without their distance",
+        "vio/inspection/inertial.py",
+        "second = total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]",
+        "second = total[2 * m :] - total[: -2 * m]",
+        ("tests/test_inspection.py",),
+    ),
+    Mutation(
         "double sphere: the first sphere's distance left out of the depth",
         "vio/geometry/sphere_models.py",
         "shifted = xi * d1 + p[..., 2]",
