@@ -52,6 +52,41 @@ _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/t
 MUTATIONS = (
     # --- vio/geometry ---
     Mutation(
+        "bags: right images in the place of left ones where the left came first",
+        "vio/datasets/bags/reader.py",
+        "((first, fields) if side == 1 else (fields, first))",
+        "((first, fields) if side == 0 else (fields, first))",
+        ("tests/test_datasets_bags.py",),
+    ),
+    Mutation(
+        "bags: static frames not inverted towards the child",
+        "vio/datasets/bags/index.py",
+        "append((child, se3_inverse(T)))",
+        "append((child, T))",
+        ("tests/test_datasets_bags.py",),
+    ),
+    Mutation(
+        "plain folders: clock offset added instead of subtracted",
+        "vio/datasets/plain.py",
+        "times_ns=record.times_ns - shift_ns",
+        "times_ns=record.times_ns + shift_ns",
+        ("tests/test_datasets_plain.py",),
+    ),
+    Mutation(
+        "ground truth of a raw camera not turned to the rectified one",
+        "vio/datasets/overlap.py",
+        "se3_inverse(se3_from_parts(R_rect_cam0, np.zeros(3)))",
+        "se3_from_parts(R_rect_cam0, np.zeros(3))",
+        ("tests/test_datasets_plain.py",),
+    ),
+    Mutation(
+        "inspection: Allan deviation of neighbouring averages without their distance",
+        "vio/inspection/inertial.py",
+        "second = total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]",
+        "second = total[2 * m :] - total[: -2 * m]",
+        ("tests/test_inspection.py",),
+    ),
+    Mutation(
         "double sphere: the first sphere's distance left out of the depth",
         "vio/geometry/sphere_models.py",
         "shifted = xi * d1 + p[..., 2]",

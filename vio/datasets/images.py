@@ -6,6 +6,7 @@ is decoded.
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections import deque
@@ -17,10 +18,11 @@ from typing import TypeVar
 
 import numpy as np
 
+from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
 from vio.errors import DataError
 from vio.records import Image
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", *OTHER_SUFFIXES)
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 _FULL_16_TO_8 = 257  # 65535 / 255
@@ -42,12 +44,17 @@ def load_gray(path: Path) -> tuple[Image, int]:
     Raises:
         UnreadableImageError: the file cannot be read, is truncated, or does not decode.
     """
-    import cv2
-
     try:
         data = path.read_bytes()
     except OSError as error:
         raise UnreadableImageError(f"cannot read {path}: {error.strerror or error}") from error
+    return decode_gray(data, path)
+
+
+def decode_gray(data: bytes, path: Path | str) -> tuple[Image, int]:
+    """Decode an image file in memory as `load_gray` does; `path` names it in messages."""
+    import cv2
+
     if problem := _damage(data):
         raise UnreadableImageError(f"{path}: {problem}; copy the image again")
     pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
@@ -79,7 +86,7 @@ def _damage(data: bytes) -> str | None:
         return _png_damage(data)
     if data.startswith(_JPEG_START):
         return None if data.rstrip(b"\0").endswith(_JPEG_END) else "the JPEG is truncated"
-    return "neither PNG nor JPEG"
+    return other_damage(data)
 
 
 def _png_damage(data: bytes) -> str | None:
@@ -99,20 +106,25 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def list_images(folder: Path) -> tuple[Path, ...]:
-    """The image files of a folder, sorted by name.
+    """The image files of a folder, sorted by name, numbers as numbers: `left2.png` before `left10.png`.
 
     Raises:
         DataError: the folder is missing or holds no image.
     """
     try:
-        found = sorted(
-            path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
-        )
+        images = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+        found = sorted(images, key=natural_key)
     except OSError as error:
         raise DataError(f"cannot list {folder}: {error.strerror or error}; give a folder of images") from error
     if not found:
         raise DataError(f"{folder}: holds no image ({', '.join(SUFFIXES)})")
     return tuple(found)
+
+
+def natural_key(path: Path) -> tuple[tuple[tuple[int, str], ...], str]:
+    """Sort key of a name with its runs of digits as numbers; equal ones (`1.png`, `01.png`) by their text."""
+    parts = re.split(r"(\d+)", path.stem)
+    return tuple((int(p), "") if k % 2 else (-1, p) for k, p in enumerate(parts)), path.name
 
 
 def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) -> Generator[Loaded]:
