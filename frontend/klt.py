@@ -44,7 +44,6 @@ class _PreviousFrame:
 
     time_ns: int
     left: View
-    right_half: Image
     tracks: Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
     trusted: bool  # the last motion had a consensus
@@ -187,7 +186,7 @@ class KltFrontend:
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
-        self._previous = _PreviousFrame(frame.time_ns, left, right.half, tracks, twist, motion is not None)
+        self._previous = _PreviousFrame(frame.time_ns, left, tracks, twist, motion is not None)
 
     # --- features of the previous frame -------------------------------------------------------------------------------
 
@@ -228,12 +227,11 @@ class KltFrontend:
 
         While it cannot, depths come from the prior, where it has them.
         """
-        assert self._previous is not None
         if not self._right.usable and prior is not None:
             depth, known = prior_depths(self._camera, np.where(tracks.shown, tracks.ids, -1), prior)
             point = np.where(known[:, None], left_rays(self._camera, tracks.left) * depth[:, None], tracks.point)
             tracks = replace(tracks, point=point, has_point=tracks.has_point | known)
-        matched = stereo.track_right(tracks, right, self._previous.right_half, moved)
+        matched = stereo.track_right(tracks, right, moved)
         usable = self._right.check_matches(index, matched.has_right[tracks.has_point], moved=moved)
         return matched if usable else tracks
 

@@ -46,6 +46,8 @@ _RESTART = ("tests/test_msckf.py",)
 _RIGHT_CAMERA = ("tests/test_right_camera.py",)
 _EXCHANGE = ("tests/test_exchange.py",)
 _MOVING_OBJECT = ("tests/test_moving_object.py",)
+_INPUTS = ("tests/test_filter_inputs.py",)
+_FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
@@ -1063,5 +1065,41 @@ MUTATIONS = (
         "T[1, 3] += py + b * cy + c * dy",
         "T[1, 3] += py",
         ("tests/test_compiled.py",),
+    ),
+    # --- input ---
+    Mutation(
+        "input: a doubled sample accepted",
+        "vio/filters/inputs.py",
+        "now <= self._sample_ns",
+        "now < self._sample_ns",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: a doubled frame accepted",
+        "vio/filters/inputs.py",
+        "now <= before",
+        "now < before",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: NaN among the right pixels accepted",
+        "vio/filters/inputs.py",
+        "finite[seen.has_right].all()",
+        "finite[~seen.has_right].all()",
+        _INPUTS,
+    ),
+    Mutation(
+        "images: the most bits that hold the levels, not the fewest",
+        "vio/datasets/images.py",
+        "_SENSOR_BITS = (10, 12, 14)",
+        "_SENSOR_BITS = (14, 12, 10)",
+        _FILES,
+    ),
+    Mutation(
+        "archives: the header believed",
+        "vio/datasets/common.py",
+        "math.prod(shape) * dtype.itemsize > info.file_size",
+        "math.prod(shape) * dtype.itemsize < 0",
+        _FILES,
     ),
 )
