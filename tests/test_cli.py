@@ -302,16 +302,22 @@ def test_reports_and_skips_truncated_images_up_to_a_limit(
     assert "000003.png" in _error(capsys, *run, "--set", "dataset.max_bad_frames=0")
 
 
-def test_interrupted_run_writes_nothing(
+def test_run_interrupted_while_its_picture_is_drawn_goes_on(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stop(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vio.plotting.plot_run", stop)
-    assert main(["run", str(recording), "--out", str(tmp_path / "deep" / "out")]) == 130
-    assert "interrupted" in capsys.readouterr().err
-    assert not (tmp_path / "deep").exists()
+    out = tmp_path / "deep" / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr("vio.plotting.plot_run", stop)
+        assert main(["run", str(recording), "--out", str(out)]) == 130
+    assert f"interrupted; what was flushed is in {out}" in capsys.readouterr().err
+    assert len(read_trajectory(out / "trajectory.tum")) > 0
+    assert main(["run", "--resume", str(out)]) == 0
+    assert not (out / "unfinished").exists()
+    assert main(["run", "--resume", str(out)]) == 1
+    assert "is complete" in capsys.readouterr().err
 
 
 def test_debug_raises_the_expected_error(tmp_path: Path) -> None:

@@ -261,6 +261,16 @@ class Odometry:
                 raise DataError("there is no map before the first frame")
             return self._chain.backend.landmarks()
 
+    def take_landmarks(self) -> Landmarks:
+        """Return the points of the map that will not change any more, and forget them, so that memory stays flat.
+
+        `landmarks` then returns the others.
+        """
+        with self._lock:
+            if self._chain is None:
+                return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+            return self._chain.backend.take_landmarks()
+
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where the window no longer holds it."""
         with self._lock:

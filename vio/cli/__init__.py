@@ -20,7 +20,7 @@ from types import FrameType
 
 from vio._version import __version__
 from vio.cli import calibrate, check, config, demo, evaluate, export, inspect, rectify, refine, render, reproduce, run
-from vio.errors import VioError
+from vio.errors import StoppedError, VioError
 from vio.printable import printable
 
 _COMMANDS = (run, inspect, evaluate, check, refine, export, calibrate, demo, render, rectify, reproduce, config)
@@ -91,6 +91,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with _orderly_end():
             status: int = args.execute(args)
             sys.stdout.flush()
+    except StoppedError as stop:
+        print(printable(" ".join(str(stop).split())), file=sys.stderr)
+        return stop.status
     except VioError as error:
         if args.debug:
             raise

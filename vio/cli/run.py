@@ -17,7 +17,9 @@ def add_parser(commands: Any) -> None:
         description="Process a recording and write a folder of results. The kind of SOURCE is detected from its "
         "content; 'kind:path' sets it (kitti, kitti_raw, euroc, plain, bag, video, ece276a, utias, log).",
     )
-    parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("source", metavar="SOURCE", nargs="?", help="a recording: folder or file, or kind:path")
+    what.add_argument("--resume", type=Path, metavar="RUN", help="go on with the unfinished run in this folder")
     add_config_arguments(parser)
     parser.add_argument("--reference", type=Path, metavar="F", help="ground truth (TUM, KITTI or EuRoC format)")
     parser.add_argument(
@@ -34,11 +36,35 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(execute=execute)
 
 
+_OF_A_NEW_RUN = (
+    "reference",
+    "start",
+    "stop",
+    "lengths",
+    "out",
+    "save_observations",
+    "set",
+    "config",
+    "motion",
+    "backend",
+    "frontend",
+    "calibration",
+    "topics",
+)
+
+
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
-    from vio.cli.running import process, rows_of
+    from vio.cli.running import process, resume, rows_of
+    from vio.errors import ConfigError
 
+    if args.resume is not None:
+        given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
+        if given:
+            raise ConfigError(f"--resume goes on as the run began; leave out {', '.join(given)}")
+        metrics = resume(args.resume, progress=not args.quiet)
+        return print_result(metrics, rows_of(metrics), as_json=args.json)
     metrics = process(
         args.source,
         config_from(args),

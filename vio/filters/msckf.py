@@ -270,6 +270,17 @@ class Msckf:
             [*self._map, Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))]
         )
 
+    def take_landmarks(self) -> Landmarks:
+        """Return the points that have left the state since the last call, and forget them; `landmarks` has the others.
+
+        None as long as the first tilt may still turn the map.
+        """
+        window = self._started()
+        if not self._map or not window.clones or window.clones[0].time_ns == self._began_ns:
+            return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        taken, self._map, self._points_stored = _newest(self._map), [], 0
+        return taken
+
     def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
         first, gone = window.first_landmark, ~kept

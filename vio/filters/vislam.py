@@ -227,6 +227,10 @@ class Vislam:
         velocity = None if twist is None else T_world_imu[:3, :3] @ twist[:3]
         return Estimate(self._time_ns or 0, T_world_imu, self._state.Sigma[:6, :6].copy(), velocity)
 
+    def take_landmarks(self) -> Landmarks:
+        """Return nothing: all points stay in the state."""
+        return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+
     def landmarks(self) -> Landmarks:
         """Return every landmark ever initialised."""
         n = len(self._map)
