@@ -83,10 +83,14 @@ class FrameValidator:
 
 @dataclass(slots=True)
 class SwapDetector:
-    """Detects swapped left and right images: few matches, but many in the mirrored images, in several frames."""
+    """Detects a recording with swapped left and right images: few matches, but many in the mirrored images.
+
+    Several frames must show it. Once a frame was in order, its recording is: what comes later is for others to say.
+    """
 
     few: float  # share of features with a match, below which the mirrored images are checked
     _suspicious: int = 0
+    _in_order: int = 0  # frames
 
     def check(self, frame: StereoFrame, features: int, matched: int, count_mirrored: Callable[[], int]) -> None:
         """Check the number of matched features; `count_mirrored` counts the matches in the mirrored images.
@@ -96,6 +100,9 @@ class SwapDetector:
         """
         if features < _SWAP_MIN_POINTS or matched >= self.few * features:
             self._suspicious = 0
+            self._in_order += features >= _SWAP_MIN_POINTS
+            return
+        if self._in_order >= _SWAP_FRAMES:
             return
         mirrored = count_mirrored()
         self._suspicious = self._suspicious + 1 if mirrored >= max(_SWAP_MANY * features, 2 * matched) else 0
@@ -127,7 +134,9 @@ class Features(Protocol):
         """Mask (N,)."""
 
 
-def make_output(frame: StereoFrame, features: Features, tracked: int, watch: Stopwatch) -> FrontendOutput:
+def make_output(
+    frame: StereoFrame, features: Features, tracked: int, watch: Stopwatch, warnings: tuple[str, ...] = ()
+) -> FrontendOutput:
     """Return the output of a front end for a frame; `tracked` features were in the previous output, too."""
     z = np.concatenate([features.left, features.right], axis=1)
     return FrontendOutput(
@@ -136,4 +145,5 @@ def make_output(frame: StereoFrame, features: Features, tracked: int, watch: Sto
         matched=int(features.has_right.sum()),
         detected=len(features.ids) - tracked,
         stages_ms=watch.stages_ms,
+        warnings=warnings,
     )

@@ -2,8 +2,7 @@
 
     python -m tools.bad_inputs
 
-The cases are the dictionaries `BAD` of the tests of the readers, which hold the same messages; `tests/test_bad_inputs.py`
-holds the page's rows equal to them.
+The cases are the dictionaries `BAD` of the tests of the readers; `tests/test_bad_inputs.py` compares the page's rows.
 """
 
 from __future__ import annotations
@@ -28,9 +27,10 @@ MODULES = {
 }
 _HEAD = """# Bad inputs
 
-What a user gets for an input that cannot be used: one line that says what is wrong, where, and what to do, and exit status 1.
-Each row is a test; `python -m tools.bad_inputs` writes this page from the same cases. What a run would not stop at but makes no
-sense of (exchanged cameras, readings in g, black images) is found by `vio inspect`, see [recordings](recordings.md).
+An input that cannot be used ends in one line, which says what is wrong, where, and what to do, and in exit status 1.
+Each row is a test; `python -m tools.bad_inputs` writes this page from the same cases. What a run would not stop at but
+makes no sense of (exchanged cameras, readings in g, black images) is found by `vio inspect`, see
+[recordings](recordings.md).
 """
 
 
@@ -79,13 +79,13 @@ def main() -> int:
 
 def _videos(root: Path) -> Path:
     """Return the folder of videos that the tests' cases change."""
-    from tests.test_datasets_videos import make_videos
     from vio.cli import main as vio
 
     flight = root / "flight"
     options = ["--rig", "small", "--width", "160", "--rate", "20", "--duration", "0.8", "--format", "euroc"]
     assert vio(["render", "--out", str(flight), "--workers", "1", "--json", *options]) == 0
-    return make_videos(flight, root / "videos")
+    folder: Path = importlib.import_module("tests.test_datasets_videos").make_videos(flight, root / "videos")
+    return folder
 
 
 if __name__ == "__main__":

@@ -88,6 +88,7 @@ def load_checkpoint(path: Path, dataset: Dataset) -> Any:
 def _program() -> dict[str, str]:
     """What must be equal for equal bits."""
     import cv2
+    import numba
 
     return {
         "format": _FORMAT,
@@ -95,6 +96,7 @@ def _program() -> dict[str, str]:
         "python": platform.python_version(),
         "numpy": np.__version__,
         "opencv": cv2.__version__,
+        "numba": numba.__version__,
     }
 
 

@@ -23,6 +23,10 @@ class EstimationError(VioError):
     """The estimator cannot continue (divergence, failed initialisation)."""
 
 
+class DivergedError(EstimationError):
+    """The filter's state is no longer usable; a filter that can restart goes on from its last good state."""
+
+
 class EvaluationError(VioError):
     """Two trajectories cannot be compared."""
 

@@ -172,6 +172,7 @@ class TrackPrior:
     ids: IntArray  # (N,)
     z: FloatArray  # (N, 4) predicted pixels
     R_cam_prev: FloatArray | None = None  # (3, 3) rotation that maps the previous cam0 frame into the coming one
+    motion: MotionPrior | None = None  # the whole motion since the previous frame, with its covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +200,7 @@ class FrontendOutput:
     matched: int  # features with a right match
     detected: int  # features new in this frame
     stages_ms: dict[str, float] = field(default_factory=dict)  # wall time per stage
+    warnings: tuple[str, ...] = ()  # what is wrong with the images, one line an event
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,12 +61,12 @@ def process(
     for note in dataset.recording.notes:
         log.warning("%s", note)
     folder = check_out(out if out is not None else free_folder(dataset.recording.path))
-    start, stop = frames_between(dataset.recording, start, stop)
+    first, end = frames_between(dataset.recording, start, stop)
     request = {
         "source": f"{dataset.recording.kind}:{dataset.recording.path.absolute()}",
         "reference": None if reference is None else str(reference.absolute()),
-        "start": start,
-        "stop": stop,
+        "start": first,
+        "stop": end,
         "lengths_m": None if lengths_m is None else list(lengths_m),
         "save_observations": save_observations,
     }

@@ -33,7 +33,7 @@ Loaded = TypeVar("Loaded")
 
 
 class UnreadableImageError(DataError):
-    """An image file is missing, truncated or corrupt; a reader may skip its frame."""
+    """An image file is missing, truncated, corrupt or of another size; a reader may skip its frame."""
 
 
 def load_gray(path: Path) -> tuple[Image, int]:

@@ -50,7 +50,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     calibration = read_calibration(path / "calib.txt", cameras)
     pairs = pair_images(*(path / f"image_{k}" for k in cameras))
     times_ns = _read_times(path / "times.txt", path / f"image_{cameras[0]}", len(pairs))
-    measured, image, bits = first_readable(pairs, settings.max_bad_frames)
+    measured, image, bits = first_readable(pairs)
     size = ImageSize(image.shape[1], image.shape[0], measured)
     motion = _read_velocity(path / "velocity.csv", times_ns)
     T_cam0_imu = read_extrinsics(path / "T_cam0_imu.txt")

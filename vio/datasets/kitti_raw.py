@@ -117,7 +117,7 @@ def _rectifier(
     c = calibration
     T_imu_cam0 = np.eye(4) if T_cam0_imu is None else se3_inverse(T_cam0_imu)
     raw, rectified = (c.cam0.width, c.cam0.height), (c.rect0.width, c.rect0.height)
-    size = first_readable(pairs, settings.max_bad_frames)[1].shape[::-1]
+    size = first_readable(pairs)[1].shape[::-1]
     if size == rectified and raw != rectified:
         T_imu_rect0 = T_imu_cam0 @ se3_from_parts(c.R_rect_cam0.T, np.zeros(3))
         rig = StereoRig(c.rect0, c.rect1, T_imu_rect0, T_imu_rect0 @ se3_inverse(c.T_rect1_rect0))

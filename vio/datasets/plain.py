@@ -108,7 +108,7 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         names = ", ".join(f"{a} {b}" for a, b in _FOLDERS[:4])
         raise DataError(f"{path}: holds no pair of image folders ({names} or others); give one with left/ and right/")
     pairs, notes = pair_files(list_images(layout.left), list_images(layout.right))
-    measured, image, bits = first_readable(pairs, settings.max_bad_frames)
+    measured, image, bits = first_readable(pairs)
     file = settings.calibration or find_calibration_of(layout)
     rig = load_rig(file, image_size=(image.shape[1], image.shape[0]))
     rig, used = with_extrinsics(rig, layout, file)

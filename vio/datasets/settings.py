@@ -46,8 +46,11 @@ class DatasetSettings(Section):
         "unrectified images: how gray values between pixels are interpolated in rectifying (cubic and lanczos4 cost 5 "
         "and 15 times as much for barely better tracks)",
     )
-    max_bad_frames: int = setting(
-        5, "image folders: unreadable stereo frames skipped before the reader stops with an error", at_least=0
+    max_bad_frames: int | None = setting(
+        None,
+        "image folders: stereo frames with unreadable images or images of another size that are skipped before the "
+        "reader stops with an error; null: all but the last usable one",
+        at_least=0,
     )
     prefetch_frames: int = setting(
         4, "image folders: stereo frames decoded ahead in a thread; 0: no thread", at_least=0, at_most=1000

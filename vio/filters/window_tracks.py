@@ -100,7 +100,7 @@ class WindowTracks:
         keep = at.ahead & np.isfinite(p).all(axis=1)
         keep[keep] = has_parallax(camera, T, p[keep], views.take(keep), at.take(keep))
         table.points[rows], table.has_point[rows] = p, keep
-        return self._linear(T, rows[keep], p[keep], at.take(keep), field)
+        return self._linear(T, rows[keep], p[keep], at.take(keep), field, views.z[keep])
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track permanently, and linearise what is left."""
@@ -115,17 +115,25 @@ class WindowTracks:
         )
         enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
         T = tracks.T_cam0_world
-        return self._linear(T, tracks.rows[enough], tracks.p_world[enough], at.take(enough), tracks.field)
+        rows = tracks.rows[enough]
+        z = self._views(rows, len(T), tracks.field).z
+        return self._linear(T, rows, tracks.p_world[enough], at.take(enough), tracks.field, z)
 
     def _linear(
-        self, T_cam0_world: FloatArray, rows: IntArray, p_world: FloatArray, at: Residuals, field: StereoField | None
+        self,
+        T_cam0_world: FloatArray,
+        rows: IntArray,
+        p_world: FloatArray,
+        at: Residuals,
+        field: StereoField | None,
+        z: FloatArray,
     ) -> LinearTracks:
         weight = robust_weights(at, self.variance)
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
         columns = None
         if field is not None:
             # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-            H = field_jacobian(self._camera, self._views(rows, at.r.shape[1], field).z - at.r)
+            H = field_jacobian(self._camera, z - at.r)
             columns = stereo_columns(at, H, information.q.p_D_q, weight)
         return LinearTracks(T_cam0_world, rows, p_world, at, information, columns, field)
 
