@@ -71,7 +71,7 @@ MUTATIONS = (
     ),
     Mutation(
         "plain folders: clock offset added instead of subtracted",
-        "vio/datasets/plain.py",
+        "vio/datasets/companions.py",
         "times_ns=record.times_ns - shift_ns",
         "times_ns=record.times_ns + shift_ns",
         ("tests/test_datasets_plain.py",),
