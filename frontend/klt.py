@@ -7,24 +7,29 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
-from frontend.columns import joined, take
-from frontend.detect import detect_corners, half_mask, load_mask, min_distance_px
-from frontend.flow import lost_contrast, track_with_retries
-from frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
-from frontend.outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors, predicted_motion, static_tracks
-from frontend.patches import FloatImage, View, half_image, inside
-from frontend.prediction import moved_pixels, prior_pixels, usable_prior
-from frontend.settings import FrontendSettings
-from frontend.stereo_fit import StereoFit
-from frontend.tracks import AnchorBank, Tracks, new_tracks, no_tracks
 from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
 
+from .align import align, on_peak, rounded, scale_change, shift_warps, template_points
+from .columns import joined, take
+from .detect import detect_corners, half_mask, load_mask, min_distance_px
+from .exchange import ExchangeDetector, MatchCounts
+from .flow import lost_contrast, track_with_retries
+from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from .moving_object import ObjectReport, choose_motion
+from .outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors, predicted_motion, static_tracks
+from .patches import FloatImage, View, half_image, inside
+from .prediction import moved_pixels, prior_depths, prior_pixels, usable_prior
+from .right_camera import RightCamera
+from .settings import FrontendSettings
+from .stereo_fit import StereoFit
+from .tracks import AnchorBank, Tracks, new_tracks, no_tracks
+
 _ITERATIONS = 5
 _ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost
+_EXCHANGE_POINTS = 80  # points that matches of either sign are counted at
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
 _NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
 _FAR_M = 1e6  # depth assumed where too few features have one
@@ -40,7 +45,6 @@ class _PreviousFrame:
 
     time_ns: int
     left: View
-    right_half: Image
     tracks: Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
     trusted: bool  # the last motion had a consensus
@@ -72,6 +76,10 @@ class KltFrontend:
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._validator = FrameValidator(camera, "klt")
         self._swap = SwapDetector(_SWAP_FEW)
+        self._exchange = ExchangeDetector()
+        self._right = RightCamera()
+        self._objects = ObjectReport()
+        self._lines: list[str] = []  # of the frame, for the log
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, self._settings.anchor_radius_px)
         self._previous: _PreviousFrame | None = None
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
@@ -90,13 +98,27 @@ class KltFrontend:
         watch.lap("prepare")
         if self._contrast_lost(left):
             return make_output(frame, no_tracks(), 0, watch)
+        order = self._exchange.order(
+            frame.index,
+            left.half,
+            right.half,
+            lambda: self._count_matches(left, right, stereo),
+            suspicious=not self._right.usable,
+        )
+        if order == "refused":
+            return make_output(frame, no_tracks(), 0, watch, self._take_lines())
+        if order == "exchanged":
+            left, right = right, left
+        if self._right.left_is_frozen(frame.index, left.half, right.half):
+            return make_output(frame, no_tracks(), 0, watch, self._take_lines())
         tracks, motion = self._track(frame, left, right, usable_prior(prior), stereo, watch)
         missing = self._grid.target_features - len(tracks)
         wanted = round(missing * (1.0 + self._settings.spare_corners))
         corners = detect_corners(left.half, tracks.left, wanted, self._grid, self._settings, allowed)
         watch.lap("detect")
         tracks = self._add_new_features(left, right, tracks, corners, motion, stereo)
-        stereo.update_rows(tracks)
+        if self._right.usable:
+            stereo.update_rows(tracks)
         watch.lap("stereo")
         points, matched = tracks.left, int(tracks.has_right.sum())
         self._swap.check(frame, len(points), matched, lambda: stereo.count_mirrored(left, right, points))
@@ -105,7 +127,12 @@ class KltFrontend:
         tracked = self._count_tracked(seen)
         self._store(frame, left, right, tracks, motion)
         watch.lap("check")
-        return make_output(frame, seen, tracked, watch)
+        return make_output(frame, seen, tracked, watch, self._take_lines())
+
+    def _take_lines(self) -> tuple[str, ...]:
+        """Return what the frame says of the images, one line an event."""
+        lines, self._lines = (*self._exchange.take_lines(), *self._right.take_lines(), *self._lines), []
+        return lines
 
     def _view(self, image: Image) -> View:
         """Equalise and convert an image; the result does not share memory with it."""
@@ -135,6 +162,17 @@ class KltFrontend:
             self._skipped = before + 1
         return self._skipped > 0
 
+    def _count_matches(self, left: View, right: View, stereo: StereoFit) -> MatchCounts:
+        """Count matches of either sign, at the points that the other camera saw last."""
+        previous = self._previous
+        if previous is None:
+            return MatchCounts(0, 0, 0)
+        tracks = previous.tracks
+        points = np.where(tracks.has_right[:, None], tracks.right, tracks.left)
+        points = points[inside(left.full, points, 0.0)][:_EXCHANGE_POINTS]
+        positive = int(stereo.search(left, right, points)[1].sum())
+        return MatchCounts(len(points), positive, stereo.count_mirrored(left, right, points))
+
     def _count_tracked(self, seen: Tracks) -> int:
         """Count the features that were output in the previous frame, too."""
         if self._previous is None:
@@ -149,7 +187,7 @@ class KltFrontend:
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
-        self._previous = _PreviousFrame(frame.time_ns, left, right.half, tracks, twist, motion is not None)
+        self._previous = _PreviousFrame(frame.time_ns, left, tracks, twist, motion is not None)
 
     # --- features of the previous frame -------------------------------------------------------------------------------
 
@@ -174,13 +212,29 @@ class KltFrontend:
         watch.lap("track")
         rng = np.random.default_rng((self._consensus.seed, frame.index))
         problem = RansacProblem(self._camera, self._consensus, settings.consensus_px, rng)
-        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, stereo.max_disparity_px)
+        near_px = stereo.max_disparity_px
+        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, near_px, frame.index)
         watch.lap("reject")
         tracks = self._align_with_anchors(previous, left, found, seen, motion)
         watch.lap("align")
-        tracks = stereo.track_right(tracks, right, previous.right_half, motion is not None)
+        tracks = self._match_right(frame.index, tracks, right, prior, stereo, motion is not None)
         watch.lap("stereo")
         return tracks, motion
+
+    def _match_right(
+        self, index: int, tracks: Tracks, right: View, prior: TrackPrior | None, stereo: StereoFit, moved: bool
+    ) -> Tracks:
+        """Match features of known depth in the right image; no match where the right image cannot be used.
+
+        While it cannot, depths come from the prior, where it has them.
+        """
+        if not self._right.usable and prior is not None:
+            depth, known = prior_depths(self._camera, np.where(tracks.shown, tracks.ids, -1), prior)
+            point = np.where(known[:, None], left_rays(self._camera, tracks.left) * depth[:, None], tracks.point)
+            tracks = replace(tracks, point=point, has_point=tracks.has_point | known)
+        matched = stereo.track_right(tracks, right, moved)
+        usable = self._right.check_matches(index, matched.has_right[tracks.has_point], moved=moved)
+        return matched if usable else tracks
 
     def _guess(self, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage) -> FloatArray:
         """Predict the left pixels (N, 2) in the current frame: from the prior, else by the last motion."""
@@ -215,10 +269,11 @@ class KltFrontend:
         prior: TrackPrior | None,
         expected: FloatArray,
         max_disparity_px: float,
+        index: int,
     ) -> tuple[BoolArray, Consensus | None]:
         """Return the mask (N,) of the found features that are static, and the consensus motion if there is one."""
         camera, rows = self._camera, np.flatnonzero(seen)
-        has_depth = (old.has_right & old.has_point)[rows]
+        has_depth = (old.has_point & (old.has_right | (not self._right.usable)))[rows]
         R_prior = T_prior = None
         if prior is not None:
             known, predicted = _prior_rows(old, rows[has_depth], prior)
@@ -226,6 +281,18 @@ class KltFrontend:
             T_prior = predicted_motion(camera, old.point[known], predicted, expected)
         before, after = old.left[rows], found[rows]
         kept, motion = static_tracks(problem, before, old.point[rows], has_depth, after, expected, R_prior, T_prior)
+        if motion is not None:
+            expected_motion = None if prior is None else prior.motion
+            chosen = choose_motion(
+                problem,
+                old.point[rows[has_depth]],
+                after[has_depth],
+                motion,
+                expected_motion,
+                in_event=self._objects.active,
+            )
+            motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
+            self._lines += self._objects.frame(index, chosen)
         if motion is not None and not has_depth.all():
             near_m = camera.fu * camera.baseline_m / max_disparity_px
             distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)
@@ -324,6 +391,34 @@ class KltFrontend:
         stereo: StereoFit,
     ) -> Tracks:
         """Search right matches for new corners and for features without one; add the best new corners."""
+        tracks, disparity_new, unique = self._search_right(left, right, tracks, corners, motion, stereo)
+        stays = self._stay_visible(corners, disparity_new, motion, left.full)
+        chosen, with_depth = self._select_corners(tracks, unique, stays)
+        centres = rounded(corners[chosen])
+        new = new_tracks(centres, self._bank.add(left.full, centres))
+        new = stereo.match_near(new, right, np.arange(with_depth), disparity_new[chosen[:with_depth]])
+        new = replace(new, left_only_frames=np.where(new.has_right, 0, 1))
+        room = max(0, self._grid.target_features - len(tracks))
+        good = np.flatnonzero(new.has_right | (len(chosen) > with_depth))
+        return joined(tracks, take(new, good[np.argsort(~new.has_right[good], kind="stable")][:room]))
+
+    def _search_right(
+        self,
+        left: View,
+        right: View,
+        tracks: Tracks,
+        corners: FloatArray,
+        motion: Consensus | None,
+        stereo: StereoFit,
+    ) -> tuple[Tracks, FloatArray, BoolArray]:
+        """Search features without a right match and corners (K, 2) along the row.
+
+        Returns:
+            The features, without those that had no match for too long; disparities (K,) of the corners in pixels; a
+            mask (K,) of the corners found. Where the right image cannot be used, nothing is searched or dropped.
+        """
+        if not self._right.usable:
+            return tracks, np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)
         unmatched = ~tracks.has_right
         if motion is not None:
             # A feature with a known point that was not matched near it must not be matched elsewhere.
@@ -334,16 +429,7 @@ class KltFrontend:
         known, unique = np.split(unique, [len(rows)])
         tracks = stereo.match_near(tracks, right, rows[known], disparity_old[known])
         tracks = replace(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
-        tracks = take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames)
-        stays = self._stay_visible(corners, disparity_new, motion, left.full)
-        chosen, with_depth = self._select_corners(tracks, unique, stays)
-        centres = rounded(corners[chosen])
-        new = new_tracks(centres, self._bank.add(left.full, centres))
-        new = stereo.match_near(new, right, np.arange(with_depth), disparity_new[chosen[:with_depth]])
-        new = replace(new, left_only_frames=np.where(new.has_right, 0, 1))
-        room = max(0, self._grid.target_features - len(tracks))
-        good = np.flatnonzero(new.has_right | (len(chosen) > with_depth))
-        return joined(tracks, take(new, good[np.argsort(~new.has_right[good], kind="stable")][:room]))
+        return take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames), disparity_new, unique
 
     def _select_corners(self, tracks: Tracks, unique: BoolArray, stays: BoolArray) -> tuple[IntArray, int]:
         """Return the rows of the corners (K,) to try, in this order, and how many of them have a depth.
@@ -377,7 +463,8 @@ class KltFrontend:
 
     def _promote(self, tracks: Tracks) -> Tracks:
         """Output features that passed their probation from now on, under new ids; all features if these are few."""
-        proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & tracks.has_right)
+        proven = tracks.has_right | (not self._right.usable)
+        proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & proven)
         if proven.sum() < _VERY_FEW * self._grid.target_features:
             proven[:] = True
         ids, first = tracks.ids.copy(), proven & ~tracks.shown

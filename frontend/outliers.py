@@ -17,11 +17,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from frontend.settings import ConsensusSettings
 from vio.compiled import compiled, move_by_twist, solve_positive
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, IntArray
+
+from .settings import ConsensusSettings
 
 _MIN_DEPTH_M = 0.05
 _MIN_POINTS = 8  # with fewer points, a consensus may be chance
@@ -191,6 +192,16 @@ def _ransac(
     cost = np.minimum(pixel_errors(camera, T, p_prev, pixels), limit) ** 2
     best = _refine(camera, T[int(np.argmin(cost.sum(axis=1)))], p_prev, pixels, limit / 2, free)
     return best, pixel_errors(camera, best, p_prev, pixels) <= limit
+
+
+def best_motion(
+    problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, starts: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the motion (4, 4) with most inliers among points (N, 3) and pixels (N, 2), and their mask (N,).
+
+    Unlike a consensus it may have few inliers; `starts` (S, 4, 4) are tried besides minimal sets.
+    """
+    return _ransac(problem, p_prev, pixels, starts, slice(0, 6))
 
 
 def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from frontend.align import FLAT_RMS
 from vio.compiled import compiled
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
+
+from .align import FLAT_RMS
 
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak

@@ -34,6 +34,7 @@ from vio.records import ImuSample, StereoFrame
 ROOT = Path(__file__).resolve().parent.parent
 README = "README.md"
 DOCS = (README, "CHANGELOG.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))))
+NOTES = tuple(f"docs/notes/{path.name}" for path in sorted((ROOT / "docs" / "notes").glob("*.md")))
 
 # Options behind a command of the README that make it small; the command itself is run as written.
 _SMALLER = {
@@ -370,7 +371,7 @@ def test_yaml_of_the_docs_is_a_configuration(name: str) -> None:
             merge(Config(), yaml.safe_load(block.text), where=name)
 
 
-@pytest.mark.parametrize("name", DOCS)
+@pytest.mark.parametrize("name", [*DOCS, *NOTES])
 def test_links_are_valid(name: str) -> None:
     broken = []
     for target in re.findall(r"\]\(([^)\s]+)\)", _text(name)):
@@ -381,6 +382,11 @@ def test_links_are_valid(name: str) -> None:
         if not file.is_file() or (heading and heading not in _anchors(file)):
             broken.append(target)
     assert not broken
+
+
+def test_every_page_is_reached_from_the_readme() -> None:
+    linked = {target for name in (README, *DOCS) for target in re.findall(r"\]\(([^)\s#]+\.md)", _text(name))}
+    assert {Path(name).name for name in (*DOCS[2:], *NOTES)} <= {Path(target).name for target in linked}
 
 
 def _anchors(file: Path) -> set[str]:

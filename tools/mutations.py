@@ -19,6 +19,7 @@ class Mutation:
 _LIE = ("tests/test_lie.py",)
 _STEREO = ("tests/test_stereo_geometry.py",)
 _LENS = ("tests/test_distortion.py", "tests/test_sim_cameras.py", "tests/test_jacobian_registry.py")
+_RIG = ("tests/test_rig.py",)
 _RECTIFY = ("tests/test_rectify.py", "tests/test_rectify_cli.py", "tests/test_datasets_euroc.py")
 _WINDOW = (
     "tests/test_multiview.py",
@@ -41,11 +42,80 @@ _SCORE = ("tests/test_evaluation.py",)
 _PIPELINE = ("tests/test_pipeline.py",)
 _REPRODUCE = ("tests/test_reproduce.py",)
 _RANSAC = ("tests/test_frontend_outliers.py",)
+_RESTART = ("tests/test_msckf.py",)
+_RIGHT_CAMERA = ("tests/test_right_camera.py",)
+_EXCHANGE = ("tests/test_exchange.py",)
+_MOVING_OBJECT = ("tests/test_moving_object.py",)
+_INPUTS = ("tests/test_filter_inputs.py",)
+_FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
 MUTATIONS = (
     # --- vio/geometry ---
+    Mutation(
+        "bags: right images in the place of left ones where the left came first",
+        "vio/datasets/bags/reader.py",
+        "((first, fields) if side == 1 else (fields, first))",
+        "((first, fields) if side == 0 else (fields, first))",
+        ("tests/test_datasets_bags.py",),
+    ),
+    Mutation(
+        "bags: static frames not inverted towards the child",
+        "vio/datasets/bags/index.py",
+        "append((child, se3_inverse(T)))",
+        "append((child, T))",
+        ("tests/test_datasets_bags.py",),
+    ),
+    Mutation(
+        "plain folders: clock offset added instead of subtracted",
+        "vio/datasets/plain.py",
+        "times_ns=record.times_ns - shift_ns",
+        "times_ns=record.times_ns + shift_ns",
+        ("tests/test_datasets_plain.py",),
+    ),
+    Mutation(
+        "ground truth of a raw camera not turned to the rectified one",
+        "vio/datasets/overlap.py",
+        "se3_inverse(se3_from_parts(R_rect_cam0, np.zeros(3)))",
+        "se3_from_parts(R_rect_cam0, np.zeros(3))",
+        ("tests/test_datasets_plain.py",),
+    ),
+    Mutation(
+        "inspection: Allan deviation of neighbouring averages without their distance",
+        "vio/inspection/inertial.py",
+        "second = total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]",
+        "second = total[2 * m :] - total[: -2 * m]",
+        ("tests/test_inspection.py",),
+    ),
+    Mutation(
+        "double sphere: the first sphere's distance left out of the depth",
+        "vio/geometry/sphere_models.py",
+        "shifted = xi * d1 + p[..., 2]",
+        "shifted = p[..., 2]",
+        _RIG,
+    ),
+    Mutation(
+        "rational lens: divisor left out",
+        "vio/geometry/distortion.py",
+        "        radial = radial / divisor[0]",
+        "        radial = radial * 1.0",
+        _RIG,
+    ),
+    Mutation(
+        "Kalibr: pose of the IMU inverted in the stereo pose",
+        "vio/datasets/rigs/kalibr.py",
+        "through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)",
+        "through_imu = T_cam0_imu @ se3_inverse(T_cam1_imu)",
+        _RIG,
+    ),
+    Mutation(
+        "CameraInfo: rectified baseline not rotated back to the raw camera",
+        "vio/datasets/rigs/camera_info.py",
+        "se3_from_parts(R1.T @ R0, R1.T @ shift)",
+        "se3_from_parts(R1.T @ R0, shift)",
+        _RIG,
+    ),
     Mutation(
         "SO(3): right Jacobian for the left",
         "vio/geometry/lie.py",
@@ -186,6 +256,13 @@ MUTATIONS = (
         "B[:, :, 3:] = so3_hat(p_world)",
         "B[:, :, 3:] = -so3_hat(p_world)",
         _WINDOW,
+    ),
+    Mutation(
+        "restart: the position's variance does not grow with the time in between",
+        "vio/filters/restart.py",
+        "np.diag(np.repeat([position, rotation], 3) ** 2)",
+        "np.diag(np.repeat([0.0, rotation], 3) ** 2)",
+        _RESTART,
     ),
     Mutation(
         "tracks: eliminated points still count",
@@ -828,6 +905,41 @@ MUTATIONS = (
     ),
     # --- frontend ---
     Mutation(
+        "right camera: an image that was repeated with noise counts as new",
+        "frontend/right_camera.py",
+        "return change < _MOST_NOISE and other_change >",
+        "return change < 0 and other_change >",
+        _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "right camera: features are dropped while it cannot be used",
+        "frontend/klt.py",
+        "return tracks, np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
+        "return take(tracks, tracks.has_right), np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
+        _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "exchange: frames that do not fit are put back, too",
+        "frontend/exchange.py",
+        'return "exchanged" if found.negative >= _MANY * found.points else "refused"',
+        'return "exchanged"',
+        _EXCHANGE,
+    ),
+    Mutation(
+        "moving object: the larger group is the scene whatever is predicted",
+        "frontend/moving_object.py",
+        "if first_agrees or not (second_agrees or in_event):",
+        "if not in_event:",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
+        "moving object: a wrong prediction overrides the consensus",
+        "frontend/moving_object.py",
+        "second_agrees = large and _agrees(",
+        "second_agrees = True or _agrees(",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
         "RANSAC: step on the wrong side of the motion",
         "frontend/outliers.py",
         "xi[i] = min(max(xi[i], -5.0), 5.0)",
@@ -953,5 +1065,41 @@ MUTATIONS = (
         "T[1, 3] += py + b * cy + c * dy",
         "T[1, 3] += py",
         ("tests/test_compiled.py",),
+    ),
+    # --- input ---
+    Mutation(
+        "input: a doubled sample accepted",
+        "vio/filters/inputs.py",
+        "now <= self._sample_ns",
+        "now < self._sample_ns",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: a doubled frame accepted",
+        "vio/filters/inputs.py",
+        "now <= before",
+        "now < before",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: NaN among the right pixels accepted",
+        "vio/filters/inputs.py",
+        "finite[seen.has_right].all()",
+        "finite[~seen.has_right].all()",
+        _INPUTS,
+    ),
+    Mutation(
+        "images: the most bits that hold the levels, not the fewest",
+        "vio/datasets/images.py",
+        "_SENSOR_BITS = (10, 12, 14)",
+        "_SENSOR_BITS = (14, 12, 10)",
+        _FILES,
+    ),
+    Mutation(
+        "archives: the header believed",
+        "vio/datasets/common.py",
+        "math.prod(shape) * dtype.itemsize > info.file_size",
+        "math.prod(shape) * dtype.itemsize < 0",
+        _FILES,
     ),
 )

@@ -38,6 +38,8 @@ class RunWatch:
 
             self._inertial = InertialCheck(camera, T_cam0_body)
         self._frames = self._features = 0
+        self._refused_last = -2
+        self.frames_refused = 0
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
@@ -48,14 +50,26 @@ class RunWatch:
             if self._inertial is not None:
                 self._inertial.imu(sample)
 
-    def observations(self, seen: Observations) -> None:
-        """Add the front end's observations, before feature selection."""
+    def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
+        """Add the front end's observations, before feature selection, and what it says of the images."""
+        self._report(warnings)
         self._frames += 1
         self._features += len(seen)
         if self._silence is not None:
             self._report(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
+
+    def refused(self, index: int, reason: str) -> None:
+        """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
+        if index != self._refused_last + 1:
+            self._report([f"frame skipped: {reason}"])
+        self._refused_last = index
+        self.frames_refused += 1
+
+    def restarted(self, index: int, why: str, estimate: Estimate) -> None:
+        """Report that the back end diverged in a frame and was started again; repeats within a second are one event."""
+        self._report(self._health.restarted(index, why, estimate))
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
