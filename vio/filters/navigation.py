@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.errors import EstimationError
+from vio.filters.imu_faults import ImuSampleCheck
 from vio.filters.imu_gaps import Hidden, ImuHistory
 from vio.filters.imu_start import imu_start
 from vio.filters.settings import MsckfSettings
@@ -94,12 +95,14 @@ class ImuMotion:
         self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
         self._samples: list[ImuSample] = []
         self._history = ImuHistory()
+        self._check = ImuSampleCheck()
 
     def take(self, sample: MotionSample) -> None:
-        """Keep a sample until the interval that needs it."""
+        """Keep a sample until the interval that needs it; leave out faulty ones."""
         assert isinstance(sample, ImuSample)
-        self._samples.append(sample)
-        self._history.take(sample)
+        for usable in self._check.take(sample):
+            self._samples.append(usable)
+            self._history.take(usable)
 
     @property
     def ready(self) -> bool:

@@ -10,6 +10,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, ImuSample, MotionSample, Observations, UpdateReport
 from vio.watch.health import RunHealth
+from vio.watch.imu_faults import ImuFaultReport
 from vio.watch.silence import ImuSilence
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class RunWatch:
         self._health = RunHealth()
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
+        self._faults = ImuFaultReport() if imu else None
         if imu:
             from vio.watch.inertial import InertialCheck  # it loads scipy.optimize
 
@@ -45,8 +47,11 @@ class RunWatch:
         if isinstance(sample, ImuSample):
             if self._silence is not None:
                 self._report(self._silence.sample(sample.time_ns))
-            if self._inertial is not None:
-                self._inertial.imu(sample)
+            if self._faults is not None and self._inertial is not None:
+                usable, lines = self._faults.sample(sample)
+                self._report(lines)
+                for x in usable:
+                    self._inertial.imu(x)
 
     def observations(self, seen: Observations) -> None:
         """Add the front end's observations, before feature selection."""
@@ -54,6 +59,8 @@ class RunWatch:
         self._features += len(seen)
         if self._silence is not None:
             self._report(self._silence.frame(seen.frame_index, seen.time_ns))
+        if self._faults is not None:
+            self._faults.frame(seen.frame_index)
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
 
@@ -69,8 +76,13 @@ class RunWatch:
             )
         if self._silence is not None:
             self._report(self._silence.finish())
+        if self._faults is not None:
+            self._report(self._faults.finish())
         if self._inertial is not None:
-            self._report_findings(self._inertial.finish())
+            findings = self._inertial.finish()
+            if self._faults is not None and self._faults.stuck_at_end:  # which is no matter of clocks
+                findings = tuple(f for f in findings if f.group != "overlap")
+            self._report_findings(findings)
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
         """Log findings; gaps are reported one by one by `ImuSilence`."""
