@@ -15,9 +15,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from frontend.patches import FloatImage, Patches, inside
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray
+
+from .patches import FloatImage, Patches, inside
 
 _PARAMETERS = 8  # shift u, v; gain; offset; linear part in row-major order
 _ROW_PARAMETERS = 6  # the same without the second row of the linear part

@@ -7,20 +7,21 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
-from frontend.columns import joined, take
-from frontend.detect import detect_corners, half_mask, load_mask, min_distance_px
-from frontend.flow import lost_contrast, track_with_retries
-from frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
-from frontend.outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors, predicted_motion, static_tracks
-from frontend.patches import FloatImage, View, half_image, inside
-from frontend.prediction import moved_pixels, prior_pixels, usable_prior
-from frontend.settings import FrontendSettings
-from frontend.stereo_fit import StereoFit
-from frontend.tracks import AnchorBank, Tracks, new_tracks, no_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
+
+from .align import align, on_peak, rounded, scale_change, shift_warps, template_points
+from .columns import joined, take
+from .detect import detect_corners, half_mask, load_mask, min_distance_px
+from .flow import lost_contrast, track_with_retries
+from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from .outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors, predicted_motion, static_tracks
+from .patches import FloatImage, View, half_image, inside
+from .prediction import moved_pixels, prior_pixels, usable_prior
+from .settings import FrontendSettings
+from .stereo_fit import StereoFit
+from .tracks import AnchorBank, Tracks, new_tracks, no_tracks
 
 _ITERATIONS = 5
 _ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost

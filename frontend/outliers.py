@@ -17,10 +17,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from frontend.settings import ConsensusSettings
 from vio.geometry.lie import FloatArray, circledot, se3_exp, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
 from vio.records import BoolArray, IntArray
+
+from .settings import ConsensusSettings
 
 _MIN_DEPTH_M = 0.05
 _MIN_POINTS = 8  # with fewer points, a consensus may be chance

@@ -10,16 +10,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from frontend.align import align, on_peak
-from frontend.columns import take
-from frontend.flow import circle_errors, match_brightness
-from frontend.patches import View
-from frontend.settings import DisparitySettings, KltSettings
-from frontend.stereo_match import RowField, match_rows, shifted_rows
-from frontend.tracks import AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import BoolArray, Image, IntArray
+
+from .align import align, on_peak
+from .columns import take
+from .flow import circle_errors, match_brightness
+from .patches import View
+from .settings import DisparitySettings, KltSettings
+from .stereo_match import RowField, match_rows, shifted_rows
+from .tracks import AnchorBank, Tracks
 
 _ITERATIONS = 5
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4

@@ -11,10 +11,11 @@ import numpy as np
 import numpy.typing as npt
 from numpy.lib.stride_tricks import sliding_window_view
 
-from frontend.align import FLAT_RMS
-from frontend.patches import integer_patches
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
+
+from .align import FLAT_RMS
+from .patches import integer_patches
 
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak

@@ -360,7 +360,7 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "three coefficients": (
         _edit("cam0/sensor.yaml", "distortion_coefficients: [-0.28, ", "distortion_coefficients: ["),
         CalibrationError,
-        r"cam0/sensor.yaml: the radtan model takes 4 distortion coefficients or 5, got 3",
+        r"cam0/sensor.yaml: the radtan model takes 4 distortion coefficients or 5 or 8, got 3",
     ),
     "short T_BS": (_edit("cam0/sensor.yaml", "data: [", "data: [0]\n  rest: ["), CalibrationError, "T_BS must hold 16"),
     "T_BS mirrors": (

@@ -79,7 +79,9 @@ def _imports(text: str) -> Iterator[str]:
             skipped.update(id(child) for statement in node.body for child in ast.walk(statement))
         elif id(node) not in skipped and isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif id(node) not in skipped and isinstance(node, ast.ImportFrom) and node.module:
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "frontend_module":
+            yield "frontend"  # vio.frontend_package finds it by its place
+        elif id(node) not in skipped and isinstance(node, ast.ImportFrom) and node.module and not node.level:
             # `from vio import calibration` names a package, `from vio.records import Image` something in one.
             yield from (f"vio.{alias.name}" for alias in node.names) if node.module == "vio" else [node.module]
 

@@ -19,6 +19,7 @@ class Mutation:
 _LIE = ("tests/test_lie.py",)
 _STEREO = ("tests/test_stereo_geometry.py",)
 _LENS = ("tests/test_distortion.py", "tests/test_sim_cameras.py", "tests/test_jacobian_registry.py")
+_RIG = ("tests/test_rig.py",)
 _RECTIFY = ("tests/test_rectify.py", "tests/test_rectify_cli.py", "tests/test_datasets_euroc.py")
 _WINDOW = (
     "tests/test_multiview.py",
@@ -47,6 +48,34 @@ _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/t
 
 MUTATIONS = (
     # --- vio/geometry ---
+    Mutation(
+        "double sphere: the first sphere's distance left out of the depth",
+        "vio/geometry/sphere_models.py",
+        "shifted = xi * d1 + p[..., 2]",
+        "shifted = p[..., 2]",
+        _RIG,
+    ),
+    Mutation(
+        "rational lens: divisor left out",
+        "vio/geometry/distortion.py",
+        "        radial = radial / divisor[0]",
+        "        radial = radial * 1.0",
+        _RIG,
+    ),
+    Mutation(
+        "Kalibr: pose of the IMU inverted in the stereo pose",
+        "vio/datasets/rigs/kalibr.py",
+        "through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)",
+        "through_imu = T_cam0_imu @ se3_inverse(T_cam1_imu)",
+        _RIG,
+    ),
+    Mutation(
+        "CameraInfo: rectified baseline not rotated back to the raw camera",
+        "vio/datasets/rigs/camera_info.py",
+        "se3_from_parts(R1.T @ R0, R1.T @ shift)",
+        "se3_from_parts(R1.T @ R0, shift)",
+        _RIG,
+    ),
     Mutation(
         "SO(3): right Jacobian for the left",
         "vio/geometry/lie.py",

@@ -13,16 +13,21 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 
-from frontend.settings import FrontendSettings
 from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError
 from vio.filters.settings import MsckfSettings, VislamSettings
+from vio.frontend_package import frontend_module
 from vio.selectors import SelectorSettings
 from vio.setting import Range, Section, setting
+
+if TYPE_CHECKING:
+    from frontend.settings import FrontendSettings
+else:
+    FrontendSettings = frontend_module("settings").FrontendSettings
 
 BackendName = Literal["vislam", "msckf"]
 MotionName = Literal["auto", "imu", "velocity", "none"]

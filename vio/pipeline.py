@@ -1,74 +1,44 @@
-"""The whole flow on one screen: events in, front end, selector, filter, result out."""
+"""A whole recording through the chain: events in, front end, selector, filter, result out."""
 
 from __future__ import annotations
 
 import logging
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.chain import BACKENDS, STAGES, FrameLog, FrameResult, build_backend
 from vio.config import BackendName, Config
 from vio.errors import ConfigError, DataError
-from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
+from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
+from vio.odometry import Odometry
 from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
 from vio.records import (
     BodyFrame,
     Estimate,
     Event,
     FrontendOutput,
-    ImuSample,
     Landmarks,
     MotionSample,
     MotionSource,
     Observations,
     Recording,
-    Selection,
     StereoFrame,
     Trajectory,
     UpdateReport,
 )
 from vio.selectors import build_selector
 from vio.threads import one_blas_thread
-from vio.watch.run import RunWatch
 
 log = logging.getLogger(__name__)
 
-STAGES = ("read", "frontend", "watch", "select", "filter")  # of a frame's wall time
+__all__ = ["STAGES", "FrameLog", "NullViewer", "RunResult", "resolve_motion", "run"]
 
-_BACKENDS: dict[BackendName, type[Vislam] | type[Msckf]] = {"vislam": Vislam, "msckf": Msckf}
-
-
-@dataclass(frozen=True, slots=True)
-class FrameLog:
-    """What happened in one frame: one row of frames.csv."""
-
-    index: int
-    time_ns: int
-    read_ms: float
-    frontend_ms: float
-    watch_ms: float
-    select_ms: float
-    filter_ms: float
-    detected: int
-    tracked: int
-    matched: int
-    selected: int
-    stale: int
-    used: int
-    gated: int
-    landmarks: int
-    innovation_median_px: float | None
-    nis_per_dof: float | None
-    stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
-
-    @property
-    def total_ms(self) -> float:
-        """Wall time of the whole frame."""
-        return sum(getattr(self, f"{stage}_ms") for stage in STAGES)
+_LEAST_REFUSED = 10  # frames that the front end refused, and more of them than not, before a run gives up
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,52 +111,38 @@ def run(
     T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
 
     features = _feature_source(dataset, config)
-    frontend = frontend or _build_frontend(features, config)
-    selector = selector or _build_selector(features, config)
-    backend = backend or _build_backend(recording, config, motion, T_cam0_body)
+    odometry = Odometry(
+        recording.camera,
+        replace(config, motion=motion or "none"),
+        T_cam0_imu=T_cam0_body,
+        frontend=frontend or _build_frontend(features, config),
+        selector=selector or _build_selector(features, config),
+        backend=backend or build_backend(recording.camera, T_cam0_body, config, motion),
+    )
     viewer = viewer or NullViewer()
     dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
-    watch = RunWatch(recording.camera, T_cam0_body, imu=motion == "imu")
-    recorder = _RunRecorder(backend, config.lag_frames, keep_observations=keep_observations)
-    timer = _StageTimer()
+    recorder = _RunRecorder(odometry, config.lag_frames, keep_observations=keep_observations)
+    began, reading = time.perf_counter(), _ReadTimer()
     try:
-        events = dataset.events(start, stop, images=_needs_images(dataset, config))
-        for event in frames_after_imu(events) if motion == "imu" else events:
-            if not isinstance(event, StereoFrame):
-                watch.sample(event)
-                recorder.sample(event)
-                if motion is not None:
-                    backend.propagate(event)
-                if dead_reckoning is not None:
-                    dead_reckoning.propagate(event)
-                continue
-            timer.end("read")
-            expected = backend.predict(event.time_ns)
-            timer.end("predict")
-            output = frontend.process(event, expected.tracks if expected and config.frontend.prior else None)
-            timer.end("frontend")
-            watch.observations(output.observations)
-            timer.end("watch")
-            seen = (
-                output.observations.take(output.observations.has_right) if backend.stereo_only else output.observations
-            )
-            selection = selector.select(seen, expected.motion if expected else None)
-            timer.end("select")
-            report = backend.update(seen.take(selection.chosen))
-            estimate = backend.estimate()
-            timer.end("update")
-
-            watch.update(event.index, report, estimate)
-            recorder.frame(estimate, _frame_log(event, timer, output, selection, report), output.observations)
+        for event in reading.timed(dataset.events(start, stop, images=_needs_images(dataset, config))):
             if dead_reckoning is not None:
-                dead_reckoning.frame(event)
-            viewer.frame(output, estimate, report)
-            timer.begin()
+                dead_reckoning.add(event)
+            if not isinstance(event, StereoFrame):
+                recorder.sample(event)
+            for result in odometry.add_event(event):
+                recorder.frame(result, reading.take_ms())
+                viewer.frame(result.output, result.estimate, result.report)
+            if _LEAST_REFUSED <= odometry.frames_refused > len(recorder.frames):
+                break
+        for result in odometry.finish():
+            recorder.frame(result, reading.take_ms())
+            viewer.frame(result.output, result.estimate, result.report)
     finally:
-        watch.close()
         viewer.close()
-    if not recorder.frames:
+    if not recorder.frames and not odometry.frames_refused:
         raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
+    if odometry.frames_refused > len(recorder.frames):
+        raise DataError(f"most frames were refused: {odometry.warnings[-1]}")
     recorder.finish()
     return RunResult(
         recording=recording,
@@ -196,36 +152,13 @@ def run(
         T_cam0_body=T_cam0_body,
         estimates=tuple(recorder.estimates),
         dead_reckoning=_trajectory(dead_reckoning.poses, recorder.frames, body) if dead_reckoning is not None else None,
-        landmarks=backend.landmarks(),
+        landmarks=odometry.landmarks(),
         frames=tuple(recorder.frames),
         observations=tuple(recorder.observations) if keep_observations else None,
         motion_samples=tuple(recorder.samples) if keep_observations else None,
-        warnings=tuple(watch.lines),
-        wall_s=timer.since_start(),
+        warnings=odometry.warnings,
+        wall_s=time.perf_counter() - began,
     )
-
-
-def frames_after_imu(events: Iterable[Event]) -> Iterator[Event]:
-    """Yield events with each frame after the first IMU sample at or after its exposure, as interpolation needs it.
-
-    Where none has come, the frame waits no longer than to the next frame or the end of the stream.
-    """
-    held: StereoFrame | None = None
-    latest_ns: int | None = None  # of the IMU samples
-    for event in events:
-        if isinstance(event, StereoFrame):
-            if held is not None:
-                yield held
-            held = event
-        else:
-            yield event
-            if isinstance(event, ImuSample):
-                latest_ns = event.time_ns
-        if held is not None and latest_ns is not None and latest_ns >= held.time_ns:
-            yield held
-            held = None
-    if held is not None:
-        yield held
 
 
 def _check(recording: Recording, config: Config, start: int, stop: int | None) -> None:
@@ -248,7 +181,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     Raises:
         ConfigError: the recording lacks what was asked for, or the back end has no model for it.
     """
-    taken = _BACKENDS[config.backend].motion_sources
+    taken = BACKENDS[config.backend].motion_sources
     if config.motion == "none":
         return None
     if config.motion == "auto":
@@ -265,7 +198,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
 
 def _auto_motion(recording: Recording, backend: BackendName) -> MotionSource | None:
     """Return what the run behind an observation log used, else the best that recording and back end share."""
-    taken = _BACKENDS[backend].motion_sources
+    taken = BACKENDS[backend].motion_sources
     if recording.run_motion == "none":
         return None
     if recording.run_motion in taken and recording.run_motion in recording.motion:
@@ -283,34 +216,34 @@ def _auto_motion(recording: Recording, backend: BackendName) -> MotionSource | N
     return found
 
 
-class _StageTimer:
-    """Wall time of the stages of one frame, the end of one being the beginning of the next."""
+class _ReadTimer:
+    """Wall time that the recording takes to give its events."""
 
     def __init__(self) -> None:
-        self._start = time.perf_counter()
-        self.begin()
+        self._ms = 0.0
 
-    def begin(self) -> None:
-        """Begin a frame."""
-        self.ms: dict[str, float] = {}
-        self._last = time.perf_counter()
+    def timed(self, events: Iterable[Event]) -> Iterator[Event]:
+        """Yield the events, and note how long each took to come."""
+        iterator = iter(events)
+        while True:
+            start = time.perf_counter()
+            event = next(iterator, None)
+            self._ms += 1e3 * (time.perf_counter() - start)
+            if event is None:
+                return
+            yield event
 
-    def end(self, stage: str) -> None:
-        """Note how long a stage has taken."""
-        now = time.perf_counter()
-        self.ms[stage] = 1e3 * (now - self._last)
-        self._last = now
-
-    def since_start(self) -> float:
-        """Seconds since the run began."""
-        return time.perf_counter() - self._start
+    def take_ms(self) -> float:
+        """Return the time since the last call, and begin anew."""
+        taken, self._ms = self._ms, 0.0
+        return taken
 
 
 class _RunRecorder:
     """What a run keeps: an estimate and a row of the log per frame and, on request, what went in."""
 
-    def __init__(self, backend: Backend, lag_frames: int, *, keep_observations: bool) -> None:
-        self._backend, self._lag, self._keep = backend, lag_frames, keep_observations
+    def __init__(self, odometry: Odometry, lag_frames: int, *, keep_observations: bool) -> None:
+        self._odometry, self._lag, self._keep = odometry, lag_frames, keep_observations
         self.estimates: list[Estimate] = []
         self.frames: list[FrameLog] = []
         self.observations: list[Observations] = []
@@ -320,13 +253,13 @@ class _RunRecorder:
         if self._keep:
             self.samples.append(sample)
 
-    def frame(self, estimate: Estimate, row: FrameLog, seen: Observations) -> None:
+    def frame(self, result: FrameResult, read_ms: float) -> None:
         if self._lag:
             self._revise(len(self.estimates) - self._lag, len(self.estimates) - self._lag + 1)
-        self.estimates.append(estimate)
-        self.frames.append(row)
+        self.estimates.append(result.estimate)
+        self.frames.append(replace(result.log, read_ms=read_ms))
         if self._keep:
-            self.observations.append(seen)
+            self.observations.append(result.output.observations)
 
     def finish(self) -> None:
         if self._lag:
@@ -335,7 +268,7 @@ class _RunRecorder:
     def _revise(self, first: int, end: int) -> None:
         """Replace estimates by the smoothed ones: pose, covariance, velocity and biases."""
         for k in range(max(first, 0), end):
-            smoothed = self._backend.smoothed(self.frames[k].index)
+            smoothed = self._odometry.smoothed(self.frames[k].index)
             if smoothed is not None:
                 self.estimates[k] = replace(
                     self.estimates[k],
@@ -355,12 +288,12 @@ class _DeadReckoning:
         self._filter = Vislam(recording.camera, T_cam0_body, settings, motion_sensor=True)
         self.poses: list[FloatArray] = []
 
-    def propagate(self, sample: MotionSample) -> None:
-        self._filter.propagate(sample)
-
-    def frame(self, frame: StereoFrame) -> None:
-        self._filter.advance(frame.time_ns)
-        self.poses.append(self._filter.estimate().T_world_imu)
+    def add(self, event: Event) -> None:
+        if isinstance(event, StereoFrame):
+            self._filter.advance(event.time_ns)
+            self.poses.append(self._filter.estimate().T_world_imu)
+        else:
+            self._filter.propagate(event)
 
 
 def _feature_source(dataset: Dataset, config: Config) -> Dataset:
@@ -382,8 +315,7 @@ def _feature_source(dataset: Dataset, config: Config) -> Dataset:
 
 
 def _build_frontend(features: Dataset, config: Config) -> Frontend:
-    from frontend import build_frontend
-
+    build_frontend = frontend_module().build_frontend
     name = config.frontend.name if config.frontend.features is None else "precomputed"
     return build_frontend(name, features.recording.camera, config.frontend, features)
 
@@ -405,42 +337,9 @@ def _build_selector(features: Dataset, config: Config) -> Selector:
     )
 
 
-def _build_backend(
-    recording: Recording, config: Config, motion: MotionSource | None, T_cam0_body: FloatArray
-) -> Backend:
-    if config.backend == "msckf":
-        return Msckf(recording.camera, T_cam0_body, config.msckf, motion=motion)
-    return Vislam(recording.camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
-
-
 def _needs_images(dataset: Dataset, config: Config) -> bool:
     front = config.frontend
     return dataset.recording.has_images and front.name != "precomputed" and front.features is None
-
-
-def _frame_log(
-    frame: StereoFrame, timer: _StageTimer, output: FrontendOutput, selection: Selection, report: UpdateReport
-) -> FrameLog:
-    return FrameLog(
-        index=frame.index,
-        time_ns=frame.time_ns,
-        read_ms=timer.ms["read"],
-        frontend_ms=timer.ms["frontend"],
-        watch_ms=timer.ms["watch"],
-        select_ms=timer.ms["select"],
-        filter_ms=timer.ms["predict"] + timer.ms["update"],
-        detected=output.detected,
-        tracked=output.tracked,
-        matched=output.matched,
-        selected=int(selection.chosen.sum()),
-        stale=int(output.observations.stale.sum()),
-        used=report.used,
-        gated=report.gated,
-        landmarks=report.landmarks,
-        innovation_median_px=report.innovation_median_px,
-        nis_per_dof=report.nis_per_dof,
-        stages_ms=output.stages_ms,
-    )
 
 
 def _trajectory(poses: list[FloatArray], frames: list[FrameLog] | tuple[FrameLog, ...], body: BodyFrame) -> Trajectory:

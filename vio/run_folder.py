@@ -23,6 +23,7 @@ from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, transform_points
 from vio.pipeline import STAGES, FrameLog, RunResult
+from vio.printable import json_text
 from vio.records import Landmarks, Trajectory
 from vio.trajectory_io import in_first_cam0, read_trajectory, write_kitti, write_tum
 
@@ -77,7 +78,7 @@ def write_run_folder(
         from vio.plotting import plot_run
 
         plot_run(temporary / "trajectory.png", result, evaluation, dead_reckoning)
-        (temporary / MARKER).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        (temporary / MARKER).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
     return metrics
 
 

@@ -57,7 +57,7 @@ class TorchFlow:
             raise MissingDependencyError(
                 f"tracking with torch needs torch ({error}); install it with: pip install 'stereo-vio[learned]'"
             ) from error
-        from frontend.learned.weights import pick_device
+        from .weights import pick_device
 
         self._device = pick_device(device)
         self._window_px, self._levels = window_px, levels

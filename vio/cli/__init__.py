@@ -1,23 +1,67 @@
 """The command `vio`: subcommands, one file each; nothing heavy is imported before a command runs.
 
-Exit status: 0 success, 1 an expected error, reported in one line, 2 wrong usage, 130 interrupted.
+Exit status: 0 success, 1 an expected error, reported in one line, 2 wrong usage, 130 interrupted by Ctrl-C, 143 ended
+by SIGTERM, 129 by SIGHUP; the last three leave no unfinished files behind.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
 import io
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
 
 from vio._version import __version__
 from vio.cli import calibrate, check, config, demo, evaluate, export, rectify, refine, render, reproduce, run
 from vio.errors import VioError
+from vio.printable import printable
 
 _COMMANDS = (run, evaluate, check, refine, export, calibrate, demo, render, rectify, reproduce, config)
+
+
+_ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process was asked to end; handled like Ctrl-C, so that nothing unfinished stays."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+@contextlib.contextmanager
+def _orderly_end() -> Iterator[None]:
+    """Raise `_Terminated` at SIGTERM and SIGHUP inside the block, where this is the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    owner = os.getpid()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        if os.getpid() != owner:  # a forked worker ends as it would have
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        signal.signal(number, signal.SIG_IGN)  # a second one must not cut short the cleaning up
+        raise _Terminated(number)
+
+    before = {number: signal.getsignal(number) for number in _ENDING}
+    for number, handler in before.items():
+        if handler == signal.SIG_DFL:  # under nohup SIGHUP is ignored, and stays so
+            signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None:
+                signal.signal(number, handler)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -44,13 +88,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     try:
-        status: int = args.execute(args)
-        sys.stdout.flush()
+        with _orderly_end():
+            status: int = args.execute(args)
+            sys.stdout.flush()
     except VioError as error:
         if args.debug:
             raise
-        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        print("error:", printable(" ".join(str(error).split())), file=sys.stderr)
         return 1
+    except _Terminated as stop:
+        print(f"ended by {signal.Signals(stop.number).name}; nothing was written", file=sys.stderr)
+        return 128 + stop.number
     except KeyboardInterrupt:
         print("interrupted; nothing was written", file=sys.stderr)
         return 130

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vio.atomic import check_replaceable
+from vio.atomic import check_replaceable, check_writable
 from vio.cli.progress import ProgressBar
 from vio.config import Config
 from vio.datasets import open_dataset
@@ -54,7 +54,7 @@ def process(
     for note in recording.notes:
         log.warning("%s", note)
     truth = recording.reference if reference is None else read_trajectory(reference)
-    folder = check_out(out) if out is not None else free_folder(recording.path)
+    folder = check_out(out if out is not None else free_folder(recording.path))
     total = len(recording.frame_times_ns)
     frames = max(min(total, total if stop is None else stop) - start, 0)
     viewer = ProgressViewer(frames, recording.path.name) if progress else None
@@ -65,14 +65,15 @@ def process(
 
 
 def check_out(folder: Path) -> Path:
-    """Reject a folder with other contents before the processing starts.
+    """Reject a folder with other contents, or one that cannot be written, before the processing starts.
 
     Raises:
-        VioError: the folder is not an earlier run's, or the path is a file.
+        VioError: the folder is not an earlier run's, the path is a file, or nothing can be written there.
     """
     if folder.exists() and not folder.is_dir():
         raise VioError(f"{folder}: is a file; --out takes a folder")
     check_replaceable(folder, replace=True, marker=MARKER, own=FILES)
+    check_writable(folder)
     return folder
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal, TypeAlias
 
+from vio.geometry.rectify import Interpolation
 from vio.setting import Section, setting
 
-Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
 ExtrinsicsMode: TypeAlias = Literal["auto", "literal", "corrected"]
 RepeatsMode: TypeAlias = Literal["auto", "split", "flag", "literal"]
 

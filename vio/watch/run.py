@@ -40,6 +40,8 @@ class RunWatch:
 
             self._inertial = InertialCheck(camera, T_cam0_body)
         self._frames = self._features = 0
+        self._refused_last = -2
+        self.frames_refused = 0
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
@@ -63,6 +65,13 @@ class RunWatch:
             self._faults.frame(seen.frame_index)
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
+
+    def refused(self, index: int, reason: str) -> None:
+        """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
+        if index != self._refused_last + 1:
+            self._report([f"frame skipped: {reason}"])
+        self._refused_last = index
+        self.frames_refused += 1
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
