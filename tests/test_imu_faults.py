@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from tests.test_msckf import CAMERA, T_CAM0_IMU, Flight
-from vio.filters.imu_faults import ImuSampleCheck
+from vio.event_order import EventOrder
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
-from vio.pipeline import frames_after_imu
+from vio.imu_faults import ImuSampleCheck
 from vio.records import Event, ImuSample, StereoFrame
 from vio.watch.clocks import Coverage
 from vio.watch.run import RunWatch
@@ -144,7 +144,9 @@ def _lines(samples: list[ImuSample]) -> list[str]:
     watch, flight = RunWatch(CAMERA, T_CAM0_IMU, imu=True), Flight(FRAMES)
     rng = np.random.default_rng(0)
     events: list[Event] = [*samples, *(StereoFrame(k, k * 50_000_000, None, None) for k in range(FRAMES))]
-    for event in frames_after_imu(sorted(events, key=lambda e: (e.time_ns, isinstance(e, StereoFrame)))):
+    order = EventOrder(wait_for_imu=True)
+    ready = [e for event in sorted(events, key=lambda e: e.time_ns) for e in order.add(event)]
+    for event in [*ready, *order.flush()]:
         if isinstance(event, StereoFrame):
             watch.observations(flight.observe(event.index, 0.1, rng))
         else:

@@ -201,6 +201,11 @@ class FrontendOutput:
     stages_ms: dict[str, float] = field(default_factory=dict)  # wall time per stage
 
 
+def no_features(frame: StereoFrame) -> FrontendOutput:
+    """Return the output for a frame whose images are not used."""
+    return FrontendOutput(observations(frame.index, frame.time_ns, [], np.zeros((0, 4))), 0, 0, 0)
+
+
 @dataclass(frozen=True, slots=True)
 class Selection:
     """Which observations enter the update, and why."""

@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.errors import EstimationError
-from vio.filters.imu_faults import ImuSampleCheck
 from vio.filters.imu_gaps import Hidden, ImuHistory
 from vio.filters.imu_start import imu_start
 from vio.filters.settings import MsckfSettings
@@ -28,6 +27,7 @@ from vio.geometry.lie import (
     so3_hat,
     so3_left_jacobian,
 )
+from vio.imu_faults import ImuSampleCheck
 from vio.records import ImuSample, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state

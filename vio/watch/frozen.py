@@ -13,10 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.filters.imu_start import imu_start
-from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_log
 from vio.records import Image, ImuSample, MotionPrior, Observations, Prediction, StereoFrame
+from vio.standstill import STANDSTILL_S, blocks_agree
 from vio.statistics import chi_square_quantile
 
 _RADIUS = 4  # of the patches whose flow is measured, pixels
@@ -26,7 +25,8 @@ _PREDICTED_PX = 0.6  # a corner that is predicted to move less tells nothing
 _UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
 _SHARE = 0.8  # of the corners that must be unmoved
 _PROBABILITY = 0.9999  # chi-square limit of the predicted motion for no motion to be possible
-_IMU_S = 0.6  # samples kept, for the last half second
+_MOST_LINES = 3  # rows of repetitions that are reported one by one
+_GYRO_NOISE, _ACCEL_NOISE = 2e-4, 1.2e-2  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
 _NS = 1e-9
 
 
@@ -50,7 +50,7 @@ class FrozenImages:
     def sample(self, sample: ImuSample) -> None:
         """Take a sample of the IMU."""
         self._imu.append(sample)
-        while (sample.time_ns - self._imu[0].time_ns) * _NS > _IMU_S:
+        while (sample.time_ns - self._imu[0].time_ns) * _NS > STANDSTILL_S:
             self._imu.popleft()
 
     def observations(self, seen: Observations) -> None:
@@ -75,26 +75,32 @@ class FrozenImages:
             return None
         assert shown.left is not None
         assert shown.right is not None
+        again = self._repeating is not None  # what was given again once is, until it changes
         if np.array_equal(frame.left, shown.left) and np.array_equal(frame.right, shown.right):
-            again = self._repeating is not None and self._repeating.exact
-            return Repeated(shown.index, True) if again or self._moves(frame.time_ns, expected) else None
-        if expected is None or self._seen is None or not self._contradicts(expected.motion):
+            return Repeated(shown.index, True) if again or self._moves(expected) else None
+        if self._seen is None or expected is None:
             return None
-        if self._unmoved(shown, frame, self._seen, expected) and not self._at_standstill(frame.time_ns):
-            return Repeated(shown.index, False)
-        return None
+        if again:
+            return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
+        if not self._contradicts(expected.motion) or self._at_standstill():
+            return None
+        return (
+            Repeated(shown.index, False) if _unmoved(shown, frame, _predicted_to_move(self._seen, expected)) else None
+        )
 
-    def _moves(self, time_ns: int, expected: Prediction | None) -> bool:
+    def _moves(self, expected: Prediction | None) -> bool:
         """Whether the rig moves: by the IMU's samples, else by the prediction."""
         if self._imu:
-            return not self._at_standstill(time_ns)
+            return not self._at_standstill()
         return expected is not None and self._contradicts(expected.motion)
 
-    def _at_standstill(self, time_ns: int) -> bool:
-        """Whether the IMU's last half second shows noise alone, and gravity."""
-        if not self._imu or not any(x.accel.any() for x in self._imu):
+    def _at_standstill(self) -> bool:
+        """Whether the IMU's last half second shows noise alone; steady motion looks the same, but no rig is steady."""
+        if not self._imu:
             return False
-        return imu_start(tuple(self._imu), time_ns, MsckfSettings()).still
+        times_s = np.array([x.time_ns - self._imu[-1].time_ns for x in self._imu]) * _NS
+        gyro, accel = np.array([x.gyro for x in self._imu]), np.array([x.accel for x in self._imu])
+        return blocks_agree(times_s, gyro, _GYRO_NOISE) and blocks_agree(times_s, accel, _ACCEL_NOISE)
 
     def _contradicts(self, motion: MotionPrior | None) -> bool:
         """Whether no motion at all contradicts the predicted one, by chi-square."""
@@ -105,24 +111,68 @@ class FrozenImages:
         scale = float(np.trace(C)) + 1e-18
         return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > chi_square_quantile(_PROBABILITY, 6))
 
-    def _unmoved(self, before: StereoFrame, now: StereoFrame, seen: Observations, expected: Prediction) -> bool:
-        """Whether the corners that are predicted to move have not moved, in both images."""
-        if expected.tracks is None:
+
+def _predicted_to_move(seen: Observations, expected: Prediction) -> Observations:
+    """The features of the last frame that the prediction moves clearly in the left image."""
+    _, a, b = np.intersect1d(seen.ids, expected.tracks.ids, assume_unique=True, return_indices=True)
+    moved = np.linalg.norm(expected.tracks.z[b, :2] - seen.z[a, :2], axis=1)
+    return seen.take(a[moved > _PREDICTED_PX])
+
+
+def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
+    """Whether features have not moved since they were seen, in both images."""
+    for old, new, pixels in (
+        (before.left, now.left, seen.z[:_CORNERS, :2]),
+        (before.right, now.right, seen.z[seen.has_right][:_CORNERS, 2:]),
+    ):
+        assert old is not None
+        assert new is not None
+        flow = corner_flow(old, new, pixels)
+        if len(flow) < _LEAST_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
             return False
-        _, a, b = np.intersect1d(seen.ids, expected.tracks.ids, assume_unique=True, return_indices=True)
-        z, moved = seen.z[a], expected.tracks.z[b] - seen.z[a]
-        has_right = seen.has_right[a]
-        for old, new, columns, there in (
-            (before.left, now.left, slice(0, 2), np.ones(len(a), dtype=np.bool_)),
-            (before.right, now.right, slice(2, 4), has_right),
-        ):
-            assert old is not None
-            assert new is not None
-            rows = np.flatnonzero(there & (np.linalg.norm(moved[:, columns], axis=1) > _PREDICTED_PX))[:_CORNERS]
-            flow = corner_flow(old, new, z[rows, columns])
-            if len(flow) < _LEAST_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
-                return False
-        return True
+    return True
+
+
+class RepeatReport:
+    """Reports pairs that were given again: the first one, long rows of them, and their number."""
+
+    def __init__(self) -> None:
+        self._row: list[StereoFrame] = []  # frames of the present row
+        self._reported = 0
+        self._total = 0
+
+    def frame(self, frame: StereoFrame, repeated: Repeated | None) -> list[str]:
+        """Take a frame and what it repeats; return the lines that follow from it."""
+        lines = self._ended(frame) if repeated is None else []
+        if repeated is None:
+            self._row = []
+            return lines
+        self._row.append(frame)
+        self._total += 1
+        if len(self._row) > 1 or self._reported >= _MOST_LINES:
+            return lines
+        self._reported += 1
+        seen = "are the same to the last bit" if repeated.exact else "show nothing that has moved"
+        cause = (
+            "the camera or its driver gave them again"
+            if repeated.exact
+            else "the camera or its driver gave them again, or it sees only what moves with it"
+        )
+        return [
+            f"frame {frame.index}: both images {seen} since frame {repeated.of_index} although the rig moves: {cause}; "
+            "left out, the pose is a prediction"
+        ]
+
+    def finish(self) -> list[str]:
+        """Return the line at the end of the run."""
+        still = [f"the images stayed the same from frame {self._row[0].index} to the end"] if self._row else []
+        return [*still, f"{self._total} frames repeated earlier images and were left out"] if self._total > 1 else still
+
+    def _ended(self, frame: StereoFrame) -> list[str]:
+        if len(self._row) < 2:
+            return []
+        seconds = (frame.time_ns - self._row[0].time_ns) * _NS
+        return [f"frame {frame.index}: the images change again, after {len(self._row)} repetitions ({seconds:.2f} s)"]
 
 
 def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:
@@ -138,9 +188,10 @@ def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:
     rows, columns = at[inside, 1, None, None] + y, at[inside, 0, None, None] + x
     old, new = before[rows, columns].astype(np.float64), after[rows, columns].astype(np.float64)
     inner = slice(1, -1)
-    gu = (old[:, inner, 2:] - old[:, inner, :-2]).reshape(len(old), -1) / 2
-    gv = (old[:, 2:, inner] - old[:, :-2, inner]).reshape(len(old), -1) / 2
-    change = (new - old)[:, inner, inner].reshape(len(old), -1)
+    flat = len(old), (2 * _RADIUS + 1) ** 2
+    gu = (old[:, inner, 2:] - old[:, inner, :-2]).reshape(flat) / 2
+    gv = (old[:, 2:, inner] - old[:, :-2, inner]).reshape(flat) / 2
+    change = (new - old)[:, inner, inner].reshape(flat)
     change = change - change.mean(axis=1, keepdims=True)
     g = np.stack([gu, gv], axis=1)
     normal = g @ g.transpose(0, 2, 1) + 1.0 * np.eye(2)  # one gray level squared, against patches without texture

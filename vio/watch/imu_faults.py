@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vio.filters.imu_faults import ImuFault, ImuFaultKind, ImuSampleCheck
+from vio.imu_faults import ImuFault, ImuFaultKind, ImuSampleCheck
 from vio.records import ImuSample
 
 _NS = 1e-9

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import Estimate, ImuSample, MotionSample, Observations, UpdateReport
+from vio.records import Estimate, ImuSample, MotionSample, Observations, Prediction, StereoFrame, UpdateReport
+from vio.watch.frozen import FrozenImages, RepeatReport
 from vio.watch.health import RunHealth
 from vio.watch.imu_faults import ImuFaultReport
 from vio.watch.silence import ImuSilence
@@ -35,6 +36,8 @@ class RunWatch:
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
+        self._frozen, self._repeats = FrozenImages(), RepeatReport()
+        self._repeated = False  # the present frame shows an earlier exposure
         if imu:
             from vio.watch.inertial import InertialCheck  # it loads scipy.optimize
 
@@ -54,6 +57,19 @@ class RunWatch:
                 self._report(lines)
                 for x in usable:
                     self._inertial.imu(x)
+                    self._frozen.sample(x)
+
+    def repeats(self, frame: StereoFrame, expected: Prediction | None) -> bool:
+        """Return whether a frame shows an earlier exposure again and must not be used; called before `observations`.
+
+        Args:
+            frame: in time order.
+            expected: the back end's prediction of it.
+        """
+        repeated = self._frozen.check(frame, expected)
+        self._repeated = repeated is not None
+        self._report(self._repeats.frame(frame, repeated))
+        return self._repeated
 
     def observations(self, seen: Observations) -> None:
         """Add the front end's observations, before feature selection."""
@@ -63,6 +79,9 @@ class RunWatch:
             self._report(self._silence.frame(seen.frame_index, seen.time_ns))
         if self._faults is not None:
             self._faults.frame(seen.frame_index)
+        if self._repeated:
+            return
+        self._frozen.observations(seen)
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
 
@@ -83,6 +102,7 @@ class RunWatch:
             self._report(
                 [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
             )
+        self._report(self._repeats.finish())
         if self._silence is not None:
             self._report(self._silence.finish())
         if self._faults is not None:
