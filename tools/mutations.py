@@ -32,6 +32,8 @@ _WINDOW = (
     "tests/test_consistency.py",
 )
 _IMU_GAPS = ("tests/test_imu_gaps.py",)
+_IMU_FAULTS = ("tests/test_imu_faults.py",)
+_FROZEN = ("tests/test_frozen_images.py",)
 _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
@@ -398,6 +400,62 @@ MUTATIONS = (
         "length_s <= max(",
         "length_s <= 10 * max(",
         _IMU_GAPS,
+    ),
+    Mutation(
+        "IMU: a spike needs no return",
+        "vio/imu_faults.py",
+        "if (back > self._limit).any() or (back > _RETURN * np.abs(jump))[axes].any():",
+        "if False:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: spikes pass",
+        "vio/imu_faults.py",
+        "if self._has_returned(suspect, reading):",
+        "if False:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: repetitions of one sensor pass until they are proven",
+        "vio/imu_faults.py",
+        "if any(r.unusual for r in self._repeats):",
+        "if self._repeats[0].unusual:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: a gap counts as a fault of the clocks",
+        "vio/watch/clocks.py",
+        "1 + self._in_gap",
+        "1",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "frozen images: a repeated pair is used",
+        "vio/chain.py",
+        "if self.watch.repeats(frame, expected):",
+        "if self.watch.repeats(frame, expected) and False:",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: a rig at standstill is taken for a frozen camera",
+        "vio/watch/frozen.py",
+        "or self._at_standstill():",
+        "or False:",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: what the prediction may be off by does not count",
+        "vio/watch/frozen.py",
+        "if not self._contradicts(expected.motion) or",
+        "if",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: a row ends with the prediction's certainty",
+        "vio/watch/frozen.py",
+        "again = self._repeating is not None",
+        "again = False",
+        _FROZEN,
     ),
     Mutation(
         "start: a steady acceleration is no evidence against the tilt",
