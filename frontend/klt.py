@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
@@ -227,7 +228,6 @@ class KltFrontend:
 
         While it cannot, depths come from the prior, where it has them.
         """
-        assert self._previous is not None
         if not self._right.usable and prior is not None:
             depth, known = prior_depths(self._camera, np.where(tracks.shown, tracks.ids, -1), prior)
             point = np.where(known[:, None], left_rays(self._camera, tracks.left) * depth[:, None], tracks.point)
@@ -482,6 +482,16 @@ def _prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntA
 
 def _spaced(points: FloatArray, distance: float) -> BoolArray:
     """Mask (N,) of points (N, 2) without an earlier point closer than `distance` in the maximum norm."""
-    u, v = points[:, 0], points[:, 1]
-    near = (np.abs(u[:, None] - u) < distance) & (np.abs(v[:, None] - v) < distance)
-    return np.asarray(~np.tril(near, -1).any(axis=1), dtype=np.bool_)
+    out = np.ones(len(points), dtype=np.bool_)
+    _mark_crowded(points, distance, out)
+    return out
+
+
+@compiled
+def _mark_crowded(points: FloatArray, distance: float, apart: BoolArray) -> None:
+    for n in range(len(points)):
+        for m in range(n):
+            du, dv = points[n, 0] - points[m, 0], points[n, 1] - points[m, 1]
+            if abs(du) < distance and abs(dv) < distance:
+                apart[n] = False
+                break

@@ -193,9 +193,9 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         "b.png: an image of KITTI raw is named by its frame number",
     ),
     "digits": (
-        lambda d: [(d / f"image_0{k}/data/0000000100.png").rename(d / f"image_0{k}/data/99.png") for k in (0, 1)],
+        lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/0100.png") for k in (0, 1)],
         DataError,
-        "99.png: its frame number does not increase after 0000000103.png",
+        "0100.png: its frame number does not increase after 0000000100.png",
     ),
     "too few times": (_times(_stamp(0), _stamp(1)), DataError, "holds 2 times for 4 images up to number 103"),
     "times repeat": (

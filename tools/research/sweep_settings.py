@@ -176,6 +176,8 @@ _TRIED: dict[str, tuple[Any, ...]] = {
 }
 _NOT_SWEPT = {
     "frontend.features": "names a file; the filter's contexts replay one",
+    "dataset.calibration": "names a file",
+    "dataset.topics": "names topics",
     "frontend.klt.mask": "names a picture",
     "frontend.learned.descriptor": "all others need weights",
     "frontend.learned.detector_weights": "names a file",

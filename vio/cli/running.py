@@ -12,6 +12,7 @@ from vio.cli.progress import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
+from vio.datasets.span import Seconds, frames_between
 from vio.errors import StoppedError, VioError
 from vio.evaluation import KITTI_LENGTHS_M
 from vio.pipeline import run
@@ -49,8 +50,8 @@ def process(
     *,
     out: Path | None,
     reference: Path | None = None,
-    start: int = 0,
-    stop: int | None = None,
+    start: int | Seconds = 0,
+    stop: int | Seconds | None = None,
     lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
     progress: bool = True,
@@ -60,11 +61,12 @@ def process(
     for note in dataset.recording.notes:
         log.warning("%s", note)
     folder = check_out(out if out is not None else free_folder(dataset.recording.path))
+    first, end = frames_between(dataset.recording, start, stop)
     request = {
         "source": f"{dataset.recording.kind}:{dataset.recording.path.absolute()}",
         "reference": None if reference is None else str(reference.absolute()),
-        "start": start,
-        "stop": stop,
+        "start": first,
+        "stop": end,
         "lengths_m": None if lengths_m is None else list(lengths_m),
         "save_observations": save_observations,
     }

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from vio.datasets.common import frame_range, merge_events
 from vio.datasets.images import WHITE_16, UnreadableImageError, list_images, load_gray, prefetch, white_level
@@ -16,6 +17,7 @@ from vio.records import Event, Image, MotionSample, Observations, Recording, Ste
 
 logger = logging.getLogger(__name__)
 
+Item = TypeVar("Item")
 ImagePairs = tuple[tuple[Path, Path], ...]  # left and right image of each frame
 
 _NAMED = 5  # skipped frames that get a line each; the others are counted in one at the end
@@ -47,7 +49,7 @@ class BadFrame:
 
 
 def readable_frames(
-    load: Callable[[int], StereoFrame | BadFrame], chosen: Iterable[int], settings: DatasetSettings
+    load: Callable[[Item], StereoFrame | BadFrame], chosen: Iterable[Item], settings: DatasetSettings
 ) -> Generator[StereoFrame]:
     """Prefetch frames in a thread, and skip unusable ones with a warning.
 

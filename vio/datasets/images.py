@@ -7,6 +7,7 @@ is decoded.
 from __future__ import annotations
 
 import contextlib
+import re
 import struct
 import zlib
 from collections import deque
@@ -19,11 +20,12 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
 from vio.errors import DataError
 from vio.input_files import check_regular, read_input
 from vio.records import Image
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", *OTHER_SUFFIXES)
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 WHITE_16 = 65535  # the level of white in an image that uses all of its 16 bits
@@ -54,7 +56,15 @@ def load_gray(path: Path, white: int = WHITE_16) -> tuple[Image, int]:
     Raises:
         UnreadableImageError: the file cannot be read, is truncated or too large, or does not decode.
     """
-    pixels = _load(path)
+    return _as_gray(_load(path), white)
+
+
+def decode_gray(data: bytes, path: Path | str, white: int = WHITE_16) -> tuple[Image, int]:
+    """Decode an image file in memory as `load_gray` does; `path` names it in messages."""
+    return _as_gray(_decoded(data, path), white)
+
+
+def _as_gray(pixels: npt.NDArray[Any], white: int) -> tuple[Image, int]:
     bits = pixels.dtype.itemsize * 8
     if bits == 16:
         pixels = np.minimum(np.rint(pixels / (white / 255)), 255)
@@ -85,12 +95,17 @@ def white_level(paths: Sequence[Path]) -> int:
 
 def _load(path: Path) -> npt.NDArray[Any]:
     """Read a file as gray (H, W) of its own depth."""
-    import cv2
-
     try:
         data = read_input(path, _MOST_BYTES)
     except OSError as error:
         raise UnreadableImageError(f"cannot read {path}: {error.strerror or error}") from error
+    return _decoded(data, path)
+
+
+def _decoded(data: bytes, path: Path | str) -> npt.NDArray[Any]:
+    """Decode a file in memory as gray (H, W) of its own depth."""
+    import cv2
+
     if problem := _damage(data):
         raise UnreadableImageError(f"{path}: {problem}; copy the image again")
     try:
@@ -121,7 +136,7 @@ def _damage(data: bytes) -> str | None:
         return _png_damage(data)
     if data.startswith(_JPEG_START):
         return _jpeg_damage(data)
-    return "neither PNG nor JPEG"
+    return other_damage(data)
 
 
 def _too_large(width: int, height: int) -> str | None:
@@ -188,20 +203,25 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def list_images(folder: Path) -> tuple[Path, ...]:
-    """The image files of a folder, sorted by name.
+    """The image files of a folder, sorted by name, numbers as numbers: `left2.png` before `left10.png`.
 
     Raises:
         DataError: the folder is missing or holds no image.
     """
     try:
-        found = sorted(
-            path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
-        )
+        images = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+        found = sorted(images, key=natural_key)
     except OSError as error:
         raise DataError(f"cannot list {folder}: {error.strerror or error}; give a folder of images") from error
     if not found:
         raise DataError(f"{folder}: holds no image ({', '.join(SUFFIXES)})")
     return tuple(found)
+
+
+def natural_key(path: Path) -> tuple[tuple[tuple[int, str], ...], str]:
+    """Sort key of a name with its runs of digits as numbers; equal ones (`1.png`, `01.png`) by their text."""
+    parts = re.split(r"(\d+)", path.stem)
+    return tuple((int(p), "") if k % 2 else (-1, p) for k, p in enumerate(parts)), path.name
 
 
 def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) -> Generator[Loaded]:

@@ -8,10 +8,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from vio import yaml_text
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray
 from vio.text_files import text_lines
+from vio.yaml_text import read_yaml as read_yaml_text
 
 Entries: TypeAlias = Mapping[str, object]
 
@@ -31,7 +31,7 @@ def read_yaml(path: Path, what: str = "the sensor's calibration") -> dict[str, o
     # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
     lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
     try:
-        entries = yaml_text.read_yaml("\n".join(lines).replace("!!opencv-matrix", ""))
+        entries = read_yaml_text("\n".join(lines).replace("!!opencv-matrix", ""))
     except ValueError as error:
         raise CalibrationError(
             f"{path}: not a YAML file of plain values ({error}); write plain numbers, or copy it again"

@@ -80,10 +80,6 @@ class InputOrder:
             )
         self._sample_ns = now
 
-    def repeat_frame(self) -> None:
-        """Let the last frame come again, after an update that failed."""
-        self._frame_ns = None
-
     def frame(self, seen: Observations, reached_ns: int) -> None:
         """Check the observations of a frame.
 

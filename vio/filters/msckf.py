@@ -201,6 +201,9 @@ class Msckf:
             DataError: the frame is out of order, or its observations are impossible; the filter is unchanged.
         """
         self._order.frame(observations, self._time_ns)
+        return self._update(observations)
+
+    def _update(self, observations: Observations) -> UpdateReport:
         seen = observations.take(~observations.stale)
         if self._window is None:
             if not self._motion.ready:
@@ -269,8 +272,7 @@ class Msckf:
         self._noise = MotionNoise(*_IMU_FACTORS) if self._source == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._output = self._window.P.copy()
         self._map = [part for part in self._map if np.isfinite(part.p_world).all()]
-        self._order.repeat_frame()
-        return self.update(observations)
+        return self._update(observations)
 
     def _is_sane(self, window: Window) -> bool:
         """Whether the state is made of numbers, and with an IMU of a possible speed."""
