@@ -264,8 +264,8 @@ class Picky:
 
 def test_frames_that_the_front_end_refuses_are_skipped_and_said() -> None:
     odometry = Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, frontend=Picky())
-    image = np.zeros((480, 752), dtype=np.uint8)
-    given = [odometry.add_stereo(k * STEP_NS, image, image) is not None for k in range(12)]
+    images = np.random.default_rng(0).integers(0, 255, (12, 480, 752), dtype=np.uint8)
+    given = [odometry.add_stereo(k * STEP_NS, images[k], images[k]) is not None for k in range(12)]
     assert given == [not 3 <= k < 8 for k in range(12)]
     assert odometry.frames_refused == 5
     assert [line for line in odometry.warnings if "skipped" in line] == ["frame skipped: frame 3: too dark"]
