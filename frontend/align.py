@@ -157,16 +157,13 @@ def _prepare(
     """Fill the columns of templates."""
     side = wide.shape[1] - 2
     size, radius = side * side, side // 2
-    basis, normal = np.empty(_PARAMETERS), np.empty((_PARAMETERS, _PARAMETERS))
+    basis, normal = np.empty((_PARAMETERS, size)), np.empty((_PARAMETERS, _PARAMETERS))
     on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
     for n in range(len(wide)):
         total = 0.0
         for k in range(size):
             total += wide[n, k // side + 1, k % side + 1]
         mean = np.float32(total / size)
-        for i in range(_PARAMETERS):
-            for j in range(i + 1):
-                normal[i, j] = 0.0
         for k in range(size):
             y, x = k // side, k % side
             centred = wide[n, y + 1, x + 1] - mean
@@ -174,13 +171,12 @@ def _prepare(
             gv = (wide[n, y + 2, x + 1] - wide[n, y, x + 1]) / np.float32(2.0)
             patch[n, k], gradient[n, 0, k], gradient[n, 1, k] = centred, gu, gv
             energy[n] += centred * centred
-            basis[0], basis[1], basis[2], basis[3] = gu, gv, centred, 1.0
-            basis[4], basis[5] = gu * (x - radius), gu * (y - radius)
-            basis[6], basis[7] = gv * (x - radius), gv * (y - radius)
-            for i in range(_PARAMETERS):
-                for j in range(i + 1):
-                    normal[i, j] += basis[i] * basis[j]
+            basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, centred, 1.0
+            basis[4, k], basis[5, k] = gu * (x - radius), gu * (y - radius)
+            basis[6, k], basis[7, k] = gv * (x - radius), gv * (y - radius)
         for i in range(_PARAMETERS):
+            for j in range(i + 1):
+                normal[i, j] = _product(basis[i], basis[j])
             normal[i, i] += _DAMPING * normal[i, i] + 1e-6
         invert_positive(normal, inverse[n])
         for i in range(_ROW_PARAMETERS):
@@ -188,6 +184,14 @@ def _prepare(
                 on_row[i, j] = normal[i, j]
         on_row[1, 1] += _ROW_WEIGHT
         invert_positive(on_row, row_inverse[n])
+
+
+@compiled_sums
+def _product(a: FloatArray, b: FloatArray) -> float:
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
 
 
 def align(

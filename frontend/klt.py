@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
@@ -44,7 +45,6 @@ class _PreviousFrame:
 
     time_ns: int
     left: View
-    right_half: Image
     tracks: Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
     trusted: bool  # the last motion had a consensus
@@ -187,7 +187,7 @@ class KltFrontend:
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
-        self._previous = _PreviousFrame(frame.time_ns, left, right.half, tracks, twist, motion is not None)
+        self._previous = _PreviousFrame(frame.time_ns, left, tracks, twist, motion is not None)
 
     # --- features of the previous frame -------------------------------------------------------------------------------
 
@@ -228,12 +228,11 @@ class KltFrontend:
 
         While it cannot, depths come from the prior, where it has them.
         """
-        assert self._previous is not None
         if not self._right.usable and prior is not None:
             depth, known = prior_depths(self._camera, np.where(tracks.shown, tracks.ids, -1), prior)
             point = np.where(known[:, None], left_rays(self._camera, tracks.left) * depth[:, None], tracks.point)
             tracks = replace(tracks, point=point, has_point=tracks.has_point | known)
-        matched = stereo.track_right(tracks, right, self._previous.right_half, moved)
+        matched = stereo.track_right(tracks, right, moved)
         usable = self._right.check_matches(index, matched.has_right[tracks.has_point], moved=moved)
         return matched if usable else tracks
 
@@ -483,6 +482,16 @@ def _prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntA
 
 def _spaced(points: FloatArray, distance: float) -> BoolArray:
     """Mask (N,) of points (N, 2) without an earlier point closer than `distance` in the maximum norm."""
-    u, v = points[:, 0], points[:, 1]
-    near = (np.abs(u[:, None] - u) < distance) & (np.abs(v[:, None] - v) < distance)
-    return np.asarray(~np.tril(near, -1).any(axis=1), dtype=np.bool_)
+    out = np.ones(len(points), dtype=np.bool_)
+    _mark_crowded(points, distance, out)
+    return out
+
+
+@compiled
+def _mark_crowded(points: FloatArray, distance: float, apart: BoolArray) -> None:
+    for n in range(len(points)):
+        for m in range(n):
+            du, dv = points[n, 0] - points[m, 0], points[n, 1] - points[m, 1]
+            if abs(du) < distance and abs(dv) < distance:
+                apart[n] = False
+                break

@@ -98,30 +98,40 @@ def _correlate(
     width, count, side = target.shape[1], out.shape[1], 2 * radius + 1
     size, flat = side * side, FLAT_RMS**2 * side * side
     strip = np.empty(count + side - 1, np.int32)
-    product, total, squares = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(count, np.int32)
+    product, total, squares = np.empty(count, np.int32), np.empty(len(strip), np.int32), np.empty(len(strip), np.int32)
     for n in range(len(centres)):
         column, row = centres[n, 0], centres[n, 1]
         own_total, own_squares = 0, 0
+        for k in range(len(strip)):
+            total[k] = squares[k] = 0  # of the columns
         for k in range(count):
-            product[k] = total[k] = squares[k] = 0
+            product[k] = 0
         for y in range(row - radius, row + radius + 1):
             for k in range(len(strip)):
                 strip[k] = target[y, min(max(first_column[n] - radius + k, 0), width - 1)]
+                total[k] += strip[k]
+                squares[k] += strip[k] * strip[k]
             for x in range(side):
                 gray = int(source[y, column - radius + x])
                 own_total += gray
                 own_squares += gray * gray
                 for k in range(count):
                     product[k] += gray * strip[x + k]
-                    total[k] += strip[x + k]
-                    squares[k] += strip[x + k] * strip[x + k]
         energy = own_squares - own_total**2 / size
+        other_total, other_squares = 0, 0  # of the window, which moves along the columns
+        for k in range(side - 1):
+            other_total += total[k]
+            other_squares += squares[k]
         for k in range(count):
-            other = squares[k] - float(total[k]) ** 2 / size
+            other_total += total[k + side - 1]
+            other_squares += squares[k + side - 1]
+            other = other_squares - float(other_total) ** 2 / size
             inside = radius <= first_column[n] + k < width - radius
             out[n, k] = -1.0
             if inside and energy > flat and other > flat:
-                out[n, k] = (product[k] - float(own_total) * total[k] / size) / np.sqrt(energy * other)
+                out[n, k] = (product[k] - float(own_total) * other_total / size) / np.sqrt(energy * other)
+            other_total -= total[k]
+            other_squares -= squares[k]
 
 
 def _search(

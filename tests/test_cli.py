@@ -15,6 +15,7 @@ import pytest
 
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_kitti, make_npz
 from vio.cli import main
+from vio.config import BASIC, Config, describe
 from vio.errors import DataError
 from vio.trajectory_io import read_trajectory
 
@@ -357,11 +358,21 @@ def test_wrong_usage_exits_with_status_2() -> None:
 
 
 def test_config_shows_every_setting_with_unit_and_default(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["config", "--show"]) == 0
+    assert main(["config", "--all"]) == 0
     out = capsys.readouterr().out
     assert "vislam.pixel_sigma_px = 0.75 px" in out
     assert "frontend.klt.window_px" in out
     assert "one of: consistent, literal" in out
+
+
+def test_config_shows_the_basic_settings_in_groups(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "--show", "--set", "msckf.clones=9"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    keys = [line.partition(" = ")[0] for line in lines if line[0] not in " #"]
+    assert keys == list(BASIC)
+    assert "msckf.clones = 9" in lines
+    assert "# The sliding-window filter (docs/math.md, section 3)" in lines
+    assert lines[-1] == f"# {len(list(describe(Config()))) - len(BASIC)} more: vio config --all"
 
 
 def test_config_prints_the_effective_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -28,7 +28,7 @@ from tests.euroc_maker import (
     truth_poses,
     write_imu,
 )
-from tools.check_rectification import match_sift
+from tools.research.check_rectification import match_sift
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.euroc import pair_stamps, read_euroc
 from vio.datasets.euroc_files import camera_yaml, read_camera_yaml

@@ -237,7 +237,7 @@ def test_wrong_calls_are_refused_and_change_nothing(
         ([1, 1], np.ones((2, 4)), "an id occurs twice"),
         ([1], np.ones((2, 4)), "disagree in length"),
         ([1], [[1, 2, np.nan, 2]], "1 pixels are not finite"),
-        (["a"], np.ones((1, 4)), "observations at 5 ns"),
+        (["a"], np.ones((1, 4)), "ids are whole numbers"),
     ],
 )
 def test_wrong_observations_are_refused(ids: Any, z: Any, message: str) -> None:

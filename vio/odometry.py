@@ -369,8 +369,7 @@ class Odometry:
             name = "klt" if config.frontend.name == "auto" else config.frontend.name
             frontend = frontend_module().build_frontend(name, camera, config.frontend)
         if selector is None:
-            size = None if camera.width is None or camera.height is None else (camera.width, camera.height)
-            selector = build_selector(config.selector, image_size=size, whole_record=None, camera=camera)
+            selector = build_selector(config.selector, whole_record=None, camera=camera)
         if backend is None:
             backend = build_backend(camera, self.T_cam0_body, config, self.motion)
         return Chain(

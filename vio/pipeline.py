@@ -394,16 +394,14 @@ def _build_selector(features: Dataset, config: Config) -> Selector:
     recording = features.recording
     indices = range(len(recording.frame_times_ns))
     precomputed = features.observations(0) is not None
-    camera = recording.camera
 
     def whole_record() -> list[Observations]:
         return [o for o in map(features.observations, indices) if o is not None]
 
     return build_selector(
         config.selector,
-        image_size=None if camera.width is None or camera.height is None else (camera.width, camera.height),
         whole_record=whole_record if precomputed else None,
-        camera=camera,
+        camera=recording.camera,
     )
 
 

@@ -21,6 +21,7 @@ from vio.datasets.common import checked_transform
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, transform_points
+from vio.input_files import read_input
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.printable import json_text
 from vio.protocols import Dataset
@@ -301,9 +302,9 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
     if not path.is_file():
         raise DataError(f"{folder}: no run folder (it has no {MARKER}); give a folder that `vio run` wrote")
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
+        metrics = json.loads(read_input(path))
         T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
     if metrics.get("complete") is False:
         log.warning("%s: the run has not reached the end of its recording; these are its results so far", folder)

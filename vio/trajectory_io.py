@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
 
 ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one accepted as rounding
+_LARGEST = 1e12  # of a coordinate, in metres: beyond, squares overflow
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _MAX_S = Decimal(INT64_MAX).scaleb(-9)
 _COLUMNS: dict[TrajectoryFormat, str] = {
@@ -196,7 +197,7 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
             out[row] = [float(field) for field in fields[first:last]]
         except ValueError as error:
             table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
-    bad = ~np.isfinite(out).all(axis=1)
+    bad = ~(np.abs(out) < _LARGEST).all(axis=1)
     if bad.any():
         table.fail(int(np.argmax(bad)), f"a pose is not finite (first of {int(bad.sum())}); remove such lines")
     return out

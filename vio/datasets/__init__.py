@@ -10,6 +10,7 @@ from pathlib import Path
 
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
+from vio.input_files import check_regular
 from vio.protocols import Dataset
 
 __all__ = ["READERS", "DatasetSettings", "open_dataset"]
@@ -99,6 +100,8 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
         CalibrationError: the recording's calibration is invalid.
     """
     kind, path = _parse(os.fspath(source))
+    if path.is_symlink() and not path.exists():
+        raise DataError(f"{path} is a link to {os.readlink(path)}, which leads nowhere; give {_LOOKED_FOR}")
     if not path.exists():
         raise DataError(f"{path} does not exist; give {_LOOKED_FOR}")
     settings = options or DatasetSettings()
@@ -182,6 +185,7 @@ def _file_kind(path: Path) -> str | None:
     from vio.datasets.observation_log import is_observation_log
 
     try:
+        check_regular(path)
         with path.open("rb") as stream:
             start = stream.read(128)
     except OSError as error:

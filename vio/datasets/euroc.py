@@ -31,6 +31,7 @@ from vio.datasets.euroc_files import (
     read_imu_yaml,
     stamped_rows,
 )
+from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import list_images
 from vio.datasets.pairing import PAIRED_NS, pair_stamps
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
@@ -93,6 +94,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
             "remove imu0"
         )
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
+    pairs = tuple((left.files[a], right.files[b]) for a, b in zip(of_left.tolist(), of_right.tolist(), strict=True))
+    white, depth_notes = full_scale(pairs)
     recording = Recording(
         kind="euroc",
         path=path,
@@ -102,16 +105,17 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=motion,
         reference=_read_reference(mav, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes),
+        notes=(*notes, *imu.notes, *depth_notes),
     )
     return RectifiedDataset(
         recording=recording,
-        pairs=tuple((left.files[a], right.files[b]) for a, b in zip(of_left.tolist(), of_right.tolist(), strict=True)),
+        pairs=pairs,
         motion=imu.samples,
         rectifier=rectifier,
         sizes=rig_sizes(rig, (mav / "cam0" / "sensor.yaml", mav / "cam1" / "sensor.yaml")),
         settings=settings,
         imu_noise=imu.noise,
+        white=white,
     )
 
 

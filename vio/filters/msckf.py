@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vio.errors import ConfigError, DivergedError, EstimationError
+from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
     MIN_DEPTH,
@@ -105,12 +106,17 @@ class Msckf:
             motion: which motion samples will come; None: images alone.
 
         Raises:
-            ConfigError: the calibration is to be estimated without an IMU.
+            ConfigError: the calibration is to be estimated without an IMU, or an argument is of another kind.
+            CalibrationError: the extrinsics are no rigid transform.
         """
+        check_parts("msckf", camera, settings, MsckfSettings)
+        if motion not in (None, *self.motion_sources):
+            raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
         if settings.calibrate != "none" and motion != "imu":
             raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to none")
         self._camera, self._settings = camera, settings
-        self._calibration = first_calibration(T_cam0_imu, settings)
+        self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings)
+        self._order = InputOrder("msckf")
         self._source = motion
         self._motion: ImuMotion | TwistMotion = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
         self._window: Window | None = None
@@ -138,10 +144,12 @@ class Msckf:
 
         Raises:
             ConfigError: the sample is not of the kind that was announced.
+            DataError: it is out of order or not finite; the filter is unchanged.
         """
         expected = {"imu": ImuSample, "velocity": VelocitySample}.get(self._source or "")
         if expected is None or not isinstance(sample, expected):
             raise ConfigError(f"msckf was built for motion {self._source or 'none'}, got a {type(sample).__name__}")
+        self._order.sample(sample)
         self._motion.take(sample)
         self._predicted_step = None  # the sample may change what the step looks like
         if isinstance(sample, VelocitySample) and self._window is not None:
@@ -190,7 +198,12 @@ class Msckf:
         Raises:
             EstimationError: the motion samples do not cover the step.
             DivergedError: the filter diverged; `restart` goes on from the last good state.
+            DataError: the frame is out of order, or its observations are impossible; the filter is unchanged.
         """
+        self._order.frame(observations, self._time_ns)
+        return self._update(observations)
+
+    def _update(self, observations: Observations) -> UpdateReport:
         seen = observations.take(~observations.stale)
         if self._window is None:
             if not self._motion.ready:
@@ -211,6 +224,8 @@ class Msckf:
         if window.clones and not len(seen):
             # A frame that shows nothing ends no track; what is seen next decides.
             self._blind = True
+            if not self._is_sane(window):
+                raise DivergedError(self._lost(observations.frame_index))
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         self._blind = False
         late_s = (self._body_ns - observations.time_ns) * 1e-9
@@ -257,7 +272,7 @@ class Msckf:
         self._noise = MotionNoise(*_IMU_FACTORS) if self._source == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._output = self._window.P.copy()
         self._map = [part for part in self._map if np.isfinite(part.p_world).all()]
-        return self.update(observations)
+        return self._update(observations)
 
     def _is_sane(self, window: Window) -> bool:
         """Whether the state is made of numbers, and with an IMU of a possible speed."""

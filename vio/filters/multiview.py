@@ -36,7 +36,7 @@ class Views:
 
     def take(self, index: BoolArray) -> Views:
         """Return the tracks of a mask (F,)."""
-        return Views(self.z[index], self.weight[index])
+        return self if index.all() else Views(self.z[index], self.weight[index])
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Residuals:
 
     def take(self, index: BoolArray) -> Residuals:
         """Return the tracks of a mask (F,)."""
-        return Residuals(self.r[index], self.z_D_p[index], self.ahead[index])
+        return self if index.all() else Residuals(self.r[index], self.z_D_p[index], self.ahead[index])
 
 
 def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views) -> Residuals:
@@ -68,6 +68,13 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
         loops.lens_of(camera), least, T_cam0_world, p_world, views.z, views.weight, at.r, at.z_D_p, at.ahead
     )
     return at
+
+
+def measured_pixels(at: Residuals) -> BoolArray:
+    """Which pixel coordinates (F, N, 4) of tracks were measured."""
+    out: BoolArray = np.empty(at.r.shape, dtype=np.bool_)
+    loops.mark_measured(at.z_D_p, out)
+    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +218,7 @@ def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
         sigma2: the pixel noise's variance, the smallest scale.
     """
     squares = np.sum(at.r**2, axis=2)
-    used: BoolArray = np.any(at.z_D_p[:, :, 1, :], axis=2)  # the row of vl is measured in every view
+    used = measured_pixels(at)[:, :, 1]  # the row of vl is measured in every view
     if not used.any():
         return np.zeros(squares.shape)
     count, clones = used.sum(axis=0), np.arange(used.shape[1])
@@ -317,7 +324,7 @@ def track_information(
         weight: (F, N) robust weight of each view.
     """
     F, N = at.r.shape[:2]
-    q = inverse_depth(camera, T_cam0_world, p_world, np.any(at.z_D_p[:, :, 1, :], axis=2))
+    q = inverse_depth(camera, T_cam0_world, p_world, measured_pixels(at)[:, :, 1])
     B = q.q_D_p @ point_D_pose(p_world)
     info = TrackInformation(q, np.empty((F, 6 * N, 3)), np.empty((F, 3, 3)), B, np.empty((F, 6 * N)), np.empty((F, 3)))
     columns = info.G, info.C, info.gradient, info.point_gradient
@@ -330,7 +337,7 @@ def relative_stereo_sigma(at: Residuals, q: InverseDepth) -> FloatArray:
 
     Infinite without a right view.
     """
-    views = np.any(at.z_D_p[:, :, 2, :], axis=2).sum(axis=1)
+    views = measured_pixels(at)[:, :, 2].sum(axis=1)
     out: FloatArray = np.sqrt(np.divide(_STEREO_VARIANCE, views, out=np.full(len(views), np.inf), where=views > 0))
     return out / q.disparity
 

@@ -67,6 +67,15 @@ def compare_views(
 
 
 @compiled
+def mark_measured(J: FloatArray, out: BoolArray) -> None:
+    """Write which pixel coordinates (F, N, 4) have a Jacobian (F, N, 4, 3) other than zero."""
+    for f in range(J.shape[0]):
+        for n in range(J.shape[1]):
+            for a in range(4):
+                out[f, n, a] = J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
+
+
+@compiled
 def anchor_points(
     lens: Lens,
     least_depth: float,

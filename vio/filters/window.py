@@ -388,13 +388,15 @@ class Window:
             phi = self.exposure_errors(error)[-3:]
             own = error[self.first_landmark :].reshape(-1, 3)
             self.landmarks = self.landmarks @ so3_exp(phi).T + own @ so3_left_jacobian(phi).T
+        velocities, rate_error = [c.velocity for c in self.clones], np.zeros(3)
+        if isinstance(self.motion, ImuMotion):
+            velocities, rate_error = self._corrected_velocities(self.motion, T, error[:DIM]), error[9:12]
         self.clones = [
-            Clone(c.frame_index, c.time_ns, T[k], c.velocity, c.rate, c.late_s) for k, c in enumerate(self.clones)
+            Clone(c.frame_index, c.time_ns, pose, velocity, c.rate - rate_error, c.late_s)
+            for c, pose, velocity in zip(self.clones, T, velocities, strict=True)
         ]
         if self.calibration.dim:
             self.calibration = self.calibration.corrected(error[DIM : self.first_clone])
-        if isinstance(self.motion, ImuMotion):
-            self._correct_twists(self.motion, error[:DIM])
         self.prior_delta = self.prior_delta + error
 
     def turn_world(self, yaw: float, yaw_D_tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -424,15 +426,11 @@ class Window:
         self.P, self.prior_delta = 0.5 * (P + P.T), turn @ self.prior_delta
         return R, M
 
-    def _correct_twists(self, motion: ImuMotion, error: FloatArray) -> None:
-        """Let the clones' velocities and rates follow the navigation state's error (15,)."""
+    def _corrected_velocities(self, motion: ImuMotion, T_world_imu: FloatArray, error: FloatArray) -> list[FloatArray]:
+        """The clones' velocities (3,), moved by the navigation state's error (15,), at corrected poses (N, 4, 4)."""
         ages = np.array([self.clones[-1].time_ns - c.time_ns for c in self.clones]) * 1e-9
-        R = np.array([c.T_world_imu[:3, :3] for c in self.clones])
-        earlier = np.array([c.velocity for c in self.clones])
-        velocities = motion.corrected_earlier(earlier, 0.5 * (R + R[-1]), ages, error)
-        self.clones = [
-            replace(c, velocity=v, rate=c.rate - error[9:12]) for c, v in zip(self.clones, velocities, strict=True)
-        ]
+        R, earlier = T_world_imu[:, :3, :3], np.array([c.velocity for c in self.clones])
+        return list(motion.corrected_earlier(earlier, 0.5 * (R + R[-1]), ages, error))
 
 
 def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -17,6 +17,7 @@ from vio.filters.multiview import (
     Views,
     first_points,
     has_parallax,
+    measured_pixels,
     refine_points,
     residuals,
     robust_weights,
@@ -51,7 +52,7 @@ class LinearTracks:
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
-        r, used = self.at.r[:, -1], np.any(self.at.z_D_p[:, -1] != 0, axis=2)
+        r, used = self.at.r[:, -1], measured_pixels(self.at)[:, -1]
         return float(np.median(np.abs(r[used]))) if used.any() else None
 
 
@@ -187,12 +188,6 @@ class WindowTracks:
         ended = rows[~self.table.seen(rows)[:, newest]]
         self.table.forget_views(spent)
         self.table.remove(ended)
-
-
-def measured_pixels(at: Residuals) -> BoolArray:
-    """Which pixel coordinates (F, N, 4) of tracks were measured."""
-    out: BoolArray = np.any(at.z_D_p, axis=3)
-    return out
 
 
 @lru_cache(maxsize=8)
