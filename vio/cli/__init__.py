@@ -18,11 +18,39 @@ from collections.abc import Iterator, Sequence
 from types import FrameType
 
 from vio._version import __version__
-from vio.cli import calibrate, check, config, demo, evaluate, export, inspect, rectify, refine, render, reproduce, run
+from vio.cli import (
+    calibrate,
+    check,
+    config,
+    convert,
+    demo,
+    evaluate,
+    export,
+    inspect,
+    rectify,
+    refine,
+    render,
+    reproduce,
+    run,
+)
 from vio.errors import StoppedError, VioError
 from vio.printable import printable
 
-_COMMANDS = (run, inspect, evaluate, check, refine, export, calibrate, demo, render, rectify, reproduce, config)
+_COMMANDS = (
+    run,
+    inspect,
+    convert,
+    evaluate,
+    check,
+    refine,
+    export,
+    calibrate,
+    demo,
+    render,
+    rectify,
+    reproduce,
+    config,
+)
 
 
 _MOST_SHOWN = 200  # characters of a path in a message

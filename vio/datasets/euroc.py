@@ -24,6 +24,7 @@ from vio.datasets.euroc_files import (
     TUM_FILE,
     camera_yaml,
     image_list_csv,
+    image_name,
     median_rate_hz,
     read_camera_yaml,
     read_imu_csv,
@@ -236,7 +237,8 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progre
         (folder / "data").mkdir(parents=True)
 
     def name(frame: StereoFrame, count: int) -> tuple[Path, Path]:
-        return folders[0] / "data" / f"{frame.time_ns}.png", folders[1] / "data" / f"{frame.time_ns}.png"
+        file = image_name(frame.time_ns, int(dataset.recording.frame_times_ns[-1]))
+        return folders[0] / "data" / file, folders[1] / "data" / file
 
     times_ns = write_frames(dataset, name, progress)
     for folder, model, T_imu_cam in zip(folders, (rig.cam0, rig.cam1), (rig.T_imu_cam0, rig.T_imu_cam1), strict=True):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.datasets.common import naming
 from vio.datasets.companions import (
     IMU_FILES,
     Layout,
@@ -28,7 +29,7 @@ from vio.datasets.companions import (
 from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.pairing import pair_stamps
-from vio.datasets.rectified import RectifiedDataset, make_rectifier
+from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import parse_stamps
@@ -114,7 +115,8 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     rig, used = with_extrinsics(rig, layout, file)
     times_ns, times_file, time_notes = _frame_times(layout, pairs)
     motion, motion_files, motion_notes = read_motion(layout, rig, times_ns, times_file is not None)
-    rectifier = make_rectifier(rig.stereo, settings.interpolation, file)
+    with naming(file):
+        rectifier = rig.rectifier(settings.interpolation)
     reference, reference_file = read_reference(layout, rig, rectifier, times_ns)
     sources = [file, times_file, *used, *motion_files, reference_file]
     recording = Recording(

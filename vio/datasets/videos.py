@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.datasets.common import frame_range, merge_events
+from vio.datasets.common import frame_range, merge_events, naming
 from vio.datasets.companions import (
     Layout,
     find_calibration_of,
@@ -27,7 +27,6 @@ from vio.datasets.companions import (
 from vio.datasets.image_pairs import ImageSize
 from vio.datasets.images import prefetch
 from vio.datasets.plain import times_of
-from vio.datasets.rectified import make_rectifier
 from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
@@ -88,7 +87,8 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
     if left.count != right.count:
         notes.append(f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the shorter counts")
     motion, motion_files, motion_notes = read_motion(layout, rig, times_ns, times_file is not None)
-    rectifier = make_rectifier(rig.stereo, settings.interpolation, calibration)
+    with naming(calibration):
+        rectifier = rig.rectifier(settings.interpolation)
     reference, reference_file = read_reference(layout, rig, rectifier, times_ns)
     sources = [f for f in (*files, calibration, times_file, *used, *motion_files, reference_file) if f is not None]
     recording = Recording(
