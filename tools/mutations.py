@@ -43,6 +43,7 @@ _REPRODUCE = ("tests/test_reproduce.py",)
 _RANSAC = ("tests/test_frontend_outliers.py",)
 _RESTART = ("tests/test_msckf.py",)
 _RIGHT_CAMERA = ("tests/test_right_camera.py",)
+_DELAY = ("tests/test_right_delay.py",)
 _EXCHANGE = ("tests/test_exchange.py",)
 _MOVING_OBJECT = ("tests/test_moving_object.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
@@ -848,9 +849,23 @@ MUTATIONS = (
     Mutation(
         "right camera: features are dropped while it cannot be used",
         "frontend/klt.py",
-        "return tracks, np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
-        "return take(tracks, tracks.has_right), np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
+        "return tracks, *nothing",
+        "return take(tracks, tracks.has_right), *nothing",
         _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "right delay: depths stay those of the exposure",
+        "frontend/right_delay.py",
+        "moved = transform_points(se3_exp(delay * se3_log(T_curr_prev)), then.point)",
+        "moved = then.point",
+        _DELAY,
+    ),
+    Mutation(
+        "right delay: a wrong rectification counts as a delay",
+        "frontend/right_delay.py",
+        "weight * rows)",
+        "weight * (rows + 0.5 * flow[:, 1]))",
+        _DELAY,
     ),
     Mutation(
         "exchange: frames that do not fit are put back, too",
