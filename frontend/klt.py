@@ -11,6 +11,7 @@ from frontend.align import align, on_peak, rounded, scale_change, shift_warps, t
 from frontend.columns import joined, take
 from frontend.detect import detect_corners, half_mask, load_mask, min_distance_px
 from frontend.exchange import ExchangeDetector, MatchCounts
+from frontend.flicker import BandRemoval
 from frontend.flow import lost_contrast, track_with_retries
 from frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
 from frontend.moving_object import ObjectReport, choose_motion
@@ -77,6 +78,7 @@ class KltFrontend:
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._validator = FrameValidator(camera, "klt")
         self._swap = SwapDetector(_SWAP_FEW)
+        self._bands = BandRemoval()
         self._exchange = ExchangeDetector()
         self._right = RightCamera()
         self._delay = RightDelay(camera)
@@ -95,7 +97,8 @@ class KltFrontend:
             ConfigError: the mask is not of the images' size.
         """
         watch = Stopwatch()
-        left, right = (self._view(image) for image in self._validator.validate(frame))
+        images = self._bands(frame.index, *self._validator.validate(frame))
+        left, right = (self._view(image) for image in images)
         stereo, allowed = self._set_up(left)
         watch.lap("prepare")
         if self._contrast_lost(left):
@@ -135,6 +138,7 @@ class KltFrontend:
         """Return what the frame says of the images, one line an event."""
         lines, self._lines = (
             (
+                *self._bands.take_lines(),
                 *self._exchange.take_lines(),
                 *self._right.take_lines(),
                 *self._delay.take_lines(),

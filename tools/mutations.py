@@ -44,6 +44,7 @@ _RANSAC = ("tests/test_frontend_outliers.py",)
 _RESTART = ("tests/test_msckf.py",)
 _RIGHT_CAMERA = ("tests/test_right_camera.py",)
 _DELAY = ("tests/test_right_delay.py",)
+_FLICKER = ("tests/test_flicker.py",)
 _EXCHANGE = ("tests/test_exchange.py",)
 _MOVING_OBJECT = ("tests/test_moving_object.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
@@ -866,6 +867,13 @@ MUTATIONS = (
         "weight * rows)",
         "weight * (rows + 0.5 * flow[:, 1]))",
         _DELAY,
+    ),
+    Mutation(
+        "flicker: bands are seen and left in the images",
+        "frontend/flicker.py",
+        "image.astype(np.float32) - off[:, None]",
+        "image.astype(np.float32) - 0 * off[:, None]",
+        _FLICKER,
     ),
     Mutation(
         "exchange: frames that do not fit are put back, too",
