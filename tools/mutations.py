@@ -408,6 +408,27 @@ MUTATIONS = (
         _FROZEN,
     ),
     Mutation(
+        "gap: features are followed across it without a prediction",
+        "frontend/klt.py",
+        "(prior is None and self._after_gap(frame))",
+        "False",
+        _TRACK,
+    ),
+    Mutation(
+        "gap: a prediction that knows nothing starts a search",
+        "vio/filters/msckf.py",
+        "[-1] > _USELESS_RAD**2",
+        "[-1] > 1e6 * _USELESS_RAD**2",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "gap: a time without frames is not reported",
+        "vio/watch/health.py",
+        "max(_GAP_S, _GAP_STEPS * usual_s)",
+        "max(_GAP_S, 100 * _GAP_STEPS * usual_s)",
+        ("tests/test_health.py",),
+    ),
+    Mutation(
         "start: a steady acceleration is no evidence against the tilt",
         "vio/filters/imu_start.py",
         "np.sqrt(max(level, 0.0))",
