@@ -429,6 +429,13 @@ MUTATIONS = (
         ("tests/test_health.py",),
     ),
     Mutation(
+        "stamps: intervals that truly vary are taken for jitter",
+        "vio/watch/stamps.py",
+        "missed = weight * (dt[used] - dt[used] * camera[used] / gyro[used])",
+        "missed = deviation",
+        ("tests/test_stamps.py",),
+    ),
+    Mutation(
         "start: a steady acceleration is no evidence against the tilt",
         "vio/filters/imu_start.py",
         "np.sqrt(max(level, 0.0))",
