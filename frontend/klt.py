@@ -39,6 +39,8 @@ _FAR_M = 1e6  # depth assumed where too few features have one
 _FEW = 0.5  # share of the least number of features below which corners without depth are added
 _TRIED = 1.5  # corners aligned per missing feature
 _VERY_FEW = 0.25  # share of the target below which new features are output at once
+_LONG_GAP_S = 0.8  # a rig that flies or is carried shows other things after it …
+_LONG_GAP_STEPS = 5.0  # … where frames usually come so many times as often
 _BANK_SPARE = 3  # templates allocated, over the number of features
 
 
@@ -91,6 +93,7 @@ class KltFrontend:
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
         self._next_id = 0
         self._skipped = 0  # frames in a row
+        self._step_ns: int | None = None  # between the last two frames
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Track, match and detect in one rectified stereo pair; see `vio.protocols.Frontend`.
@@ -200,6 +203,7 @@ class KltFrontend:
         """Store the state that the next frame needs."""
         self._bank.keep_only(tracks.slot)
         before = self._previous
+        self._step_ns = None if before is None else frame.time_ns - before.time_ns
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
@@ -218,7 +222,7 @@ class KltFrontend:
     ) -> tuple[Tracks, Consensus | None]:
         """Track the features of the previous frame into both images; return those kept and the consensus motion."""
         previous = self._previous
-        if previous is None or len(previous.tracks) == 0:
+        if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
             return no_tracks(), None
         old, settings = previous.tracks, self._settings
         expected = se3_exp(previous.twist_per_s * ((frame.time_ns - previous.time_ns) * 1e-9))
@@ -320,6 +324,13 @@ class KltFrontend:
         then = stereo.match_near(then, right, rows[unique], disparity[unique])
         stereo.update_rows(then)
         return at_present(self._camera, tracks, then, T, delay)
+
+    def _after_gap(self, frame: StereoFrame) -> bool:
+        """Whether so many frames are missing that similar patches are no evidence of the same points."""
+        if self._previous is None or self._step_ns is None:
+            return False
+        gap_ns = frame.time_ns - self._previous.time_ns
+        return gap_ns > max(_LONG_GAP_S * 1e9, _LONG_GAP_STEPS * self._step_ns)
 
     def _guess(self, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage) -> FloatArray:
         """Predict the left pixels (N, 2) in the current frame: from the prior, else by the last motion."""
