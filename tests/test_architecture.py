@@ -125,6 +125,12 @@ def test_pycolmap_stays_in_its_package() -> None:
     assert all(_within(name, "vio.colmap") for name in users), users
 
 
+def test_rosbags_stays_in_its_package() -> None:
+    users = [_name(f) for f in FILES if "rosbags" in _heads(f, top_level_only=False)]
+    assert users
+    assert all(_within(name, "vio.datasets.bags") for name in users), users
+
+
 def test_matplotlib_stays_out_of_import_time() -> None:
     assert not [_name(f) for f in FILES if "matplotlib" in _heads(f, top_level_only=True)]
 
@@ -137,6 +143,7 @@ def _loaded(code: str, suspects: set[str]) -> set[str]:
 
 
 HEAVY = {"numpy", "scipy", "numba", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
+HEAVY |= {"rosbags"}
 HELP = """
 import contextlib, vio.cli
 with contextlib.suppress(SystemExit):

@@ -34,8 +34,13 @@ def write_video(path: Path, images: list[np.ndarray], rate_hz: float = 20.0) -> 
 
 @pytest.fixture(scope="module")
 def videos(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The rendered flight as two videos, Kalibr's calibration, and its IMU."""
-    folder = tmp_path_factory.mktemp("videos")
+    """The rendered flight as two videos."""
+    return make_videos(flight, tmp_path_factory.mktemp("videos") / "videos")
+
+
+def make_videos(flight: Path, folder: Path) -> Path:
+    """Write a flight's images as two videos, with Kalibr's calibration and the IMU."""
+    folder.mkdir()
     for camera, side in (("cam0", "left"), ("cam1", "right")):
         files = sorted((flight / "mav0" / camera / "data").iterdir(), key=lambda f: int(f.stem))
         write_video(folder / f"{side}.avi", [cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) for f in files])

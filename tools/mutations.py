@@ -32,6 +32,8 @@ _WINDOW = (
     "tests/test_consistency.py",
 )
 _IMU_GAPS = ("tests/test_imu_gaps.py",)
+_IMU_FAULTS = ("tests/test_imu_faults.py",)
+_FROZEN = ("tests/test_frozen_images.py",)
 _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
@@ -46,6 +48,8 @@ _RESTART = ("tests/test_msckf.py",)
 _RIGHT_CAMERA = ("tests/test_right_camera.py",)
 _EXCHANGE = ("tests/test_exchange.py",)
 _MOVING_OBJECT = ("tests/test_moving_object.py",)
+_ODOMETRY = ("tests/test_odometry.py",)
+_UNFINISHED = ("tests/test_unfinished_runs.py",)
 _INPUTS = ("tests/test_filter_inputs.py",)
 _FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
@@ -69,7 +73,7 @@ MUTATIONS = (
     ),
     Mutation(
         "plain folders: clock offset added instead of subtracted",
-        "vio/datasets/plain.py",
+        "vio/datasets/companions.py",
         "times_ns=record.times_ns - shift_ns",
         "times_ns=record.times_ns + shift_ns",
         ("tests/test_datasets_plain.py",),
@@ -371,9 +375,9 @@ MUTATIONS = (
     ),
     Mutation(
         "IMU: a frame does not wait for the sample after it",
-        "vio/pipeline.py",
-        "latest_ns >= held.time_ns",
-        "latest_ns >= 0",
+        "vio/event_order.py",
+        "self._newest_ns >= frame.time_ns",
+        "self._newest_ns >= 0",
         _IMU_GAPS,
     ),
     Mutation(
@@ -396,6 +400,62 @@ MUTATIONS = (
         "length_s <= max(",
         "length_s <= 10 * max(",
         _IMU_GAPS,
+    ),
+    Mutation(
+        "IMU: a spike needs no return",
+        "vio/imu_faults.py",
+        "if (back > self._limit).any() or (back > _RETURN * np.abs(jump))[axes].any():",
+        "if False:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: spikes pass",
+        "vio/imu_faults.py",
+        "if self._has_returned(suspect, reading):",
+        "if False:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: repetitions of one sensor pass until they are proven",
+        "vio/imu_faults.py",
+        "if any(r.unusual for r in self._repeats):",
+        "if self._repeats[0].unusual:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: a gap counts as a fault of the clocks",
+        "vio/watch/clocks.py",
+        "1 + self._in_gap",
+        "1",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "frozen images: a repeated pair is used",
+        "vio/chain.py",
+        "if self.watch.repeats(frame, expected):",
+        "if self.watch.repeats(frame, expected) and False:",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: a rig at standstill is taken for a frozen camera",
+        "vio/watch/frozen.py",
+        "or self._at_standstill():",
+        "or False:",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: what the prediction may be off by does not count",
+        "vio/watch/frozen.py",
+        "if not self._contradicts(expected.motion) or",
+        "if",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: a row ends with the prediction's certainty",
+        "vio/watch/frozen.py",
+        "again = self._repeating is not None",
+        "again = False",
+        _FROZEN,
     ),
     Mutation(
         "start: a steady acceleration is no evidence against the tilt",
@@ -1065,6 +1125,56 @@ MUTATIONS = (
         "T[1, 3] += py + b * cy + c * dy",
         "T[1, 3] += py",
         ("tests/test_compiled.py",),
+    ),
+    # --- live use, unfinished runs ---
+    Mutation(
+        "events: a frame waits for an IMU that is silent",
+        "vio/event_order.py",
+        "return self._frames[-1].time_ns - frame.time_ns >= LONGEST_WAIT_NS",
+        "return False",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "live use: the caller's image buffer is kept",
+        "vio/odometry.py",
+        'return np.array(array, dtype=np.uint8, order="C")',
+        "return np.asarray(array)",
+        _ODOMETRY,
+    ),
+    Mutation(
+        "poses between frames: gravity left out",
+        "vio/pose_prediction.py",
+        "force = R @ (sample.accel - self._bias[1]) + self._gravity",
+        "force = R @ (sample.accel - self._bias[1])",
+        _ODOMETRY,
+    ),
+    Mutation(
+        "resume: samples of the last second taken twice",
+        "vio/pipeline.py",
+        "return known is None or event.time_ns > known",
+        "return known is None or event.time_ns >= 0",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "resume: rows written after the checkpoint stay",
+        "vio/tables.py",
+        "self._file.truncate(start + keep * self.dtype.itemsize)",
+        "pass",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "checkpoint: any function may be called",
+        "vio/checkpoint.py",
+        "if not ours and (module, name) not in _OTHERS:",
+        "if False:",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "run folder: points put away are lost",
+        "vio/run_recorder.py",
+        "if not len(stored):",
+        "if True:",
+        _UNFINISHED,
     ),
     # --- input ---
     Mutation(

@@ -21,6 +21,7 @@ from vio.records import (
     Selection,
     StereoFrame,
     UpdateReport,
+    no_features,
 )
 from vio.watch.run import RunWatch
 
@@ -116,7 +117,10 @@ class Chain:
         expected = self.backend.predict(frame.time_ns)
         timer.end("predict")
         try:
-            output = self.frontend.process(frame, expected.tracks if expected and self._use_prior else None)
+            if self.watch.repeats(frame, expected):
+                output = no_features(frame)
+            else:
+                output = self.frontend.process(frame, expected.tracks if expected and self._use_prior else None)
         except DataError as error:
             self.watch.refused(frame.index, str(error))
             return None

@@ -264,6 +264,11 @@ class FrontendOutput:
     warnings: tuple[str, ...] = ()  # what is wrong with the images, one line an event
 
 
+def no_features(frame: StereoFrame) -> FrontendOutput:
+    """Return the output for a frame whose images are not used."""
+    return FrontendOutput(observations(frame.index, frame.time_ns, [], np.zeros((0, 4))), 0, 0, 0)
+
+
 @dataclass(frozen=True, slots=True)
 class Selection:
     """Which observations enter the update, and why."""

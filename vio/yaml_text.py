@@ -1,4 +1,4 @@
-"""YAML of untrusted files: plain data of a bounded depth, without aliases, each key once."""
+"""YAML of untrusted files: plain data of bounded depth and size, each key once."""
 
 from __future__ import annotations
 
@@ -7,27 +7,43 @@ from typing import Any
 import yaml
 
 MOST_BYTES = 2**22  # of a configuration or calibration
+_MOST_NODES = 20_000  # a long list of views of a calibration; aliases of aliases make a kilobyte a billion
 _MOST_DEPTH = 32  # the deepest known calibration has five levels
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """Refuses what makes a small text large (aliases) or deep, and duplicate keys, of which YAML would use the last."""
+    """Refuses what makes a small text large or deep, and duplicate keys, of which YAML itself would use the last."""
 
-    _depth = 0
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = 0
+        self._nodes = 0  # with each alias counted as what it stands for
+        self._nodes_of: dict[str, int] = {}  # of the nodes with an anchor
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose one node, within the depth and without aliases."""
+        """Compose one node, within the depth and the number of nodes."""
         event = self.peek_event()  # type: ignore[no-untyped-call] # of the stubs
-        if isinstance(event, yaml.AliasEvent):
-            why = f"aliases such as *{event.anchor} are not read; write the value"
-            raise yaml.composer.ComposerError(None, None, why, event.start_mark)  # type: ignore[arg-type]
+        before = self._nodes
+        alias = isinstance(event, yaml.AliasEvent)
+        self._nodes += self._nodes_of.get(event.anchor, 0) if alias else 1
+        if alias and event.anchor in self.anchors and event.anchor not in self._nodes_of:
+            raise self._refused(f"the value of &{event.anchor} contains itself", event)
+        if self._nodes > _MOST_NODES:
+            raise self._refused(f"more than {_MOST_NODES} values", event)
         if self._depth >= _MOST_DEPTH:
-            raise yaml.composer.ComposerError(None, None, f"nested deeper than {_MOST_DEPTH} levels", event.start_mark)
+            raise self._refused(f"nested deeper than {_MOST_DEPTH} levels", event)
         self._depth += 1
         try:
-            return super().compose_node(parent, index)
+            node = super().compose_node(parent, index)
         finally:
             self._depth -= 1
+        if not alias and event.anchor is not None:
+            self._nodes_of[event.anchor] = self._nodes - before
+        return node
+
+    @staticmethod
+    def _refused(why: str, event: Any) -> yaml.composer.ComposerError:
+        return yaml.composer.ComposerError(None, None, why, event.start_mark)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Reject a duplicate key."""

@@ -48,6 +48,8 @@ _OF_A_NEW_RUN = (
     "motion",
     "backend",
     "frontend",
+    "calibration",
+    "topics",
 )
 
 

@@ -33,7 +33,9 @@ def read_yaml(path: Path, what: str = "the sensor's calibration") -> dict[str, o
     try:
         entries = read_yaml_text("\n".join(lines).replace("!!opencv-matrix", ""))
     except ValueError as error:
-        raise CalibrationError(f"{path}: not a YAML file of plain values ({error}); copy it again") from error
+        raise CalibrationError(
+            f"{path}: not a YAML file of plain values ({error}); write plain numbers, or copy it again"
+        ) from error
     if not isinstance(entries, dict):
         raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
     return {str(key): value for key, value in entries.items()}

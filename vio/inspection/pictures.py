@@ -80,7 +80,8 @@ def rows_part(frames: Sequence[StereoFrame]) -> Part:
             f"only {max(counts, default=0)} points match between left and right; check that the folders are of one "
             "stereo camera, its lenses clean and in focus"
         )
-        return Part("stereo", str(found), {"matches": int(sum(counts))}, [fault])
+        hopeless = max(counts, default=0) < _LEAST_MATCHES
+        return Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])
     return Part("stereo", _rows_text(found, counts), _rows_facts(found, z), _rows_faults(found))
 
 

@@ -67,7 +67,7 @@ class BagDataset:
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
 
-        A frame whose image does not decode is skipped with a warning, up to `max_bad_frames` of them.
+        A frame whose image does not decode or has another size is skipped with a warning, as the settings allow.
 
         Raises:
             DataError: the range holds no frame, an image has another size, or the bag is damaged.
@@ -120,9 +120,9 @@ class BagDataset:
             where = f"{self.recording.path}, {topic.name}, frame {pair.index}"
             try:
                 image = gray_of(fields, where, compressed=topic.kind == COMPRESSED, white=self.white)
+                size.check(image, Path(where))
             except UnreadableImageError as error:
                 return BadFrame(pair.index, str(error))
-            size.check(image, Path(where))
             images.append(image)
         left, right = self.rectifier(*images)
         return StereoFrame(pair.index, int(self.recording.frame_times_ns[pair.index]), left, right)
