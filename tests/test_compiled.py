@@ -27,7 +27,10 @@ CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 
 
 def test_patches_are_sampled_exactly_inside_the_image_and_at_its_border() -> None:
-    warp = shift_warps(np.concatenate([POINTS, [[0.0, 0.0], [298.6, 198.9], [-9.0, 50.0], [150.0, 1e9], [7.0, 7.0]]]))
+    across = np.stack([np.arange(284.0, 302.0, 0.7), np.linspace(40.0, 160.0, 26)], axis=1)  # the right border
+    down = np.stack([np.linspace(40.0, 260.0, 26), np.arange(184.0, 202.0, 0.7)], axis=1)  # the lower border
+    outside = [[0.0, 0.0], [298.6, 198.9], [-9.0, 50.0], [150.0, 1e9], [7.0, 7.0]]
+    warp = shift_warps(np.concatenate([POINTS, across, down, outside]))
     warp[:, :, :2] += np.random.default_rng(3).normal(0, 0.2, (len(warp), 2, 2))
     image = PLAIN.astype(np.float32)
     np.testing.assert_allclose(warped_patches(image, warp, 7), numpy_twins.sampled(PLAIN, warp, 7), atol=2e-3)
