@@ -4,47 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from frontend.settings import FrontendSettings
 from vio.errors import ConfigError
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Dataset, Frontend
 
+from .settings import FrontendSettings
+
 __all__ = ["BUILDERS", "FrontendSettings", "build_frontend"]
 
 
-def _build_klt(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
-    from frontend.klt import KltFrontend
+def _build_klt(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+    from .klt import KltFrontend
 
     return KltFrontend(camera, settings)
 
 
-def _build_orb(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
-    from frontend.descriptors import DescriptorFrontend, MutualNearest, orb_extractor
+def _build_orb(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+    from .descriptors import DescriptorFrontend, MutualNearest, orb_extractor
 
     match = settings.match
     return DescriptorFrontend(camera, settings, "orb", orb_extractor(match), MutualNearest(match.ratio))
 
 
-def _build_sift(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
-    from frontend.descriptors import DescriptorFrontend, MutualNearest, sift_extractor
+def _build_sift(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+    from .descriptors import DescriptorFrontend, MutualNearest, sift_extractor
 
     match = settings.match
     return DescriptorFrontend(camera, settings, "sift", sift_extractor(match), MutualNearest(match.ratio))
 
 
-def _build_kornia(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
-    from frontend.learned import build_learned
+def _build_kornia(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+    from .learned import build_learned
 
     return build_learned(camera, settings)
 
 
-def _build_precomputed(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
-    from frontend.precomputed import PrecomputedFrontend
+def _build_precomputed(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
+    from .precomputed import PrecomputedFrontend
 
+    if dataset is None:
+        raise ConfigError("frontend.name: precomputed needs a recording of features")
     return PrecomputedFrontend(dataset.observations)
 
 
-BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset], Frontend]] = {
+BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset | None], Frontend]] = {
     "klt": _build_klt,
     "orb": _build_orb,
     "sift": _build_sift,
@@ -53,14 +56,21 @@ BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset], Frontend
 }
 
 
-def build_frontend(name: str, camera: StereoCamera, settings: FrontendSettings, dataset: Dataset) -> Frontend:
-    """Build the front end called `name`; "auto" selects by what the recording contains.
+def build_frontend(
+    name: str, camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None = None
+) -> Frontend:
+    """Build the front end called `name`; "auto" selects by what the recording contains, None being a live camera.
 
     Raises:
-        ConfigError: no front end has this name.
+        ConfigError: no front end has this name, or camera or settings are of another kind.
     """
+    if not isinstance(camera, StereoCamera) or not isinstance(settings, FrontendSettings):
+        raise ConfigError(
+            f"build_frontend takes a StereoCamera and FrontendSettings, got {type(camera).__name__} and "
+            f"{type(settings).__name__}"
+        )
     if name == "auto":
-        name = "klt" if dataset.recording.has_images else "precomputed"
+        name = "klt" if dataset is None or dataset.recording.has_images else "precomputed"
     if name not in BUILDERS:
         raise ConfigError(f"frontend.name: there is no front end {name!r}; choose one of auto, {', '.join(BUILDERS)}")
     return BUILDERS[name](camera, settings, dataset)

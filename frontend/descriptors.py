@@ -9,17 +9,18 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from frontend.align import align, cut_patches, on_peak, rounded, shift_warps, template_points, templates
-from frontend.columns import joined, take
-from frontend.detect import spread_evenly
-from frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
-from frontend.outliers import RansacProblem, predicted_motion, static_tracks
-from frontend.patches import FloatImage, inside
-from frontend.prediction import moved_pixels, prior_pixels, usable_prior
-from frontend.settings import FrontendSettings, MatchSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, triangulate
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
+
+from .align import align, cut_patches, on_peak, rounded, shift_warps, template_points, templates
+from .columns import joined, take
+from .detect import spread_evenly
+from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from .outliers import RansacProblem, predicted_motion, static_tracks
+from .patches import FloatImage, inside
+from .prediction import moved_pixels, prior_pixels, usable_prior
+from .settings import FrontendSettings, MatchSettings
 
 Descriptors: TypeAlias = npt.NDArray[np.float32] | npt.NDArray[np.uint8]
 

@@ -15,8 +15,9 @@ from typing import Literal, TypeAlias
 import cv2
 import numpy as np
 
-from frontend.right_camera import image_change
 from vio.records import Image
+
+from .right_camera import image_change
 
 Order: TypeAlias = Literal["given", "exchanged", "refused"]
 

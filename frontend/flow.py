@@ -5,10 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from frontend.patches import View, inside
-from frontend.settings import KltSettings
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image
+
+from .patches import View, inside
+from .settings import KltSettings
 
 _LK_EPSILON_PX = 0.02  # of the half-resolution image
 _LK_MIN_EIGENVALUE = 1e-4  # as OpenCV's own default
@@ -53,24 +54,6 @@ def track_with_retries(
             last, view, points[retry], start[retry], settings.pyramid_levels, settings
         )
     return found, good
-
-
-def circle_errors(
-    last: Image, current: Image, before: FloatArray, after: FloatArray, settings: KltSettings
-) -> FloatArray:
-    """Distances (N,) in pixels between matched and temporally tracked right pixels; infinite where tracking fails.
-
-    Args:
-        last: last right image (H/2, W/2) at half resolution.
-        current: current one.
-        before: right pixels (N, 2) matched in the last frame.
-        after: right pixels (N, 2) matched in the current one.
-        settings: of the tracking.
-    """
-    if len(before) == 0:
-        return np.zeros(0)
-    found, seen = _flow(last, current, before, after, settings.trusted_levels, settings)
-    return np.where(seen, np.linalg.norm(found - after, axis=1), np.inf)
 
 
 def lost_contrast(image: Image, last: Image) -> bool:

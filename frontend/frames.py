@@ -49,6 +49,8 @@ class FrameValidator:
         Raises:
             DataError: no images, images of a wrong size or type, or a time not after the previous frame's.
         """
+        if not isinstance(frame, StereoFrame):
+            raise DataError(f"the {self.name} front end takes a StereoFrame, got {type(frame).__name__}")
         if frame.left is None or frame.right is None:
             raise DataError(
                 f"frame {frame.index} has no images, but the {self.name} front end needs them; "
@@ -61,9 +63,12 @@ class FrameValidator:
             )
         expected = (self.camera.height, self.camera.width)
         for name, image in (("left", frame.left), ("right", frame.right)):
-            if image.ndim != 2 or image.dtype != np.uint8:
+            if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8 or not image.size:
+                found = (
+                    f"has shape {image.shape} and type {image.dtype}" if isinstance(image, np.ndarray) else "is none"
+                )
                 raise DataError(
-                    f"frame {frame.index}: the {name} image has shape {image.shape} and type {image.dtype}; "
+                    f"frame {frame.index}: the {name} image {found}; "
                     f"the {self.name} front end needs 8-bit gray images: read them with vio.datasets.images.load_gray"
                 )
             size = image.shape

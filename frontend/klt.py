@@ -7,25 +7,27 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
-from frontend.columns import joined, take
-from frontend.detect import detect_corners, half_mask, load_mask, min_distance_px
-from frontend.exchange import ExchangeDetector, MatchCounts
-from frontend.flicker import BandRemoval
-from frontend.flow import lost_contrast, track_with_retries
-from frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
-from frontend.moving_object import ObjectReport, choose_motion
-from frontend.outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors, predicted_motion, static_tracks
-from frontend.patches import FloatImage, View, half_image, inside
-from frontend.prediction import moved_pixels, prior_depths, prior_pixels, usable_prior
-from frontend.right_camera import RightCamera
-from frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
-from frontend.settings import FrontendSettings
-from frontend.stereo_fit import StereoFit
-from frontend.tracks import AnchorBank, Tracks, new_tracks, no_tracks
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
+
+from .align import align, on_peak, rounded, scale_change, shift_warps, template_points
+from .columns import joined, take
+from .detect import detect_corners, half_mask, load_mask, min_distance_px
+from .exchange import ExchangeDetector, MatchCounts
+from .flicker import BandRemoval
+from .flow import lost_contrast, track_with_retries
+from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from .moving_object import ObjectReport, choose_motion
+from .outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors, predicted_motion, static_tracks
+from .patches import FloatImage, View, half_image, inside
+from .prediction import moved_pixels, prior_depths, prior_pixels, usable_prior
+from .right_camera import RightCamera
+from .right_delay import PairingCounts, RightDelay, at_exposure, at_present
+from .settings import FrontendSettings
+from .stereo_fit import StereoFit
+from .tracks import AnchorBank, Tracks, new_tracks, no_tracks
 
 _ITERATIONS = 5
 _ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost
@@ -37,6 +39,8 @@ _FAR_M = 1e6  # depth assumed where too few features have one
 _FEW = 0.5  # share of the least number of features below which corners without depth are added
 _TRIED = 1.5  # corners aligned per missing feature
 _VERY_FEW = 0.25  # share of the target below which new features are output at once
+_LONG_GAP_S = 0.8  # a rig that flies or is carried shows other things after it …
+_LONG_GAP_STEPS = 5.0  # … where frames usually come so many times as often
 _BANK_SPARE = 3  # templates allocated, over the number of features
 
 
@@ -89,6 +93,7 @@ class KltFrontend:
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
         self._next_id = 0
         self._skipped = 0  # frames in a row
+        self._step_ns: int | None = None  # between the last two frames
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Track, match and detect in one rectified stereo pair; see `vio.protocols.Frontend`.
@@ -198,6 +203,7 @@ class KltFrontend:
         """Store the state that the next frame needs."""
         self._bank.keep_only(tracks.slot)
         before = self._previous
+        self._step_ns = None if before is None else frame.time_ns - before.time_ns
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
@@ -216,7 +222,7 @@ class KltFrontend:
     ) -> tuple[Tracks, Consensus | None]:
         """Track the features of the previous frame into both images; return those kept and the consensus motion."""
         previous = self._previous
-        if previous is None or len(previous.tracks) == 0:
+        if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
             return no_tracks(), None
         old, settings = previous.tracks, self._settings
         expected = se3_exp(previous.twist_per_s * ((frame.time_ns - previous.time_ns) * 1e-9))
@@ -258,7 +264,7 @@ class KltFrontend:
         has_point, delay = tracks.has_point, self._delay.frames
         flow = tracks.left - previous.tracks.left[_rows_by_slot(previous.tracks, tracks)]
         if delay == 0.0:
-            matched = stereo.track_right(tracks, right, previous.right_half, motion is not None)
+            matched = stereo.track_right(tracks, right, motion is not None)
         else:
             T = np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev
             T = T if motion is None else motion.T_curr_prev
@@ -312,12 +318,19 @@ class KltFrontend:
             stereo: the matcher.
         """
         delay = self._delay.frames
-        then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, previous.right_half, True)
+        then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
         rows = np.flatnonzero(~then.has_right & ~then.has_point)
         disparity, unique = stereo.search(previous.left, right, (tracks.left - flow)[rows])
         then = stereo.match_near(then, right, rows[unique], disparity[unique])
         stereo.update_rows(then)
         return at_present(self._camera, tracks, then, T, delay)
+
+    def _after_gap(self, frame: StereoFrame) -> bool:
+        """Whether so many frames are missing that similar patches are no evidence of the same points."""
+        if self._previous is None or self._step_ns is None:
+            return False
+        gap_ns = frame.time_ns - self._previous.time_ns
+        return gap_ns > max(_LONG_GAP_S * 1e9, _LONG_GAP_STEPS * self._step_ns)
 
     def _guess(self, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage) -> FloatArray:
         """Predict the left pixels (N, 2) in the current frame: from the prior, else by the last motion."""
@@ -578,6 +591,16 @@ def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:
 
 def _spaced(points: FloatArray, distance: float) -> BoolArray:
     """Mask (N,) of points (N, 2) without an earlier point closer than `distance` in the maximum norm."""
-    u, v = points[:, 0], points[:, 1]
-    near = (np.abs(u[:, None] - u) < distance) & (np.abs(v[:, None] - v) < distance)
-    return np.asarray(~np.tril(near, -1).any(axis=1), dtype=np.bool_)
+    out = np.ones(len(points), dtype=np.bool_)
+    _mark_crowded(points, distance, out)
+    return out
+
+
+@compiled
+def _mark_crowded(points: FloatArray, distance: float, apart: BoolArray) -> None:
+    for n in range(len(points)):
+        for m in range(n):
+            du, dv = points[n, 0] - points[m, 0], points[n, 1] - points[m, 1]
+            if abs(du) < distance and abs(dv) < distance:
+                apart[n] = False
+                break

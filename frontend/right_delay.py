@@ -11,9 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from frontend.tracks import Tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays
+
+from .tracks import Tracks
 
 _MEMORY = 0.97  # per frame, of the normal equations
 _LEAST_MATCHES = 30  # in a frame that is learned from

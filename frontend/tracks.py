@@ -6,11 +6,12 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from frontend.align import Templates, cut_patches, empty_templates, shift_warps, templates
-from frontend.columns import joined
-from frontend.patches import FloatImage
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray
+
+from .align import Templates, cut_patches, empty_templates, shift_warps, templates
+from .columns import joined
+from .patches import FloatImage
 
 
 @dataclass(frozen=True, slots=True)

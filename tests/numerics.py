@@ -20,6 +20,8 @@ TESTED_JACOBIANS = {
     "vio.filters.vislam.z_D_landmark",
     "vio.filters.vislam.z_D_xi",
     "vio.geometry.distortion.uv_D_p_cam",
+    "vio.geometry.sphere_models.double_sphere_D_p",
+    "vio.geometry.sphere_models.unified_D_p",
     "vio.geometry.stereo.p_cam_D_z",
     "vio.geometry.stereo.z_D_p_cam",
 }

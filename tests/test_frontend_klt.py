@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from frontend.detect import cell_index, grid_shape, min_distance_px
-from frontend.flow import circle_errors
 from frontend.klt import KltFrontend
 from frontend.outliers import fit_motion
-from frontend.patches import half_image
 from frontend.settings import FrontendSettings, GridSettings, KltSettings
 from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
 from vio.errors import ConfigError, DataError
@@ -294,6 +292,19 @@ def test_last_motion_is_scaled_by_time() -> None:
     assert outputs[-1].tracked > 0.7 * outputs[-2].tracked
 
 
+def test_features_are_not_followed_across_a_long_gap_without_a_prediction() -> None:
+    """Three seconds without frames: similar patches are no evidence then, unless a filter predicts where they are."""
+    late = replace(FRAMES[3], time_ns=FRAMES[2].time_ns + 3_000_000_000)
+    outputs = run([*FRAMES[:3], late])
+    assert outputs[-1].tracked == 0
+    assert not np.isin(outputs[-1].observations.ids, outputs[-2].observations.ids).any()
+    assert run([*FRAMES[:3], replace(late, time_ns=FRAMES[2].time_ns + 600_000_000)])[-1].tracked > 100
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    seen = [frontend.process(frame) for frame in FRAMES[:3]][-1].observations
+    prior = TrackPrior(seen.ids, truth(SLANTED, POSES[2], seen.z[:, :2], POSES[3]))
+    assert frontend.process(late, prior).tracked > 100
+
+
 def test_features_failing_the_forward_backward_check_are_dropped() -> None:
     assert run(FRAMES[:2], with_klt(max_forward_backward_px=1e-4))[1].tracked < 10
 
@@ -378,30 +389,6 @@ def test_new_features_are_output_after_probation(outputs: list[FrontendOutput]) 
     # Of the features that can live for three frames or more, fewer are seen only once.
     shares = [np.mean(counts == 1) for counts in once]
     assert shares[0] <= shares[1]
-
-
-def test_circle_errors_separate_right_from_wrong_matches(outputs: list[FrontendOutput]) -> None:
-    before, after = common(outputs[2], outputs[3])
-    z, z_next = (truth(SLANTED, POSES[k], rows[:, :2], POSES[k]) for k, rows in ((2, before), (3, after)))
-    halves = []
-    for frame in FRAMES[2:4]:
-        assert frame.right is not None
-        halves.append(half_image(frame.right))
-    wrong = np.arange(len(z)) % 3 == 0
-    off = np.where(wrong[:, None], [3.0, -1.5], [0.0, 0.0])
-    gap = circle_errors(halves[0], halves[1], z[:, 2:], z_next[:, 2:] + off, SETTINGS.klt)
-    assert np.median(gap[~wrong]) < 0.2
-    assert np.mean(gap[~wrong] <= SETTINGS.klt.max_circle_px) > 0.98
-    assert np.mean(gap[wrong] > SETTINGS.klt.max_circle_px) > 0.95
-    assert len(circle_errors(halves[0], halves[1], z[:0, 2:], z[:0, 2:], SETTINGS.klt)) == 0
-
-
-def test_circle_check_keeps_good_matches(outputs: list[FrontendOutput]) -> None:
-    checked = run(FRAMES, with_klt(circle_check=True))
-    strict = run(FRAMES, with_klt(circle_check=True, max_circle_px=0.02))
-    for plain, output in zip(outputs[1:], checked[1:], strict=True):
-        assert output.matched >= 0.98 * plain.matched
-    assert strict[-1].matched < 0.5 * outputs[-1].matched  # control: the setting has an effect
 
 
 def test_rectification_error_is_estimated_and_does_not_bias_disparity() -> None:

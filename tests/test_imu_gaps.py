@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from vio.evaluation import nees, nees_bounds
+from vio.event_order import EventOrder
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
-from vio.pipeline import frames_after_imu
 from vio.records import Event, ImuSample, StereoFrame, UpdateReport, VelocitySample
 from vio.watch.run import RunWatch
 
@@ -32,7 +33,12 @@ def _frame(index: int, time_ns: int) -> StereoFrame:
 
 def _order(events: list[Event]) -> list[int]:
     """Times of samples and, negative, numbers of frames."""
-    return [-e.index if isinstance(e, StereoFrame) else e.time_ns for e in frames_after_imu(events)]
+    return [-e.index if isinstance(e, StereoFrame) else e.time_ns for e in _ordered(events)]
+
+
+def _ordered(events: list[Event]) -> list[Event]:
+    order = EventOrder(wait_for_imu=True)
+    return [ready for event in events for ready in order.add(event)] + order.flush()
 
 
 def test_a_frame_waits_for_the_sample_after_it() -> None:
@@ -41,19 +47,40 @@ def test_a_frame_waits_for_the_sample_after_it() -> None:
     ]
 
 
-def test_a_frame_waits_no_longer_than_to_the_next_frame_or_the_end() -> None:
-    assert _order([_frame(1, 5), _frame(2, 15), _sample(20), _frame(3, 25)]) == [-1, 20, -2, -3]
+def test_a_frame_waits_until_one_a_tenth_of_a_second_newer_has_come() -> None:
+    ms = 1_000_000
+    early = [_frame(1, 5 * ms), _frame(2, 55 * ms), _frame(3, 104 * ms)]
+    assert _order([*early, _sample(110 * ms)]) == [110 * ms, -1, -2, -3], "the sample may still come"
+    assert _order([*early, _frame(4, 105 * ms), _sample(110 * ms)]) == [-1, 110 * ms, -2, -3, -4]
+
+
+def test_a_frame_waits_no_longer_than_to_the_end() -> None:
+    assert _order([_sample(1), _frame(1, 5), _frame(2, 15)]) == [1, -1, -2]
 
 
 def test_a_frame_with_a_sample_at_its_own_time_does_not_wait() -> None:
-    events: Iterator[Event] = iter([_sample(10), _frame(1, 10)])
-    ordered = frames_after_imu(events)
-    assert [type(next(ordered)), type(next(ordered))] == [ImuSample, StereoFrame]
+    order = EventOrder(wait_for_imu=True)
+    assert order.add(_sample(10)) == []
+    assert [type(event) for event in order.add(_frame(1, 10))] == [ImuSample, StereoFrame]
 
 
-def test_velocities_hold_no_frame_up_for_imu_samples_alone_release_it() -> None:
-    velocity = VelocitySample(20, np.zeros(3), np.zeros(3))
-    assert _order([_frame(1, 15), velocity, _sample(20)]) == [20, 20, -1]
+def test_without_an_imu_a_frame_passes_at_once() -> None:
+    order = EventOrder(wait_for_imu=False)
+    velocities = [VelocitySample(k, np.zeros(3), np.zeros(3)) for k in (10, 15, 20)]
+    assert [order.add(velocity) for velocity in velocities] == [[], [], []]
+    assert order.add(frame := _frame(1, 15)) == [*velocities[:2], frame]
+    assert order.flush() == velocities[2:]
+
+
+@given(st.integers(-90, 90))
+def test_the_order_does_not_depend_on_the_arrival(late_ms: int) -> None:
+    """Frames and IMU samples arrive on two streams, one behind the other by up to the longest wait."""
+    ms = 1_000_000
+    samples: list[Event] = [_sample(5 * ms * k) for k in range(60)]
+    frames: list[Event] = [_frame(k + 1, ms * (33 * k + 7)) for k in range(8)]
+    arrival = {id(e): e.time_ns + (late_ms * ms if isinstance(e, StereoFrame) else 0) for e in [*samples, *frames]}
+    mixed = sorted([*samples, *frames], key=lambda e: arrival[id(e)])
+    assert _order(mixed) == _order(sorted([*samples, *frames], key=lambda e: e.time_ns))
 
 
 # The step in units of its noise
@@ -175,7 +202,7 @@ def _lines(times_s: list[float], frames_s: list[float]) -> list[str]:
     flight, rng = Flight(), np.random.default_rng(0)
     events: list[Event] = [_sample(round(1e9 * t)) for t in times_s]
     events += [_frame(k, round(1e9 * t)) for k, t in enumerate(frames_s)]
-    for event in frames_after_imu(sorted(events, key=lambda e: e.time_ns)):
+    for event in _ordered(sorted(events, key=lambda e: e.time_ns)):
         if isinstance(event, StereoFrame):
             watch.observations(replace(flight.observe(0, 0.5, rng), frame_index=event.index, time_ns=event.time_ns))
         else:
@@ -211,7 +238,7 @@ def test_an_imu_that_ends_early_is_told() -> None:
 
 def test_an_imu_that_begins_late_or_never_is_told() -> None:
     lines = _lines(_imu_s((-1.0, 2.02)), FRAMES_S)
-    assert lines == ["frame 40: the first IMU sample came 2.02 s after frame 0; 40 frames have no pose of their own"]
+    assert lines == ["frame 39: the first IMU sample came 2.02 s after frame 0; 39 frames have no pose of their own"]
     lines = _lines([], FRAMES_S)
     assert lines == ["no IMU sample in any of 100 frames: no frame has a pose; use --motion none"]
 
@@ -229,3 +256,16 @@ def test_frames_wait_for_an_imu_that_begins_late() -> None:
             filt.propagate(sample)
     filt.update(flight.observe(60, 0.5, rng))
     assert filt.update(flight.observe(61, 0.5, rng)).used > 30  # a filter that has started, on a held sample
+
+
+@pytest.mark.parametrize(("motion", "useful"), [(None, False), ("imu", True)])
+def test_a_prediction_over_seconds_is_made_by_an_imu_alone(motion: str | None, useful: bool) -> None:
+    """Images alone know nothing of a turn after three seconds, so no track is searched where they put it."""
+    flight = Flight(8)
+    _, _, filt = flight.run(MsckfSettings(), motion, limit=30)
+    assert filt.predict(8 * STEP_NS) is not None
+    if motion == "imu":
+        for sample in Flight(80).imu(np.random.default_rng(1), MsckfSettings(), np.zeros(6)):
+            if sample.time_ns > 7 * STEP_NS:
+                filt.propagate(sample)
+    assert (filt.predict(7 * STEP_NS + 3_000_000_000) is not None) is useful

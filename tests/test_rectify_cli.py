@@ -12,7 +12,7 @@ import pytest
 
 from tests.dataset_makers import make_kitti
 from tests.euroc_maker import RECTIFIED_RIG, camera_stamps, make_euroc, make_kitti_raw
-from tools.check_rectification import main as check
+from tools.research.check_rectification import main as check
 from vio.cli import main
 from vio.cli.rectify import MARKER
 from vio.datasets import open_dataset

@@ -19,6 +19,7 @@ class Mutation:
 _LIE = ("tests/test_lie.py",)
 _STEREO = ("tests/test_stereo_geometry.py",)
 _LENS = ("tests/test_distortion.py", "tests/test_sim_cameras.py", "tests/test_jacobian_registry.py")
+_RIG = ("tests/test_rig.py",)
 _RECTIFY = ("tests/test_rectify.py", "tests/test_rectify_cli.py", "tests/test_datasets_euroc.py")
 _WINDOW = (
     "tests/test_multiview.py",
@@ -31,6 +32,8 @@ _WINDOW = (
     "tests/test_consistency.py",
 )
 _IMU_GAPS = ("tests/test_imu_gaps.py",)
+_IMU_FAULTS = ("tests/test_imu_faults.py",)
+_FROZEN = ("tests/test_frozen_images.py",)
 _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
@@ -47,11 +50,78 @@ _DELAY = ("tests/test_right_delay.py",)
 _FLICKER = ("tests/test_flicker.py",)
 _EXCHANGE = ("tests/test_exchange.py",)
 _MOVING_OBJECT = ("tests/test_moving_object.py",)
+_ODOMETRY = ("tests/test_odometry.py",)
+_UNFINISHED = ("tests/test_unfinished_runs.py",)
+_INPUTS = ("tests/test_filter_inputs.py",)
+_FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
 MUTATIONS = (
     # --- vio/geometry ---
+    Mutation(
+        "bags: right images in the place of left ones where the left came first",
+        "vio/datasets/bags/reader.py",
+        "((first, fields) if side == 1 else (fields, first))",
+        "((first, fields) if side == 0 else (fields, first))",
+        ("tests/test_datasets_bags.py",),
+    ),
+    Mutation(
+        "bags: static frames not inverted towards the child",
+        "vio/datasets/bags/index.py",
+        "append((child, se3_inverse(T)))",
+        "append((child, T))",
+        ("tests/test_datasets_bags.py",),
+    ),
+    Mutation(
+        "plain folders: clock offset added instead of subtracted",
+        "vio/datasets/companions.py",
+        "times_ns=record.times_ns - shift_ns",
+        "times_ns=record.times_ns + shift_ns",
+        ("tests/test_datasets_plain.py",),
+    ),
+    Mutation(
+        "ground truth of a raw camera not turned to the rectified one",
+        "vio/datasets/overlap.py",
+        "se3_inverse(se3_from_parts(R_rect_cam0, np.zeros(3)))",
+        "se3_from_parts(R_rect_cam0, np.zeros(3))",
+        ("tests/test_datasets_plain.py",),
+    ),
+    Mutation(
+        "inspection: Allan deviation of neighbouring averages without their distance",
+        "vio/inspection/inertial.py",
+        "second = total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]",
+        "second = total[2 * m :] - total[: -2 * m]",
+        ("tests/test_inspection.py",),
+    ),
+    Mutation(
+        "double sphere: the first sphere's distance left out of the depth",
+        "vio/geometry/sphere_models.py",
+        "shifted = xi * d1 + p[..., 2]",
+        "shifted = p[..., 2]",
+        _RIG,
+    ),
+    Mutation(
+        "rational lens: divisor left out",
+        "vio/geometry/distortion.py",
+        "        radial = radial / divisor[0]",
+        "        radial = radial * 1.0",
+        _RIG,
+    ),
+    Mutation(
+        "Kalibr: pose of the IMU inverted in the stereo pose",
+        "vio/datasets/rigs/kalibr.py",
+        "through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)",
+        "through_imu = T_cam0_imu @ se3_inverse(T_cam1_imu)",
+        _RIG,
+    ),
+    Mutation(
+        "CameraInfo: rectified baseline not rotated back to the raw camera",
+        "vio/datasets/rigs/camera_info.py",
+        "se3_from_parts(R1.T @ R0, R1.T @ shift)",
+        "se3_from_parts(R1.T @ R0, shift)",
+        _RIG,
+    ),
     Mutation(
         "SO(3): right Jacobian for the left",
         "vio/geometry/lie.py",
@@ -202,9 +272,9 @@ MUTATIONS = (
     ),
     Mutation(
         "tracks: eliminated points still count",
-        "vio/filters/multiview.py",
-        "b -= flat.T @",
-        "b -= 0 * flat.T @",
+        "vio/filters/track_loops.py",
+        "b[k] += gradient[f, k] - v0 * y[0]",
+        "b[k] += gradient[f, k] + v0 * y[0]",
         _WINDOW,
     ),
     Mutation(
@@ -230,16 +300,16 @@ MUTATIONS = (
     ),
     Mutation(
         "many views: no prior on the disparity of a point",
-        "vio/filters/multiview.py",
-        "2, 2] += _PRIOR",
-        "2, 2] += 0 * _PRIOR",
+        "vio/filters/track_loops.py",
+        "C_i[2, 2] += prior",
+        "C_i[2, 2] += 0 * prior",
         _WINDOW,
     ),
     Mutation(
         "many views: the prior on a disparity hangs on another camera",
-        "vio/filters/multiview.py",
-        "C_i[np.arange(F), q.anchor,",
-        "C_i[np.arange(F), q.anchor - 1,",
+        "vio/filters/track_loops.py",
+        "if n == anchor[f]:",
+        "if n == anchor[f] - 1:",
         _WINDOW,
     ),
     Mutation(
@@ -307,9 +377,9 @@ MUTATIONS = (
     ),
     Mutation(
         "IMU: a frame does not wait for the sample after it",
-        "vio/pipeline.py",
-        "latest_ns >= held.time_ns",
-        "latest_ns >= 0",
+        "vio/event_order.py",
+        "self._newest_ns >= frame.time_ns",
+        "self._newest_ns >= 0",
         _IMU_GAPS,
     ),
     Mutation(
@@ -332,6 +402,90 @@ MUTATIONS = (
         "length_s <= max(",
         "length_s <= 10 * max(",
         _IMU_GAPS,
+    ),
+    Mutation(
+        "IMU: a spike needs no return",
+        "vio/imu_faults.py",
+        "if (back > self._limit).any() or (back > _RETURN * np.abs(jump))[axes].any():",
+        "if False:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: spikes pass",
+        "vio/imu_faults.py",
+        "if self._has_returned(suspect, reading):",
+        "if False:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: repetitions of one sensor pass until they are proven",
+        "vio/imu_faults.py",
+        "if any(r.unusual for r in self._repeats):",
+        "if self._repeats[0].unusual:",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "IMU: a gap counts as a fault of the clocks",
+        "vio/watch/clocks.py",
+        "1 + self._in_gap",
+        "1",
+        _IMU_FAULTS,
+    ),
+    Mutation(
+        "frozen images: a repeated pair is used",
+        "vio/chain.py",
+        "if self.watch.repeats(frame, expected):",
+        "if self.watch.repeats(frame, expected) and False:",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: a rig at standstill is taken for a frozen camera",
+        "vio/watch/frozen.py",
+        "or self._at_standstill():",
+        "or False:",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: what the prediction may be off by does not count",
+        "vio/watch/frozen.py",
+        "if not self._contradicts(expected.motion) or",
+        "if",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen images: a row ends with the prediction's certainty",
+        "vio/watch/frozen.py",
+        "again = self._repeating is not None",
+        "again = False",
+        _FROZEN,
+    ),
+    Mutation(
+        "gap: features are followed across it without a prediction",
+        "frontend/klt.py",
+        "(prior is None and self._after_gap(frame))",
+        "False",
+        _TRACK,
+    ),
+    Mutation(
+        "gap: a prediction that knows nothing starts a search",
+        "vio/filters/msckf.py",
+        "[-1] > _USELESS_RAD**2",
+        "[-1] > 1e6 * _USELESS_RAD**2",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "gap: a time without frames is not reported",
+        "vio/watch/health.py",
+        "max(_GAP_S, _GAP_STEPS * usual_s)",
+        "max(_GAP_S, 100 * _GAP_STEPS * usual_s)",
+        ("tests/test_health.py",),
+    ),
+    Mutation(
+        "stamps: intervals that truly vary are taken for jitter",
+        "vio/watch/stamps.py",
+        "missed = weight * (dt[used] - dt[used] * camera[used] / gyro[used])",
+        "missed = deviation",
+        ("tests/test_stamps.py",),
     ),
     Mutation(
         "start: a steady acceleration is no evidence against the tilt",
@@ -420,8 +574,8 @@ MUTATIONS = (
     Mutation(
         "window: new anchor with the sign of the old one",
         "vio/filters/window.py",
-        "A[rows, newest : newest + 3] += p_cross[k]",
-        "A[rows, newest : newest + 3] -= p_cross[k]",
+        "p_cross @ (P[turn] - P[before])",
+        "p_cross @ (P[before] - P[turn])",
         _WINDOW,
     ),
     Mutation(
@@ -455,8 +609,8 @@ MUTATIONS = (
     Mutation(
         "window: posterior without the prior",
         "vio/filters/window.py",
-        "inner = np.eye(len(P)) + L.T",
-        "inner = 1e-6 * np.eye(len(P)) + L.T",
+        'np.einsum("ii->i", inner)[:] += 1.0',
+        'np.einsum("ii->i", inner)[:] += 0.01',
         _WINDOW,
     ),
     Mutation(
@@ -645,22 +799,22 @@ MUTATIONS = (
     Mutation(
         "stereo field: linearised at the pixels that were seen",
         "vio/filters/window_tracks.py",
-        "self._views(rows, at.r.shape[1], field).z - at.r)",
-        "self._views(rows, at.r.shape[1], field).z)",
+        "field_jacobian(self._camera, z - at.r)",
+        "field_jacobian(self._camera, z)",
         _STEREO_FIELD,
     ),
     Mutation(
         "stereo field: sign of a term that follows from the rows",
-        "vio/filters/stereo_calibration.py",
-        "(-c[1] * y + (c[5] - c[4]) * x * y - c[3] * y * y)",
-        "(-c[1] * y + (c[4] - c[5]) * x * y - c[3] * y * y)",
+        "vio/filters/track_loops.py",
+        "(rows[5] - rows[4]) * xr * y",
+        "(rows[4] - rows[5]) * xr * y",
         _STEREO_FIELD,
     ),
     Mutation(
         "stereo field: eliminated points still count",
-        "vio/filters/stereo_calibration.py",
-        "H.reshape(-1, S) - flat_G.T @ flat_CG",
-        "H.reshape(-1, S)",
+        "vio/filters/track_loops.py",
+        "A[s, t] -= own[0, s] * X[t, 0]",
+        "A[s, t] -= 0 * own[0, s] * X[t, 0]",
         _STEREO_FIELD,
     ),
     Mutation(
@@ -899,8 +1053,8 @@ MUTATIONS = (
     Mutation(
         "RANSAC: step on the wrong side of the motion",
         "frontend/outliers.py",
-        "T = se3_exp(xi) @ T",
-        "T = T @ se3_exp(xi)",
+        "xi[i] = min(max(xi[i], -5.0), 5.0)",
+        "xi[i] = min(max(-xi[i], -5.0), 5.0)",
         _RANSAC,
     ),
     Mutation(
@@ -969,22 +1123,22 @@ MUTATIONS = (
     Mutation(
         "alignment of patches: step not undone",
         "frontend/align.py",
-        "np.stack([d, -b, -c, a], axis=1)",
-        "np.stack([a, b, c, d], axis=1)",
+        "warp[i, 2] -= x * du + y * dv",
+        "warp[i, 2] += x * du + y * dv",
         _PATCHES,
     ),
     Mutation(
         "alignment of patches: gain ignored",
         "frontend/align.py",
-        "fit /= np.maximum(fit[:, 2:3], 0.1)",
-        "fit /= 1.0",
+        "gain = max(fit[2], 0.1)",
+        "gain = 1.0",
         _PATCHES,
     ),
     Mutation(
         "stereo search: sub-pixel offset of the wrong sign",
         "frontend/stereo_match.py",
-        "(before - after) / (2 *",
-        "(after - before) / (2 *",
+        "(before - after) / (2.0 *",
+        "(after - before) / (2.0 *",
         _PATCHES,
     ),
     Mutation(
@@ -1000,5 +1154,113 @@ MUTATIONS = (
         "_FIELD_MEMORY * self._normal + prior",
         "self._normal + prior",
         _PATCHES,
+    ),
+    # --- vio/compiled.py ---
+    Mutation(
+        "compiled loops: no folder for the cache ends the run",
+        "vio/compiled.py",
+        "except RuntimeError:",
+        "except KeyError:",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "compiled loops: a pixel outside the image is read from beyond its row",
+        "frontend/align.py",
+        "width - 1.001 - reach_u",
+        "width + 1.001 - reach_u",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "compiled loops: twist without the coupling of rotation and translation",
+        "vio/compiled.py",
+        "T[1, 3] += py + b * cy + c * dy",
+        "T[1, 3] += py",
+        ("tests/test_compiled.py",),
+    ),
+    # --- live use, unfinished runs ---
+    Mutation(
+        "events: a frame waits for an IMU that is silent",
+        "vio/event_order.py",
+        "return self._frames[-1].time_ns - frame.time_ns >= LONGEST_WAIT_NS",
+        "return False",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "live use: the caller's image buffer is kept",
+        "vio/odometry.py",
+        'return np.array(array, dtype=np.uint8, order="C")',
+        "return np.asarray(array)",
+        _ODOMETRY,
+    ),
+    Mutation(
+        "poses between frames: gravity left out",
+        "vio/pose_prediction.py",
+        "force = R @ (sample.accel - self._bias[1]) + self._gravity",
+        "force = R @ (sample.accel - self._bias[1])",
+        _ODOMETRY,
+    ),
+    Mutation(
+        "resume: samples of the last second taken twice",
+        "vio/pipeline.py",
+        "return known is None or event.time_ns > known",
+        "return known is None or event.time_ns >= 0",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "resume: rows written after the checkpoint stay",
+        "vio/tables.py",
+        "self._file.truncate(start + keep * self.dtype.itemsize)",
+        "pass",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "checkpoint: any function may be called",
+        "vio/checkpoint.py",
+        "if not ours and (module, name) not in _OTHERS:",
+        "if False:",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "run folder: points put away are lost",
+        "vio/run_recorder.py",
+        "if not len(stored):",
+        "if True:",
+        _UNFINISHED,
+    ),
+    # --- input ---
+    Mutation(
+        "input: a doubled sample accepted",
+        "vio/filters/inputs.py",
+        "now <= self._sample_ns",
+        "now < self._sample_ns",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: a doubled frame accepted",
+        "vio/filters/inputs.py",
+        "now <= before",
+        "now < before",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: NaN among the right pixels accepted",
+        "vio/filters/inputs.py",
+        "finite[seen.has_right].all()",
+        "finite[~seen.has_right].all()",
+        _INPUTS,
+    ),
+    Mutation(
+        "images: the most bits that hold the levels, not the fewest",
+        "vio/datasets/images.py",
+        "_SENSOR_BITS = (10, 12, 14)",
+        "_SENSOR_BITS = (14, 12, 10)",
+        _FILES,
+    ),
+    Mutation(
+        "archives: the header believed",
+        "vio/datasets/common.py",
+        "math.prod(shape) * dtype.itemsize > info.file_size",
+        "math.prod(shape) * dtype.itemsize < 0",
+        _FILES,
     ),
 )

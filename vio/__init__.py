@@ -3,6 +3,42 @@
 Importing this package loads nothing heavy; in particular it never imports torch.
 """
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from vio._version import __version__
 
-__all__ = ["__version__"]
+if TYPE_CHECKING:
+    from vio.config import load_config
+    from vio.datasets import open_dataset
+    from vio.datasets.rigs import load_rig
+    from vio.evaluation import evaluate
+    from vio.odometry import Odometry
+    from vio.pipeline import run
+    from vio.rig import Rig
+
+__all__ = ["Odometry", "Rig", "__version__", "evaluate", "load_config", "load_rig", "open_dataset", "run"]
+
+_MODULES = {  # loaded when the name is first used
+    "Odometry": "vio.odometry",
+    "Rig": "vio.rig",
+    "evaluate": "vio.evaluation",
+    "load_config": "vio.config",
+    "load_rig": "vio.datasets.rigs",
+    "open_dataset": "vio.datasets",
+    "run": "vio.pipeline",
+}
+
+
+def __getattr__(name: str) -> object:
+    """Load a public name from its module."""
+    if name not in _MODULES:
+        raise AttributeError(f"module 'vio' has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    """Return the public names."""
+    return sorted({*globals(), *__all__})

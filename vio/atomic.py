@@ -1,4 +1,8 @@
-"""Atomic writing of files and folders."""
+"""Atomic writing of files and folders.
+
+What is being written lies beside its target, as `.NAME.<12 hex digits>.partial`, and is locked by its process. The lock
+ends with the process, whatever ends that; the next write of the same target removes what has none.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import contextlib
 import errno
 import logging
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Collection, Iterator
@@ -15,12 +20,69 @@ from vio.errors import DataError, VioError
 
 logger = logging.getLogger(__name__)
 
+try:
+    import fcntl
+except ImportError:  # Windows: leftovers stay
+    fcntl = None  # type: ignore[assignment]
+
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_PROBE_BYTES = 2**22  # what a run of a thousand frames writes, about
 
 
 def _sibling(path: Path, kind: str) -> Path:
     """Return a unique hidden name beside `path`, on the same file system, so that a rename is atomic."""
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.{kind}")
+
+
+def lock_path(path: Path) -> int | None:
+    """Lock a file or folder for this process; return the descriptor that holds the lock, None if another holds it."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except OSError:
+        return None
+    try:
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            os.close(descriptor)
+            return None
+        # A file system without locks: nothing can be told to be left over.
+    return descriptor
+
+
+def _remove_leftovers(target: Path) -> None:
+    """Remove what killed processes left of their attempts to write `target`."""
+    if fcntl is None:
+        return
+    pattern = re.compile(re.escape(f".{target.name}.") + r"[0-9a-f]{12}\.(partial|old)")
+    try:
+        found = [path for path in target.parent.iterdir() if pattern.fullmatch(path.name)]
+    except OSError:
+        return
+    for path in found:
+        if path.suffix == ".old" and not target.exists():  # killed between two renames: the only copy there is
+            logger.warning("%s is the earlier content of %s, kept when a process was killed", path, target)
+            continue
+        descriptor = None if path.is_symlink() else lock_path(path)
+        if descriptor is None:
+            continue
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink()
+        os.close(descriptor)
+
+
+def _new_partial_folder(target: Path) -> tuple[Path, int | None]:
+    """Make a folder for `target` to be written in, and lock it."""
+    while True:
+        partial = _sibling(target, "partial")
+        partial.mkdir(parents=True)
+        lock = lock_path(partial)
+        if partial.is_dir():  # another process may have taken it for a leftover before it was locked
+            return partial, lock
 
 
 def _unwritable(path: Path, error: OSError) -> DataError:
@@ -34,10 +96,14 @@ def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:
         DataError: the folder is missing or not writable, or the disk is full.
     """
     target = Path(path)
+    _remove_leftovers(target)
     partial = _sibling(target, "partial")
     try:
         try:
             with partial.open("xb") as stream:
+                if fcntl is not None:
+                    with contextlib.suppress(OSError):
+                        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 stream.write(data)
                 stream.flush()
                 os.fsync(stream.fileno())
@@ -73,12 +139,14 @@ def atomic_folder(
     """
     target = Path(path).absolute()
     check_replaceable(target, replace, marker, own)
-    partial = _sibling(target, "partial")
+    _remove_leftovers(target)
     parents = [parent for parent in target.parents if not parent.exists()]
+    partial: Path | None = None
+    lock: int | None = None
     done = False
     try:
         try:
-            partial.mkdir(parents=True)
+            partial, lock = _new_partial_folder(target)
         except OSError as error:
             raise _unwritable(target, error) from error
         try:
@@ -94,8 +162,11 @@ def atomic_folder(
             raise _unwritable(target, error) from error
         done = True
     finally:
+        if lock is not None:
+            os.close(lock)
         if not done:
-            shutil.rmtree(partial, ignore_errors=True)
+            if partial is not None:
+                shutil.rmtree(partial, ignore_errors=True)
             for parent in parents:
                 with contextlib.suppress(OSError):
                     parent.rmdir()
@@ -119,6 +190,58 @@ def check_replaceable(target: Path, replace: bool, marker: str | None, own: Coll
             f"{target} holds {names} beside an earlier result and will not be replaced; move that away, or choose "
             "another path"
         )
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Check, before work of minutes begins, that a folder can be written: a few MiB beside it, which are removed again.
+
+    Raises:
+        DataError: no folder can be made there, or the disk is full.
+    """
+    target = Path(path).absolute()
+    parents = [parent for parent in target.parents if not parent.exists()]
+    try:
+        try:
+            partial, lock = _new_partial_folder(target)
+            try:
+                with (partial / "probe").open("wb") as stream:
+                    stream.write(bytes(_PROBE_BYTES))
+            finally:
+                if lock is not None:
+                    os.close(lock)
+                shutil.rmtree(partial, ignore_errors=True)
+        finally:
+            for parent in parents:
+                with contextlib.suppress(OSError):
+                    parent.rmdir()
+    except OSError as error:
+        raise _unwritable(target, error) from error
+
+
+@contextlib.contextmanager
+def locked_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Create a folder if it is missing and lock it for this process; one that is empty at the end is removed again.
+
+    Raises:
+        VioError: another process holds the lock.
+        DataError: the folder cannot be created.
+    """
+    target = Path(path).absolute()
+    missing = [folder for folder in (target, *target.parents) if not folder.exists()]
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(target, error) from error
+    lock = lock_path(target)
+    if lock is None:
+        raise VioError(f"{target}: another process is writing into this folder; choose another path, or wait for it")
+    try:
+        yield target
+    finally:
+        os.close(lock)
+        for folder in missing:
+            with contextlib.suppress(OSError):  # not empty
+                folder.rmdir()
 
 
 def _swap_in(partial: Path, target: Path) -> None:

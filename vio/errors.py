@@ -33,3 +33,11 @@ class EvaluationError(VioError):
 
 class MissingDependencyError(VioError):
     """An optional package is needed; the message names the extra to install."""
+
+
+class StoppedError(VioError):
+    """A run ended before its recording, in order; its results so far are written."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status  # exit status of a command

@@ -1,74 +1,48 @@
-"""The whole flow on one screen: events in, front end, selector, filter, result out."""
+"""A whole recording through the chain: events in, front end, selector, filter, result out."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 
+from vio.chain import BACKENDS, STAGES, FrameLog, FrameResult, build_backend
 from vio.config import BackendName, Config
-from vio.errors import ConfigError, DataError, DivergedError
-from vio.filters.msckf import Msckf
+from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
+from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
+from vio.odometry import Odometry
 from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
 from vio.records import (
     BodyFrame,
     Estimate,
     Event,
     FrontendOutput,
-    ImuSample,
     Landmarks,
     MotionSample,
     MotionSource,
     Observations,
     Recording,
-    Selection,
     StereoFrame,
     Trajectory,
     UpdateReport,
 )
+from vio.run_recorder import GrowingFolder, RunRecorder
 from vio.selectors import build_selector
+from vio.tables import Records
 from vio.threads import one_blas_thread
-from vio.watch.run import RunWatch
 
 log = logging.getLogger(__name__)
 
-STAGES = ("read", "frontend", "watch", "select", "filter")  # of a frame's wall time
+__all__ = ["STAGES", "FrameLog", "NullViewer", "RunResult", "resolve_motion", "run"]
 
-_BACKENDS: dict[BackendName, type[Vislam] | type[Msckf]] = {"vislam": Vislam, "msckf": Msckf}
-
-
-@dataclass(frozen=True, slots=True)
-class FrameLog:
-    """What happened in one frame: one row of frames.csv."""
-
-    index: int
-    time_ns: int
-    read_ms: float
-    frontend_ms: float
-    watch_ms: float
-    select_ms: float
-    filter_ms: float
-    detected: int
-    tracked: int
-    matched: int
-    selected: int
-    stale: int
-    used: int
-    gated: int
-    landmarks: int
-    innovation_median_px: float | None
-    nis_per_dof: float | None
-    stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
-
-    @property
-    def total_ms(self) -> float:
-        """Wall time of the whole frame."""
-        return sum(getattr(self, f"{stage}_ms") for stage in STAGES)
+_LEAST_REFUSED = 10  # frames that the front end refused, and more of them than not, before a run gives up
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,19 +54,23 @@ class RunResult:
     motion: MotionSource | None  # what carried the pose between frames
     body: BodyFrame  # what the trajectory describes
     T_cam0_body: FloatArray  # (4, 4)
-    estimates: tuple[Estimate, ...]
+    estimates: Records[Estimate]
     dead_reckoning: Trajectory | None
     landmarks: Landmarks
-    frames: tuple[FrameLog, ...]
-    observations: tuple[Observations, ...] | None  # kept on request
-    motion_samples: tuple[MotionSample, ...] | None  # kept on request
+    frames: Records[FrameLog]
+    observations: Sequence[Observations] | None  # kept on request
+    motion_samples: Sequence[MotionSample] | None  # kept on request
     warnings: tuple[str, ...]  # what went wrong in the run, or with its IMU
     wall_s: float
+    stopped: str | None = None  # why the run ended before the recording; None: it did not
 
     @property
     def trajectory(self) -> Trajectory:
         """The estimated poses of the body, one per frame."""
-        return _trajectory([e.T_world_imu for e in self.estimates], self.frames, self.body)
+        T_world_body, times_ns, indices = (
+            np.array(self.estimates.column(name)) for name in ("T_world_imu", "time_ns", "index")
+        )
+        return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=self.body, frame_indices=indices)
 
 
 class NullViewer:
@@ -117,6 +95,9 @@ def run(
     frontend: Frontend | None = None,
     selector: Selector | None = None,
     backend: Backend | None = None,
+    folder: GrowingFolder | None = None,
+    resume: bool = False,
+    should_stop: Callable[[], str | None] = lambda: None,
 ) -> RunResult:
     """Process a recording from its frame `start` to before frame `stop`, with BLAS pinned to one thread meanwhile.
 
@@ -130,114 +111,163 @@ def run(
         frontend: used in place of the configured front end.
         selector: used in place of the configured selector.
         backend: used in place of the configured back end.
+        folder: where to write while the run goes on; None: everything stays in memory.
+        resume: go on from the checkpoint in `folder`.
+        should_stop: asked after each event; a reason ends the run in order, and the result names it.
 
     Raises:
-        VioError: the configuration, the data or the estimation is at fault; the message says which.
+        VioError: the configuration, the data or the estimation is at fault; the message says which. With a folder, a
+            fault after the first frame ends the run in order instead, and the result names it.
     """
     recording = dataset.recording
     _check(recording, config, start, stop)
     motion = resolve_motion(recording, config)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
-
+    began = time.perf_counter()
+    recorder = RunRecorder(body, lag_frames=config.lag_frames, keep_observations=keep_observations, folder=folder)
     features = _feature_source(dataset, config)
-    frontend = frontend or _build_frontend(features, config)
-    selector = selector or _build_selector(features, config)
-    backend = backend or _build_backend(recording, config, motion, T_cam0_body)
-    viewer = viewer or NullViewer()
-    dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
-    watch = RunWatch(recording.camera, T_cam0_body, imu=motion == "imu")
-    recorder = _RunRecorder(backend, config.lag_frames, keep_observations=keep_observations)
-    timer = _StageTimer()
-    try:
-        events = dataset.events(start, stop, images=_needs_images(dataset, config))
-        for event in frames_after_imu(events) if motion == "imu" else events:
-            if not isinstance(event, StereoFrame):
-                watch.sample(event)
-                recorder.sample(event)
-                if motion is not None:
-                    backend.propagate(event)
-                if dead_reckoning is not None:
-                    dead_reckoning.propagate(event)
-                continue
-            timer.end("read")
-            expected = backend.predict(event.time_ns)
-            timer.end("predict")
-            output = frontend.process(event, expected.tracks if expected and config.frontend.prior else None)
-            timer.end("frontend")
-            watch.observations(output.observations, output.warnings)
-            timer.end("watch")
-            seen = (
-                output.observations.take(output.observations.has_right) if backend.stereo_only else output.observations
-            )
-            selection = selector.select(seen, expected.motion if expected else None)
-            timer.end("select")
-            report = _update(backend, seen.take(selection.chosen), watch)
-            estimate = backend.estimate()
-            timer.end("update")
-
-            watch.update(event.index, report, estimate)
-            recorder.frame(estimate, _frame_log(event, timer, output, selection, report), output.observations)
-            if dead_reckoning is not None:
-                dead_reckoning.frame(event)
-            viewer.frame(output, estimate, report)
-            timer.begin()
-    finally:
-        watch.close()
-        viewer.close()
-    if not recorder.frames:
-        raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
-    recorder.finish()
-    return RunResult(
-        recording=recording,
-        config=config,
-        motion=motion,
-        body=body,
-        T_cam0_body=T_cam0_body,
-        estimates=tuple(recorder.estimates),
-        dead_reckoning=_trajectory(dead_reckoning.poses, recorder.frames, body) if dead_reckoning is not None else None,
-        landmarks=backend.landmarks(),
-        frames=tuple(recorder.frames),
-        observations=tuple(recorder.observations) if keep_observations else None,
-        motion_samples=tuple(recorder.samples) if keep_observations else None,
-        warnings=tuple(watch.lines),
-        wall_s=timer.since_start(),
-    )
+    if resume:
+        state = recorder.restore(features)
+        viewer = _skipped(viewer, len(recorder))
+    else:
+        odometry = Odometry(
+            recording.camera,
+            replace(config, motion=motion or "none"),
+            T_cam0_imu=T_cam0_body,
+            frontend=frontend or _build_frontend(features, config),
+            selector=selector or _build_selector(features, config),
+            backend=backend or build_backend(recording.camera, T_cam0_body, config, motion),
+        )
+        dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
+        state = _RunState(odometry, dead_reckoning, start)
+    stopped = None
+    with contextlib.closing(recorder), contextlib.closing(viewer or NullViewer()) as shown:
+        loop = _Loop(state, recorder, shown)
+        try:
+            events = dataset.events(state.next_frame, stop, images=_needs_images(dataset, config))
+            stopped = loop.run(events, features, should_stop)
+        except VioError as error:
+            if folder is None or not len(recorder):
+                raise
+            stopped = str(error)
+        odometry = state.odometry
+        if not len(recorder):
+            _nothing_done(recording, odometry, stopped)
+        reckoned = state.dead_reckoning is not None
+        return RunResult(
+            recording=recording,
+            config=config,
+            motion=motion,
+            body=body,
+            T_cam0_body=T_cam0_body,
+            estimates=recorder.estimates,
+            dead_reckoning=_trajectory(recorder.dead_reckoned(), recorder, body) if reckoned else None,
+            landmarks=recorder.landmarks(odometry.landmarks()),
+            frames=recorder.frames,
+            observations=recorder.observations,
+            motion_samples=recorder.samples,
+            warnings=odometry.warnings,
+            wall_s=time.perf_counter() - began,
+            stopped=stopped,
+        )
 
 
-def _update(backend: Backend, seen: Observations, watch: RunWatch) -> UpdateReport:
-    """Update with a frame; a back end that can start again does so where it diverges."""
-    try:
-        return backend.update(seen)
-    except DivergedError as error:
-        if not isinstance(backend, Msckf):
-            raise
-        report = backend.restart(seen)
-        watch.restarted(seen.frame_index, str(error), backend.estimate())
-        return report
+def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:
+    """Say why a run has no frame.
 
-
-def frames_after_imu(events: Iterable[Event]) -> Iterator[Event]:
-    """Yield events with each frame after the first IMU sample at or after its exposure, as interpolation needs it.
-
-    Where none has come, the frame waits no longer than to the next frame or the end of the stream.
+    Raises:
+        StoppedError: it was asked to stop.
+        DataError: its frames could not be read, or were refused.
     """
-    held: StereoFrame | None = None
-    latest_ns: int | None = None  # of the IMU samples
-    for event in events:
+    if stopped is not None:
+        raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
+    if odometry.frames_refused:
+        raise DataError(odometry.warnings[-1])
+    raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
+
+
+@dataclass(slots=True)
+class _RunState:
+    """What a checkpoint holds of a run."""
+
+    odometry: Odometry
+    dead_reckoning: _DeadReckoning | None
+    next_frame: int  # where to take up the recording's events: the last frame taken, or the first one
+    frame_ns: int | None = None  # newest time of a frame that was taken
+    sample_ns: int | None = None  # newest time of a motion sample that was taken
+
+    def is_new(self, event: Event) -> bool:
+        """Whether an event of a recording that is read again has not been taken before."""
+        known = self.frame_ns if isinstance(event, StereoFrame) else self.sample_ns
+        return known is None or event.time_ns > known
+
+    def note(self, event: Event) -> None:
+        """Note that an event was taken."""
         if isinstance(event, StereoFrame):
-            if held is not None:
-                yield held
-            held = event
+            self.frame_ns, self.next_frame = event.time_ns, event.index
         else:
-            yield event
-            if isinstance(event, ImuSample):
-                latest_ns = event.time_ns
-        if held is not None and latest_ns is not None and latest_ns >= held.time_ns:
-            yield held
-            held = None
-    if held is not None:
-        yield held
+            self.sample_ns = event.time_ns
+
+
+class _Loop:
+    """Takes a recording's events through the odometry into the recorder."""
+
+    def __init__(self, state: _RunState, recorder: RunRecorder, viewer: Viewer) -> None:
+        self._state, self._recorder, self._viewer = state, recorder, viewer
+        self._reading = _ReadTimer()
+
+    def run(self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]) -> str | None:
+        """Take events to their end; return why they ended before.
+
+        Raises:
+            VioError: data or estimation are at fault.
+        """
+        state, recorder, odometry = self._state, self._recorder, self._state.odometry
+        stopped = None
+        resumed = state.frame_ns is not None
+        for event in self._reading.timed(events):
+            if resumed and not state.is_new(event):
+                continue
+            self._take(event)
+            state.note(event)
+            if _LEAST_REFUSED <= odometry.frames_refused > len(recorder):
+                break
+            if recorder.wants_checkpoint:
+                recorder.save(state, dataset, odometry.take_landmarks())
+            stopped = should_stop()
+            if stopped:
+                recorder.save(state, dataset, odometry.take_landmarks())
+                break
+        self._record(odometry.finish())
+        recorder.revise(odometry.smoothed)
+        if odometry.frames_refused > len(recorder):
+            raise DataError(f"most frames were refused: {odometry.warnings[-1]}")
+        return stopped
+
+    def _take(self, event: Event) -> None:
+        state = self._state
+        if not isinstance(event, StereoFrame):
+            self._recorder.sample(event)
+        self._record(state.odometry.add_event(event))
+        if state.dead_reckoning is not None:
+            state.dead_reckoning.add(event)
+
+    def _record(self, results: list[FrameResult]) -> None:
+        state = self._state
+        for result in results:
+            self._recorder.frame(result, self._reading.take_ms(), state.odometry.smoothed)
+            if state.dead_reckoning is not None:
+                self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
+            self._viewer.frame(result.output, result.estimate, result.report)
+
+
+def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:
+    """Tell a viewer that knows it of frames that an earlier process has done."""
+    skip = getattr(viewer, "skip", None)
+    if skip is not None:
+        skip(frames)
+    return viewer
 
 
 def _check(recording: Recording, config: Config, start: int, stop: int | None) -> None:
@@ -260,7 +290,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
     Raises:
         ConfigError: the recording lacks what was asked for, or the back end has no model for it.
     """
-    taken = _BACKENDS[config.backend].motion_sources
+    taken = BACKENDS[config.backend].motion_sources
     if config.motion == "none":
         return None
     if config.motion == "auto":
@@ -277,7 +307,7 @@ def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
 
 def _auto_motion(recording: Recording, backend: BackendName) -> MotionSource | None:
     """Return what the run behind an observation log used, else the best that recording and back end share."""
-    taken = _BACKENDS[backend].motion_sources
+    taken = BACKENDS[backend].motion_sources
     if recording.run_motion == "none":
         return None
     if recording.run_motion in taken and recording.run_motion in recording.motion:
@@ -295,68 +325,27 @@ def _auto_motion(recording: Recording, backend: BackendName) -> MotionSource | N
     return found
 
 
-class _StageTimer:
-    """Wall time of the stages of one frame, the end of one being the beginning of the next."""
+class _ReadTimer:
+    """Wall time that the recording takes to give its events."""
 
     def __init__(self) -> None:
-        self._start = time.perf_counter()
-        self.begin()
+        self._ms = 0.0
 
-    def begin(self) -> None:
-        """Begin a frame."""
-        self.ms: dict[str, float] = {}
-        self._last = time.perf_counter()
+    def timed(self, events: Iterable[Event]) -> Iterator[Event]:
+        """Yield the events, and note how long each took to come."""
+        iterator = iter(events)
+        while True:
+            start = time.perf_counter()
+            event = next(iterator, None)
+            self._ms += 1e3 * (time.perf_counter() - start)
+            if event is None:
+                return
+            yield event
 
-    def end(self, stage: str) -> None:
-        """Note how long a stage has taken."""
-        now = time.perf_counter()
-        self.ms[stage] = 1e3 * (now - self._last)
-        self._last = now
-
-    def since_start(self) -> float:
-        """Seconds since the run began."""
-        return time.perf_counter() - self._start
-
-
-class _RunRecorder:
-    """What a run keeps: an estimate and a row of the log per frame and, on request, what went in."""
-
-    def __init__(self, backend: Backend, lag_frames: int, *, keep_observations: bool) -> None:
-        self._backend, self._lag, self._keep = backend, lag_frames, keep_observations
-        self.estimates: list[Estimate] = []
-        self.frames: list[FrameLog] = []
-        self.observations: list[Observations] = []
-        self.samples: list[MotionSample] = []
-
-    def sample(self, sample: MotionSample) -> None:
-        if self._keep:
-            self.samples.append(sample)
-
-    def frame(self, estimate: Estimate, row: FrameLog, seen: Observations) -> None:
-        if self._lag:
-            self._revise(len(self.estimates) - self._lag, len(self.estimates) - self._lag + 1)
-        self.estimates.append(estimate)
-        self.frames.append(row)
-        if self._keep:
-            self.observations.append(seen)
-
-    def finish(self) -> None:
-        if self._lag:
-            self._revise(len(self.estimates) - self._lag, len(self.estimates))
-
-    def _revise(self, first: int, end: int) -> None:
-        """Replace estimates by the smoothed ones: pose, covariance, velocity and biases."""
-        for k in range(max(first, 0), end):
-            smoothed = self._backend.smoothed(self.frames[k].index)
-            if smoothed is not None:
-                self.estimates[k] = replace(
-                    self.estimates[k],
-                    T_world_imu=smoothed.T_world_imu,
-                    covariance=smoothed.covariance,
-                    velocity_world=smoothed.velocity_world,
-                    gyro_bias=smoothed.gyro_bias,
-                    accel_bias=smoothed.accel_bias,
-                )
+    def take_ms(self) -> float:
+        """Return the time since the last call, and begin anew."""
+        taken, self._ms = self._ms, 0.0
+        return taken
 
 
 class _DeadReckoning:
@@ -365,14 +354,16 @@ class _DeadReckoning:
     def __init__(self, recording: Recording, config: Config, T_cam0_body: FloatArray) -> None:
         settings = replace(config.vislam, mode="dead_reckoning", motion_model="input")
         self._filter = Vislam(recording.camera, T_cam0_body, settings, motion_sensor=True)
-        self.poses: list[FloatArray] = []
 
-    def propagate(self, sample: MotionSample) -> None:
-        self._filter.propagate(sample)
+    def add(self, event: Event) -> None:
+        """Take a motion sample."""
+        if not isinstance(event, StereoFrame):
+            self._filter.propagate(event)
 
-    def frame(self, frame: StereoFrame) -> None:
-        self._filter.advance(frame.time_ns)
-        self.poses.append(self._filter.estimate().T_world_imu)
+    def pose_at(self, time_ns: int) -> FloatArray:
+        """The pose (4, 4) of the body at a frame, which may not be older than the last one."""
+        self._filter.advance(time_ns)
+        return self._filter.estimate().T_world_imu
 
 
 def _feature_source(dataset: Dataset, config: Config) -> Dataset:
@@ -394,8 +385,7 @@ def _feature_source(dataset: Dataset, config: Config) -> Dataset:
 
 
 def _build_frontend(features: Dataset, config: Config) -> Frontend:
-    from frontend import build_frontend
-
+    build_frontend = frontend_module().build_frontend
     name = config.frontend.name if config.frontend.features is None else "precomputed"
     return build_frontend(name, features.recording.camera, config.frontend, features)
 
@@ -404,25 +394,15 @@ def _build_selector(features: Dataset, config: Config) -> Selector:
     recording = features.recording
     indices = range(len(recording.frame_times_ns))
     precomputed = features.observations(0) is not None
-    camera = recording.camera
 
     def whole_record() -> list[Observations]:
         return [o for o in map(features.observations, indices) if o is not None]
 
     return build_selector(
         config.selector,
-        image_size=None if camera.width is None or camera.height is None else (camera.width, camera.height),
         whole_record=whole_record if precomputed else None,
-        camera=camera,
+        camera=recording.camera,
     )
-
-
-def _build_backend(
-    recording: Recording, config: Config, motion: MotionSource | None, T_cam0_body: FloatArray
-) -> Backend:
-    if config.backend == "msckf":
-        return Msckf(recording.camera, T_cam0_body, config.msckf, motion=motion)
-    return Vislam(recording.camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
 
 
 def _needs_images(dataset: Dataset, config: Config) -> bool:
@@ -430,35 +410,6 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
     return dataset.recording.has_images and front.name != "precomputed" and front.features is None
 
 
-def _frame_log(
-    frame: StereoFrame, timer: _StageTimer, output: FrontendOutput, selection: Selection, report: UpdateReport
-) -> FrameLog:
-    return FrameLog(
-        index=frame.index,
-        time_ns=frame.time_ns,
-        read_ms=timer.ms["read"],
-        frontend_ms=timer.ms["frontend"],
-        watch_ms=timer.ms["watch"],
-        select_ms=timer.ms["select"],
-        filter_ms=timer.ms["predict"] + timer.ms["update"],
-        detected=output.detected,
-        tracked=output.tracked,
-        matched=output.matched,
-        selected=int(selection.chosen.sum()),
-        stale=int(output.observations.stale.sum()),
-        used=report.used,
-        gated=report.gated,
-        landmarks=report.landmarks,
-        innovation_median_px=report.innovation_median_px,
-        nis_per_dof=report.nis_per_dof,
-        stages_ms=output.stages_ms,
-    )
-
-
-def _trajectory(poses: list[FloatArray], frames: list[FrameLog] | tuple[FrameLog, ...], body: BodyFrame) -> Trajectory:
-    return Trajectory(
-        T_world_body=np.array(poses),
-        times_ns=np.array([f.time_ns for f in frames], dtype=np.int64),
-        body=body,
-        frame_indices=np.array([f.index for f in frames], dtype=np.int64),
-    )
+def _trajectory(T_world_body: FloatArray, rows: RunRecorder, body: BodyFrame) -> Trajectory:
+    times_ns, indices = (np.asarray(rows.estimates.column(name)) for name in ("time_ns", "index"))
+    return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=body, frame_indices=indices)

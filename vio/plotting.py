@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import logging
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +15,9 @@ import numpy as np
 from vio.evaluation import Evaluation
 from vio.geometry.lie import FloatArray, transform_points
 from vio.pipeline import RunResult
+from vio.printable import printable
+
+log = logging.getLogger(__name__)
 
 _ESTIMATE, _REFERENCE, _DEAD_RECKONING, _LANDMARKS = "#1f5fbf", "#111111", "#d9822b", "#9aa5b1"
 _STRAIGHT = 0.1  # extent across a path over that along it, below which it gives no plane
@@ -19,29 +26,48 @@ _STRAIGHT = 0.1  # extent across a path over that along it, below which it gives
 def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
     """Plot the map from above, and errors, feature counts and times over the frames; write a PNG.
 
+    A picture that cannot be drawn or written gives a warning: it must not cost the results of the run.
+
     Args:
         path: the PNG to write.
         result: the run.
         evaluation: the trajectory against the reference; None without one.
         dead_reckoning: dead reckoning against the reference; None without one.
     """
+    write_picture(path, lambda: _figure(result, evaluation, dead_reckoning))
+
+
+def write_picture(path: Path, draw: Callable[[], Any]) -> None:
+    """Write the matplotlib figure that `draw` returns as a PNG; a failure gives a warning and leaves no file."""
+    try:
+        stream = io.BytesIO()
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # another script
+            draw().savefig(stream, format="png")
+        path.write_bytes(stream.getvalue())
+    except Exception as error:
+        log.warning("%s was not drawn (%s: %s)", path.name, type(error).__name__, " ".join(str(error).split()))
+        log.debug("the traceback of the picture", exc_info=True)
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def _figure(result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 7.2), dpi=110, layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
     _draw_map(figure.add_subplot(grid[:, 0]), result, evaluation, dead_reckoning)
-    seconds = np.array([f.time_ns - result.frames[0].time_ns for f in result.frames]) * 1e-9
+    seconds = np.array(result.frames.column("time_ns") - result.frames[0].time_ns) * 1e-9
     _draw_error(figure.add_subplot(grid[0, 1]), seconds, result, evaluation, dead_reckoning)
     _draw_counts(figure.add_subplot(grid[1, 1]), seconds, result)
     _draw_time(figure.add_subplot(grid[2, 1]), seconds, result)
-    figure.suptitle(_title(result, evaluation), fontsize=12)
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Glyph .* missing", category=UserWarning)  # a name in another script
-        figure.savefig(path)
+    figure.suptitle(_title(result, evaluation), fontsize=12, parse_math=False)  # a $ in a file name is no formula
+    return figure
 
 
 def _title(result: RunResult, evaluation: Evaluation | None) -> str:
-    name = f"{result.recording.path.name}: {result.config.backend}, motion {result.motion or 'none'}"
+    name = f"{printable(result.recording.path.name)}: {result.config.backend}, motion {result.motion or 'none'}"
     if evaluation is None:
         return f"{name}, no reference"
     scores = evaluation.as_dict()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vio.atomic import atomic_folder
+from vio.atomic import atomic_folder, check_writable
 from vio.config import BackendName, Config, MotionName
 from vio.datasets import DatasetSettings, open_dataset
 from vio.errors import DataError
@@ -17,6 +16,8 @@ from vio.evaluation import Evaluation, evaluate
 from vio.filters.settings import VislamSettings
 from vio.geometry.lie import FloatArray
 from vio.pipeline import RunResult, run
+from vio.plotting import write_picture
+from vio.printable import json_text, printable
 from vio.records import Trajectory
 from vio.selectors import SelectorSettings
 from vio.threads import one_blas_thread
@@ -150,6 +151,7 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> Table:
     if "velocity" not in recording.motion or dataset.observations(0) is None:
         raise DataError(f"{file}: the experiment needs features and velocities; this is a {recording.kind} recording")
     truth = recording.reference if reference is None else read_trajectory(reference)
+    check_writable(out / file.stem)
     results: list[tuple[Variant, RunResult, Evaluation | None]] = []
     with one_blas_thread():
         for variant in VARIANTS:
@@ -159,8 +161,8 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> Table:
     table = Table(file.stem, out / file.stem, tuple(_row(*each) for each in results))
     with atomic_folder(table.out, replace=True, marker="table.json") as inside:
         (inside / "table.md").write_text(table.as_text(), encoding="utf-8")
-        (inside / "table.json").write_text(json.dumps(table.as_dict(), indent=2) + "\n", encoding="utf-8")
-        _plot(inside / "trajectories.png", file.stem, results, truth)
+        (inside / "table.json").write_text(json_text(table.as_dict(), indent=2) + "\n", encoding="utf-8")
+        write_picture(inside / "trajectories.png", lambda: _figure(file.stem, results))
     return table
 
 
@@ -177,9 +179,7 @@ def _row(variant: Variant, result: RunResult, score: Evaluation | None) -> Row:
     )
 
 
-def _plot(
-    path: Path, drive: str, results: list[tuple[Variant, RunResult, Evaluation | None]], truth: Trajectory | None
-) -> None:
+def _figure(drive: str, results: list[tuple[Variant, RunResult, Evaluation | None]]) -> Any:
     from matplotlib.figure import Figure
 
     shown = (
@@ -208,12 +208,13 @@ def _plot(
     for label, positions, colour in curves:
         axes.plot(*positions.T, color=colour, lw=1.5, label=label)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_title(f"{drive}: the paper's filter, and the effect of a gate and of consistent noise", fontsize=11)
+    title = f"{printable(drive)}: the paper's filter, and the effect of a gate and of consistent noise"
+    axes.set_title(title, fontsize=11, parse_math=False)
     axes.set_xlabel("m")
     axes.set_ylabel("m")
     axes.grid(alpha=0.25)
     axes.legend(fontsize=9)
-    figure.savefig(path)
+    return figure
 
 
 def _ground(reference: Trajectory) -> list[int]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any
 
 
 @contextmanager
@@ -13,3 +14,17 @@ def one_blas_thread() -> Iterator[None]:
 
     with threadpool_limits(limits=1, user_api="blas"):
         yield
+
+
+class BlasLimit:
+    """As `one_blas_thread`, for blocks that are entered often: it looks for the BLAS libraries once."""
+
+    def __init__(self) -> None:
+        from threadpoolctl import ThreadpoolController
+
+        self._controller = ThreadpoolController()
+
+    def __call__(self) -> AbstractContextManager[Any]:
+        """Return the context."""
+        limit: AbstractContextManager[Any] = self._controller.limit(limits=1, user_api="blas")
+        return limit

@@ -7,13 +7,14 @@ needs them is built.
 
 from __future__ import annotations
 
-from frontend.descriptors import DescriptorFrontend, Matcher, MutualNearest
-from frontend.learned.extractors import build_extractor
-from frontend.learned.lightglue import build_lightglue
-from frontend.learned.weights import pick_device
-from frontend.settings import FrontendSettings
 from vio.errors import MissingDependencyError
 from vio.geometry.stereo import StereoCamera
+
+from ..descriptors import DescriptorFrontend, Matcher, MutualNearest
+from ..settings import FrontendSettings
+from .extractors import build_extractor
+from .lightglue import build_lightglue
+from .weights import pick_device
 
 
 def build_learned(camera: StereoCamera, settings: FrontendSettings) -> DescriptorFrontend:

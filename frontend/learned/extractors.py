@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
 
-from frontend.descriptors import Extractor, Keypoints
-from frontend.learned.weights import SECTION, Module, filled, half_precision, load_weights
-from frontend.settings import LearnedSettings, MatchSettings
 from vio.errors import DataError
 from vio.records import Image
+
+from ..descriptors import Extractor, Keypoints
+from ..settings import LearnedSettings, MatchSettings
+from .weights import SECTION, Module, filled, half_precision, load_weights
 
 if TYPE_CHECKING:
     import torch

@@ -1,23 +1,95 @@
 """The command `vio`: subcommands, one file each; nothing heavy is imported before a command runs.
 
-Exit status: 0 success, 1 an expected error, reported in one line, 2 wrong usage, 130 interrupted.
+Exit status: 0 success, 1 an expected error, reported in one line, 2 wrong usage, 130 interrupted by Ctrl-C, 143 ended
+by SIGTERM, 129 by SIGHUP; the last three leave no unfinished files behind.
 """
 
 from __future__ import annotations
 
 import argparse
-import errno
+import contextlib
 import io
 import logging
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from types import FrameType
 
 from vio._version import __version__
-from vio.cli import calibrate, check, config, demo, evaluate, export, rectify, refine, render, reproduce, run
-from vio.errors import VioError
+from vio.cli import (
+    calibrate,
+    check,
+    config,
+    convert,
+    demo,
+    evaluate,
+    export,
+    inspect,
+    rectify,
+    refine,
+    render,
+    reproduce,
+    run,
+)
+from vio.errors import StoppedError, VioError
+from vio.printable import printable
 
-_COMMANDS = (run, evaluate, check, refine, export, calibrate, demo, render, rectify, reproduce, config)
+_COMMANDS = (
+    run,
+    inspect,
+    convert,
+    evaluate,
+    check,
+    refine,
+    export,
+    calibrate,
+    demo,
+    render,
+    rectify,
+    reproduce,
+    config,
+)
+
+
+_MOST_SHOWN = 200  # characters of a path in a message
+_ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process was asked to end; handled like Ctrl-C, so that nothing unfinished stays."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+@contextlib.contextmanager
+def _orderly_end() -> Iterator[None]:
+    """Raise `_Terminated` at SIGTERM and SIGHUP inside the block, where this is the main thread."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    owner = os.getpid()
+
+    def end(number: int, frame: FrameType | None) -> None:
+        if os.getpid() != owner:  # a forked worker ends as it would have
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+            return
+        signal.signal(number, signal.SIG_IGN)  # a second one must not cut short the cleaning up
+        raise _Terminated(number)
+
+    before = {number: signal.getsignal(number) for number in _ENDING}
+    for number, handler in before.items():
+        if handler == signal.SIG_DFL:  # under nohup SIGHUP is ignored, and stays so
+            signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None:
+                signal.signal(number, handler)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -44,13 +116,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     try:
-        status: int = args.execute(args)
-        sys.stdout.flush()
+        with _orderly_end():
+            status: int = args.execute(args)
+            sys.stdout.flush()
+    except StoppedError as stop:
+        print(printable(" ".join(str(stop).split())), file=sys.stderr)
+        return stop.status
     except VioError as error:
         if args.debug:
             raise
-        print("error:", " ".join(str(error).split()), file=sys.stderr)
+        print("error:", printable(" ".join(str(error).split())), file=sys.stderr)
         return 1
+    except _Terminated as stop:
+        print(f"ended by {signal.Signals(stop.number).name}; nothing was written", file=sys.stderr)
+        return 128 + stop.number
     except KeyboardInterrupt:
         print("interrupted; nothing was written", file=sys.stderr)
         return 130
@@ -59,9 +138,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        if error.filename is not None or error.errno != errno.ENOSPC:
+        if args.debug:
             raise
-        print(f"error: cannot write the output: {error.strerror}", file=sys.stderr)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # A path that no check foresaw: too long a name, a folder that may not be entered, a disk that fails.
+        where = (
+            "cannot write the output" if error.filename is None else f"cannot use {str(error.filename)[:_MOST_SHOWN]}"
+        )
+        print("error:", printable(f"{where}: {error.strerror or error}"), file=sys.stderr)
+        if error.filename is None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except MemoryError as error:
+        if args.debug:
+            raise
+        print(
+            f"error: out of memory ({str(error)[:_MOST_SHOWN] or 'no details'}); process less at once", file=sys.stderr
+        )
         return 1
     return status

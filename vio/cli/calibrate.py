@@ -43,9 +43,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    import json
-
-    from vio.atomic import atomic_folder
+    from vio.atomic import atomic_folder, check_replaceable, check_writable
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.cli.running import free_folder
@@ -54,28 +52,32 @@ def execute(args: argparse.Namespace) -> int:
     from vio.offline.calibrate import measure
     from vio.offline.calibration_files import write_calibration
     from vio.offline.source import open_source
+    from vio.printable import json_text
     from vio.threads import one_blas_thread
 
     if args.pairs < 1 or args.frames < 2:
         raise ConfigError("--pairs must be at least 1 and --frames at least 2")
     quiet()
     source = open_source(args.source)
+    out = args.out or free_folder(source.path, Path("calibrations"))
+    check_replaceable(out.absolute(), replace=True, marker=MARKER)
+    check_writable(out)
     with one_blas_thread(), ProgressBar(f"calibrate {source.path.name}") as bar:
         report = measure(source, _frontend, pairs=args.pairs, frames=args.frames, progress=bar.update)
-    out = args.out or free_folder(source.path, Path("calibrations"))
     facts = {"out": str(out), **_facts(report)}
     with atomic_folder(out, replace=True, marker=MARKER) as folder:
         write_calibration(folder, report)
-        (folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+        (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
     return print_result(facts, [*_rows(report), ("results", str(out))], as_json=args.json, name_width=22)
 
 
 def _frontend(dataset: Dataset) -> Frontend:
     """Return the default front end."""
-    from frontend import build_frontend
-    from frontend.settings import FrontendSettings
+    from vio.frontend_package import frontend_module
 
-    return build_frontend("auto", dataset.recording.camera, FrontendSettings(), dataset)
+    package = frontend_module()
+    frontend: Frontend = package.build_frontend("auto", dataset.recording.camera, package.FrontendSettings(), dataset)
+    return frontend
 
 
 def _facts(report: CalibrationReport) -> dict[str, Any]:

@@ -44,7 +44,6 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    import json
 
     from vio.atomic import atomic_folder
     from vio.cli.output import print_result
@@ -52,6 +51,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.colmap import quiet
     from vio.errors import ConfigError
     from vio.offline.check import check_run
+    from vio.printable import json_text
     from vio.saved_run import read_saved_run
 
     if args.threads < 1 or args.keyframes < 2:
@@ -70,7 +70,7 @@ def execute(args: argparse.Namespace) -> int:
             "keyframes": results[0].total,
             "mappers": {result.mapper: _facts(result) for result in results},
         }
-        (folder / MARKER).write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        (folder / MARKER).write_text(json_text(report, indent=2) + "\n", encoding="utf-8")
     rows = [(result.mapper, f"{key:<10} {value}") for result in results for key, value in _rows(result)]
     return print_result(report, [*rows, ("plot", str(out / "check.png"))], as_json=args.json, name_width=12)
 

@@ -33,7 +33,6 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    import json
     from dataclasses import asdict
 
     from vio.atomic import atomic_folder
@@ -42,6 +41,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.colmap import quiet
     from vio.errors import ConfigError
     from vio.offline.export import export_colmap
+    from vio.printable import json_text
     from vio.saved_run import read_saved_run, with_poses
     from vio.threads import one_blas_thread
 
@@ -67,7 +67,7 @@ def execute(args: argparse.Namespace) -> int:
             "poses": "refined" if args.refined else "filter",
             **asdict(done),
         }
-        (folder / MARKER).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+        (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
     rows = (
         ("folder", str(out)),
         ("keyframes", f"{done.keyframes} stereo pairs, {done.images} images written"),

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from typing import Any
+
+from vio.printable import json_text, printable
 
 
 def print_result(
     facts: Mapping[str, Any], rows: Iterable[tuple[str, str]], *, as_json: bool, name_width: int = 10
 ) -> int:
-    """Print all results as JSON, or rows of names and values as a table; return the exit status."""
+    """Print all results as JSON, or rows of names and values as a table, names of files escaped; return the status."""
     if as_json:
-        print(json.dumps(facts))
+        print(json_text(facts))
     else:
         for name, value in rows:
-            print(f"{name:<{name_width}} {value}")
+            print(f"{name:<{name_width}} {printable(value)}")
     return 0

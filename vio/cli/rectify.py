@@ -32,7 +32,6 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    import json
     import logging
 
     from vio.atomic import atomic_folder
@@ -43,6 +42,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.datasets.kitti_raw import write_rectified_kitti
     from vio.datasets.rectified import RectifiedDataset, check_not_rectified
     from vio.errors import DataError
+    from vio.printable import json_text
     from vio.text_files import write_text
 
     dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation))
@@ -70,7 +70,7 @@ def execute(args: argparse.Namespace) -> int:
         with ProgressBar(f"rectify {recording.path.name}") as bar:
             frames = writers[recording.kind](dataset, folder, bar.update)
         facts["frames"] = frames
-        write_text(folder / MARKER, json.dumps(facts, indent=2) + "\n")
+        write_text(folder / MARKER, json_text(facts, indent=2) + "\n")
     rows = (
         ("folder", str(args.out)),
         ("frames", f"{frames}"),

@@ -23,13 +23,13 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    import json
 
+    from vio.printable import json_text
     from vio.reproduce import reproduce
 
     tables = [reproduce(*_split(text), args.out) for text in args.files]
     if args.json:
-        print(json.dumps([table.as_dict() for table in tables]))
+        print(json_text([table.as_dict() for table in tables]))
     else:
         for table in tables:
             print(table.as_text())

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from vio.datasets.common import checked_transform, image_size, naming
+from vio.datasets.yaml_files import as_number, numbers, read_yaml
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
@@ -27,6 +27,7 @@ DISTORTION_MODELS: dict[str, DistortionModel] = {
     "equidistant": "equidistant",
     "none": "pinhole",
 }
+SENSOR_YAML_MODELS: tuple[DistortionModel, ...] = ("pinhole", "radtan", "equidistant")  # those it has a name for
 STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, within mav0
 TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
 _NOISE = {  # entries of the IMU's sensor.yaml, and their units
@@ -56,7 +57,7 @@ def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
     Raises:
         CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
     """
-    entries = _read_yaml(path)
+    entries = read_yaml(path)
     if (kind := entries.get("camera_model", "pinhole")) != "pinhole":
         raise CalibrationError(f"{path}: camera_model {kind!r} is not supported; only 'pinhole' is (with distortion)")
     name = entries.get("distortion_model", "none")
@@ -65,18 +66,24 @@ def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
             f"{path}: distortion_model {name!r} is unknown; the known ones are {', '.join(DISTORTION_MODELS)}"
         )
     model = DISTORTION_MODELS[name]
-    coefficients = () if model == "pinhole" else _numbers(entries, "distortion_coefficients", path)
+    coefficients = () if model == "pinhole" else numbers(entries, "distortion_coefficients", path)
     if model == "radtan" and not any(coefficients):
         model, coefficients = "pinhole", ()
-    fu, fv, cu, cv = _numbers(entries, "intrinsics", path, 4)
-    width, height = image_size(_numbers(entries, "resolution", path, 2), f"{path}, resolution")
+    fu, fv, cu, cv = numbers(entries, "intrinsics", path, 4)
+    width, height = image_size(numbers(entries, "resolution", path, 2), f"{path}, resolution")
     with naming(path):
         camera = CameraModel(fu, fv, cu, cv, width, height, model, coefficients)
     return camera, _T_BS(entries, path)
 
 
 def camera_yaml(camera: CameraModel, T_body_cam: FloatArray, *, comment: str, rate_hz: float) -> str:
-    """The text of a camera's `sensor.yaml`, with all digits; `T_body_cam` (4, 4) becomes its `T_BS`."""
+    """The text of a camera's `sensor.yaml`, with all digits; `T_body_cam` (4, 4) becomes its `T_BS`.
+
+    Raises:
+        CalibrationError: the format has no name for the lens model.
+    """
+    if camera.model not in SENSOR_YAML_MODELS:
+        raise CalibrationError(f"EuRoC's sensor.yaml has no {camera.model} lens; rectify the images first")
     name = "equidistant" if camera.model == "equidistant" else "radial-tangential"
     return (
         f"%YAML:1.0\nsensor_type: camera\ncomment: {comment}\n\n"
@@ -94,7 +101,7 @@ def read_imu_yaml(path: Path) -> tuple[FloatArray, ImuDensities | None]:
     Raises:
         CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
     """
-    entries = _read_yaml(path)
+    entries = read_yaml(path)
     return _T_BS(entries, path), _noise(entries, path)
 
 
@@ -102,7 +109,7 @@ def _noise(entries: Mapping[str, object], path: Path) -> ImuDensities | None:
     """Return the noise densities; None where none is given."""
     if not any(key in entries for key in _NOISE):
         return None
-    values = [_numbers(entries, key, path, 1)[0] for key in _NOISE]
+    values = [numbers(entries, key, path, 1)[0] for key in _NOISE]
     for key, value in zip(_NOISE, values, strict=True):
         if not value > 0:
             raise CalibrationError(f"{path}: {key} is {value:g}; a noise density must be positive")
@@ -124,40 +131,6 @@ def median_rate_hz(times_ns: IntArray) -> float:
     return NS_PER_S / float(np.median(np.diff(times_ns))) if len(times_ns) > 1 else 0.0
 
 
-def _read_yaml(path: Path) -> Mapping[str, object]:
-    if not path.is_file():
-        raise CalibrationError(f"{path} is missing; it holds the sensor's calibration")
-    # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
-    lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
-    try:
-        entries = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
-    except yaml.YAMLError as error:
-        raise CalibrationError(f"{path}: not a YAML file ({' '.join(str(error).split())}); copy it again") from error
-    if not isinstance(entries, dict):
-        raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
-    return entries
-
-
-def _number(value: object) -> float:
-    """Parse a number from YAML or csv (PyYAML reads 1e-3 as text); NaN where it is none."""
-    try:
-        return float(value) if isinstance(value, (int, float, str)) else float("nan")
-    except ValueError:
-        return float("nan")
-
-
-def _numbers(entries: Mapping[str, object], key: str, path: Path, count: int | None = None) -> tuple[float, ...]:
-    """Return a list of finite numbers, or a single one as a list."""
-    if key not in entries:
-        raise CalibrationError(f"{path}: has no entry '{key}'; copy the calibration again")
-    value = entries[key]
-    numbers = tuple(_number(v) for v in (value if isinstance(value, list) else [value]))
-    if (count is not None and len(numbers) != count) or not np.all(np.isfinite(numbers)):
-        wanted = "finite numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
-        raise CalibrationError(f"{path}: '{key}' is {value!r} instead of {wanted}")
-    return numbers
-
-
 def _T_BS(entries: Mapping[str, object], path: Path) -> FloatArray:
     """Read the transform from the sensor to the body, given as an OpenCV matrix or a list of rows."""
     entry = entries.get("T_BS")
@@ -166,7 +139,7 @@ def _T_BS(entries: Mapping[str, object], path: Path) -> FloatArray:
         values = [value for row in values for value in row]
     if not isinstance(values, list) or len(values) != 16:
         raise CalibrationError(f"{path}: T_BS must hold 16 numbers, the 4x4 transform from the sensor to the body")
-    return checked_transform(np.array([_number(v) for v in values]).reshape(4, 4), f"{path}, T_BS")
+    return checked_transform(np.array([as_number(v) for v in values]).reshape(4, 4), f"{path}, T_BS")
 
 
 def _T_BS_yaml(T_body_sensor: FloatArray) -> str:
@@ -177,9 +150,15 @@ def _T_BS_yaml(T_body_sensor: FloatArray) -> str:
 # --- data.csv -------------------------------------------------------------------------------------------------------
 
 
+def image_name(time_ns: int, last_ns: int) -> str:
+    """The file name of an image by its time, with the digits of the last one's, so that names sort by time as text."""
+    return f"{time_ns:0{len(str(last_ns))}d}.png"
+
+
 def image_list_csv(times_ns: IntArray) -> str:
     """The text of a camera's `data.csv` for images named by their times (N,), nanoseconds."""
-    return "\n".join([_IMAGES_HEADER, *(f"{t},{t}.png" for t in times_ns.tolist())]) + "\n"
+    last_ns = int(times_ns[-1])
+    return "\n".join([_IMAGES_HEADER, *(f"{t},{image_name(t, last_ns)}" for t in times_ns.tolist())]) + "\n"
 
 
 def read_imu_csv(path: Path) -> ImuRecord:
@@ -192,7 +171,7 @@ def read_imu_csv(path: Path) -> ImuRecord:
     try:
         values = np.array(rows, dtype=np.float64)
     except ValueError:
-        values = np.array([[_number(text) for text in row] for row in rows])
+        values = np.array([[as_number(text) for text in row] for row in rows])
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         k = int(np.argmax(bad))

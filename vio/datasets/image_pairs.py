@@ -5,17 +5,19 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from vio.datasets.common import frame_range, merge_events
-from vio.datasets.images import UnreadableImageError, list_images, load_gray, prefetch
+from vio.datasets.images import WHITE_16, UnreadableImageError, list_images, load_gray, prefetch, white_level
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.records import Event, Image, MotionSample, Observations, Recording, StereoFrame
 
 logger = logging.getLogger(__name__)
 
+Item = TypeVar("Item")
 ImagePairs = tuple[tuple[Path, Path], ...]  # left and right image of each frame
 
 _NAMED = 5  # skipped frames that get a line each; the others are counted in one at the end
@@ -47,7 +49,7 @@ class BadFrame:
 
 
 def readable_frames(
-    load: Callable[[int], StereoFrame | BadFrame], chosen: Iterable[int], settings: DatasetSettings
+    load: Callable[[Item], StereoFrame | BadFrame], chosen: Iterable[Item], settings: DatasetSettings
 ) -> Generator[StereoFrame]:
     """Prefetch frames in a thread, and skip unusable ones with a warning.
 
@@ -72,6 +74,19 @@ def readable_frames(
         raise DataError(f"none of {bad} frames can be used; the first: {first_bad}")
     if bad > _NAMED:
         logger.warning("%d of %d frames were skipped; the first %d are named above", bad, bad + good, _NAMED)
+
+
+_WHITE_FRAMES = 8  # that tell the level of white, spread over the recording: the first may be dark
+
+
+def full_scale(pairs: ImagePairs) -> tuple[int, tuple[str, ...]]:
+    """Return the level of white of a recording's 16-bit images, for `load_gray`, with a note where it is not 65535."""
+    chosen = {(len(pairs) - 1) * k // (_WHITE_FRAMES - 1) for k in range(_WHITE_FRAMES)} if pairs else set()
+    white = white_level([path for k in sorted(chosen) for path in pairs[k]])
+    if white == WHITE_16:
+        return white, ()
+    note = f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits"
+    return white, (note,)
 
 
 def first_readable(pairs: ImagePairs) -> tuple[Path, Image, int]:
@@ -113,6 +128,7 @@ class ImageDataset:
     motion: tuple[MotionSample, ...]  # in time order
     sizes: tuple[ImageSize, ImageSize]  # of the left and the right files
     settings: DatasetSettings
+    white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
@@ -144,7 +160,7 @@ class ImageDataset:
         """Read one frame; runs in the prefetch thread."""
         paths = self.pairs[index]
         try:
-            left, right = (load_gray(path)[0] for path in paths)
+            left, right = (load_gray(path, self.white)[0] for path in paths)
             for size, image, path in zip(self.sizes, (left, right), paths, strict=True):
                 size.check(image, path)
         except UnreadableImageError as error:

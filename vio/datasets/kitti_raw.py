@@ -21,15 +21,16 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
-from vio.datasets.image_pairs import ImagePairs, first_readable, pair_images
+from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pair_images
 from vio.datasets.kitti import write_calibration, write_times
-from vio.datasets.rectified import RectifiedDataset, Rectifier, make_rectifier, rig_sizes, write_frames
+from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.protocols import Progress
 from vio.records import NS_PER_S, IntArray, Recording, StereoFrame
+from vio.rig import Rectifier
 from vio.text_files import check_increasing, text_lines
 
 CAMERAS = "calib_cam_to_cam.txt"
@@ -79,10 +80,11 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
             f"{path}: {CAMERAS} is neither there nor in the folders above; copy KITTI's calibration of that day there"
         )
     calibration = read_cam_to_cam(calibration_path)
-    T_cam0_imu, imu_notes = _read_imu_pose(path)
+    T_cam0_imu, imu_notes = read_imu_pose(path)
     numbers = _frame_numbers(pairs)
     times_ns, time_notes = _read_times(path / "image_00" / "timestamps.txt", numbers)
     rectifier = _rectifier(calibration, T_cam0_imu, pairs, settings, calibration_path)
+    white, depth_notes = full_scale(pairs)
     recording = Recording(
         kind="kitti_raw",
         path=path,
@@ -92,10 +94,10 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=frozenset(),
         reference=None,
-        notes=(*time_notes, *imu_notes),
+        notes=(*time_notes, *imu_notes, *depth_notes),
     )
     sizes = rig_sizes(rectifier.rig, (calibration_path, calibration_path))
-    return RectifiedDataset(recording, pairs, (), sizes, settings, rectifier)
+    return RectifiedDataset(recording, pairs, (), sizes, settings, rectifier, white=white)
 
 
 def _find(path: Path, name: str) -> Path | None:
@@ -188,7 +190,7 @@ def _rotation(entries: Mapping[str, str], name: str, path: Path) -> FloatArray:
     return checked_transform(np.column_stack([R, np.zeros(3)]), f"{path}, {name}")[:3, :3]
 
 
-def _read_imu_pose(path: Path) -> tuple[FloatArray | None, tuple[str, ...]]:
+def read_imu_pose(path: Path) -> tuple[FloatArray | None, tuple[str, ...]]:
     """`T_cam0_imu` (4, 4) of the raw camera 0, through the laser scanner's frame; None where a file is missing."""
     velo, imu = _find(path, VELO), _find(path, IMU)
     if velo is None or imu is None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
+from vio.geometry.rectify import Interpolation
 from vio.setting import Section, setting
 
-Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
 ExtrinsicsMode: TypeAlias = Literal["auto", "literal", "corrected"]
 RepeatsMode: TypeAlias = Literal["auto", "split", "flag", "literal"]
 
@@ -32,6 +33,13 @@ class DatasetSettings(Section):
         "feature files, rows that repeat old pixels while the vehicle moves: mark them stale and give the track a new "
         "id from there on (split), mark them and keep the id (flag), use them as they are (literal), or decide by the "
         "motion of the pixels afterwards whether the track switched to another point (auto: split if so, else flag)",
+    )
+    calibration: Path | None = setting(
+        None,
+        "plain folders, bags and videos: the calibration file, in the place of the recording's own",
+    )
+    topics: str | None = setting(
+        None, "bags: topics by name, such as left=/a,right=/b,imu=/c, in the place of those found by type"
     )
     interpolation: Interpolation = setting(
         "linear",

@@ -16,12 +16,8 @@ from vio.errors import EstimationError
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, so3_exp
 from vio.records import ImuSample
-from vio.statistics import chi_square_quantile
+from vio.standstill import NOISE_FACTOR, STANDSTILL_S, blocks_agree
 
-_WINDOW_S, _BLOCK_S = 0.5, 0.1
-_LEAST_BLOCKS = 4  # with samples in them for a standstill to be concluded
-_NOISE_FACTOR = 5.0  # by which a rig's noise may exceed the data sheet's, as the filter takes it at the start
-_PROBABILITY = 0.999  # of the chi-square test: a standstill passes so often
 _MOST_TILT_RAD = np.pi / 4  # beyond, the direction of gravity is unknown; a larger prior says no more
 
 
@@ -49,7 +45,7 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, settings: MsckfSetting
         EstimationError: the accelerometer reads nothing.
     """
     before = [x for x in samples if x.time_ns <= time_ns] or list(samples[:1])
-    recent = [x for x in before if x.time_ns >= before[-1].time_ns - _WINDOW_S * 1e9]
+    recent = [x for x in before if x.time_ns >= before[-1].time_ns - STANDSTILL_S * 1e9]
     times_s = np.array([x.time_ns - before[-1].time_ns for x in recent]) * 1e-9
     gyro, accel = np.array([x.gyro for x in recent]), np.array([x.accel for x in recent])
     force = np.mean(_turned_to_the_last(times_s, gyro, accel), axis=0)
@@ -59,19 +55,19 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, settings: MsckfSetting
     s = settings
     span_s = max(-float(times_s[0]), 1e-3) if len(recent) > 1 else 5e-3
     force_noise, rate_noise = (d / np.sqrt(span_s) for d in (s.accel_noise_density, s.gyro_noise_density))
-    tolerance = 3 * np.hypot(s.accel_bias_sigma_mps2, _NOISE_FACTOR * force_noise)
+    tolerance = 3 * np.hypot(s.accel_bias_sigma_mps2, NOISE_FACTOR * force_noise)
     mean_rate = gyro.mean(axis=0)
     turn = float(np.linalg.norm(mean_rate))
-    still = _blocks_agree(times_s, gyro, s.gyro_noise_density) and _blocks_agree(times_s, accel, s.accel_noise_density)
+    still = blocks_agree(times_s, gyro, s.gyro_noise_density) and blocks_agree(times_s, accel, s.accel_noise_density)
     still = still and abs(length - s.gravity_mps2) < tolerance and turn < 3 * s.gyro_bias_sigma_radps
     # |f|^2 = g^2 + a^2 where the acceleration is level; what noise alone makes of |f|^2 - g^2 is no evidence.
     level = abs(length**2 - s.gravity_mps2**2) - 4 * s.gravity_mps2 * force_noise
     shown = np.sqrt(max(level, 0.0))
     if still:
         # The whole reading may be a turn, so the bias is known to its size.
-        bias_sigma = float(np.hypot(turn, _NOISE_FACTOR * rate_noise))
+        bias_sigma = float(np.hypot(turn, NOISE_FACTOR * rate_noise))
         return ImuStart(
-            True, force, gyro[-1], mean_rate, bias_sigma, float(np.hypot(shown, _NOISE_FACTOR * force_noise))
+            True, force, gyro[-1], mean_rate, bias_sigma, float(np.hypot(shown, NOISE_FACTOR * force_noise))
         )
     scatter = float(np.sqrt(accel.var(axis=0).sum()))
     base = s.gravity_mps2 * np.radians(s.start_tilt_sigma_deg)
@@ -88,14 +84,3 @@ def _turned_to_the_last(times_s: FloatArray, gyro: FloatArray, accel: FloatArray
         if k:
             R = R @ steps[k - 1].T
     return out
-
-
-def _blocks_agree(times_s: FloatArray, values: FloatArray, density: float) -> bool:
-    """Chi-square test that the means of a signal (N, 3) over blocks differ by white noise alone."""
-    blocks = np.minimum((-times_s / _BLOCK_S).astype(np.int64), round(_WINDOW_S / _BLOCK_S) - 1)
-    present = np.unique(blocks)
-    if len(present) < _LEAST_BLOCKS:
-        return False
-    means = np.array([values[blocks == k].mean(axis=0) for k in present])
-    statistic = np.sum((means - means.mean(axis=0)) ** 2) / ((_NOISE_FACTOR * density) ** 2 / _BLOCK_S)
-    return bool(statistic < chi_square_quantile(_PROBABILITY, 3 * (len(present) - 1)))

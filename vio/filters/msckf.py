@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vio.errors import ConfigError, DivergedError, EstimationError
+from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
     MIN_DEPTH,
@@ -42,7 +43,7 @@ from vio.filters.stereo_calibration import (
     landmark_columns,
 )
 from vio.filters.tracks import latest_pixels
-from vio.filters.window import Clone, Window, posterior
+from vio.filters.window import Clone, Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
@@ -77,6 +78,7 @@ _LANDMARK_DEPTH_SIGMA = 0.01  # by all views
 _LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scale
 _MAP_DEPTH_SIGMA = 0.2  # by all views; a point of the map is reported with its covariance, and not used
 _LEAST_MERGE = 1000  # stored points up to which the map is not merged
+_USELESS_RAD = 0.2  # standard deviation of a predicted rotation beyond which its pixels start no search
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 _MOST_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
 _MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
@@ -105,12 +107,17 @@ class Msckf:
             motion: which motion samples will come; None: images alone.
 
         Raises:
-            ConfigError: the calibration is to be estimated without an IMU.
+            ConfigError: the calibration is to be estimated without an IMU, or an argument is of another kind.
+            CalibrationError: the extrinsics are no rigid transform.
         """
+        check_parts("msckf", camera, settings, MsckfSettings)
+        if motion not in (None, *self.motion_sources):
+            raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
         if settings.calibrate != "none" and motion != "imu":
             raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to none")
         self._camera, self._settings = camera, settings
-        self._calibration = first_calibration(T_cam0_imu, settings)
+        self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings)
+        self._order = InputOrder("msckf")
         self._source = motion
         self._motion: ImuMotion | TwistMotion = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
         self._window: Window | None = None
@@ -138,10 +145,12 @@ class Msckf:
 
         Raises:
             ConfigError: the sample is not of the kind that was announced.
+            DataError: it is out of order or not finite; the filter is unchanged.
         """
         expected = {"imu": ImuSample, "velocity": VelocitySample}.get(self._source or "")
         if expected is None or not isinstance(sample, expected):
             raise ConfigError(f"msckf was built for motion {self._source or 'none'}, got a {type(sample).__name__}")
+        self._order.sample(sample)
         self._motion.take(sample)
         self._predicted_step = None  # the sample may change what the step looks like
         if isinstance(sample, VelocitySample) and self._window is not None:
@@ -167,6 +176,8 @@ class Msckf:
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
         motion = MotionPrior(T_curr_prev, A @ self._expected_error(growth) @ A.T)
+        if np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1] > _USELESS_RAD**2:
+            return None
         return Prediction(self._expected_tracks(window, T_cam0_world, motion), motion)
 
     def _expected_error(self, growth: Growth) -> FloatArray:
@@ -190,7 +201,12 @@ class Msckf:
         Raises:
             EstimationError: the motion samples do not cover the step.
             DivergedError: the filter diverged; `restart` goes on from the last good state.
+            DataError: the frame is out of order, or its observations are impossible; the filter is unchanged.
         """
+        self._order.frame(observations, self._time_ns)
+        return self._update(observations)
+
+    def _update(self, observations: Observations) -> UpdateReport:
         seen = observations.take(~observations.stale)
         if self._window is None:
             if not self._motion.ready:
@@ -211,6 +227,8 @@ class Msckf:
         if window.clones and not len(seen):
             # A frame that shows nothing ends no track; what is seen next decides.
             self._blind = True
+            if not self._is_sane(window):
+                raise DivergedError(self._lost(observations.frame_index))
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         self._blind = False
         late_s = (self._body_ns - observations.time_ns) * 1e-9
@@ -257,7 +275,7 @@ class Msckf:
         self._noise = MotionNoise(*_IMU_FACTORS) if self._source == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._output = self._window.P.copy()
         self._map = [part for part in self._map if np.isfinite(part.p_world).all()]
-        return self.update(observations)
+        return self._update(observations)
 
     def _is_sane(self, window: Window) -> bool:
         """Whether the state is made of numbers, and with an IMU of a possible speed."""
@@ -313,6 +331,17 @@ class Msckf:
         return _newest(
             [*self._map, Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))]
         )
+
+    def take_landmarks(self) -> Landmarks:
+        """Return the points that have left the state since the last call, and forget them; `landmarks` has the others.
+
+        None as long as the first tilt may still turn the map.
+        """
+        window = self._started()
+        if not self._map or not window.clones or window.clones[0].time_ns == self._began_ns:
+            return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        taken, self._map, self._points_stored = _newest(self._map), [], 0
+        return taken
 
     def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
@@ -529,7 +558,7 @@ class Msckf:
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
-            P = self._move_to_optimum(window, tracks, A, b)
+            P = self._move_to_optimum(window, tracks, A, b, len(A))
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go.
@@ -538,7 +567,9 @@ class Msckf:
             innovation = residual
         return tracks, P
 
-    def _move_to_optimum(self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray) -> FloatArray:
+    def _move_to_optimum(
+        self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int
+    ) -> FloatArray:
         """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
 
         Args:
@@ -546,12 +577,12 @@ class Msckf:
             tracks: whose points are moved.
             A: information (D, D).
             b: its vector (D,).
+            size: how many errors, the first ones, it is about.
 
         Returns:
-            The covariance (D, D) there.
+            Their covariance (size, size) there.
         """
-        P, shift = posterior(window.P, A, b + A @ window.prior_delta)
-        error = shift - window.prior_delta
+        P, error = window.optimum(A, b, size)
         self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
         window.relinearise(error)
         return P
@@ -622,7 +653,8 @@ class Msckf:
         window.absorb(*self._information(window, tracks, ending & good, pixels))
         promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
 
-        P = self._move_to_optimum(window, tracks, *self._information(window, tracks, good & ~ending, None))
+        A, b = self._information(window, tracks, good & ~ending, None)
+        P = self._move_to_optimum(window, tracks, A, b, window.first_landmark)  # no landmark is in it
         own = slice(0, window.first_clone)
         self._output = P[own, own]
         self._smoothed = WindowPosterior.of(window, P)

@@ -27,6 +27,7 @@ from vio.geometry.lie import (
     so3_hat,
     so3_left_jacobian,
 )
+from vio.imu_faults import ImuSampleCheck
 from vio.records import ImuSample, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state
@@ -94,12 +95,14 @@ class ImuMotion:
         self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
         self._samples: list[ImuSample] = []
         self._history = ImuHistory()
+        self._check = ImuSampleCheck()
 
     def take(self, sample: MotionSample) -> None:
-        """Keep a sample until the interval that needs it."""
+        """Keep a sample until the interval that needs it; leave out faulty ones."""
         assert isinstance(sample, ImuSample)
-        self._samples.append(sample)
-        self._history.take(sample)
+        for usable in self._check.take(sample):
+            self._samples.append(usable)
+            self._history.take(usable)
 
     @property
     def ready(self) -> bool:

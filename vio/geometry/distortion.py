@@ -1,9 +1,10 @@
-"""Camera models: pinhole, radial-tangential or equidistant, and the stereo rig of two cameras.
+"""Camera models: pinhole, radial-tangential, equidistant, unified, double sphere, and the stereo rig of two cameras.
 
 Pixels: u right, v down, the centre of the top-left pixel is (0, 0). Rays and points are in the camera frame
 (x right, y down, z forward).
-References: Brown, Close-range camera calibration (1971), as written by OpenCV, EuRoC and KITTI with `k1 k2 p1 p2 [k3]`;
-Kannala & Brandt, A generic camera model (2006), with `k1 k2 k3 k4` on the angle, as OpenCV's fisheye model.
+References: Brown, Close-range camera calibration (1971), as written by OpenCV, EuRoC and KITTI with `k1 k2 p1 p2 [k3]`,
+or with OpenCV's rational `k4 k5 k6` as well; Kannala & Brandt, A generic camera model (2006), with `k1 k2 k3 k4` on the
+angle, as OpenCV's fisheye model. Unified and double sphere: `vio.geometry.sphere_models`.
 """
 
 from __future__ import annotations
@@ -15,12 +16,19 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import CalibrationError
+from vio.geometry import sphere_models
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
-DistortionModel: TypeAlias = Literal["pinhole", "radtan", "equidistant"]
+DistortionModel: TypeAlias = Literal["pinhole", "radtan", "equidistant", "unified", "double_sphere"]
 
-_COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {"pinhole": (0,), "radtan": (4, 5), "equidistant": (4,)}
+_COEFFICIENTS: dict[DistortionModel, tuple[int, ...]] = {
+    "pinhole": (0,),
+    "radtan": (4, 5, 8),
+    "equidistant": (4,),
+    "unified": (1, 5),
+    "double_sphere": (2,),
+}
 _NEWTON_STEPS = 30
 _NEWTON_TOLERANCE = 1e-11  # on the normalised image plane: about 1e-8 px
 # Tolerances of a pair that is rectified up to the rounding of its calibration file: rows within 0.01 px.
@@ -40,7 +48,9 @@ class CameraModel:
     width: int  # pixels
     height: int  # pixels
     model: DistortionModel = "pinhole"
-    coefficients: tuple[float, ...] = ()  # radtan: k1 k2 p1 p2 [k3]; equidistant: k1 k2 k3 k4; pinhole: none
+    # radtan: k1 k2 p1 p2 [k3 [k4 k5 k6]]; equidistant: k1 k2 k3 k4; unified: xi [k1 k2 p1 p2]; double_sphere: xi alpha;
+    # pinhole: none
+    coefficients: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if self.model not in _COEFFICIENTS:
@@ -59,6 +69,19 @@ class CameraModel:
                 f"the {self.model} model takes {expected[0]} distortion coefficients"
                 f"{''.join(f' or {n}' for n in expected[1:])}, got {len(self.coefficients)}"
             )
+        self._check_spheres()
+
+    def _check_spheres(self) -> None:
+        """Raise CalibrationError unless the sphere models' parameters are in their range."""
+        if self.model == "unified" and self.coefficients[0] < 0:
+            raise CalibrationError(f"the unified model's xi must not be negative, got {self.coefficients[0]:g}")
+        if self.model == "double_sphere":
+            xi, alpha = self.coefficients
+            if not (-1 < xi <= 1 and 0 <= alpha < 1):
+                raise CalibrationError(
+                    f"the double sphere model needs -1 < xi <= 1 and 0 <= alpha < 1, got xi={xi:g}, alpha={alpha:g}; "
+                    "check their order"
+                )
 
     @property
     def K(self) -> FloatArray:
@@ -129,6 +152,13 @@ def project_point(camera: CameraModel, p_cam: npt.ArrayLike) -> tuple[FloatArray
     p = np.asarray(p_cam, dtype=np.float64)
     if camera.model == "equidistant":
         xy, valid = _equidistant(camera.coefficients, p)
+    elif camera.model == "double_sphere":
+        xy, valid = sphere_models.double_sphere(camera.coefficients, p)
+    elif camera.model == "unified":
+        xy, valid = sphere_models.unified(camera.coefficients[0], p)
+        if len(bend := camera.coefficients[1:]):
+            valid = valid & (np.linalg.norm(xy, axis=-1) < _radtan_max_radius(bend))
+            xy = _radtan(bend, np.where(valid[..., None], xy, 0.0))
     else:
         valid = np.greater(p[..., 2], 1e-9)
         xy = p[..., :2] / np.where(valid, p[..., 2], 1.0)[..., None]
@@ -144,6 +174,12 @@ def uv_D_p_cam(camera: CameraModel, p_cam: npt.ArrayLike) -> FloatArray:
     p = np.asarray(p_cam, dtype=np.float64)
     if camera.model == "equidistant":
         xy_D_p = _equidistant_D_p(camera.coefficients, p)
+    elif camera.model == "double_sphere":
+        xy_D_p = sphere_models.double_sphere_D_p(camera.coefficients, p)
+    elif camera.model == "unified":
+        xy_D_p = sphere_models.unified_D_p(camera.coefficients[0], p)
+        if len(bend := camera.coefficients[1:]):
+            xy_D_p = _radtan_D_xy(bend, sphere_models.unified(camera.coefficients[0], p)[0]) @ xy_D_p
     else:
         depth = p[..., 2]
         xy_D_p = np.zeros((*p.shape[:-1], 2, 3))
@@ -163,7 +199,14 @@ def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray,
     xy = (uv - (camera.cu, camera.cv)) / (camera.fu, camera.fv)
     if camera.model == "equidistant":
         return _unproject_equidistant(camera.coefficients, xy)
+    if camera.model == "double_sphere":
+        return sphere_models.unproject_double_sphere(camera.coefficients, xy)
     valid: npt.NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=-1))
+    if camera.model == "unified":
+        if len(bend := camera.coefficients[1:]):
+            xy, valid = _undistort_radtan(bend, xy)
+        ray, inside = sphere_models.unproject_unified(camera.coefficients[0], xy)
+        return ray, valid & inside
     if camera.model == "radtan":
         xy, valid = _undistort_radtan(camera.coefficients, xy)
     ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
@@ -173,7 +216,15 @@ def unproject_pixel(camera: CameraModel, uv: npt.ArrayLike) -> tuple[FloatArray,
 def _five(coefficients: tuple[float, ...]) -> tuple[float, float, float, float, float]:
     """Return the radial-tangential coefficients k1 k2 p1 p2 k3; an absent k3 is zero."""
     k1, k2, p1, p2 = coefficients[:4]
-    return k1, k2, p1, p2, coefficients[4] if len(coefficients) == 5 else 0.0
+    return k1, k2, p1, p2, coefficients[4] if len(coefficients) > 4 else 0.0
+
+
+def _divisor(coefficients: tuple[float, ...], r2: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Divisor of the rational model's radial factor and its derivative with respect to `r2`; None: not rational."""
+    if len(coefficients) < 8:
+        return None
+    k4, k5, k6 = coefficients[5:]
+    return 1 + r2 * (k4 + r2 * (k5 + r2 * k6)), k4 + r2 * (2 * k5 + r2 * 3 * k6)
 
 
 def _radtan(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
@@ -181,6 +232,8 @@ def _radtan(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if (divisor := _divisor(coefficients, r2)) is not None:
+        radial = radial / divisor[0]
     return np.stack(
         [
             x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
@@ -195,6 +248,9 @@ def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     radial, slope = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 2 * k1 + r2 * (4 * k2 + r2 * 6 * k3)
+    if (divisor := _divisor(coefficients, r2)) is not None:
+        below, below_D_r2 = divisor
+        radial, slope = radial / below, (slope - 2 * radial * below_D_r2 / below) / below
     out = np.empty((*xy.shape[:-1], 2, 2))
     out[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     out[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
@@ -205,10 +261,21 @@ def _radtan_D_xy(coefficients: tuple[float, ...], xy: FloatArray) -> FloatArray:
 def _radtan_max_radius(coefficients: tuple[float, ...]) -> float:
     """Radius on the undistorted plane where the radial polynomial stops growing: the model folds back beyond it."""
     k1, k2, _, _, k3 = _five(coefficients)
+    if len(coefficients) == 8:
+        return _rational_max_radius((1.0, k1, k2, k3), (1.0, *coefficients[5:]))
     # In 1/r^2 the polynomial is monic, which avoids dividing by a small coefficient.
     roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
     inverse = [float(root.real) for root in roots if abs(root.imag) < 1e-12 and root.real > 1e-12]
     return float(1 / np.sqrt(max(inverse))) if inverse else np.inf
+
+
+def _rational_max_radius(above: tuple[float, ...], below: tuple[float, ...]) -> float:
+    """Radius where `r above(r^2) / below(r^2)` stops growing, or the divisor vanishes; ascending powers of r^2."""
+    n, d = np.polynomial.Polynomial(above), np.polynomial.Polynomial(below)
+    s = np.polynomial.Polynomial([0.0, 1.0])
+    roots = [*(n * d + 2 * s * (n.deriv() * d - n * d.deriv())).roots(), *d.roots()]
+    positive = [float(root.real) for root in roots if abs(root.imag) < 1e-9 and root.real > 1e-12]
+    return float(np.sqrt(min(positive))) if positive else np.inf
 
 
 def _undistort_radtan(coefficients: tuple[float, ...], target: FloatArray) -> tuple[FloatArray, npt.NDArray[np.bool_]]:

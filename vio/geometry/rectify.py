@@ -8,6 +8,7 @@ pairs (2000); Loop & Zhang, Computing rectifying homographies for stereo vision 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera, left_rays
 
 MapArray = npt.NDArray[np.float32]
+Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
 
 _BORDER_SAMPLES = 60  # points along each image border that determine the common field of view
 _MAX_TANGENT = 1.4  # beyond about 54 degrees off axis a planar image only stretches pixels
@@ -26,22 +28,45 @@ _MAX_ROTATION_DEG = 30.0  # a camera that needs a larger rotation is not one hal
 
 
 @dataclass(frozen=True, slots=True)
-class Rectification:
-    """The rectifying rotations and maps of a rig."""
+class RectifiedPair:
+    """The rectified cameras of a rig."""
 
     camera: StereoCamera
     R_rect_cam0: FloatArray  # (3, 3)
     R_rect_cam1: FloatArray  # (3, 3)
     T_rect0_imu: FloatArray  # (4, 4) extrinsics of the rectified left camera
+
+
+@dataclass(frozen=True, slots=True)
+class Rectification(RectifiedPair):
+    """The rectified cameras of a rig, and the maps of its images."""
+
     map0: tuple[MapArray, MapArray]  # (H, W) each: source u and v of every rectified pixel, for cv2.remap
     map1: tuple[MapArray, MapArray]
 
 
 def rectify(rig: StereoRig) -> Rectification:
-    """Find the rectified pair of a rig; its images have the size of the left one and no invalid border.
+    """Find the rectified pair of a rig and its maps; its images have the size of the left one and no invalid border.
 
     Raises:
         CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
+    """
+    pair = rectified_cameras(rig)
+    return Rectification(
+        camera=pair.camera,
+        R_rect_cam0=pair.R_rect_cam0,
+        R_rect_cam1=pair.R_rect_cam1,
+        T_rect0_imu=pair.T_rect0_imu,
+        map0=_lookup(pair.camera, rig.cam0, pair.R_rect_cam0),
+        map1=_lookup(pair.camera, rig.cam1, pair.R_rect_cam1),
+    )
+
+
+def rectified_cameras(rig: StereoRig) -> RectifiedPair:
+    """Find the rectified pair of a rig, without the maps of its images.
+
+    Raises:
+        CalibrationError: as `rectify`.
     """
     R_rect_cam0, R_rect_cam1, baseline_m = rectifying_rotations(rig)
     low0, high0 = _inner_rectangle(rig.cam0, R_rect_cam0)
@@ -57,13 +82,11 @@ def rectify(rig: StereoRig) -> Rectification:
     cu, cv = (width - 1) / 2 - f * centre[0], (height - 1) / 2 - f * centre[1]
     camera = StereoCamera(f, f, float(cu), float(cv), baseline_m, width, height)
     T_cam0_imu = se3_inverse(rig.T_imu_cam0)
-    return Rectification(
+    return RectifiedPair(
         camera=camera,
         R_rect_cam0=R_rect_cam0,
         R_rect_cam1=R_rect_cam1,
         T_rect0_imu=se3_from_parts(R_rect_cam0, np.zeros(3)) @ T_cam0_imu,
-        map0=_lookup(camera, rig.cam0, R_rect_cam0),
-        map1=_lookup(camera, rig.cam1, R_rect_cam1),
     )
 
 

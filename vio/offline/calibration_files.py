@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 
 from vio.calibration.inertial import ImuAlignment
 from vio.calibration.lever_arm import LeverArm
 from vio.calibration.stereo import StereoEstimate
-from vio.datasets.euroc_files import camera_yaml, median_rate_hz
+from vio.datasets.euroc_files import SENSOR_YAML_MODELS, camera_yaml, median_rate_hz
 from vio.datasets.rectified import RectifiedDataset
-from vio.geometry.distortion import CameraModel, StereoRig
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.offline.calibrate import CalibrationReport
+from vio.rig import Rig
 
-_KALIBR_MODELS = {"pinhole": "none", "radtan": "radtan", "equidistant": "equidistant"}
 _USUAL_RATE_HZ = 20.0  # where there are no time stamps to derive it from
 
 
@@ -39,11 +37,14 @@ def write_calibration(folder: Path, report: CalibrationReport) -> None:
     times = np.zeros(0, dtype=np.int64) if dataset is None else dataset.recording.frame_times_ns
     rate_hz = median_rate_hz(times) or _USUAL_RATE_HZ
     for name, camera in cameras.items():
+        if camera.model not in SENSOR_YAML_MODELS:
+            continue  # Kalibr's file has names for the other models
         (folder / name).mkdir()
         (folder / name / "sensor.yaml").write_text(
             camera_yaml(camera, poses[name], comment=f"{name}, by vio calibrate", rate_hz=rate_hz), encoding="utf-8"
         )
-    (folder / "camchain-imucam.yaml").write_text(_kalibr(cameras, poses, T_cam0_cam1, offset_s), encoding="utf-8")
+    measured = Rig(rig.cam0, rig.cam1, se3_inverse(T_cam0_cam1), T_cam0_imu, time_offset_s=offset_s)
+    (folder / "camchain-imucam.yaml").write_text(kalibr_text(measured), encoding="utf-8")
 
 
 def _measured_stereo(report: CalibrationReport, rig: StereoRig) -> FloatArray:
@@ -67,31 +68,3 @@ def _measured_imu(report: CalibrationReport, rig: StereoRig) -> tuple[FloatArray
     if isinstance(lever_arm, LeverArm):
         T_cam0_imu = se3_from_parts(T_cam0_imu[:3, :3], R_rect_cam0.T @ lever_arm.t_cam0_imu)
     return T_cam0_imu, offset_s
-
-
-def _kalibr(
-    cameras: Mapping[str, CameraModel], poses: Mapping[str, FloatArray], T_cam0_cam1: FloatArray, offset_s: float
-) -> str:
-    """Return Kalibr's camchain: `T_cam_imu` maps the IMU to the camera, `t_imu = t_cam + timeshift_cam_imu`.
-
-    Args:
-        cameras: by name.
-        poses: (4, 4) `T_imu_cam` of each.
-        T_cam0_cam1: (4, 4).
-        offset_s: IMU's clock minus the camera's.
-    """
-    chain: dict[str, Any] = {}
-    for name, camera in cameras.items():
-        sheet: dict[str, Any] = {"T_cam_imu": se3_inverse(poses[name]).tolist()}
-        if name == "cam1":
-            sheet["T_cn_cnm1"] = se3_inverse(T_cam0_cam1).tolist()
-        sheet |= {
-            "camera_model": "pinhole",
-            "distortion_model": _KALIBR_MODELS[camera.model],
-            "distortion_coeffs": [float(c) for c in camera.coefficients[:4]],
-            "intrinsics": [camera.fu, camera.fv, camera.cu, camera.cv],
-            "resolution": [camera.width, camera.height],
-            "timeshift_cam_imu": offset_s,
-        }
-        chain[name] = sheet
-    return yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from vio.colmap.reconstruction import Mapper, Reconstructed, match_images, recon
 from vio.mapping.comparison import Comparison, compare_keyframes
 from vio.mapping.keyframes import choose_keyframes
 from vio.offline.images import write_images
+from vio.plotting import write_picture
 from vio.records import Trajectory
 from vio.saved_run import SavedRun
 
@@ -88,13 +90,13 @@ def check_run(
             found = model, compare_keyframes(path, rows, model.T_world_cam0, run.truth)
         results.append(MapperResult(mapper, len(keyframes), found))
         progress(2 + len(results), steps)
-    _draw(folder / "check.png", path.trajectory, results)
+    write_picture(folder / "check.png", lambda: _figure(path.trajectory, results))
     shutil.rmtree(images)
     database.unlink()
     return tuple(results)
 
 
-def _draw(path: Path, trajectory: Trajectory, results: Sequence[MapperResult]) -> None:
+def _figure(trajectory: Trajectory, results: Sequence[MapperResult]) -> Any:
     """Plot the trajectories from above, and their distance along the path."""
     from matplotlib.figure import Figure
 
@@ -120,4 +122,4 @@ def _draw(path: Path, trajectory: Trajectory, results: Sequence[MapperResult]) -
         if panel.get_legend_handles_labels()[0]:
             panel.legend()
         panel.grid(alpha=0.3)
-    figure.savefig(path)
+    return figure

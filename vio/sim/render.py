@@ -30,7 +30,7 @@ Radiance: TypeAlias = npt.NDArray[np.float32]
 _TILE = 64  # pixels
 _COARSE = 2  # tiles along a coarse tile
 # Tiles shaded in one go; sample positions within a pixel follow the ray derivative at the middle of the run.
-_RUN: dict[DistortionModel, int] = {"pinhole": 4, "radtan": 2, "equidistant": 1}
+_RUN: dict[DistortionModel, int] = {"pinhole": 4, "radtan": 2, "equidistant": 1, "unified": 1, "double_sphere": 1}
 _EDGE_MARK, _NONE = np.int16(-1), np.int16(-2)
 _EMPTY = np.float32(90.0)  # gray level where no surface is hit
 _LOD_STEP = 4  # pixels between evaluations of the level of detail
@@ -80,7 +80,7 @@ def camera_rays(camera: CameraModel) -> CameraRays:
     corner, found_corner = unproject_pixel(camera, _grid(camera.width + 1, camera.height + 1, -0.5))
     if not (found.all() and found_corner.all()):
         raise SimulationError("the distortion model does not reach every pixel of the image; check its coefficients")
-    if camera.model != "equidistant":
+    if camera.model in ("pinhole", "radtan"):
         centre, corner = centre / centre[..., 2:], corner / corner[..., 2:]
     return CameraRays(
         camera,

@@ -37,19 +37,24 @@ def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[Iner
 
 
 class Coverage:
-    """Count the frames that have IMU samples during a run."""
+    """Count the frames that have IMU samples during a run; a gap between samples is no matter of clocks."""
 
     def __init__(self) -> None:
         self._first_ns: int | None = None
         self._last_ns = 0
         self._frames = self._covered = 0
+        self._in_gap = 0  # frames without samples since some frame had them
 
     def frame(self, time_ns: int, last_imu_ns: int | None) -> None:
         """Count a frame, given the time of the last sample before it."""
         self._first_ns = time_ns if self._first_ns is None else self._first_ns
         self._last_ns = time_ns
         self._frames += 1
-        self._covered += last_imu_ns is not None and (time_ns - last_imu_ns) * _NS <= _LATE_S
+        if last_imu_ns is not None and (time_ns - last_imu_ns) * _NS <= _LATE_S:
+            self._covered += 1 + self._in_gap
+            self._in_gap = 0
+        elif self._covered:
+            self._in_gap += 1
 
     def so_far(self, imu: tuple[int, int] | None, step_ns: float) -> list[InertialFinding]:
         """Report early that no frame has samples.

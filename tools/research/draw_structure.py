@@ -1,6 +1,6 @@
 """The figure of docs/architecture.md: every package, what it imports, and in which layer it stands.
 
-    python tools/draw_structure.py docs/images/structure.png [--root CHECKOUT]
+    python tools/research/draw_structure.py docs/images/structure.png [--root CHECKOUT]
 
 A package here is a package or a single module directly in `vio/`, or `frontend/`. It stands one layer above the
 highest one that it imports. Arrows point at what is imported; those that a longer way implies are left out, and so are
@@ -79,7 +79,9 @@ def _imports(text: str) -> Iterator[str]:
             skipped.update(id(child) for statement in node.body for child in ast.walk(statement))
         elif id(node) not in skipped and isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif id(node) not in skipped and isinstance(node, ast.ImportFrom) and node.module:
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "frontend_module":
+            yield "frontend"  # vio.frontend_package finds it by its place
+        elif id(node) not in skipped and isinstance(node, ast.ImportFrom) and node.module and not node.level:
             # `from vio import calibration` names a package, `from vio.records import Image` something in one.
             yield from (f"vio.{alias.name}" for alias in node.names) if node.module == "vio" else [node.module]
 
@@ -190,7 +192,7 @@ def main() -> int:
     """Draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="PNG to write")
-    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parent.parent, help="the checkout")
+    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[2], help="the checkout")
     args = parser.parse_args()
     packages = read_packages(args.root)
     draw(packages, args.out)

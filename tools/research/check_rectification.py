@@ -1,8 +1,8 @@
 """Check rectification: rows of matched points on real recordings, and tracking accuracy on rendered images.
 
-    python tools/check_rectification.py rows FOLDER...      # |vl - vr| of matched points
-    python tools/check_rectification.py tracking            # rectified against raw images, with exact ground truth
-    python tools/check_rectification.py resampling          # error and time of the interpolation
+    python tools/research/check_rectification.py rows FOLDER...      # |vl - vr| of matched points
+    python tools/research/check_rectification.py tracking            # rectified against raw images, exact truth
+    python tools/research/check_rectification.py resampling          # error and time of the interpolation
 
 All print a table, or JSON with --json. The figures in docs/rectification.md are from this tool.
 """
@@ -24,13 +24,13 @@ import numpy as np
 from frontend.align import align, cut_patches, shift_warps, templates
 from frontend.flow import lucas_kanade
 from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.rectified import Rectifier, make_rectifier
-from vio.datasets.settings import Interpolation
+from vio.datasets.rectified import make_rectifier
 from vio.errors import VioError
 from vio.geometry.distortion import StereoRig, project_point, rig_from_rectified, unproject_pixel
 from vio.geometry.lie import FloatArray
-from vio.geometry.rectify import Rectification, rectify, rectify_pixels
+from vio.geometry.rectify import Interpolation, Rectification, rectify, rectify_pixels
 from vio.records import BoolArray, Image, StereoFrame
+from vio.rig import Rectifier
 from vio.sim.effects import SensorEffects, apply_effects
 from vio.sim.motion import MotionSpline, evaluate, hand_held, rotate_body_axes
 from vio.sim.render import View, camera_rays, correspondence, inside_image, render

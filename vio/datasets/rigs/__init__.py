@@ -1,0 +1,157 @@
+"""Calibration files as a `Rig`: Kalibr, EuRoC, KITTI, OpenCV, ROS CameraInfo and BoofCV, detected from the content."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.common import naming
+from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
+from vio.datasets.kitti import read_calibration, read_extrinsics
+from vio.datasets.kitti_raw import CAMERAS, read_cam_to_cam, read_imu_pose
+from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
+from vio.datasets.rigs.camera_info import is_camera_info, pair_of_files, read_camera_info, rig_from_camera_infos
+from vio.datasets.rigs.kalibr import is_camchain, read_camchain
+from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
+from vio.datasets.yaml_files import read_yaml
+from vio.errors import CalibrationError
+from vio.geometry.lie import se3_from_parts, se3_inverse
+from vio.rig import Rig
+from vio.text_files import text_lines
+
+__all__ = ["find_calibration", "load_rig"]
+
+Size = tuple[int, int]
+
+KNOWN = (
+    "Kalibr's camchain.yaml or camchain-imucam.yaml, EuRoC's sensor.yaml (mav0), KITTI's calib.txt or "
+    "calib_cam_to_cam.txt, OpenCV's stereo .yml or .xml (M1 D1 M2 D2 R T), ROS's left.yaml and right.yaml, or BoofCV's "
+    "stereo.xml"
+)
+# File names looked for in a folder, in this order; the content decides what they are.
+_IN_FOLDER = (
+    "calibration.yaml",
+    "calibration.yml",
+    "camchain-imucam*.yaml",
+    "*camchain-imucam*.yaml",
+    "camchain*.yaml",
+    "*camchain*.yaml",
+    "calib_cam_to_cam.txt",
+    "calib.txt",
+    "left.y*ml",
+    "stereo*.y*ml",
+    "intrinsics.y*ml",
+    "stereo*.xml",
+    "calibration.xml",
+)
+
+
+def load_rig(path: str | os.PathLike[str], *, image_size: Size | None = None) -> Rig:
+    """Read a stereo calibration; the format is detected from the content.
+
+    Args:
+        path: a calibration file, or a folder that holds one.
+        image_size: width and height of the images in pixels, for formats that do not state it (KITTI's calib.txt,
+            OpenCV). With KITTI's calib_cam_to_cam.txt, the size decides between the raw and the rectified cameras.
+
+    Raises:
+        CalibrationError: there is no calibration of a known format, an entry is missing or impossible, or the image
+            size is neither stated nor given; the message names file, entry and remedy.
+    """
+    file = Path(path)
+    if not file.exists():
+        raise CalibrationError(f"{file} does not exist; give {KNOWN}")
+    if file.is_dir():
+        found = find_calibration(file)
+        if found is None:
+            raise CalibrationError(f"{file}: holds no calibration; looked for {KNOWN}")
+        file = found
+    return _read(file, image_size)
+
+
+def find_calibration(folder: Path) -> Path | None:
+    """Return the calibration file in a folder; None where there is none."""
+    for mav in (folder / "mav0", folder):
+        if (mav / "cam0" / "sensor.yaml").is_file():
+            return mav / "cam0" / "sensor.yaml"
+    for pattern in _IN_FOLDER:
+        if found := sorted(file for file in folder.glob(pattern) if file.is_file()):
+            return found[0]
+    pair = pair_of_files(folder)
+    return None if pair is None else pair[0]
+
+
+def _read(path: Path, image_size: Size | None) -> Rig:
+    suffix = path.suffix.lower()
+    if path.name == CAMERAS:
+        return _kitti_raw(path, image_size)
+    if suffix == ".txt":
+        return _kitti(path, image_size)
+    if suffix == ".xml":
+        return read_boofcv(path) if is_boofcv(path) else rig_from_opencv(read_entries(path), str(path), image_size)
+    entries = read_yaml(path, "the cameras' calibration")
+    if is_camchain(entries):
+        return read_camchain(path)
+    if "T_BS" in entries:
+        return _euroc(path)
+    if is_camera_info(entries):
+        return _camera_infos(path)
+    whole = read_entries(path)
+    if is_opencv(whole):
+        return rig_from_opencv(whole, str(path), image_size)
+    raise CalibrationError(f"{path}: is no stereo calibration of a known format; give {KNOWN}")
+
+
+def _euroc(path: Path) -> Rig:
+    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it lies beside them, `imu0/sensor.yaml`."""
+    mav = path.parent.parent
+    (cam0, T_body_cam0), (cam1, T_body_cam1) = (
+        read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")
+    )
+    T_body_imu, noise = np.eye(4), None
+    if (imu := mav / "imu0" / "sensor.yaml").is_file():
+        T_body_imu, noise = read_imu_yaml(imu)
+    T_imu_cam0, T_imu_cam1 = (se3_inverse(T_body_imu) @ T for T in (T_body_cam0, T_body_cam1))
+    with naming(mav):
+        return Rig(cam0, cam1, se3_inverse(T_imu_cam1) @ T_imu_cam0, se3_inverse(T_imu_cam0), noise)
+
+
+def _kitti(path: Path, image_size: Size | None) -> Rig:
+    """Read KITTI's `calib.txt` of the gray pair (else of the colour pair), and `T_cam0_imu.txt` beside it."""
+    lines = [line for _, line in text_lines(path)]
+    gray = any(line.startswith("P0:") for line in lines)
+    calibration = read_calibration(path, (0, 1) if gray else (2, 3))
+    if image_size is None:
+        raise CalibrationError(f"{path}: states no image size; pass image_size=(W, H)")
+    c, T_cam0_imu = calibration.camera, read_extrinsics(path.with_name("T_cam0_imu.txt"))
+    T_left_imu = None if T_cam0_imu is None else calibration.T_left_cam0 @ T_cam0_imu
+    with naming(path):
+        return Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, *image_size, T_cam0_imu=T_left_imu)
+
+
+def _kitti_raw(path: Path, image_size: Size | None) -> Rig:
+    """Read `calib_cam_to_cam.txt`: the raw gray pair, or KITTI's rectified one where the images have its size."""
+    c = read_cam_to_cam(path)
+    T_cam0_imu, notes = read_imu_pose(path.parent)
+    raw, rectified = (c.cam0.width, c.cam0.height), (c.rect0.width, c.rect0.height)
+    if image_size is not None and image_size not in (raw, rectified):
+        raise CalibrationError(
+            f"{path}: is for images of {raw[0]} x {raw[1]} (raw) or {rectified[0]} x {rectified[1]} (rectified), not "
+            f"{image_size[0]} x {image_size[1]} pixels; give the calibration of these images"
+        )
+    with naming(path):
+        if image_size == rectified != raw:
+            turn = se3_from_parts(c.R_rect_cam0, np.zeros(3))
+            T = None if T_cam0_imu is None else turn @ T_cam0_imu
+            return Rig(c.rect0, c.rect1, c.T_rect1_rect0, T, notes=notes)
+        return Rig(c.cam0, c.cam1, c.T_cam1_cam0, T_cam0_imu, notes=notes)
+
+
+def _camera_infos(path: Path) -> Rig:
+    pair = pair_of_files(path)
+    if pair is None:
+        raise CalibrationError(f"{path}: is the calibration of one camera; name the pair left.yaml and right.yaml")
+    left, right = (read_camera_info(file) for file in pair)
+    return rig_from_camera_infos(left, right)

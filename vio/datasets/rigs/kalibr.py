@@ -1,0 +1,195 @@
+"""Kalibr's results: `camchain.yaml`, `camchain-imucam.yaml`, and the `imu.yaml` beside them.
+
+`T_cn_cnm1` maps coordinates of the camera before to this one, `T_cam_imu` those of the IMU to the camera; times of the
+IMU are `t_imu = t_cam + timeshift_cam_imu`.
+Reference: the page "yaml formats" of Kalibr's documentation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from vio.datasets.common import checked_transform, image_size, naming
+from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
+from vio.errors import CalibrationError
+from vio.geometry.distortion import CameraModel, DistortionModel
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.records import ImuDensities
+from vio.rig import Rig
+
+_BENDS: dict[str, DistortionModel] = {
+    "none": "pinhole",
+    "radtan": "radtan",
+    "plumb_bob": "radtan",
+    "equi": "equidistant",
+    "equidistant": "equidistant",
+}
+_LEADING = {"pinhole": 0, "omni": 1, "ds": 2}  # parameters of the projection before fu fv cu cv
+NOISE_KEYS = (
+    "gyroscope_noise_density",
+    "gyroscope_random_walk",
+    "accelerometer_noise_density",
+    "accelerometer_random_walk",
+)
+_SAME_M, _SAME_RAD = 2e-3, 5e-3  # how far the two statements of the stereo pose may be apart before it is said
+
+
+def is_camchain(entries: Entries) -> bool:
+    """Return whether entries are those of a camchain."""
+    return all(isinstance(entries.get(name), dict) and "intrinsics" in entries[name] for name in ("cam0", "cam1"))  # type: ignore[operator]
+
+
+def is_imu_sheet(entries: Entries) -> bool:
+    """Return whether entries are those of Kalibr's IMU file, plain or with a block for each IMU."""
+    return any(key in _imu_block(entries) for key in NOISE_KEYS)
+
+
+def read_camchain(path: Path) -> Rig:
+    """Read a camchain and, beside it, the IMU's file.
+
+    Raises:
+        CalibrationError: an entry is missing or impossible, or a model is not known; the message names it.
+    """
+    entries = read_yaml(path, "Kalibr's calibration of both cameras")
+    if not is_camchain(entries):
+        raise CalibrationError(f"{path}: is no camchain of Kalibr; it must hold the blocks cam0 and cam1 (stereo)")
+    left, right = (section(entries, name, str(path)) for name in ("cam0", "cam1"))
+    cam0, cam1 = (_camera(block, f"{path}, {name}") for block, name in ((left, "cam0"), (right, "cam1")))
+    T_cam0_imu, T_cam1_imu = (_pose(b, "T_cam_imu", f"{path}, {n}") for b, n in ((left, "cam0"), (right, "cam1")))
+    T_cam1_cam0 = _pose(right, "T_cn_cnm1", f"{path}, cam1")
+    notes: list[str] = []
+    if T_cam0_imu is not None and T_cam1_imu is not None:
+        through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)
+        if T_cam1_cam0 is None:
+            T_cam1_cam0 = through_imu
+        elif _apart(T_cam1_cam0, through_imu):
+            notes.append(f"{path}: T_cn_cnm1 of cam1 and the T_cam_imu of both cameras disagree; T_cn_cnm1 is used")
+    if T_cam1_cam0 is None:
+        raise CalibrationError(f"{path}: states no pose of cam1; add T_cn_cnm1 to cam1, or T_cam_imu to both cameras")
+    if further := sorted(name for name in entries if name.startswith("cam") and name not in ("cam0", "cam1")):
+        notes.append(f"{path}: cam0 and cam1 are used, {', '.join(further)} not")
+    noise, imu_notes = _imu_beside(path)
+    offset_s = _time_shift(left, right, path)
+    with naming(path):
+        return Rig(cam0, cam1, T_cam1_cam0, T_cam0_imu, noise, offset_s, (*notes, *imu_notes))
+
+
+def _camera(block: Mapping[str, Any], where: str) -> CameraModel:
+    kind, bend = block.get("camera_model", "pinhole"), str(block.get("distortion_model", "none"))
+    if kind not in _LEADING:
+        raise CalibrationError(f"{where}: camera_model {kind!r} is not read; calibrate with {', '.join(_LEADING)}")
+    if bend not in _BENDS:
+        raise CalibrationError(f"{where}: distortion_model {bend!r} is not read; calibrate with {', '.join(_BENDS)}")
+    leading = _LEADING[str(kind)]
+    values = numbers(block, "intrinsics", where, leading + 4)
+    fu, fv, cu, cv = values[leading:]
+    model = _BENDS[bend]
+    coefficients = () if model == "pinhole" else numbers(block, "distortion_coeffs", where)
+    if kind == "ds" and not any(coefficients):
+        model, coefficients = "double_sphere", values[:2]
+    elif kind == "omni" and (model == "radtan" or not any(coefficients)):
+        model, coefficients = "unified", (values[0], *(coefficients if any(coefficients) else ()))
+    elif kind != "pinhole":
+        raise CalibrationError(
+            f"{where}: {kind} with distortion {bend!r} is not read; calibrate {kind}-none or omni-radtan"
+        )
+    elif model == "radtan" and not any(coefficients):
+        model, coefficients = "pinhole", ()
+    width, height = image_size(numbers(block, "resolution", where, 2), f"{where}, resolution")
+    with naming(where):
+        return CameraModel(fu, fv, cu, cv, width, height, model, coefficients)
+
+
+def _pose(block: Mapping[str, Any], key: str, where: str) -> FloatArray | None:
+    if key not in block:
+        return None
+    return checked_transform(matrix(block[key], (4, 4), f"{where}, {key}"), f"{where}, {key}")
+
+
+def _apart(A: FloatArray, B: FloatArray) -> bool:
+    difference = A @ se3_inverse(B)
+    return bool(np.linalg.norm(difference[:3, 3]) > _SAME_M or np.abs(difference[:3, :3] - np.eye(3)).max() > _SAME_RAD)
+
+
+def _time_shift(left: Mapping[str, Any], right: Mapping[str, Any], path: Path) -> float:
+    """Return the mean of the shifts of both cameras, which one exposure shares."""
+    shifts = [
+        numbers(block, "timeshift_cam_imu", f"{path}, {name}", 1)[0]
+        for block, name in ((left, "cam0"), (right, "cam1"))
+        if "timeshift_cam_imu" in block
+    ]
+    return sum(shifts) / len(shifts) if shifts else 0.0
+
+
+def _imu_beside(path: Path) -> tuple[ImuDensities | None, tuple[str, ...]]:
+    """Find the IMU's file in the folder of a camchain: its noise, and a note where several fit."""
+    found: list[tuple[Path, ImuDensities]] = []
+    for file in sorted([*path.parent.glob("*imu*.yaml"), *path.parent.glob("*imu*.yml")]):
+        if "camchain" in file.name or file == path or not file.is_file():
+            continue
+        entries = read_yaml(file, "Kalibr's IMU noise")
+        if is_imu_sheet(entries):
+            found.append((file, read_noise(entries, file)))
+    if not found:
+        return None, ()
+    names = ", ".join(file.name for file, _ in found)
+    return found[0][1], (f"of {names} the first gives the IMU's noise",) if len(found) > 1 else ()
+
+
+def read_noise(entries: Entries, path: Path) -> ImuDensities:
+    """Read the noise densities of Kalibr's IMU file.
+
+    Raises:
+        CalibrationError: a density is missing or not positive.
+    """
+    block = _imu_block(entries)
+    values = [numbers(block, key, path, 1)[0] for key in NOISE_KEYS]
+    for key, value in zip(NOISE_KEYS, values, strict=True):
+        if not value > 0:
+            raise CalibrationError(f"{path}: {key} is {value:g}; a noise density must be positive")
+    return ImuDensities(*values)
+
+
+def _imu_block(entries: Entries) -> Entries:
+    nested = entries.get("imu0")
+    return {str(k): v for k, v in nested.items()} if isinstance(nested, dict) else entries
+
+
+def kalibr_text(rig: Rig) -> str:
+    """Return the camchain of a rig, with all digits."""
+    T_cam0_imu = np.eye(4) if rig.T_cam0_imu is None else rig.T_cam0_imu
+    poses = {"cam0": T_cam0_imu, "cam1": rig.T_cam1_cam0 @ T_cam0_imu}
+    chain: dict[str, Any] = {}
+    for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1)):
+        sheet: dict[str, Any] = {}
+        if rig.T_cam0_imu is not None:
+            sheet["T_cam_imu"] = poses[name].tolist()
+        if name == "cam1":
+            sheet["T_cn_cnm1"] = rig.T_cam1_cam0.tolist()
+        kind, bend, leading, coefficients = _kalibr_names(camera)
+        sheet |= {
+            "camera_model": kind,
+            "distortion_model": bend,
+            "distortion_coeffs": [float(c) for c in coefficients],
+            "intrinsics": [*leading, camera.fu, camera.fv, camera.cu, camera.cv],
+            "resolution": [camera.width, camera.height],
+        }
+        if rig.T_cam0_imu is not None:
+            sheet["timeshift_cam_imu"] = float(rig.time_offset_s)
+        chain[name] = sheet
+    return yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
+
+
+def _kalibr_names(camera: CameraModel) -> tuple[str, str, list[float], tuple[float, ...]]:
+    """Kalibr's names of projection and distortion, the parameters before the focal lengths, and the coefficients."""
+    c = camera.coefficients
+    if camera.model == "double_sphere":
+        return "ds", "none", [float(x) for x in c], ()
+    if camera.model == "unified":
+        return "omni", "radtan" if len(c) > 1 else "none", [float(c[0])], c[1:]
+    return "pinhole", "none" if camera.model == "pinhole" else camera.model, [], c

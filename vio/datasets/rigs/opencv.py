@@ -1,0 +1,270 @@
+"""OpenCV's stereo calibrations: FileStorage YAML or XML with the matrices of `stereoCalibrate` and `stereoRectify`.
+
+`R` and `T` map points of the first camera to the second. Names are those of OpenCV's samples (`M1 D1 M2 D2 R T` in one
+file, or in `intrinsics.yml` and `extrinsics.yml`), of common tutorials, and of ORB-SLAM's `LEFT.K`. A file with
+`P1` and `P2` and no raw matrices describes images that are rectified already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from vio.datasets.common import checked_transform, naming
+from vio.datasets.yaml_files import Entries, as_number, matrix, read_yaml
+from vio.errors import CalibrationError
+from vio.geometry.distortion import DistortionModel
+from vio.geometry.lie import FloatArray
+from vio.rig import Rig, camera_from_matrix
+
+_NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
+    "K0": (
+        "M1",
+        "K1",
+        "cameraMatrix1",
+        "camera_matrix_1",
+        "cameraMatrixL",
+        "K_left",
+        "left_camera_matrix",
+        "LEFT.K",
+        "mtxL",
+        "KL",
+    ),
+    "K1": (
+        "M2",
+        "K2",
+        "cameraMatrix2",
+        "camera_matrix_2",
+        "cameraMatrixR",
+        "K_right",
+        "right_camera_matrix",
+        "RIGHT.K",
+        "mtxR",
+        "KR",
+    ),
+    "D0": ("D1", "distCoeffs1", "dist_coeffs_1", "distCoeffsL", "D_left", "left_distortion", "LEFT.D", "distL", "DL"),
+    "D1": (
+        "D2",
+        "distCoeffs2",
+        "dist_coeffs_2",
+        "distCoeffsR",
+        "D_right",
+        "right_distortion",
+        "RIGHT.D",
+        "distR",
+        "DR",
+    ),
+    "R": ("R", "rotation", "Rot", "R_stereo"),
+    "T": ("T", "translation", "Trns", "T_stereo"),
+    "R0": ("R1", "LEFT.R", "RL"),
+    "R1": ("R2", "RIGHT.R", "RR"),
+    "P0": ("P1", "LEFT.P", "projMatrixL", "PL"),
+    "P1": ("P2", "RIGHT.P", "projMatrixR", "PR"),
+}
+_SIZES = (
+    ("image_width", "image_height"),
+    ("width", "height"),
+    ("imageWidth", "imageHeight"),
+    ("LEFT.width", "LEFT.height"),
+)
+_MODELS: dict[str, DistortionModel] = {
+    "radtan": "radtan",
+    "plumb_bob": "radtan",
+    "pinhole": "radtan",
+    "fisheye": "equidistant",
+    "equidistant": "equidistant",
+    "kannala_brandt": "equidistant",
+}
+_TOO_WIDE_M = 5.0  # a longer baseline is taken for millimetres, or squares of the board, and said
+
+
+class CoefficientsError(CalibrationError):
+    """Distortion coefficients beyond those of the models here."""
+
+
+def is_opencv(entries: Entries) -> bool:
+    """Return whether entries hold matrices of a stereo calibration, raw or rectified."""
+    return all(_find(entries, key) is not None for key in ("K0", "K1")) or _is_rectified(entries)
+
+
+def _is_rectified(entries: Entries) -> bool:
+    return all(_find(entries, key) is not None for key in ("P0", "P1"))
+
+
+def read_entries(path: Path) -> dict[str, object]:
+    """Read FileStorage's YAML or XML, and `extrinsics` beside `intrinsics`.
+
+    Raises:
+        CalibrationError: a file is missing, or neither YAML nor XML.
+    """
+    read = _read_xml if path.suffix.lower() == ".xml" else read_yaml
+    entries = read(path)
+    for here, there in (("intrinsic", "extrinsic"), ("extrinsic", "intrinsic")):
+        beside = path.with_name(path.name.replace(here, there))
+        if here in path.name and beside.is_file():
+            entries = {**read(beside), **entries}
+    return entries
+
+
+def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | None) -> Rig:
+    """Return the rig that the entries describe.
+
+    Args:
+        entries: as `read_entries` returns them.
+        where: the file, for messages.
+        image_size: width and height in pixels, used where the file states none.
+
+    Raises:
+        CalibrationError: a matrix is missing or impossible, or no image size is known.
+    """
+    width, height = _size(entries, where, image_size)
+    if _find(entries, "K0") is None:
+        rig = _rectified(entries, where, width, height)
+    else:
+        rig = _raw(entries, where, width, height)
+    baseline = float(np.linalg.norm(rig.T_cam1_cam0[:3, 3]))
+    if baseline <= _TOO_WIDE_M:
+        return rig
+    return rig.noting(
+        f"{where}: the cameras are {baseline:g} m apart; where the board was measured in millimetres, T is too: divide "
+        "it by 1000, or all lengths of the run will be in that unit"
+    )
+
+
+def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
+    K0, K1 = (_required(entries, key, (3, 3), where) for key in ("K0", "K1"))
+    stated = entries.get("distortion_model", entries.get("camera_model", entries.get("model")))
+    if stated is not None and str(stated).lower() not in _MODELS:
+        raise CalibrationError(f"{where}: distortion model {stated!r} is not read; known: {', '.join(_MODELS)}")
+    model = _MODELS[str(stated).lower()] if stated is not None else "radtan"
+    notes: list[str] = []
+    cameras = []
+    for K, key in ((K0, "D0"), (K1, "D1")):
+        found = _find(entries, key)
+        D = () if found is None else tuple(np.ravel(matrix(found, None, f"{where}, {_name(entries, key)}")).tolist())
+        if len(D) == 4 and stated is None and any(D):
+            notes.append(
+                f"{where}: four coefficients without a model's name are read as k1 k2 p1 p2; for a fisheye lens add "
+                "'distortion_model: equidistant'"
+            )
+        with naming(where):
+            cameras.append(
+                camera_from_matrix(K, width, height, model, trimmed_coefficients(D) if model == "radtan" else D)
+            )
+    pose = _stereo_pose(entries, where)
+    with naming(where):
+        return Rig(cameras[0], cameras[1], pose, notes=tuple(dict.fromkeys(notes)))
+
+
+def _stereo_pose(entries: Entries, where: str) -> FloatArray:
+    """`T_cam1_cam0` (4, 4) from R and T or, where only the rectification is given, from R1, R2 and P2."""
+    if _find(entries, "T") is not None:
+        R = _required(entries, "R", None, where)
+        if R.size == 3:
+            raise CalibrationError(f"{where}: R holds 3 numbers (a rotation vector); write the 3x3 matrix")
+        T = np.ravel(_required(entries, "T", None, where))
+        if R.shape != (3, 3) or T.shape != (3,):
+            raise CalibrationError(f"{where}: R must be 3x3 and T hold 3 numbers, not {R.shape} and {T.shape}")
+        return checked_transform(np.column_stack([R, T]), f"{where}, R")
+    R0, R1 = (_required(entries, key, (3, 3), where) for key in ("R0", "R1"))
+    P = _required(entries, "P1", None, where)[:3, :4]
+    return checked_transform(
+        np.column_stack([R1.T @ R0, R1.T @ np.linalg.solve(P[:, :3], P[:, 3])]), f"{where}, rectification"
+    )
+
+
+def _rectified(entries: Entries, where: str, width: int, height: int) -> Rig:
+    P0, P1 = (_required(entries, key, (3, 4), where) for key in ("P0", "P1"))
+    with naming(where):
+        if not np.allclose(P0[:, :3], P1[:, :3], rtol=1e-6):
+            raise CalibrationError("P1 and P2 differ in focal length or centre; calibrate with CALIB_ZERO_DISPARITY")
+        camera = camera_from_matrix(P0[:, :3], width, height, name="P1")
+        baseline = -float(P1[0, 3] / P1[0, 0])
+        return Rig.rectified(camera.fu, camera.fv, camera.cu, camera.cv, baseline, width, height).noting(
+            f"{where}: holds P1 and P2 only, so the images are taken to be rectified"
+        )
+
+
+def trimmed_coefficients(D: Sequence[float]) -> tuple[float, ...]:
+    """Return OpenCV's `k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 .. s4 [tx ty]]]]` without the part that is zero.
+
+    Raises:
+        CoefficientsError: thin-prism or tilt terms are used, or the count is none of OpenCV's.
+    """
+    if len(D) not in (0, 4, 5, 8, 12, 14):
+        raise CoefficientsError(f"{len(D)} distortion coefficients; OpenCV has 4, 5, 8, 12 or 14")
+    if any(D[8:]):
+        raise CoefficientsError(
+            "thin-prism or tilt coefficients are not read; calibrate without CALIB_THIN_PRISM_MODEL"
+        )
+    kept = D[:8] if any(D[5:8]) else D[:5]
+    return tuple(float(d) for d in kept)
+
+
+def _size(entries: Entries, where: str, image_size: tuple[int, int] | None) -> tuple[int, int]:
+    for names in _SIZES:
+        found = [as_number(entries.get(name)) for name in names]
+        if all(value >= 1 for value in found):
+            return int(found[0]), int(found[1])
+    for name in ("image_size", "imageSize", "imgSize", "size"):
+        if name in entries:
+            width, height = np.ravel(matrix(entries[name], None, f"{where}, {name}"))[:2]
+            return int(width), int(height)
+    if image_size is None:
+        raise CalibrationError(
+            f"{where}: states no image size; add 'image_width: W' and 'image_height: H', or pass image_size=(W, H)"
+        )
+    return image_size
+
+
+def _find(entries: Entries, key: str) -> object | None:
+    return next((entries[name] for name in _NAMES[key] if name in entries), None)
+
+
+def _name(entries: Entries, key: str) -> str:
+    return next((name for name in _NAMES[key] if name in entries), _NAMES[key][0])
+
+
+def _required(entries: Entries, key: str, shape: tuple[int, int] | None, where: str) -> FloatArray:
+    value = _find(entries, key)
+    if value is None:
+        raise CalibrationError(
+            f"{where}: has no entry {' or '.join(_NAMES[key][:3])}; save the whole stereo calibration"
+        )
+    return matrix(value, shape, f"{where}, {_name(entries, key)}")
+
+
+def _read_xml(path: Path) -> dict[str, object]:
+    """Read FileStorage's XML: matrices as blocks of rows, cols and data, other entries as text."""
+    root = read_xml(path)
+    entries: dict[str, object] = {}
+    for child in root:
+        data = child.find("data")
+        if data is None:
+            entries[child.tag] = (child.text or "").strip()
+        else:
+            block: dict[str, object] = {name: child.findtext(name) for name in ("rows", "cols")}
+            block["data"] = (data.text or "").split()
+            entries[child.tag] = block
+    return entries
+
+
+def read_xml(path: Path) -> ElementTree.Element:
+    """Parse an XML file.
+
+    Raises:
+        CalibrationError: the file is missing, declares entities, or is no XML.
+    """
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise CalibrationError(f"cannot read {path}: {error.strerror or error}; give a readable file") from error
+    if b"<!ENTITY" in text or len(text) > 1_000_000:
+        raise CalibrationError(f"{path}: declares entities or is too large for a calibration; give the original file")
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise CalibrationError(f"{path}: not an XML file ({error}); copy it again") from error

@@ -1,0 +1,103 @@
+"""Read calibration files in YAML, OpenCV's dialect included, as plain entries, and their numbers with strict checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from vio.errors import CalibrationError
+from vio.geometry.lie import FloatArray
+from vio.text_files import text_lines
+from vio.yaml_text import read_yaml as read_yaml_text
+
+Entries: TypeAlias = Mapping[str, object]
+
+_MAX_BYTES = 1_000_000  # a calibration is some kilobytes; a larger file is another one
+
+
+def read_yaml(path: Path, what: str = "the sensor's calibration") -> dict[str, object]:
+    """Read a YAML file of `key: value` lines.
+
+    Raises:
+        CalibrationError: the file is missing, too large, no YAML, or uses tags other than OpenCV's.
+    """
+    if not path.is_file():
+        raise CalibrationError(f"{path} is missing; it holds {what}")
+    if (size := path.stat().st_size) > _MAX_BYTES:
+        raise CalibrationError(f"{path}: {size} bytes are too many for a calibration; give the right file")
+    # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
+    lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
+    try:
+        entries = read_yaml_text("\n".join(lines).replace("!!opencv-matrix", ""))
+    except ValueError as error:
+        raise CalibrationError(
+            f"{path}: not a YAML file of plain values ({error}); write plain numbers, or copy it again"
+        ) from error
+    if not isinstance(entries, dict):
+        raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
+    return {str(key): value for key, value in entries.items()}
+
+
+def section(entries: Entries, key: str, where: str) -> dict[str, Any]:
+    """Return a nested block.
+
+    Raises:
+        CalibrationError: it is missing or no block.
+    """
+    value = entries.get(key)
+    if not isinstance(value, dict):
+        raise CalibrationError(f"{where}: has no block '{key}:'; copy the calibration again")
+    return {str(k): v for k, v in value.items()}
+
+
+def as_number(value: object) -> float:
+    """Parse a number from YAML or csv (PyYAML reads 1e-3 as text); NaN where it is none."""
+    try:
+        return float(value) if isinstance(value, (int, float, str)) else float("nan")
+    except (ValueError, OverflowError):
+        return float("nan")
+
+
+def numbers(entries: Entries, key: str, where: Path | str, count: int | None = None) -> tuple[float, ...]:
+    """Return a list of finite numbers, or a single one as a list.
+
+    Raises:
+        CalibrationError: the entry is missing, or is not `count` finite numbers.
+    """
+    if key not in entries:
+        raise CalibrationError(f"{where}: has no entry '{key}'; copy the calibration again")
+    value = entries[key]
+    found = tuple(as_number(v) for v in (value if isinstance(value, list) else [value]))
+    if (count is not None and len(found) != count) or not np.all(np.isfinite(found)):
+        wanted = "finite numbers" if count is None else f"{count} finite number{'s' * (count > 1)}"
+        raise CalibrationError(f"{where}: '{key}' is {value!r} instead of {wanted}")
+    return found
+
+
+def matrix(value: object, shape: tuple[int, int] | None, where: str) -> FloatArray:
+    """Return a matrix given as rows, as a flat list, or as OpenCV's block of `rows`, `cols` and `data`.
+
+    Args:
+        value: the entry.
+        shape: expected rows and columns; None: any, as stated by the block or the rows.
+        where: names the file and the entry, for the message.
+
+    Raises:
+        CalibrationError: it holds other counts, or a value is not a finite number.
+    """
+    stated: tuple[int, int] | None = None
+    if isinstance(value, dict):
+        rows, cols = as_number(value.get("rows")), as_number(value.get("cols", value.get("columns")))
+        stated = (int(rows), int(cols)) if rows >= 1 and cols >= 1 else None
+        value = value.get("data")
+    if isinstance(value, list) and value and all(isinstance(row, list) for row in value):
+        stated = stated or (len(value), len(value[0]))
+        value = [x for row in value for x in row]
+    found = np.array([as_number(x) for x in value] if isinstance(value, list) else [as_number(value)])
+    size = shape or stated or (1, len(found))
+    if len(found) != size[0] * size[1] or not np.isfinite(found).all():
+        raise CalibrationError(f"{where} holds {len(found)} values, expected {size[0]} x {size[1]} finite numbers")
+    return found.reshape(size)

@@ -1,0 +1,129 @@
+"""Poses between and after frames, at the rate of the IMU, without touching the filter."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.records import Estimate, MotionSample, VelocitySample
+
+_NS = 1e-9
+_KEPT_NS = 2_000_000_000  # samples that a late estimate can be carried over
+_LONGEST_STEP_S = 0.5  # a motion is held no longer than this beyond the last sample or frame
+_MOST_STATES = 10_000  # after the newest estimate: beyond, older ones are forgotten
+_ZERO: FloatArray = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedPose:
+    """A pose by propagation alone."""
+
+    time_ns: int
+    T_world_imu: FloatArray  # (4, 4)
+    velocity_world: FloatArray  # (3,) m/s
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """Pose and velocity at a time, and the motion that is held from there on."""
+
+    time_ns: int
+    R: FloatArray  # (3, 3)
+    p: FloatArray  # (3,)
+    v: FloatArray  # (3,) world frame
+    gyro: FloatArray  # (3,) body frame, without bias
+    accel: FloatArray  # (3,) world frame, without gravity and bias
+
+
+class PosePredictor:
+    """Carries the newest estimate over the motion samples after it.
+
+    IMU: strapdown integration with the estimated biases. Velocities and images alone: the rate and velocity are held.
+    One thread may predict while another adds: states are only appended, and replaced as a whole.
+    """
+
+    def __init__(self, gravity_mps2: float) -> None:
+        self._gravity = np.array([0.0, 0.0, -gravity_mps2])
+        self._samples: deque[MotionSample] = deque()
+        self._bias: tuple[FloatArray, FloatArray] = (_ZERO, _ZERO)
+        self._last: Estimate | None = None
+        self._states: list[_State] = []  # at the newest estimate and at the samples after it
+
+    def sample(self, sample: MotionSample) -> None:
+        """Take a motion sample."""
+        self._samples.append(sample)
+        while sample.time_ns - self._samples[0].time_ns > _KEPT_NS:
+            self._samples.popleft()
+        states = self._states
+        if states and sample.time_ns > states[-1].time_ns:
+            states.append(self._carried(states[-1], sample))
+            if len(states) > _MOST_STATES:
+                self._states = [states[0], *states[-_MOST_STATES // 2 :]]
+
+    def estimate(self, estimate: Estimate) -> None:
+        """Take a new estimate, and carry it over the samples that have come since."""
+        gyro_bias = _ZERO if estimate.gyro_bias is None else estimate.gyro_bias
+        accel_bias = _ZERO if estimate.accel_bias is None else estimate.accel_bias
+        self._bias = gyro_bias, accel_bias
+        omega, v = self._motion_of(estimate)
+        state = _State(estimate.time_ns, estimate.T_world_imu[:3, :3], estimate.T_world_imu[:3, 3], v, omega, _ZERO)
+        before = [sample for sample in self._samples if sample.time_ns <= estimate.time_ns]
+        states = [self._held(state, before[-1]) if before else state]
+        for sample in self._samples:
+            if sample.time_ns > estimate.time_ns:
+                states.append(self._carried(states[-1], sample))
+        self._last, self._states = estimate, states
+
+    def predict(self, time_ns: int) -> PredictedPose:
+        """Return the pose at a time at or after the newest estimate.
+
+        Raises:
+            DataError: there is no estimate yet, or the time lies before it.
+        """
+        states = self._states
+        if not states:
+            raise DataError("no pose can be predicted before the first estimate")
+        if time_ns < states[0].time_ns:
+            raise DataError(f"{time_ns} ns lies before the newest estimate at {states[0].time_ns} ns; take that one")
+        state = next(state for state in reversed(states) if state.time_ns <= time_ns)
+        R, p, v = _moved(state, min((time_ns - state.time_ns) * _NS, _LONGEST_STEP_S))
+        return PredictedPose(time_ns, se3_from_parts(R, p), v)
+
+    def _motion_of(self, estimate: Estimate) -> tuple[FloatArray, FloatArray]:
+        """Body rate (3,) rad/s and world velocity (3,) m/s at an estimate, from the last two where it has none."""
+        last = self._last
+        omega, v = _ZERO, _ZERO
+        if last is not None and estimate.time_ns > last.time_ns:
+            dt = (estimate.time_ns - last.time_ns) * _NS
+            omega = se3_log(se3_inverse(last.T_world_imu) @ estimate.T_world_imu)[3:] / dt
+            v = (estimate.T_world_imu[:3, 3] - last.T_world_imu[:3, 3]) / dt
+        return omega, v if estimate.velocity_world is None else estimate.velocity_world
+
+    def _held(self, state: _State, sample: MotionSample) -> _State:
+        """The state with the motion of a sample, which holds from there on."""
+        if isinstance(sample, VelocitySample):
+            return _State(state.time_ns, state.R, state.p, state.R @ sample.linear, sample.angular, _ZERO)
+        gyro_bias, accel_bias = self._bias
+        force = state.R @ (sample.accel - accel_bias) + self._gravity
+        return _State(state.time_ns, state.R, state.p, state.v, sample.gyro - gyro_bias, force)
+
+    def _carried(self, state: _State, sample: MotionSample) -> _State:
+        """The state at a later sample; with an IMU by the mean of its readings at both ends."""
+        dt = (sample.time_ns - state.time_ns) * _NS
+        if isinstance(sample, VelocitySample):
+            R, p, v = _moved(state, dt)
+            return self._held(_State(sample.time_ns, R, p, v, state.gyro, state.accel), sample)
+        gyro = sample.gyro - self._bias[0]
+        R = state.R @ so3_exp(0.5 * (state.gyro + gyro) * dt)
+        force = R @ (sample.accel - self._bias[1]) + self._gravity
+        a = 0.5 * (state.accel + force)
+        return _State(sample.time_ns, R, state.p + state.v * dt + 0.5 * a * dt**2, state.v + a * dt, gyro, force)
+
+
+def _moved(state: _State, dt: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    R = state.R @ so3_exp(state.gyro * dt)
+    return R, state.p + state.v * dt + 0.5 * state.accel * dt**2, state.v + state.accel * dt

@@ -1,0 +1,199 @@
+"""Find image pairs that show no motion although the rig moves: frames that a camera or driver gives again.
+
+Equal to the last bit is the same exposure, as noise differs from one to the next. Nearly equal pairs (encoded again, or
+with noise on top) are the same where the tracked corners have not moved, while the motion predicted since the last
+frame moves them by more than its uncertainty allows and the IMU is not at standstill. A rig at standstill gives nearly
+equal images, too; there the prediction agrees, and they are used.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, se3_log
+from vio.records import Image, ImuSample, MotionPrior, Observations, Prediction, StereoFrame
+from vio.standstill import STANDSTILL_S, blocks_agree
+from vio.statistics import chi_square_quantile
+
+_RADIUS = 4  # of the patches whose flow is measured, pixels
+_CORNERS = 60  # measured per image
+_LEAST_CORNERS = 15
+_PREDICTED_PX = 0.6  # a corner that is predicted to move less tells nothing
+_UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
+_SHARE = 0.8  # of the corners that must be unmoved
+_PROBABILITY = 0.9999  # chi-square limit of the predicted motion for no motion to be possible
+_MOST_LINES = 3  # rows of repetitions that are reported one by one
+_GYRO_NOISE, _ACCEL_NOISE = 2e-4, 1.2e-2  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
+_NS = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Repeated:
+    """A pair that shows the exposure of an earlier frame."""
+
+    of_index: int  # that frame's number
+    exact: bool  # equal to the last bit
+
+
+class FrozenImages:
+    """Compares each pair with the last one that showed something new."""
+
+    def __init__(self) -> None:
+        self._imu: deque[ImuSample] = deque()
+        self._shown: StereoFrame | None = None  # the last frame that is no repetition
+        self._seen: Observations | None = None  # its features
+        self._repeating: Repeated | None = None  # of the frame before
+
+    def sample(self, sample: ImuSample) -> None:
+        """Take a sample of the IMU."""
+        self._imu.append(sample)
+        while (sample.time_ns - self._imu[0].time_ns) * _NS > STANDSTILL_S:
+            self._imu.popleft()
+
+    def observations(self, seen: Observations) -> None:
+        """Take the features of a frame that `check` let pass."""
+        self._seen = seen
+
+    def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
+        """Return which frame a pair repeats; None: it shows something new, or a rig at standstill.
+
+        Args:
+            frame: the pair, with or without images; frames come in time order.
+            expected: the back end's prediction of this frame, its motion since the last frame with features.
+        """
+        self._repeating = self._compare(frame, expected)
+        if self._repeating is None:
+            self._shown = frame
+        return self._repeating
+
+    def _compare(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
+        shown = self._shown
+        if shown is None or frame.left is None or frame.right is None:
+            return None
+        assert shown.left is not None
+        assert shown.right is not None
+        again = self._repeating is not None  # what was given again once is, until it changes
+        if np.array_equal(frame.left, shown.left) and np.array_equal(frame.right, shown.right):
+            return Repeated(shown.index, True) if again or self._moves(expected) else None
+        if self._seen is None or expected is None:
+            return None
+        if again:
+            return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
+        if not self._contradicts(expected.motion) or self._at_standstill():
+            return None
+        return (
+            Repeated(shown.index, False) if _unmoved(shown, frame, _predicted_to_move(self._seen, expected)) else None
+        )
+
+    def _moves(self, expected: Prediction | None) -> bool:
+        """Whether the rig moves: by the IMU's samples, else by the prediction."""
+        if self._imu:
+            return not self._at_standstill()
+        return expected is not None and self._contradicts(expected.motion)
+
+    def _at_standstill(self) -> bool:
+        """Whether the IMU's last half second shows noise alone; steady motion looks the same, but no rig is steady."""
+        if not self._imu:
+            return False
+        times_s = np.array([x.time_ns - self._imu[-1].time_ns for x in self._imu]) * _NS
+        gyro, accel = np.array([x.gyro for x in self._imu]), np.array([x.accel for x in self._imu])
+        return blocks_agree(times_s, gyro, _GYRO_NOISE) and blocks_agree(times_s, accel, _ACCEL_NOISE)
+
+    def _contradicts(self, motion: MotionPrior | None) -> bool:
+        """Whether no motion at all contradicts the predicted one, by chi-square."""
+        if motion is None:
+            return False
+        xi = se3_log(motion.T_curr_prev)
+        C = motion.covariance
+        scale = float(np.trace(C)) + 1e-18
+        return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > chi_square_quantile(_PROBABILITY, 6))
+
+
+def _predicted_to_move(seen: Observations, expected: Prediction) -> Observations:
+    """The features of the last frame that the prediction moves clearly in the left image."""
+    _, a, b = np.intersect1d(seen.ids, expected.tracks.ids, assume_unique=True, return_indices=True)
+    moved = np.linalg.norm(expected.tracks.z[b, :2] - seen.z[a, :2], axis=1)
+    return seen.take(a[moved > _PREDICTED_PX])
+
+
+def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
+    """Whether features have not moved since they were seen, in both images."""
+    for old, new, pixels in (
+        (before.left, now.left, seen.z[:_CORNERS, :2]),
+        (before.right, now.right, seen.z[seen.has_right][:_CORNERS, 2:]),
+    ):
+        assert old is not None
+        assert new is not None
+        flow = corner_flow(old, new, pixels)
+        if len(flow) < _LEAST_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
+            return False
+    return True
+
+
+class RepeatReport:
+    """Reports pairs that were given again: the first one, long rows of them, and their number."""
+
+    def __init__(self) -> None:
+        self._row: list[StereoFrame] = []  # frames of the present row
+        self._reported = 0
+        self._total = 0
+
+    def frame(self, frame: StereoFrame, repeated: Repeated | None) -> list[str]:
+        """Take a frame and what it repeats; return the lines that follow from it."""
+        lines = self._ended(frame) if repeated is None else []
+        if repeated is None:
+            self._row = []
+            return lines
+        self._row.append(frame)
+        self._total += 1
+        if len(self._row) > 1 or self._reported >= _MOST_LINES:
+            return lines
+        self._reported += 1
+        seen = "are the same to the last bit" if repeated.exact else "show nothing that has moved"
+        cause = (
+            "the camera or its driver gave them again"
+            if repeated.exact
+            else "the camera or its driver gave them again, or it sees only what moves with it"
+        )
+        return [
+            f"frame {frame.index}: both images {seen} since frame {repeated.of_index} although the rig moves: {cause}; "
+            "left out, the pose is a prediction"
+        ]
+
+    def finish(self) -> list[str]:
+        """Return the line at the end of the run."""
+        still = [f"the images stayed the same from frame {self._row[0].index} to the end"] if self._row else []
+        return [*still, f"{self._total} frames repeated earlier images and were left out"] if self._total > 1 else still
+
+    def _ended(self, frame: StereoFrame) -> list[str]:
+        if len(self._row) < 2:
+            return []
+        seconds = (frame.time_ns - self._row[0].time_ns) * _NS
+        return [f"frame {frame.index}: the images change again, after {len(self._row)} repetitions ({seconds:.2f} s)"]
+
+
+def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:
+    """Flow (M, 2) of patches at pixels (N, 2) between two images by one Lucas-Kanade step, offsets of gray removed.
+
+    Exact for no motion; for motions of many pixels it only says that there is one. Patches that leave the image are
+    left out, so M <= N.
+    """
+    height, width = before.shape
+    margin, at = _RADIUS + 1, np.rint(pixels).astype(np.int64)
+    inside = np.all((at >= margin) & (at < np.array([width, height]) - margin), axis=1)
+    y, x = np.mgrid[-margin : margin + 1, -margin : margin + 1]
+    rows, columns = at[inside, 1, None, None] + y, at[inside, 0, None, None] + x
+    old, new = before[rows, columns].astype(np.float64), after[rows, columns].astype(np.float64)
+    inner = slice(1, -1)
+    flat = len(old), (2 * _RADIUS + 1) ** 2
+    gu = (old[:, inner, 2:] - old[:, inner, :-2]).reshape(flat) / 2
+    gv = (old[:, 2:, inner] - old[:, :-2, inner]).reshape(flat) / 2
+    change = (new - old)[:, inner, inner].reshape(flat)
+    change = change - change.mean(axis=1, keepdims=True)
+    g = np.stack([gu, gv], axis=1)
+    normal = g @ g.transpose(0, 2, 1) + 1.0 * np.eye(2)  # one gray level squared, against patches without texture
+    flow: FloatArray = -np.linalg.solve(normal, (g @ change[..., None]))[..., 0]
+    return flow
