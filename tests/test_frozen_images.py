@@ -118,6 +118,13 @@ def test_a_pair_that_moved_is_used_whatever_the_prediction() -> None:
         assert _watching().check(_frame(1, _shifted(LEFT, px), _shifted(RIGHT, px)), _expected(2.0)) is None
 
 
+def test_images_of_another_size_are_no_repetition() -> None:
+    """They are compared with nothing: the front end refuses them, and the next pair is compared with no error."""
+    frozen = _watching()
+    assert frozen.check(_frame(1, LEFT[::2, ::2].copy(), RIGHT), _expected()) is None
+    assert frozen.check(_frame(2, LEFT, RIGHT), _expected()) is None
+
+
 def test_one_camera_that_repeats_is_not_a_repeated_pair() -> None:
     assert _watching().check(_frame(1, LEFT, _shifted(RIGHT, 2.0)), _expected()) is None
     assert _watching().check(_frame(1, _shifted(LEFT, 2.0), RIGHT), _expected()) is None

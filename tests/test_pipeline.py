@@ -234,6 +234,25 @@ def test_run_uses_one_blas_thread_and_restores_the_callers_number(fails: bool) -
     assert inside == [{1}] * (1 if fails else 3)
 
 
+def test_a_divergence_is_an_event_and_not_the_end_of_the_run() -> None:
+    """The filter's state is no number in frame 8: the run goes on from the pose of frame 7, and says so once."""
+
+    class Fragile(Msckf):
+        def update(self, seen: Observations) -> UpdateReport:
+            if seen.frame_index == 8 and self._smoothed is not None:
+                assert self._window is not None
+                self._window.P[0, 0] = np.nan
+            return super().update(seen)
+
+    drive = FakeDrive(frames=20)
+    backend = Fragile(CAMERA, T_CAM0_IMU, Config().msckf, motion="velocity")
+    result = run(drive, Config(), backend=backend)
+    (line,) = [line for line in result.warnings if "started again" in line]
+    assert line.startswith("frame 8: msckf diverged at frame 8")
+    np.testing.assert_allclose(result.trajectory.positions, drive.poses[:, :3, 3], atol=0.3)
+    assert len(result.frames) == 20
+
+
 @pytest.mark.parametrize(
     ("overrides", "velocity", "message"),
     [

@@ -75,6 +75,8 @@ class FrozenImages:
             return None
         assert shown.left is not None
         assert shown.right is not None
+        if frame.left.shape != shown.left.shape or frame.right.shape != shown.right.shape:
+            return None  # the front end refuses it
         again = self._repeating is not None  # what was given again once is, until it changes
         if np.array_equal(frame.left, shown.left) and np.array_equal(frame.right, shown.right):
             return Repeated(shown.index, True) if again or self._moves(expected) else None
