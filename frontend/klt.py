@@ -16,6 +16,7 @@ from .align import align, on_peak, rounded, scale_change, shift_warps, template_
 from .columns import joined, take
 from .detect import detect_corners, half_mask, load_mask, min_distance_px
 from .exchange import ExchangeDetector, MatchCounts
+from .flicker import BandRemoval
 from .flow import lost_contrast, track_with_retries
 from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
 from .moving_object import ObjectReport, choose_motion
@@ -23,12 +24,14 @@ from .outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors,
 from .patches import FloatImage, View, half_image, inside
 from .prediction import moved_pixels, prior_depths, prior_pixels, usable_prior
 from .right_camera import RightCamera
+from .right_delay import PairingCounts, RightDelay, at_exposure, at_present
 from .settings import FrontendSettings
 from .stereo_fit import StereoFit
 from .tracks import AnchorBank, Tracks, new_tracks, no_tracks
 
 _ITERATIONS = 5
 _ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost
+_PAIRING_POINTS = 150  # features that are tried with images of other frames
 _EXCHANGE_POINTS = 80  # points that matches of either sign are counted at
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
 _NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
@@ -36,6 +39,8 @@ _FAR_M = 1e6  # depth assumed where too few features have one
 _FEW = 0.5  # share of the least number of features below which corners without depth are added
 _TRIED = 1.5  # corners aligned per missing feature
 _VERY_FEW = 0.25  # share of the target below which new features are output at once
+_LONG_GAP_S = 0.8  # a rig that flies or is carried shows other things after it …
+_LONG_GAP_STEPS = 5.0  # … where frames usually come so many times as often
 _BANK_SPARE = 3  # templates allocated, over the number of features
 
 
@@ -45,6 +50,7 @@ class _PreviousFrame:
 
     time_ns: int
     left: View
+    right_half: Image
     tracks: Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
     trusted: bool  # the last motion had a consensus
@@ -76,8 +82,10 @@ class KltFrontend:
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._validator = FrameValidator(camera, "klt")
         self._swap = SwapDetector(_SWAP_FEW)
+        self._bands = BandRemoval()
         self._exchange = ExchangeDetector()
         self._right = RightCamera()
+        self._delay = RightDelay(camera)
         self._objects = ObjectReport()
         self._lines: list[str] = []  # of the frame, for the log
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, self._settings.anchor_radius_px)
@@ -85,6 +93,7 @@ class KltFrontend:
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
         self._next_id = 0
         self._skipped = 0  # frames in a row
+        self._step_ns: int | None = None  # between the last two frames
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
         """Track, match and detect in one rectified stereo pair; see `vio.protocols.Frontend`.
@@ -93,7 +102,8 @@ class KltFrontend:
             ConfigError: the mask is not of the images' size.
         """
         watch = Stopwatch()
-        left, right = (self._view(image) for image in self._validator.validate(frame))
+        images = self._bands(frame.index, *self._validator.validate(frame))
+        left, right = (self._view(image) for image in images)
         stereo, allowed = self._set_up(left)
         watch.lap("prepare")
         if self._contrast_lost(left):
@@ -117,7 +127,7 @@ class KltFrontend:
         corners = detect_corners(left.half, tracks.left, wanted, self._grid, self._settings, allowed)
         watch.lap("detect")
         tracks = self._add_new_features(left, right, tracks, corners, motion, stereo)
-        if self._right.usable:
+        if self._right.usable and self._delay.frames == 0.0:
             stereo.update_rows(tracks)
         watch.lap("stereo")
         points, matched = tracks.left, int(tracks.has_right.sum())
@@ -131,7 +141,16 @@ class KltFrontend:
 
     def _take_lines(self) -> tuple[str, ...]:
         """Return what the frame says of the images, one line an event."""
-        lines, self._lines = (*self._exchange.take_lines(), *self._right.take_lines(), *self._lines), []
+        lines, self._lines = (
+            (
+                *self._bands.take_lines(),
+                *self._exchange.take_lines(),
+                *self._right.take_lines(),
+                *self._delay.take_lines(),
+                *self._lines,
+            ),
+            [],
+        )
         return lines
 
     def _view(self, image: Image) -> View:
@@ -184,10 +203,11 @@ class KltFrontend:
         """Store the state that the next frame needs."""
         self._bank.keep_only(tracks.slot)
         before = self._previous
+        self._step_ns = None if before is None else frame.time_ns - before.time_ns
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
-        self._previous = _PreviousFrame(frame.time_ns, left, tracks, twist, motion is not None)
+        self._previous = _PreviousFrame(frame.time_ns, left, right.half, tracks, twist, motion is not None)
 
     # --- features of the previous frame -------------------------------------------------------------------------------
 
@@ -202,7 +222,7 @@ class KltFrontend:
     ) -> tuple[Tracks, Consensus | None]:
         """Track the features of the previous frame into both images; return those kept and the consensus motion."""
         previous = self._previous
-        if previous is None or len(previous.tracks) == 0:
+        if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
             return no_tracks(), None
         old, settings = previous.tracks, self._settings
         expected = se3_exp(previous.twist_per_s * ((frame.time_ns - previous.time_ns) * 1e-9))
@@ -217,24 +237,100 @@ class KltFrontend:
         watch.lap("reject")
         tracks = self._align_with_anchors(previous, left, found, seen, motion)
         watch.lap("align")
-        tracks = self._match_right(frame.index, tracks, right, prior, stereo, motion is not None)
+        tracks = self._match_right(frame, tracks, left, right, prior, stereo, motion)
         watch.lap("stereo")
         return tracks, motion
 
     def _match_right(
-        self, index: int, tracks: Tracks, right: View, prior: TrackPrior | None, stereo: StereoFit, moved: bool
+        self,
+        frame: StereoFrame,
+        tracks: Tracks,
+        left: View,
+        right: View,
+        prior: TrackPrior | None,
+        stereo: StereoFit,
+        motion: Consensus | None,
     ) -> Tracks:
         """Match features of known depth in the right image; no match where the right image cannot be used.
 
         While it cannot, depths come from the prior, where it has them.
         """
+        previous = self._previous
+        assert previous is not None
         if not self._right.usable and prior is not None:
             depth, known = prior_depths(self._camera, np.where(tracks.shown, tracks.ids, -1), prior)
             point = np.where(known[:, None], left_rays(self._camera, tracks.left) * depth[:, None], tracks.point)
             tracks = replace(tracks, point=point, has_point=tracks.has_point | known)
-        matched = stereo.track_right(tracks, right, moved)
-        usable = self._right.check_matches(index, matched.has_right[tracks.has_point], moved=moved)
-        return matched if usable else tracks
+        has_point, delay = tracks.has_point, self._delay.frames
+        flow = tracks.left - previous.tracks.left[_rows_by_slot(previous.tracks, tracks)]
+        if delay == 0.0:
+            matched = stereo.track_right(tracks, right, motion is not None)
+        else:
+            T = np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev
+            T = T if motion is None else motion.T_curr_prev
+            matched = self._match_delayed(previous, tracks, right, flow, T, stereo)
+        frame_s = (frame.time_ns - previous.time_ns) * 1e-9
+        if not self._right.check_matches(frame.index, matched.has_right[has_point], moved=motion is not None):
+            if self._right.contradicts and self._delay.suspect(
+                frame.index, self._count_pairings(previous, left, tracks, right, stereo), frame_s
+            ):
+                self._right.explained()
+                stereo.restart_rows()
+                return no_tracks()
+            return tracks
+        seen = matched.has_right
+        rows = matched.right[seen, 1] - matched.left[seen, 1] - delay * flow[seen, 1]
+        if self._delay.update(frame.index, matched.left[seen], flow[seen], rows, frame_s):
+            stereo.restart_rows()
+            return no_tracks()  # their depths are those of images of different times
+        return matched
+
+    def _count_pairings(
+        self, previous: _PreviousFrame, left: View, tracks: Tracks, right: View, stereo: StereoFit
+    ) -> PairingCounts:
+        """Count the features that match if the right image belongs to this frame, the one before, or the next one."""
+        before = previous.tracks.left[_rows_by_slot(previous.tracks, tracks)][:_PAIRING_POINTS]
+        now = tracks.left[:_PAIRING_POINTS]
+        return PairingCounts(
+            points=len(now),
+            same=stereo.count_on_rows(left.half, right.half, now),
+            late=stereo.count_on_rows(previous.left.half, right.half, before),
+            early=stereo.count_on_rows(left.half, previous.right_half, now),
+        )
+
+    def _match_delayed(
+        self,
+        previous: _PreviousFrame,
+        tracks: Tracks,
+        right: View,
+        flow: FloatArray,
+        T: FloatArray,
+        stereo: StereoFit,
+    ) -> Tracks:
+        """Match features in a right image of another time, and bring the matches to the present.
+
+        Args:
+            previous: the last frame.
+            tracks: features at their new left pixels.
+            right: the right image.
+            flow: motion (N, 2) of the features since the last frame, pixels.
+            T: motion (4, 4) of the camera, `T_curr_prev`.
+            stereo: the matcher.
+        """
+        delay = self._delay.frames
+        then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
+        rows = np.flatnonzero(~then.has_right & ~then.has_point)
+        disparity, unique = stereo.search(previous.left, right, (tracks.left - flow)[rows])
+        then = stereo.match_near(then, right, rows[unique], disparity[unique])
+        stereo.update_rows(then)
+        return at_present(self._camera, tracks, then, T, delay)
+
+    def _after_gap(self, frame: StereoFrame) -> bool:
+        """Whether so many frames are missing that similar patches are no evidence of the same points."""
+        if self._previous is None or self._step_ns is None:
+            return False
+        gap_ns = frame.time_ns - self._previous.time_ns
+        return gap_ns > max(_LONG_GAP_S * 1e9, _LONG_GAP_STEPS * self._step_ns)
 
     def _guess(self, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage) -> FloatArray:
         """Predict the left pixels (N, 2) in the current frame: from the prior, else by the last motion."""
@@ -417,8 +513,11 @@ class KltFrontend:
             The features, without those that had no match for too long; disparities (K,) of the corners in pixels; a
             mask (K,) of the corners found. Where the right image cannot be used, nothing is searched or dropped.
         """
+        nothing = np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)
         if not self._right.usable:
-            return tracks, np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)
+            return tracks, *nothing
+        if self._delay.frames != 0.0:  # a corner can be matched once it has been seen in two frames
+            return self._without_old_left_only(tracks), *nothing
         unmatched = ~tracks.has_right
         if motion is not None:
             # A feature with a known point that was not matched near it must not be matched elsewhere.
@@ -428,8 +527,12 @@ class KltFrontend:
         disparity_old, disparity_new = np.split(disparity, [len(rows)])
         known, unique = np.split(unique, [len(rows)])
         tracks = stereo.match_near(tracks, right, rows[known], disparity_old[known])
+        return self._without_old_left_only(tracks), disparity_new, unique
+
+    def _without_old_left_only(self, tracks: Tracks) -> Tracks:
+        """Count frames without a right match, and drop the features that had none for too long."""
         tracks = replace(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
-        return take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames), disparity_new, unique
+        return take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames)
 
     def _select_corners(self, tracks: Tracks, unique: BoolArray, stays: BoolArray) -> tuple[IntArray, int]:
         """Return the rows of the corners (K,) to try, in this order, and how many of them have a depth.
@@ -444,7 +547,7 @@ class KltFrontend:
         staying, leaving = np.flatnonzero(unique & stays)[:tried], np.flatnonzero(unique & ~stays)[:tried]
         leaving = leaving[: max(0, round(_TRIED * (least - matched - len(staying) / _TRIED)))]
         no_depth = np.flatnonzero(~unique)[:room]
-        if matched > _FEW * least:
+        if matched > _FEW * least and self._delay.frames == 0.0:
             no_depth = no_depth[:0]
         return np.concatenate([staying, leaving, no_depth]), len(staying) + len(leaving)
 
@@ -478,6 +581,12 @@ def _prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntA
     shown = rows[tracks.shown[rows]]
     named, predicted = prior_pixels(tracks.ids[shown], prior)
     return shown[named], predicted
+
+
+def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:
+    """Rows (N,) in `old` of the features (N,) of `now`, all of which it contains: an active feature keeps its slot."""
+    order = np.argsort(old.slot)
+    return np.asarray(order[np.searchsorted(old.slot, now.slot, sorter=order)], dtype=np.int64)
 
 
 def _spaced(points: FloatArray, distance: float) -> BoolArray:

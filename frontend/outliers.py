@@ -98,7 +98,7 @@ def _gauss_newton(
 
     `free` selects the part of the twist `[rho; phi]` that is estimated: all of it, or the translation alone.
     """
-    T = np.array(T)
+    T = np.array(T, order="C")  # of one layout, so that one version is compiled
     points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
     _iterate((camera.fu, camera.fv, camera.cu, camera.cv), T, points, seen, w, iterations, free.stop)
     return T

@@ -61,9 +61,23 @@ class RightCamera:
         self._lines: list[str] = []
 
     @property
+    def contradicts(self) -> bool:
+        """Whether the right image is not used because its matches contradict the left one, for no known cause."""
+        return self._cause == "contradicts"
+
+    @property
     def usable(self) -> bool:
         """Whether the right image of the last frame was used."""
         return self._cause is None
+
+    def explained(self) -> None:
+        """Trust the right image again at once: another cause was found and taken out. What is not yet logged is not."""
+        self._lines = []
+        self._reset()
+
+    def _reset(self) -> None:
+        self._cause, self._said = None, False
+        self._count = self._agreeing = self._untested = 0
 
     def take_lines(self) -> tuple[str, ...]:
         """Return the lines since the last call."""
@@ -145,8 +159,7 @@ class RightCamera:
     def _trust(self, index: int) -> None:
         if self._said:
             self._lines.append(f"frame {index}: the right images agree with the left ones again, and are used")
-        self._cause, self._said = None, False
-        self._count = self._agreeing = self._untested = 0
+        self._reset()
 
     def _count_left(self, since: int, index: int) -> None:
         """Count frames with a frozen left image, and say it once."""

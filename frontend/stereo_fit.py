@@ -103,6 +103,14 @@ class StereoFit:
         disparity, unique = self._search(a, b, flipped, self._settings.min_correlation)
         return int((unique & (disparity >= 1.0)).sum())
 
+    def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:
+        """Count the left pixels (N, 2) that match well on their row between two images at half resolution."""
+        return int(self._search(left_half, right_half, points, _GOOD_MATCH)[1].sum())
+
+    def restart_rows(self) -> None:
+        """Forget the row differences."""
+        self._rows.restart(0.0)
+
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
         few = len(tracks) >= _LEAST_POINTS and tracks.has_right.mean() < _FEW_MATCHES

@@ -292,6 +292,19 @@ def test_last_motion_is_scaled_by_time() -> None:
     assert outputs[-1].tracked > 0.7 * outputs[-2].tracked
 
 
+def test_features_are_not_followed_across_a_long_gap_without_a_prediction() -> None:
+    """Three seconds without frames: similar patches are no evidence then, unless a filter predicts where they are."""
+    late = replace(FRAMES[3], time_ns=FRAMES[2].time_ns + 3_000_000_000)
+    outputs = run([*FRAMES[:3], late])
+    assert outputs[-1].tracked == 0
+    assert not np.isin(outputs[-1].observations.ids, outputs[-2].observations.ids).any()
+    assert run([*FRAMES[:3], replace(late, time_ns=FRAMES[2].time_ns + 600_000_000)])[-1].tracked > 100
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    seen = [frontend.process(frame) for frame in FRAMES[:3]][-1].observations
+    prior = TrackPrior(seen.ids, truth(SLANTED, POSES[2], seen.z[:, :2], POSES[3]))
+    assert frontend.process(late, prior).tracked > 100
+
+
 def test_features_failing_the_forward_backward_check_are_dropped() -> None:
     assert run(FRAMES[:2], with_klt(max_forward_backward_px=1e-4))[1].tracked < 10
 

@@ -54,6 +54,25 @@ def test_new_landmarks_alone_do_not_end_a_gap_without_features() -> None:
     assert back == "frame 50: features again, after 2.1 s without"
 
 
+def _gaps(times_s: list[float]) -> list[str]:
+    health = RunHealth()
+    estimates = [replace(_estimate(k, 0.0), time_ns=round(1e9 * t)) for k, t in enumerate(times_s)]
+    return [line for k, e in enumerate(estimates) for line in health.frame(k, GOOD, e)]
+
+
+def test_reports_a_time_without_frames_once() -> None:
+    (line,) = _gaps([0.05 * k for k in range(20)] + [3.95 + 0.05 * k for k in range(20)])
+    assert line.startswith("frame 20: no frame for 3.00 s since frame 19; the motion in between is a prediction")
+    assert "standard deviation of the position is 0.017 m" in line
+
+
+def test_slow_irregular_or_dropped_frames_are_no_gap() -> None:
+    assert _gaps([1.0 * k for k in range(20)]) == []
+    assert _gaps([0.05 * k for k in range(60) if k % 9 < 5]) == []
+    rng = np.random.default_rng(0)
+    assert _gaps(np.cumsum(rng.uniform(0.3, 1.5, 50)).tolist()) == []
+
+
 def test_two_gaps_without_features_are_two_events() -> None:
     assert len(_lines([GOOD] * 5 + [EMPTY] * 30 + [GOOD] * 5 + [EMPTY] * 30 + [GOOD])) == 4
 

@@ -256,3 +256,16 @@ def test_frames_wait_for_an_imu_that_begins_late() -> None:
             filt.propagate(sample)
     filt.update(flight.observe(60, 0.5, rng))
     assert filt.update(flight.observe(61, 0.5, rng)).used > 30  # a filter that has started, on a held sample
+
+
+@pytest.mark.parametrize(("motion", "useful"), [(None, False), ("imu", True)])
+def test_a_prediction_over_seconds_is_made_by_an_imu_alone(motion: str | None, useful: bool) -> None:
+    """Images alone know nothing of a turn after three seconds, so no track is searched where they put it."""
+    flight = Flight(8)
+    _, _, filt = flight.run(MsckfSettings(), motion, limit=30)
+    assert filt.predict(8 * STEP_NS) is not None
+    if motion == "imu":
+        for sample in Flight(80).imu(np.random.default_rng(1), MsckfSettings(), np.zeros(6)):
+            if sample.time_ns > 7 * STEP_NS:
+                filt.propagate(sample)
+    assert (filt.predict(7 * STEP_NS + 3_000_000_000) is not None) is useful

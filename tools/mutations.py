@@ -46,6 +46,8 @@ _REPRODUCE = ("tests/test_reproduce.py",)
 _RANSAC = ("tests/test_frontend_outliers.py",)
 _RESTART = ("tests/test_msckf.py",)
 _RIGHT_CAMERA = ("tests/test_right_camera.py",)
+_DELAY = ("tests/test_right_delay.py",)
+_FLICKER = ("tests/test_flicker.py",)
 _EXCHANGE = ("tests/test_exchange.py",)
 _MOVING_OBJECT = ("tests/test_moving_object.py",)
 _ODOMETRY = ("tests/test_odometry.py",)
@@ -456,6 +458,34 @@ MUTATIONS = (
         "again = self._repeating is not None",
         "again = False",
         _FROZEN,
+    ),
+    Mutation(
+        "gap: features are followed across it without a prediction",
+        "frontend/klt.py",
+        "(prior is None and self._after_gap(frame))",
+        "False",
+        _TRACK,
+    ),
+    Mutation(
+        "gap: a prediction that knows nothing starts a search",
+        "vio/filters/msckf.py",
+        "[-1] > _USELESS_RAD**2",
+        "[-1] > 1e6 * _USELESS_RAD**2",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "gap: a time without frames is not reported",
+        "vio/watch/health.py",
+        "max(_GAP_S, _GAP_STEPS * usual_s)",
+        "max(_GAP_S, 100 * _GAP_STEPS * usual_s)",
+        ("tests/test_health.py",),
+    ),
+    Mutation(
+        "stamps: intervals that truly vary are taken for jitter",
+        "vio/watch/stamps.py",
+        "missed = weight * (dt[used] - dt[used] * camera[used] / gyro[used])",
+        "missed = deviation",
+        ("tests/test_stamps.py",),
     ),
     Mutation(
         "start: a steady acceleration is no evidence against the tilt",
@@ -974,9 +1004,30 @@ MUTATIONS = (
     Mutation(
         "right camera: features are dropped while it cannot be used",
         "frontend/klt.py",
-        "return tracks, np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
-        "return take(tracks, tracks.has_right), np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)",
+        "return tracks, *nothing",
+        "return take(tracks, tracks.has_right), *nothing",
         _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "right delay: depths stay those of the exposure",
+        "frontend/right_delay.py",
+        "moved = transform_points(se3_exp(delay * se3_log(T_curr_prev)), then.point)",
+        "moved = then.point",
+        _DELAY,
+    ),
+    Mutation(
+        "right delay: a wrong rectification counts as a delay",
+        "frontend/right_delay.py",
+        "weight * rows)",
+        "weight * (rows + 0.5 * flow[:, 1]))",
+        _DELAY,
+    ),
+    Mutation(
+        "flicker: bands are seen and left in the images",
+        "frontend/flicker.py",
+        "image.astype(np.float32) - off[:, None]",
+        "image.astype(np.float32) - 0 * off[:, None]",
+        _FLICKER,
     ),
     Mutation(
         "exchange: frames that do not fit are put back, too",

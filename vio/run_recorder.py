@@ -18,6 +18,7 @@ from typing import Any, overload
 
 import numpy as np
 
+from vio.atomic import atomic_write_text
 from vio.chain import FrameLog, FrameResult
 from vio.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.errors import DataError
@@ -293,11 +294,11 @@ class RunRecorder:
                 self._folder.path.mkdir(parents=True, exist_ok=True)
                 texts = self._folder.texts
                 for name in [name for name in texts if not name.startswith(UNFINISHED)]:  # they say whose folder it is
-                    (self._folder.path / name).write_text(texts[name], encoding="utf-8")
+                    atomic_write_text(self._folder.path / name, texts[name])
                 _remove(self._folder.path, [UNFINISHED, *(n for n in self._folder.replaces if n not in texts)])
                 self._unfinished.mkdir()
                 for name in [name for name in texts if name.startswith(UNFINISHED)]:
-                    (self._folder.path / name).write_text(texts[name], encoding="utf-8")
+                    atomic_write_text(self._folder.path / name, texts[name])
                 self._tables = {name: Table(dtype, self._unfinished / f"{name}.npy") for name, dtype in _TABLES.items()}
         for row in self._early:
             self._tables["samples"].append(row)

@@ -178,5 +178,6 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         score = metrics["landmark_error"]
         rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
     rows.append(("results", metrics["out"]))
-    rows.append(("plot", str(Path(metrics["out"]) / "trajectory.png")))
+    plot = Path(metrics["out"]) / "trajectory.png"
+    rows.append(("plot", str(plot) if plot.is_file() else "could not be drawn"))
     return rows

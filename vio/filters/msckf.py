@@ -78,6 +78,7 @@ _LANDMARK_DEPTH_SIGMA = 0.01  # by all views
 _LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scale
 _MAP_DEPTH_SIGMA = 0.2  # by all views; a point of the map is reported with its covariance, and not used
 _LEAST_MERGE = 1000  # stored points up to which the map is not merged
+_USELESS_RAD = 0.2  # standard deviation of a predicted rotation beyond which its pixels start no search
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 _MOST_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
 _MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
@@ -175,6 +176,8 @@ class Msckf:
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
         motion = MotionPrior(T_curr_prev, A @ self._expected_error(growth) @ A.T)
+        if np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1] > _USELESS_RAD**2:
+            return None
         return Prediction(self._expected_tracks(window, T_cam0_world, motion), motion)
 
     def _expected_error(self, growth: Growth) -> FloatArray:

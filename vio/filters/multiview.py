@@ -114,7 +114,7 @@ def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: Float
     )
     least = MIN_DEPTH * camera.baseline_m
     columns = q.anchor, q.centre, q.disparity, q.p_D_q, q.q_D_p
-    loops.anchor_points(loops.lens_of(camera), least, T_cam0_world, p_world, seen, *columns)
+    loops.anchor_points(loops.lens_of(camera), least, T_cam0_world, p_world, np.ascontiguousarray(seen), *columns)
     return q
 
 

@@ -23,6 +23,7 @@ InertialFault: TypeAlias = Literal[
     "upside down",
     "saturation",
     "IMU gap",
+    "camera stamps",
 ]
 
 # A second finding of a group would repeat the first.

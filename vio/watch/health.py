@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.records import Estimate, UpdateReport
 
 _NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
+_GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many times the usual time
+_LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
 _REJECTING_FRAMES = 20
 _ROWS_OFF_PX = 0.2
 _RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
@@ -23,6 +27,8 @@ class RunHealth:
         self._last: tuple[int, FloatArray] | None = None  # time and position of the frame before
         self._last_used: tuple[int, int] | None = None  # index and time of the last frame with used features
         self._without_features = False
+        self._steps_s: deque[float] = deque(maxlen=_RECENT_STEPS)
+        self._last_index = 0
         self._rejecting = 0
         self._reported: set[str] = set()
         self._restarted_ns: int | None = None  # time of the last restart
@@ -53,10 +59,28 @@ class RunHealth:
             report: what the update did.
             estimate: the state estimate after it.
         """
-        lines = [*self._features(index, report, estimate), *self._rejections(index, report)]
+        lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
+        lines += self._rejections(index, report)
         lines += self._stereo(index, estimate)
         lines += self._implausible(index, estimate)
         return tuple(lines)
+
+    def _gap(self, index: int, estimate: Estimate) -> list[str]:
+        """Report a time without frames, with what is known of the pose after it."""
+        last, last_index = self._last, self._last_index
+        self._last_index = index
+        if last is None:
+            return []
+        step_s = (estimate.time_ns - last[0]) * 1e-9
+        usual_s = float(np.median(self._steps_s)) if len(self._steps_s) >= _LEAST_STEPS else np.inf
+        self._steps_s.append(step_s)
+        if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
+            return []
+        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        return [
+            f"frame {index}: no frame for {step_s:.2f} s since frame {last_index}; the motion in between is a "
+            f"prediction, the standard deviation of the position is {sigma:.2g} m after it"
+        ]
 
     def _stereo(self, index: int, estimate: Estimate) -> list[str]:
         """Report once that the filter estimates the stereo calibration, as the rows show that it is off."""

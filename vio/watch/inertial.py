@@ -25,6 +25,7 @@ from vio.watch.gyro import judge_gyro
 from vio.watch.gyro_fit import AGREES, fit_gyro, judge_offset
 from vio.watch.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.watch.samples import Samples, Size, judge_size
+from vio.watch.stamps import judge_stamps
 
 _LEAST_AT_END = 20  # intervals needed to judge at the end of a run
 _LATER_EVALUATIONS = 150  # intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
@@ -150,7 +151,7 @@ class InertialCheck:
         gyro_fit, last = evidence.gyro_fit, evidence.last
         size = resolve_size(size, evidence)
         offset = judge_offset(gyro_fit, record, _LEAST_AT_END)
-        found = [f for f in (size.finding, offset) if f is not None]
+        found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
         rotation = judge_gyro(evidence, size.unit or 1.0)
         found += rotation
         agrees, measured = gyro_fit.unexplained < AGREES, False
