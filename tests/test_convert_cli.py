@@ -81,3 +81,12 @@ def test_features_cannot_be_converted(tmp_path: Path, capsys: pytest.CaptureFixt
     path = make_npz(tmp_path / "a.npz", ece276a_arrays(make_drive(6)))
     assert main(["convert", str(path), "--to", "plain", "--out", str(tmp_path / "out")]) == 1
     assert "holds no images, so there is nothing to convert" in capsys.readouterr().err
+
+
+def test_rectify_names_convert_for_other_kinds(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = tmp_path / "plain"
+    assert main(["convert", str(flight), "--to", "plain", "--out", str(plain)]) == 0
+    assert main(["rectify", str(plain), "--out", str(tmp_path / "r")]) == 1
+    assert "is of kind plain; rectify it with vio convert --to euroc" in capsys.readouterr().err

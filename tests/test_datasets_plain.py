@@ -105,6 +105,22 @@ def test_other_image_types_are_read_and_truncated_ones_refused(suffix: str, tmp_
         load_gray(tmp_path / f"b{suffix}")
 
 
+def test_twelve_bits_in_sixteen_are_scaled_and_said(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, imu=False, rig=RECTIFIED_RIG)
+    expected = frames_of(folder)
+    for file in folder.glob("*/*.png"):
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        assert cv2.imwrite(str(file), image.astype(np.uint16) * 16)
+    assert (
+        "the images have 16 bits but use 12: the levels 0 to 4095 are scaled to 8 bits"
+        in open_dataset(folder).recording.notes
+    )
+    for dark, bright in zip(frames_of(folder), expected, strict=True):
+        assert dark.left is not None
+        np.testing.assert_allclose(dark.left, bright.left, atol=1)
+
+
 def test_unknown_image_data_is_named() -> None:
     assert other_damage(b"GIF89a") == "neither PNG nor JPEG, BMP, TIFF, PGM, PPM or WebP"
     assert other_damage(b"P5 nothing") == "the PGM or PPM has no valid header"

@@ -50,6 +50,8 @@ def execute(args: argparse.Namespace) -> int:
     for note in recording.notes:
         logging.getLogger(__name__).warning("%s", note)
     writers = {"euroc": write_rectified_euroc, "kitti_raw": write_rectified_kitti}
+    if recording.kind in ("plain", "bag", "video"):
+        raise DataError(f"{recording.path} is of kind {recording.kind}; rectify it with vio convert --to euroc")
     if not isinstance(dataset, RectifiedDataset):
         raise DataError(
             f"{recording.path} is of kind {recording.kind}, which is rectified already: there is nothing to do; the "

@@ -17,22 +17,21 @@ import numpy as np
 from vio.datasets.common import naming
 from vio.datasets.companions import (
     IMU_FILES,
-    Layout,
     calibration_beside,
     find_calibration_of,
     read_motion,
     read_reference,
     sources_of,
-    unused_note,
     with_extrinsics,
 )
-from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable
+from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable, full_scale
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.pairing import pair_stamps
 from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import parse_stamps
+from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
 from vio.records import NS_PER_S, IntArray, Recording
 from vio.text_files import text_lines
@@ -110,6 +109,9 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         raise DataError(f"{path}: holds no pair of image folders ({names} or others); give one with left/ and right/")
     pairs, notes = pair_files(list_images(layout.left), list_images(layout.right))
     measured, image, bits = first_readable(pairs)
+    white, depth_notes = full_scale(pairs)
+    if bits == 16 and not depth_notes:
+        depth_notes = (f"images have 16 bits ({measured.name}); scaled to 8 bits by 1/257",)
     file = settings.calibration or find_calibration_of(layout)
     rig = load_rig(file, image_size=(image.shape[1], image.shape[0]))
     rig, used = with_extrinsics(rig, layout, file)
@@ -130,7 +132,7 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         reference=reference,
         notes=(
             *notes,
-            *([] if bits == 8 else [f"images have {bits} bits ({measured.name}); they are scaled to 8 bits"]),
+            *depth_notes,
             *rig.notes,
             *time_notes,
             *motion_notes,
@@ -138,7 +140,7 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         ),
     )
     sizes = (ImageSize(rig.cam0.width, rig.cam0.height, file), ImageSize(rig.cam1.width, rig.cam1.height, file))
-    return RectifiedDataset(recording, pairs, motion, sizes, settings, rectifier, rig.imu_noise)
+    return RectifiedDataset(recording, pairs, motion, sizes, settings, rectifier, rig.imu_noise, white=white)
 
 
 # --- images and times -----------------------------------------------------------------------------------------------

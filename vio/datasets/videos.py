@@ -16,12 +16,10 @@ import numpy as np
 
 from vio.datasets.common import frame_range, merge_events, naming
 from vio.datasets.companions import (
-    Layout,
     find_calibration_of,
     read_motion,
     read_reference,
     sources_of,
-    unused_note,
     with_extrinsics,
 )
 from vio.datasets.image_pairs import ImageSize
@@ -29,6 +27,7 @@ from vio.datasets.images import prefetch
 from vio.datasets.plain import times_of
 from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
 from vio.records import (
     NS_PER_S,

@@ -7,18 +7,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.images import UnreadableImageError, decode_gray
+from vio.datasets.images import WHITE_16, UnreadableImageError, decode_gray
 from vio.errors import DataError
 from vio.records import Image
 
 # OpenCV names a Bayer pattern by its second row and column; ROS by its first pixels.
 _BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
 _YUV = {"yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2"}
-_WHITE_16 = 65535
 _SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
 
 
-def gray_of(fields: Any, where: str, *, compressed: bool, white: int = _WHITE_16) -> Image:
+def gray_of(fields: Any, where: str, *, compressed: bool, white: int = WHITE_16) -> Image:
     """Return a sensor_msgs/Image or CompressedImage as gray (H, W).
 
     Args:
@@ -87,4 +86,4 @@ def _form(encoding: str, where: str, *, bayer: bool, yuv: str | None) -> tuple[s
 
 def white_of(level: float) -> int:
     """Return the level of white of 16-bit images whose brightest pixels have `level`: that of 10, 12, 14 or 16 bits."""
-    return next((2**bits - 1 for bits in _SENSOR_BITS if level <= 2**bits - 1), _WHITE_16)
+    return next((2**bits - 1 for bits in _SENSOR_BITS if level <= 2**bits - 1), WHITE_16)

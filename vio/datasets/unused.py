@@ -1,0 +1,57 @@
+"""What lies in a recording's folder and is not used."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vio.datasets.images import SUFFIXES
+
+_SILENT = ("readme*", "license*", "*.md", "simulation.json", "rectification.json", "conversion.json")  # no data
+_NAMED = 12  # unused files listed by name
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the parts of a recording lie."""
+
+    root: Path  # the folder that was given
+    base: Path  # holds the image folders: the root, or its mav0
+    left: Path  # folder of the images, or video
+    right: Path
+
+
+def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
+    """Return one note that names what lies in the folder and was not read."""
+    kept = {layout.left.absolute(), layout.right.absolute(), *(file.absolute() for file in used)}
+    kept |= {parent for path in kept for parent in path.parents}
+    for path in used:  # the other files of a calibration that lies in several
+        if path.suffix.lower() in (".yaml", ".yml", ".txt", ".xml"):
+            kept |= {other.absolute() for other in path.parent.iterdir() if _belongs(other, path)}
+    images = [side for side in (layout.left, layout.right) if side.is_dir()]
+    folders = dict.fromkeys((layout.root, layout.base, *images, *(side.parent for side in images)))
+    found = []
+    for folder in folders:
+        if folder != layout.root and layout.root not in folder.parents:
+            continue
+        for child in sorted(folder.iterdir()):
+            image = folder in images and child.suffix.lower() in SUFFIXES
+            silent = child.name.startswith(".") or any(fnmatch.fnmatch(child.name.lower(), s) for s in _SILENT)
+            if not image and not silent and child.absolute() not in kept:
+                found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
+    if not found:
+        return []
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    return [f"not used: {', '.join(found[:_NAMED])}{more}"]
+
+
+def _belongs(other: Path, calibration: Path) -> bool:
+    """Return whether a file is read together with a calibration file."""
+    partners = {"left": "right", "intrinsic": "extrinsic", "camchain": "imu", "calibration": "imu"}
+    named = any(a in calibration.name and b in other.name for a, b in partners.items())
+    return (named and other.suffix in (".yaml", ".yml")) or (
+        calibration.name.startswith("calib_cam_to_cam")
+        and (other.name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"))
+    )
