@@ -436,6 +436,20 @@ MUTATIONS = (
         ("tests/test_stamps.py",),
     ),
     Mutation(
+        "late IMU: the first tilt's corrections turn the world of the first frame",
+        "vio/filters/late_imu.py",
+        "own = super().smoothed(index)",
+        "own = super().smoothed(index) if index == self._window.clones[-1].frame_index else None",
+        ("tests/test_late_imu.py",),
+    ),
+    Mutation(
+        "late IMU: its poses count from the handover",
+        "vio/filters/late_imu.py",
+        "T_world_imu=self._T_first_world @ own.T_world_imu",
+        "T_world_imu=own.T_world_imu",
+        ("tests/test_late_imu.py",),
+    ),
+    Mutation(
         "start: a steady acceleration is no evidence against the tilt",
         "vio/filters/imu_start.py",
         "np.sqrt(max(level, 0.0))",
