@@ -62,8 +62,13 @@ def build_frontend(
     """Build the front end called `name`; "auto" selects by what the recording contains, None being a live camera.
 
     Raises:
-        ConfigError: no front end has this name.
+        ConfigError: no front end has this name, or camera or settings are of another kind.
     """
+    if not isinstance(camera, StereoCamera) or not isinstance(settings, FrontendSettings):
+        raise ConfigError(
+            f"build_frontend takes a StereoCamera and FrontendSettings, got {type(camera).__name__} and "
+            f"{type(settings).__name__}"
+        )
     if name == "auto":
         name = "klt" if dataset is None or dataset.recording.has_images else "precomputed"
     if name not in BUILDERS:

@@ -2,7 +2,8 @@
 
 The inverse-compositional form uses the gradients of the template in every iteration: an iteration costs one
 interpolation of the image under each template, and a template is prepared only once. A warp (2, 3) maps
-template offsets `[x, y, 1]` to image pixels `[u, v]`.
+template offsets `[x, y, 1]` to image pixels `[u, v]`. The loops over pixels are compiled; `tests/numpy_twins.py` holds
+the same alignment in NumPy.
 Reference: Baker & Matthews, Lucas-Kanade 20 years on, IJCV (2004).
 """
 
@@ -11,10 +12,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.compiled import compiled, compiled_sums, invert_positive
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, IntArray
 
@@ -30,9 +31,10 @@ _DONE_PX = 0.05  # step at which a template has converged; the remaining error i
 _MAX_STEP_PX = 1.0
 _MAX_LINEAR_STEP = 0.3
 _DAMPING = 1e-6  # relative to the diagonal: limits the step in weakly textured directions
-_SUBPIXELS = 32  # cv2.remap rounds coordinates to this fraction of a pixel, so shifts are rounded beforehand
-_REMAP_ROWS = 30_000  # cv2.remap takes fewer than 32768 rows
+_SUBPIXELS = 32  # anchors are cut at multiples of this fraction of a pixel, where the weights of float32 are exact
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
+
+Pixels = npt.NDArray[np.float32]  # gray levels and what is computed from them
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,30 +56,80 @@ def empty_templates(count: int, radius: int) -> Templates:
 
 
 @lru_cache(maxsize=8)
-def offsets(radius: int) -> npt.NDArray[np.float32]:
-    """Offsets (3, S) `[x, y, 1]` of the pixels of a patch from its centre, in row-major order; read-only."""
-    y, x = np.mgrid[-radius : radius + 1, -radius : radius + 1].astype(np.float32).reshape(2, -1)
-    out = np.stack([x, y, np.ones_like(x)])
+def offsets(radius: int) -> Pixels:
+    """Offsets (2, S) `[x, y]` of the pixels of a patch from its centre, in row-major order; read-only."""
+    out = np.mgrid[-radius : radius + 1, -radius : radius + 1][::-1].astype(np.float32).reshape(2, -1)
     out.flags.writeable = False
     return out
 
 
-def warped_patches(image: FloatImage, warp: FloatArray, radius: int) -> npt.NDArray[np.float32]:
-    """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated.
+def warped_patches(image: FloatImage, warp: FloatArray, radius: int) -> Pixels:
+    """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated."""
+    out = np.empty((len(warp), (2 * radius + 1) ** 2), dtype=np.float32)
+    _sample_all(np.ascontiguousarray(image), warp, offsets(radius), out)
+    return out
 
-    Coordinates are rounded to 1/32 pixel.
-    """
-    if len(warp) == 0:
-        return np.zeros((0, (2 * radius + 1) ** 2), dtype=np.float32)
-    uv = (warp.reshape(-1, 3).astype(np.float32) @ offsets(radius)).reshape(len(warp), 2, -1)
-    u, v = np.ascontiguousarray(uv[:, 0]), np.ascontiguousarray(uv[:, 1])
-    parts = [
-        cv2.remap(
-            image, u[k : k + _REMAP_ROWS], v[k : k + _REMAP_ROWS], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-        for k in range(0, len(warp), _REMAP_ROWS)
-    ]
-    return np.asarray(parts[0] if len(parts) == 1 else np.concatenate(parts), dtype=np.float32)
+
+@compiled
+def _sample_all(image: FloatImage, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
+    size = xy.shape[1]
+    at, part = np.empty(size, np.int32), np.empty((2, size), np.float32)
+    for n in range(len(warp)):
+        _sample(image, warp[n], xy, at, part, out[n])
+
+
+@compiled
+def _sample(
+    image: FloatImage, warp: FloatArray, xy: Pixels, at: npt.NDArray[np.int32], part: Pixels, out: Pixels
+) -> None:
+    """Write the gray levels (S,) under one warp (2, 3) into `out`; `at` (S,) and `part` (2, S) are overwritten."""
+    height, width = image.shape
+    radius = -xy[0, 0]
+    reach_u = radius * (abs(warp[0, 0]) + abs(warp[0, 1]))
+    reach_v = radius * (abs(warp[1, 0]) + abs(warp[1, 1]))
+    # False also for a warp that is not finite.
+    if not (reach_u <= warp[0, 2] < width - 1.001 - reach_u and reach_v <= warp[1, 2] < height - 1.001 - reach_v):
+        _sample_border(image, warp, xy, out)
+        return
+    # Pixels are counted from the patch's corner, where float32 is exact enough.
+    first_u, first_v = int(warp[0, 2] - reach_u), int(warp[1, 2] - reach_v)
+    u_x, u_y, u_1 = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[0, 2] - first_u)
+    v_x, v_y, v_1 = np.float32(warp[1, 0]), np.float32(warp[1, 1]), np.float32(warp[1, 2] - first_v)
+    row = np.int32(width)
+    for k in range(len(at)):
+        u, v = u_x * xy[0, k] + u_y * xy[1, k] + u_1, v_x * xy[0, k] + v_y * xy[1, k] + v_1
+        i, j = np.int32(u), np.int32(v)
+        part[0, k], part[1, k] = u - np.float32(i), v - np.float32(j)
+        at[k] = np.int32(j * row) + i
+    # Unsigned indices are not checked for being negative.
+    pixels, one, down = image.reshape(-1)[first_v * width + first_u :], np.uint32(1), np.uint32(width)
+    for k in range(len(at)):
+        p = np.uint32(at[k])
+        q = np.uint32(p + down)
+        above = pixels[p] + part[0, k] * (pixels[np.uint32(p + one)] - pixels[p])
+        below = pixels[q] + part[0, k] * (pixels[np.uint32(q + one)] - pixels[q])
+        out[k] = above + part[1, k] * (below - above)
+
+
+@compiled
+def _sample_border(image: FloatImage, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
+    """Write the gray levels (S,) under one warp (2, 3) into `out`, pixels outside the image from its border."""
+    height, width = image.shape
+    for k in range(len(out)):
+        u = _clamped(warp[0, 0] * xy[0, k] + warp[0, 1] * xy[1, k] + warp[0, 2], width - 1.0)
+        v = _clamped(warp[1, 0] * xy[0, k] + warp[1, 1] * xy[1, k] + warp[1, 2], height - 1.0)
+        i, j = min(int(u), width - 2), min(int(v), height - 2)
+        above = image[j, i] + (u - i) * (image[j, i + 1] - image[j, i])
+        below = image[j + 1, i] + (u - i) * (image[j + 1, i + 1] - image[j + 1, i])
+        out[k] = above + (v - j) * (below - above)
+
+
+@compiled
+def _clamped(value: float, most: float) -> float:
+    """The value between 0 and `most`; 0 for one that is not a number."""
+    if not value > 0.0:
+        return 0.0
+    return min(value, most)
 
 
 def cut_patches(image: FloatImage, centres: FloatArray, radius: int) -> Patches:
@@ -93,25 +145,53 @@ def rounded(centres: FloatArray) -> FloatArray:
 
 def templates(wide: Patches) -> Templates:
     """Prepare templates from patches (N, 2r+3, 2r+3) cut by `cut_patches`."""
-    n, radius = len(wide), wide.shape[1] // 2 - 1
-    flat = (n, (2 * radius + 1) ** 2)
-    patch = wide[:, 1:-1, 1:-1].reshape(flat)
-    gu = ((wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2).reshape(flat)
-    gv = ((wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2).reshape(flat)
-    x, y, one = offsets(radius)
-    centred = patch - patch.mean(axis=1, keepdims=True, dtype=np.float32)
-    basis = np.stack([gu, gv, centred, np.broadcast_to(one, patch.shape), gu * x, gu * y, gv * x, gv * y], axis=1)
-    normal = (basis @ basis.transpose(0, 2, 1)).astype(np.float64)
-    normal += (_DAMPING * np.einsum("nii->ni", normal) + 1e-6)[:, :, None] * np.eye(_PARAMETERS)
-    on_row = normal[:, :_ROW_PARAMETERS, :_ROW_PARAMETERS].copy()
-    on_row[:, 1, 1] += _ROW_WEIGHT
-    return Templates(
-        patch=centred,
-        gradient=np.stack([gu, gv], axis=1),
-        energy=np.einsum("ns,ns->n", centred, centred),
-        inverse=np.linalg.inv(normal).astype(np.float32),
-        row_inverse=np.linalg.inv(on_row).astype(np.float32),
-    )
+    out = empty_templates(len(wide), wide.shape[1] // 2 - 1)
+    _prepare(wide, out.patch, out.gradient, out.energy, out.inverse, out.row_inverse)
+    return out
+
+
+@compiled
+def _prepare(
+    wide: Patches, patch: Pixels, gradient: Pixels, energy: Pixels, inverse: Pixels, row_inverse: Pixels
+) -> None:
+    """Fill the columns of templates."""
+    side = wide.shape[1] - 2
+    size, radius = side * side, side // 2
+    basis, normal = np.empty((_PARAMETERS, size)), np.empty((_PARAMETERS, _PARAMETERS))
+    on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
+    for n in range(len(wide)):
+        total = 0.0
+        for k in range(size):
+            total += wide[n, k // side + 1, k % side + 1]
+        mean = np.float32(total / size)
+        for k in range(size):
+            y, x = k // side, k % side
+            centred = wide[n, y + 1, x + 1] - mean
+            gu = (wide[n, y + 1, x + 2] - wide[n, y + 1, x]) / np.float32(2.0)
+            gv = (wide[n, y + 2, x + 1] - wide[n, y, x + 1]) / np.float32(2.0)
+            patch[n, k], gradient[n, 0, k], gradient[n, 1, k] = centred, gu, gv
+            energy[n] += centred * centred
+            basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, centred, 1.0
+            basis[4, k], basis[5, k] = gu * (x - radius), gu * (y - radius)
+            basis[6, k], basis[7, k] = gv * (x - radius), gv * (y - radius)
+        for i in range(_PARAMETERS):
+            for j in range(i + 1):
+                normal[i, j] = _product(basis[i], basis[j])
+            normal[i, i] += _DAMPING * normal[i, i] + 1e-6
+        invert_positive(normal, inverse[n])
+        for i in range(_ROW_PARAMETERS):
+            for j in range(i + 1):
+                on_row[i, j] = normal[i, j]
+        on_row[1, 1] += _ROW_WEIGHT
+        invert_positive(on_row, row_inverse[n])
+
+
+@compiled_sums
+def _product(a: FloatArray, b: FloatArray) -> float:
+    total = 0.0
+    for k in range(len(a)):
+        total += a[k] * b[k]
+    return total
 
 
 def align(
@@ -137,65 +217,100 @@ def align(
         The refined warps (N, 2, 3), and the normalised correlation (N,) just before the last step; -1 where the
         template's centre comes too close to the image border for the patch to fit.
     """
-    n, radius = len(warp), int(store.patch.shape[1] ** 0.5) // 2
-    warp, score = warp.copy(), np.full(n, -1.0)
-    active = np.arange(n)
-    inverse = store.inverse if rows is None else store.row_inverse
-    for _ in range(iterations):
-        if len(active) == 0:
-            break
-        chosen, here = slots[active], warp[active]
-        here[:, :, 2] = rounded(here[:, :, 2])
-        view = warped_patches(image, here, radius)
-        moments = _moments(store, chosen, view, radius)
-        score[active] = _correlation(store.energy[chosen], moments, view)
-        if rows is not None:
-            gain = np.maximum(moments[:, 2] / np.maximum(store.energy[chosen], 1.0), 0.1)
-            moments[:, 1] += np.float32(_ROW_WEIGHT) * gain * (here[:, 1, 2] - rows[active]).astype(np.float32)
-        size = inverse.shape[1]
-        fit = (inverse[chosen] @ moments[:, :size, None])[:, :, 0].astype(np.float64)
-        # The image under the current warp is gain * template(step(x)) + offset, so the inverse step is applied.
-        fit /= np.maximum(fit[:, 2:3], 0.1)
-        shift = np.clip(fit[:, :2], -_MAX_STEP_PX, _MAX_STEP_PX)
-        linear = np.zeros((len(active), 4))
-        linear[:, : size - 4] = np.clip(fit[:, 4:], -_MAX_LINEAR_STEP, _MAX_LINEAR_STEP)
-        warp[active] = _undo(here, shift, linear)
-        active = active[np.abs(fit[:, :2]).max(axis=1) > _DONE_PX]
+    radius = int(store.patch.shape[1] ** 0.5) // 2
+    warp, score = warp.copy(), np.full(len(warp), -1.0)
+    inverse, row_weight = (store.inverse, 0.0) if rows is None else (store.row_inverse, _ROW_WEIGHT)
+    expected = np.zeros(len(warp)) if rows is None else np.ascontiguousarray(rows)
+    columns = store.patch, store.gradient, store.energy, inverse, offsets(radius)
+    _refine(*columns, slots, np.ascontiguousarray(image), warp, expected, row_weight, iterations, score)
     return warp, np.where(inside(image, warp[:, :, 2], radius + 1), score, -1.0)
 
 
-def _moments(store: Templates, chosen: IntArray, view: npt.NDArray[np.float32], radius: int) -> npt.NDArray[np.float32]:
-    """Products (N, 8) of pixels (N, S) with the derivatives by the parameters; the linear part comes last."""
-    size = view.shape[1]
-    by_gradient = ((store.gradient[chosen] * view[:, None]).reshape(-1, size) @ offsets(radius).T).reshape(-1, 2, 3)
-    out = np.empty((len(view), _PARAMETERS), dtype=np.float32)
-    out[:, :2] = by_gradient[:, :, 2]
-    out[:, 2] = np.einsum("ns,ns->n", store.patch[chosen], view)
-    out[:, 3] = view.sum(axis=1)
-    out[:, 4:] = by_gradient[:, :, :2].reshape(-1, 4)
-    return out
+@compiled
+def _refine(
+    patch: Pixels,
+    gradient: Pixels,
+    energy: Pixels,
+    inverse: Pixels,
+    xy: Pixels,
+    slots: IntArray,
+    image: FloatImage,
+    warp: FloatArray,
+    rows: FloatArray,
+    row_weight: float,
+    iterations: int,
+    score: FloatArray,
+) -> None:
+    """Refine the warps (N, 2, 3) in place, and write the correlations (N,) into `score`."""
+    size, parameters = patch.shape[1], inverse.shape[1]
+    at, part, view = np.empty(size, np.int32), np.empty((2, size), np.float32), np.empty(size, np.float32)
+    moments, fit = np.empty(_PARAMETERS, np.float32), np.zeros(_PARAMETERS)
+    for n, slot in enumerate(slots):
+        for _ in range(iterations):
+            _sample(image, warp[n], xy, at, part, view)
+            square = _moments(patch[slot], gradient[slot], view, xy, moments)
+            score[n] = _correlation(energy[slot], moments[2], square - moments[3] ** 2 / size, size)
+            if row_weight > 0.0:
+                gain = max(moments[2] / max(energy[slot], 1.0), 0.1)
+                moments[1] += row_weight * gain * (warp[n, 1, 2] - rows[n])
+            for i in range(parameters):
+                fit[i] = 0.0
+                for j in range(parameters):
+                    fit[i] += inverse[slot, i, j] * moments[j]
+            # The image under the current warp is gain * template(step(x)) + offset, so the inverse step is applied.
+            gain = max(fit[2], 0.1)
+            for i in range(parameters):
+                fit[i] /= gain
+            _undo(warp[n], fit)
+            if max(abs(fit[0]), abs(fit[1])) <= _DONE_PX:
+                break
 
 
-def _undo(warp: FloatArray, shift: FloatArray, linear: FloatArray) -> FloatArray:
-    """`warp` (N, 2, 3) after the inverse of the step `x -> (I + linear) x + shift`, given as (N, 2) and (N, 4)."""
-    a, b, c, d = 1.0 + linear[:, 0], linear[:, 1], linear[:, 2], 1.0 + linear[:, 3]
-    inverse = np.stack([d, -b, -c, a], axis=1).reshape(-1, 2, 2) / (a * d - b * c)[:, None, None]
-    out = np.empty_like(warp)
-    out[:, :, :2] = warp[:, :, :2] @ inverse
-    out[:, :, 2] = warp[:, :, 2] - (out[:, :, :2] @ shift[:, :, None])[:, :, 0]
-    return out
+@compiled_sums
+def _moments(patch: Pixels, gradient: Pixels, view: Pixels, xy: Pixels, out: Pixels) -> np.float32:
+    """Write the products (8,) of pixels (S,) with the derivatives by the parameters; return the sum of squares."""
+    zero = np.float32(0.0)
+    u, v, like, total, u_x, u_y, v_x, v_y, square = zero, zero, zero, zero, zero, zero, zero, zero, zero
+    for k in range(len(view)):
+        gray = view[k]
+        gu, gv = gradient[0, k] * gray, gradient[1, k] * gray
+        u += gu
+        v += gv
+        u_x += xy[0, k] * gu
+        u_y += xy[1, k] * gu
+        v_x += xy[0, k] * gv
+        v_y += xy[1, k] * gv
+        like += patch[k] * gray
+        total += gray
+        square += gray * gray
+    out[0], out[1], out[2], out[3] = u, v, like, total
+    out[4], out[5], out[6], out[7] = u_x, u_y, v_x, v_y
+    return square
 
 
-def _correlation(
-    energy: npt.NDArray[np.float32], moments: npt.NDArray[np.float32], view: npt.NDArray[np.float32]
-) -> FloatArray:
-    """Normalised correlation (N,) of patches of known energy with pixels (N, S); -1 where either has no contrast."""
-    size = view.shape[1]
-    other = np.maximum(np.einsum("ns,ns->n", view, view) - moments[:, 3] ** 2 / size, 0.0)
+@compiled
+def _undo(warp: FloatArray, fit: FloatArray) -> None:
+    """Apply the inverse of the step `x -> (I + linear) x + shift` to a warp (2, 3) in place; parameters (8,)."""
+    du = min(max(fit[0], -_MAX_STEP_PX), _MAX_STEP_PX)
+    dv = min(max(fit[1], -_MAX_STEP_PX), _MAX_STEP_PX)
+    a = 1.0 + min(max(fit[4], -_MAX_LINEAR_STEP), _MAX_LINEAR_STEP)
+    b = min(max(fit[5], -_MAX_LINEAR_STEP), _MAX_LINEAR_STEP)
+    c = min(max(fit[6], -_MAX_LINEAR_STEP), _MAX_LINEAR_STEP)
+    d = 1.0 + min(max(fit[7], -_MAX_LINEAR_STEP), _MAX_LINEAR_STEP)
+    det = a * d - b * c
+    for i in range(2):
+        x, y = (warp[i, 0] * d - warp[i, 1] * c) / det, (warp[i, 1] * a - warp[i, 0] * b) / det
+        warp[i, 0], warp[i, 1] = x, y
+        warp[i, 2] -= x * du + y * dv
+
+
+@compiled
+def _correlation(energy: float, product: float, other: float, size: int) -> float:
+    """Normalised correlation of a patch of known energy with pixels of energy `other`; -1 if either is flat."""
     flat = FLAT_RMS**2 * size
-    good = (other > flat) & (energy > flat)
-    norm = np.sqrt(np.where(good, other.astype(np.float64) * energy, 1.0))
-    return np.where(good, moments[:, 2] / norm, -1.0)
+    if not (other > flat and energy > flat):
+        return -1.0
+    return product / np.sqrt(np.float64(other) * energy)
 
 
 def shift_warps(centres: FloatArray) -> FloatArray:

@@ -206,10 +206,14 @@ def load_mask(path: Path) -> Image:
     Raises:
         ConfigError: the file does not decode.
     """
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
-    if mask is None:
-        raise ConfigError(f"frontend.klt.mask: {path} cannot be read as an image; give a PNG of the recording's size")
-    return np.asarray(mask, dtype=np.uint8)
+    from vio.datasets.images import UnreadableImageError, load_gray
+
+    try:
+        return load_gray(path)[0]
+    except UnreadableImageError as error:
+        raise ConfigError(
+            f"frontend.klt.mask: {path} cannot be read as an image ({error}); give a PNG of the recording's size"
+        ) from error
 
 
 def half_mask(mask: Image, shape: tuple[int, ...], half_shape: tuple[int, ...]) -> BoolArray:

@@ -56,24 +56,6 @@ def track_with_retries(
     return found, good
 
 
-def circle_errors(
-    last: Image, current: Image, before: FloatArray, after: FloatArray, settings: KltSettings
-) -> FloatArray:
-    """Distances (N,) in pixels between matched and temporally tracked right pixels; infinite where tracking fails.
-
-    Args:
-        last: last right image (H/2, W/2) at half resolution.
-        current: current one.
-        before: right pixels (N, 2) matched in the last frame.
-        after: right pixels (N, 2) matched in the current one.
-        settings: of the tracking.
-    """
-    if len(before) == 0:
-        return np.zeros(0)
-    found, seen = _flow(last, current, before, after, settings.trusted_levels, settings)
-    return np.where(seen, np.linalg.norm(found - after, axis=1), np.inf)
-
-
 def lost_contrast(image: Image, last: Image) -> bool:
     """Whether an image (H, W) has almost no contrast although the last one had: black, saturated or covered."""
     return _contrast(image) < _LOST_CONTRAST_SHARE * _contrast(last)

@@ -49,6 +49,8 @@ class FrameValidator:
         Raises:
             DataError: no images, images of a wrong size or type, or a time not after the previous frame's.
         """
+        if not isinstance(frame, StereoFrame):
+            raise DataError(f"the {self.name} front end takes a StereoFrame, got {type(frame).__name__}")
         if frame.left is None or frame.right is None:
             raise DataError(
                 f"frame {frame.index} has no images, but the {self.name} front end needs them; "
@@ -61,9 +63,12 @@ class FrameValidator:
             )
         expected = (self.camera.height, self.camera.width)
         for name, image in (("left", frame.left), ("right", frame.right)):
-            if image.ndim != 2 or image.dtype != np.uint8:
+            if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8 or not image.size:
+                found = (
+                    f"has shape {image.shape} and type {image.dtype}" if isinstance(image, np.ndarray) else "is none"
+                )
                 raise DataError(
-                    f"frame {frame.index}: the {name} image has shape {image.shape} and type {image.dtype}; "
+                    f"frame {frame.index}: the {name} image {found}; "
                     f"the {self.name} front end needs 8-bit gray images: read them with vio.datasets.images.load_gray"
                 )
             size = image.shape
@@ -83,10 +88,14 @@ class FrameValidator:
 
 @dataclass(slots=True)
 class SwapDetector:
-    """Detects swapped left and right images: few matches, but many in the mirrored images, in several frames."""
+    """Detects a recording with swapped left and right images: few matches, but many in the mirrored images.
+
+    Several frames must show it. Once a frame was in order, its recording is: what comes later is for others to say.
+    """
 
     few: float  # share of features with a match, below which the mirrored images are checked
     _suspicious: int = 0
+    _in_order: int = 0  # frames
 
     def check(self, frame: StereoFrame, features: int, matched: int, count_mirrored: Callable[[], int]) -> None:
         """Check the number of matched features; `count_mirrored` counts the matches in the mirrored images.
@@ -96,6 +105,9 @@ class SwapDetector:
         """
         if features < _SWAP_MIN_POINTS or matched >= self.few * features:
             self._suspicious = 0
+            self._in_order += features >= _SWAP_MIN_POINTS
+            return
+        if self._in_order >= _SWAP_FRAMES:
             return
         mirrored = count_mirrored()
         self._suspicious = self._suspicious + 1 if mirrored >= max(_SWAP_MANY * features, 2 * matched) else 0
@@ -127,7 +139,9 @@ class Features(Protocol):
         """Mask (N,)."""
 
 
-def make_output(frame: StereoFrame, features: Features, tracked: int, watch: Stopwatch) -> FrontendOutput:
+def make_output(
+    frame: StereoFrame, features: Features, tracked: int, watch: Stopwatch, warnings: tuple[str, ...] = ()
+) -> FrontendOutput:
     """Return the output of a front end for a frame; `tracked` features were in the previous output, too."""
     z = np.concatenate([features.left, features.right], axis=1)
     return FrontendOutput(
@@ -136,4 +150,5 @@ def make_output(frame: StereoFrame, features: Features, tracked: int, watch: Sto
         matched=int(features.has_right.sum()),
         detected=len(features.ids) - tracked,
         stages_ms=watch.stages_ms,
+        warnings=warnings,
     )

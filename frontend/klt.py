@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
@@ -14,17 +15,24 @@ from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame,
 from .align import align, on_peak, rounded, scale_change, shift_warps, template_points
 from .columns import joined, take
 from .detect import detect_corners, half_mask, load_mask, min_distance_px
+from .exchange import ExchangeDetector, MatchCounts
+from .flicker import BandRemoval
 from .flow import lost_contrast, track_with_retries
 from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from .moving_object import ObjectReport, choose_motion
 from .outliers import Consensus, RansacProblem, epipolar_distance, pixel_errors, predicted_motion, static_tracks
 from .patches import FloatImage, View, half_image, inside
-from .prediction import moved_pixels, prior_pixels, usable_prior
+from .prediction import moved_pixels, prior_depths, prior_pixels, usable_prior
+from .right_camera import RightCamera
+from .right_delay import PairingCounts, RightDelay, at_exposure, at_present
 from .settings import FrontendSettings
 from .stereo_fit import StereoFit
 from .tracks import AnchorBank, Tracks, new_tracks, no_tracks
 
 _ITERATIONS = 5
 _ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost
+_PAIRING_POINTS = 150  # features that are tried with images of other frames
+_EXCHANGE_POINTS = 80  # points that matches of either sign are counted at
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
 _NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
 _FAR_M = 1e6  # depth assumed where too few features have one
@@ -74,6 +82,12 @@ class KltFrontend:
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._validator = FrameValidator(camera, "klt")
         self._swap = SwapDetector(_SWAP_FEW)
+        self._bands = BandRemoval()
+        self._exchange = ExchangeDetector()
+        self._right = RightCamera()
+        self._delay = RightDelay(camera)
+        self._objects = ObjectReport()
+        self._lines: list[str] = []  # of the frame, for the log
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, self._settings.anchor_radius_px)
         self._previous: _PreviousFrame | None = None
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
@@ -88,18 +102,33 @@ class KltFrontend:
             ConfigError: the mask is not of the images' size.
         """
         watch = Stopwatch()
-        left, right = (self._view(image) for image in self._validator.validate(frame))
+        images = self._bands(frame.index, *self._validator.validate(frame))
+        left, right = (self._view(image) for image in images)
         stereo, allowed = self._set_up(left)
         watch.lap("prepare")
         if self._contrast_lost(left):
             return make_output(frame, no_tracks(), 0, watch)
+        order = self._exchange.order(
+            frame.index,
+            left.half,
+            right.half,
+            lambda: self._count_matches(left, right, stereo),
+            suspicious=not self._right.usable,
+        )
+        if order == "refused":
+            return make_output(frame, no_tracks(), 0, watch, self._take_lines())
+        if order == "exchanged":
+            left, right = right, left
+        if self._right.left_is_frozen(frame.index, left.half, right.half):
+            return make_output(frame, no_tracks(), 0, watch, self._take_lines())
         tracks, motion = self._track(frame, left, right, usable_prior(prior), stereo, watch)
         missing = self._grid.target_features - len(tracks)
         wanted = round(missing * (1.0 + self._settings.spare_corners))
         corners = detect_corners(left.half, tracks.left, wanted, self._grid, self._settings, allowed)
         watch.lap("detect")
         tracks = self._add_new_features(left, right, tracks, corners, motion, stereo)
-        stereo.update_rows(tracks)
+        if self._right.usable and self._delay.frames == 0.0:
+            stereo.update_rows(tracks)
         watch.lap("stereo")
         points, matched = tracks.left, int(tracks.has_right.sum())
         self._swap.check(frame, len(points), matched, lambda: stereo.count_mirrored(left, right, points))
@@ -108,7 +137,21 @@ class KltFrontend:
         tracked = self._count_tracked(seen)
         self._store(frame, left, right, tracks, motion)
         watch.lap("check")
-        return make_output(frame, seen, tracked, watch)
+        return make_output(frame, seen, tracked, watch, self._take_lines())
+
+    def _take_lines(self) -> tuple[str, ...]:
+        """Return what the frame says of the images, one line an event."""
+        lines, self._lines = (
+            (
+                *self._bands.take_lines(),
+                *self._exchange.take_lines(),
+                *self._right.take_lines(),
+                *self._delay.take_lines(),
+                *self._lines,
+            ),
+            [],
+        )
+        return lines
 
     def _view(self, image: Image) -> View:
         """Equalise and convert an image; the result does not share memory with it."""
@@ -137,6 +180,17 @@ class KltFrontend:
         if lost_contrast(left.half, previous.left.half):
             self._skipped = before + 1
         return self._skipped > 0
+
+    def _count_matches(self, left: View, right: View, stereo: StereoFit) -> MatchCounts:
+        """Count matches of either sign, at the points that the other camera saw last."""
+        previous = self._previous
+        if previous is None:
+            return MatchCounts(0, 0, 0)
+        tracks = previous.tracks
+        points = np.where(tracks.has_right[:, None], tracks.right, tracks.left)
+        points = points[inside(left.full, points, 0.0)][:_EXCHANGE_POINTS]
+        positive = int(stereo.search(left, right, points)[1].sum())
+        return MatchCounts(len(points), positive, stereo.count_mirrored(left, right, points))
 
     def _count_tracked(self, seen: Tracks) -> int:
         """Count the features that were output in the previous frame, too."""
@@ -178,13 +232,98 @@ class KltFrontend:
         watch.lap("track")
         rng = np.random.default_rng((self._consensus.seed, frame.index))
         problem = RansacProblem(self._camera, self._consensus, settings.consensus_px, rng)
-        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, stereo.max_disparity_px)
+        near_px = stereo.max_disparity_px
+        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, near_px, frame.index)
         watch.lap("reject")
         tracks = self._align_with_anchors(previous, left, found, seen, motion)
         watch.lap("align")
-        tracks = stereo.track_right(tracks, right, previous.right_half, motion is not None)
+        tracks = self._match_right(frame, tracks, left, right, prior, stereo, motion)
         watch.lap("stereo")
         return tracks, motion
+
+    def _match_right(
+        self,
+        frame: StereoFrame,
+        tracks: Tracks,
+        left: View,
+        right: View,
+        prior: TrackPrior | None,
+        stereo: StereoFit,
+        motion: Consensus | None,
+    ) -> Tracks:
+        """Match features of known depth in the right image; no match where the right image cannot be used.
+
+        While it cannot, depths come from the prior, where it has them.
+        """
+        previous = self._previous
+        assert previous is not None
+        if not self._right.usable and prior is not None:
+            depth, known = prior_depths(self._camera, np.where(tracks.shown, tracks.ids, -1), prior)
+            point = np.where(known[:, None], left_rays(self._camera, tracks.left) * depth[:, None], tracks.point)
+            tracks = replace(tracks, point=point, has_point=tracks.has_point | known)
+        has_point, delay = tracks.has_point, self._delay.frames
+        flow = tracks.left - previous.tracks.left[_rows_by_slot(previous.tracks, tracks)]
+        if delay == 0.0:
+            matched = stereo.track_right(tracks, right, motion is not None)
+        else:
+            T = np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev
+            T = T if motion is None else motion.T_curr_prev
+            matched = self._match_delayed(previous, tracks, right, flow, T, stereo)
+        frame_s = (frame.time_ns - previous.time_ns) * 1e-9
+        if not self._right.check_matches(frame.index, matched.has_right[has_point], moved=motion is not None):
+            if self._right.contradicts and self._delay.suspect(
+                frame.index, self._count_pairings(previous, left, tracks, right, stereo), frame_s
+            ):
+                self._right.explained()
+                stereo.restart_rows()
+                return no_tracks()
+            return tracks
+        seen = matched.has_right
+        rows = matched.right[seen, 1] - matched.left[seen, 1] - delay * flow[seen, 1]
+        if self._delay.update(frame.index, matched.left[seen], flow[seen], rows, frame_s):
+            stereo.restart_rows()
+            return no_tracks()  # their depths are those of images of different times
+        return matched
+
+    def _count_pairings(
+        self, previous: _PreviousFrame, left: View, tracks: Tracks, right: View, stereo: StereoFit
+    ) -> PairingCounts:
+        """Count the features that match if the right image belongs to this frame, the one before, or the next one."""
+        before = previous.tracks.left[_rows_by_slot(previous.tracks, tracks)][:_PAIRING_POINTS]
+        now = tracks.left[:_PAIRING_POINTS]
+        return PairingCounts(
+            points=len(now),
+            same=stereo.count_on_rows(left.half, right.half, now),
+            late=stereo.count_on_rows(previous.left.half, right.half, before),
+            early=stereo.count_on_rows(left.half, previous.right_half, now),
+        )
+
+    def _match_delayed(
+        self,
+        previous: _PreviousFrame,
+        tracks: Tracks,
+        right: View,
+        flow: FloatArray,
+        T: FloatArray,
+        stereo: StereoFit,
+    ) -> Tracks:
+        """Match features in a right image of another time, and bring the matches to the present.
+
+        Args:
+            previous: the last frame.
+            tracks: features at their new left pixels.
+            right: the right image.
+            flow: motion (N, 2) of the features since the last frame, pixels.
+            T: motion (4, 4) of the camera, `T_curr_prev`.
+            stereo: the matcher.
+        """
+        delay = self._delay.frames
+        then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
+        rows = np.flatnonzero(~then.has_right & ~then.has_point)
+        disparity, unique = stereo.search(previous.left, right, (tracks.left - flow)[rows])
+        then = stereo.match_near(then, right, rows[unique], disparity[unique])
+        stereo.update_rows(then)
+        return at_present(self._camera, tracks, then, T, delay)
 
     def _after_gap(self, frame: StereoFrame) -> bool:
         """Whether so many frames are missing that similar patches are no evidence of the same points."""
@@ -226,10 +365,11 @@ class KltFrontend:
         prior: TrackPrior | None,
         expected: FloatArray,
         max_disparity_px: float,
+        index: int,
     ) -> tuple[BoolArray, Consensus | None]:
         """Return the mask (N,) of the found features that are static, and the consensus motion if there is one."""
         camera, rows = self._camera, np.flatnonzero(seen)
-        has_depth = (old.has_right & old.has_point)[rows]
+        has_depth = (old.has_point & (old.has_right | (not self._right.usable)))[rows]
         R_prior = T_prior = None
         if prior is not None:
             known, predicted = _prior_rows(old, rows[has_depth], prior)
@@ -237,6 +377,18 @@ class KltFrontend:
             T_prior = predicted_motion(camera, old.point[known], predicted, expected)
         before, after = old.left[rows], found[rows]
         kept, motion = static_tracks(problem, before, old.point[rows], has_depth, after, expected, R_prior, T_prior)
+        if motion is not None:
+            expected_motion = None if prior is None else prior.motion
+            chosen = choose_motion(
+                problem,
+                old.point[rows[has_depth]],
+                after[has_depth],
+                motion,
+                expected_motion,
+                in_event=self._objects.active,
+            )
+            motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
+            self._lines += self._objects.frame(index, chosen)
         if motion is not None and not has_depth.all():
             near_m = camera.fu * camera.baseline_m / max_disparity_px
             distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)
@@ -335,17 +487,7 @@ class KltFrontend:
         stereo: StereoFit,
     ) -> Tracks:
         """Search right matches for new corners and for features without one; add the best new corners."""
-        unmatched = ~tracks.has_right
-        if motion is not None:
-            # A feature with a known point that was not matched near it must not be matched elsewhere.
-            unmatched &= ~tracks.has_point
-        rows = np.flatnonzero(unmatched)
-        disparity, unique = stereo.search(left, right, np.concatenate([tracks.left[rows], corners]))
-        disparity_old, disparity_new = np.split(disparity, [len(rows)])
-        known, unique = np.split(unique, [len(rows)])
-        tracks = stereo.match_near(tracks, right, rows[known], disparity_old[known])
-        tracks = replace(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
-        tracks = take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames)
+        tracks, disparity_new, unique = self._search_right(left, right, tracks, corners, motion, stereo)
         stays = self._stay_visible(corners, disparity_new, motion, left.full)
         chosen, with_depth = self._select_corners(tracks, unique, stays)
         centres = rounded(corners[chosen])
@@ -355,6 +497,42 @@ class KltFrontend:
         room = max(0, self._grid.target_features - len(tracks))
         good = np.flatnonzero(new.has_right | (len(chosen) > with_depth))
         return joined(tracks, take(new, good[np.argsort(~new.has_right[good], kind="stable")][:room]))
+
+    def _search_right(
+        self,
+        left: View,
+        right: View,
+        tracks: Tracks,
+        corners: FloatArray,
+        motion: Consensus | None,
+        stereo: StereoFit,
+    ) -> tuple[Tracks, FloatArray, BoolArray]:
+        """Search features without a right match and corners (K, 2) along the row.
+
+        Returns:
+            The features, without those that had no match for too long; disparities (K,) of the corners in pixels; a
+            mask (K,) of the corners found. Where the right image cannot be used, nothing is searched or dropped.
+        """
+        nothing = np.zeros(len(corners)), np.zeros(len(corners), dtype=np.bool_)
+        if not self._right.usable:
+            return tracks, *nothing
+        if self._delay.frames != 0.0:  # a corner can be matched once it has been seen in two frames
+            return self._without_old_left_only(tracks), *nothing
+        unmatched = ~tracks.has_right
+        if motion is not None:
+            # A feature with a known point that was not matched near it must not be matched elsewhere.
+            unmatched &= ~tracks.has_point
+        rows = np.flatnonzero(unmatched)
+        disparity, unique = stereo.search(left, right, np.concatenate([tracks.left[rows], corners]))
+        disparity_old, disparity_new = np.split(disparity, [len(rows)])
+        known, unique = np.split(unique, [len(rows)])
+        tracks = stereo.match_near(tracks, right, rows[known], disparity_old[known])
+        return self._without_old_left_only(tracks), disparity_new, unique
+
+    def _without_old_left_only(self, tracks: Tracks) -> Tracks:
+        """Count frames without a right match, and drop the features that had none for too long."""
+        tracks = replace(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
+        return take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames)
 
     def _select_corners(self, tracks: Tracks, unique: BoolArray, stays: BoolArray) -> tuple[IntArray, int]:
         """Return the rows of the corners (K,) to try, in this order, and how many of them have a depth.
@@ -369,7 +547,7 @@ class KltFrontend:
         staying, leaving = np.flatnonzero(unique & stays)[:tried], np.flatnonzero(unique & ~stays)[:tried]
         leaving = leaving[: max(0, round(_TRIED * (least - matched - len(staying) / _TRIED)))]
         no_depth = np.flatnonzero(~unique)[:room]
-        if matched > _FEW * least:
+        if matched > _FEW * least and self._delay.frames == 0.0:
             no_depth = no_depth[:0]
         return np.concatenate([staying, leaving, no_depth]), len(staying) + len(leaving)
 
@@ -388,7 +566,8 @@ class KltFrontend:
 
     def _promote(self, tracks: Tracks) -> Tracks:
         """Output features that passed their probation from now on, under new ids; all features if these are few."""
-        proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & tracks.has_right)
+        proven = tracks.has_right | (not self._right.usable)
+        proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & proven)
         if proven.sum() < _VERY_FEW * self._grid.target_features:
             proven[:] = True
         ids, first = tracks.ids.copy(), proven & ~tracks.shown
@@ -404,8 +583,24 @@ def _prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntA
     return shown[named], predicted
 
 
+def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:
+    """Rows (N,) in `old` of the features (N,) of `now`, all of which it contains: an active feature keeps its slot."""
+    order = np.argsort(old.slot)
+    return np.asarray(order[np.searchsorted(old.slot, now.slot, sorter=order)], dtype=np.int64)
+
+
 def _spaced(points: FloatArray, distance: float) -> BoolArray:
     """Mask (N,) of points (N, 2) without an earlier point closer than `distance` in the maximum norm."""
-    u, v = points[:, 0], points[:, 1]
-    near = (np.abs(u[:, None] - u) < distance) & (np.abs(v[:, None] - v) < distance)
-    return np.asarray(~np.tril(near, -1).any(axis=1), dtype=np.bool_)
+    out = np.ones(len(points), dtype=np.bool_)
+    _mark_crowded(points, distance, out)
+    return out
+
+
+@compiled
+def _mark_crowded(points: FloatArray, distance: float, apart: BoolArray) -> None:
+    for n in range(len(points)):
+        for m in range(n):
+            du, dv = points[n, 0] - points[m, 0], points[n, 1] - points[m, 1]
+            if abs(du) < distance and abs(dv) < distance:
+                apart[n] = False
+                break

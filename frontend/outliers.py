@@ -17,8 +17,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vio.geometry.lie import FloatArray, circledot, se3_exp, se3_from_parts, so3_exp, so3_log, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
+from vio.compiled import compiled, move_by_twist, solve_positive
+from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
+from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, IntArray
 
 from .settings import ConsensusSettings
@@ -62,12 +63,25 @@ def pixel_errors(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArr
 
     Points behind the camera have infinite distance.
     """
-    p = p_prev @ np.swapaxes(T_curr_prev[..., :3, :3], -1, -2) + T_curr_prev[..., None, :3, 3]
-    ahead = p[..., 2] > _MIN_DEPTH_M
-    depth = np.where(ahead, p[..., 2], 1.0)
-    du = camera.fu * p[..., 0] / depth + camera.cu - pixels[:, 0]
-    dv = camera.fv * p[..., 1] / depth + camera.cv - pixels[:, 1]
-    return np.where(ahead, np.sqrt(du * du + dv * dv), np.inf)
+    T = np.ascontiguousarray(T_curr_prev).reshape(-1, 4, 4)
+    out = np.empty((len(T), len(p_prev)))
+    points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
+    _distances(camera.fu, camera.fv, camera.cu, camera.cv, T, points, seen, out)
+    return out.reshape(*T_curr_prev.shape[:-2], len(p_prev))
+
+
+@compiled
+def _distances(
+    fu: float, fv: float, cu: float, cv: float, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray
+) -> None:
+    """Write the distances (H, N) of points (N, 3) moved by motions (H, 4, 4) from pixels (N, 2)."""
+    for h in range(len(T)):
+        for n in range(len(points)):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            depth = T[h, 2, 0] * x + T[h, 2, 1] * y + T[h, 2, 2] * z + T[h, 2, 3]
+            du = fu * (T[h, 0, 0] * x + T[h, 0, 1] * y + T[h, 0, 2] * z + T[h, 0, 3]) / depth + cu - pixels[n, 0]
+            dv = fv * (T[h, 1, 0] * x + T[h, 1, 1] * y + T[h, 1, 2] * z + T[h, 1, 3]) / depth + cv - pixels[n, 1]
+            out[h, n] = np.sqrt(du * du + dv * dv) if depth > _MIN_DEPTH_M else np.inf
 
 
 def _gauss_newton(
@@ -84,23 +98,59 @@ def _gauss_newton(
 
     `free` selects the part of the twist `[rho; phi]` that is estimated: all of it, or the translation alone.
     """
-    for _ in range(iterations):
-        p = p_prev @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-        ahead = p[..., 2] > _MIN_DEPTH_M
-        p = np.where(ahead[..., None], p, np.array([0.0, 0.0, 1.0]))
-        w = np.where(ahead, weight, 0.0)
-        residual = pixels - project(camera, p)[..., :2]
-        pixel_D_xi = z_D_p_cam(camera, p)[..., :2, :] @ circledot(p)[..., :3, free]
-        n = pixel_D_xi.shape[-1]
-        J = (pixel_D_xi * w[..., None, None]).reshape(len(T), -1, n)
-        r = (residual * w[..., None]).reshape(len(T), -1, 1)
-        A = np.swapaxes(J, 1, 2) @ J
-        A = A + (_DAMPING * np.trace(A, axis1=1, axis2=2)[:, None, None] / n + 1e-9) * np.eye(n)
-        step = np.linalg.solve(A, np.swapaxes(J, 1, 2) @ r)[..., 0]
-        xi = np.zeros((len(T), 6))
-        xi[:, free] = np.clip(step, -5.0, 5.0)
-        T = se3_exp(xi) @ T
+    T = np.array(T, order="C")  # of one layout, so that one version is compiled
+    points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
+    _iterate((camera.fu, camera.fv, camera.cu, camera.cv), T, points, seen, w, iterations, free.stop)
     return T
+
+
+@compiled
+def _iterate(
+    intrinsics: tuple[float, float, float, float],
+    T: FloatArray,
+    points: FloatArray,
+    pixels: FloatArray,
+    weight: FloatArray,
+    iterations: int,
+    free: int,
+) -> None:
+    """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see `_gauss_newton`."""
+    fu, fv, cu, cv = intrinsics
+    A, xi, u_D_xi, v_D_xi = np.empty((free, free)), np.zeros(6), np.empty(6), np.empty(6)
+    for h in range(len(T)):
+        for _ in range(iterations):
+            for i in range(free):
+                xi[i] = 0.0
+                for j in range(i + 1):
+                    A[i, j] = 0.0
+            for n in range(points.shape[1]):
+                px, py, pz = points[h, n, 0], points[h, n, 1], points[h, n, 2]
+                x = T[h, 0, 0] * px + T[h, 0, 1] * py + T[h, 0, 2] * pz + T[h, 0, 3]
+                y = T[h, 1, 0] * px + T[h, 1, 1] * py + T[h, 1, 2] * pz + T[h, 1, 3]
+                z = T[h, 2, 0] * px + T[h, 2, 1] * py + T[h, 2, 2] * pz + T[h, 2, 3]
+                w2 = weight[h, n] ** 2
+                if not z > _MIN_DEPTH_M or w2 == 0.0:
+                    continue
+                a, b = x / z, y / z
+                du, dv = pixels[h, n, 0] - fu * a - cu, pixels[h, n, 1] - fv * b - cv
+                # pixel_D_point circledot(point)
+                u_D_xi[0], u_D_xi[1], u_D_xi[2] = fu / z, 0.0, -fu * a / z
+                u_D_xi[3], u_D_xi[4], u_D_xi[5] = -fu * a * b, fu * (1.0 + a * a), -fu * b
+                v_D_xi[0], v_D_xi[1], v_D_xi[2] = 0.0, fv / z, -fv * b / z
+                v_D_xi[3], v_D_xi[4], v_D_xi[5] = -fv * (1.0 + b * b), fv * a * b, fv * a
+                for i in range(free):
+                    xi[i] += w2 * (u_D_xi[i] * du + v_D_xi[i] * dv)
+                    for j in range(i + 1):
+                        A[i, j] += w2 * (u_D_xi[i] * u_D_xi[j] + v_D_xi[i] * v_D_xi[j])
+            trace = 0.0
+            for i in range(free):
+                trace += A[i, i]
+            for i in range(free):
+                A[i, i] += _DAMPING * trace / free + 1e-9
+            solve_positive(A, xi[:free])
+            for i in range(free):
+                xi[i] = min(max(xi[i], -5.0), 5.0)
+            move_by_twist(xi, T[h])
 
 
 def _refine(
@@ -142,6 +192,16 @@ def _ransac(
     cost = np.minimum(pixel_errors(camera, T, p_prev, pixels), limit) ** 2
     best = _refine(camera, T[int(np.argmin(cost.sum(axis=1)))], p_prev, pixels, limit / 2, free)
     return best, pixel_errors(camera, best, p_prev, pixels) <= limit
+
+
+def best_motion(
+    problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, starts: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the motion (4, 4) with most inliers among points (N, 3) and pixels (N, 2), and their mask (N,).
+
+    Unlike a consensus it may have few inliers; `starts` (S, 4, 4) are tried besides minimal sets.
+    """
+    return _ransac(problem, p_prev, pixels, starts, slice(0, 6))
 
 
 def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:

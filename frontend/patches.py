@@ -1,4 +1,4 @@
-"""Images in the forms that tracking needs, and extraction of many small patches at once."""
+"""Images in the forms that tracking needs."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import TypeAlias
 import cv2
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 
-from vio.records import BoolArray, Image, IntArray
+from vio.records import BoolArray, Image
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]  # (H, W) gray levels
 Patches: TypeAlias = npt.NDArray[np.float32]  # (N, h, w) gray levels
@@ -34,9 +33,3 @@ def inside(image: Image | FloatImage, points: npt.NDArray[np.float64], margin: f
     height, width = image.shape
     u, v = points[:, 0], points[:, 1]
     return (u >= margin) & (u <= width - 1 - margin) & (v >= margin) & (v <= height - 1 - margin)
-
-
-def integer_patches(image: Image, top_left: IntArray, height: int, width: int) -> Patches:
-    """Patches (N, height, width) whose first pixel is `top_left` (N, 2) `[u v]`; all must be inside the image."""
-    windows = sliding_window_view(image, (height, width))
-    return windows[top_left[:, 1], top_left[:, 0]].astype(np.float32)

@@ -6,7 +6,7 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.records import IntArray, TrackPrior
+from vio.records import BoolArray, IntArray, TrackPrior
 
 _ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
 _MIN_DEPTH_M = 0.1
@@ -23,13 +23,31 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
         R = None
     if R is None and not finite.any():
         return None
-    return TrackPrior(ids[finite], prior.z[first[finite]], R)
+    motion = prior.motion
+    if motion is not None and not (np.isfinite(motion.T_curr_prev).all() and np.isfinite(motion.covariance).all()):
+        motion = None
+    return TrackPrior(ids[finite], prior.z[first[finite]], R, motion)
 
 
 def prior_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
     """Rows (K,) of the ids (N,) that a usable prior contains, and the left pixels (K, 2) that it predicts."""
     _, rows, given = np.intersect1d(ids, prior.ids, assume_unique=True, return_indices=True)
     return rows, prior.z[given, :2]
+
+
+def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tuple[FloatArray, BoolArray]:
+    """Depths (N,) that a usable prior predicts for ids (N,), metres, and a mask (N,) of those that it contains.
+
+    Ids below zero are in no prior; depths outside the mask are one metre.
+    """
+    depth, known = np.ones(len(ids)), np.zeros(len(ids), dtype=np.bool_)
+    named = np.flatnonzero(ids >= 0)
+    _, rows, given = np.intersect1d(ids[named], prior.ids, assume_unique=True, return_indices=True)
+    disparity = prior.z[given, 0] - prior.z[given, 2]
+    ahead = np.isfinite(disparity) & (disparity > 0)
+    rows = named[rows[ahead]]
+    depth[rows], known[rows] = camera.fu * camera.baseline_m / disparity[ahead], True
+    return depth, known
 
 
 def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, left: FloatArray) -> FloatArray:

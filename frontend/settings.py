@@ -15,8 +15,12 @@ class GridSettings(Section):
 
     section: ClassVar[str] = "frontend.grid"
 
-    target_features: int = setting(400, "number of features to track; new ones are added below it", at_least=1)
-    cell_features: int = setting(4, "target number of features per grid cell; determines the cell size", at_least=1)
+    target_features: int = setting(
+        400, "number of features to track; new ones are added below it", at_least=1, at_most=5000
+    )
+    cell_features: int = setting(
+        4, "target number of features per grid cell; determines the cell size", at_least=1, at_most=1000
+    )
     min_distance: float = setting(
         0.15, "least distance between features, over the spacing of a uniform grid of them", at_least=0, at_most=1
     )
@@ -38,7 +42,7 @@ class ConsensusSettings(Section):
 
     section: ClassVar[str] = "frontend.consensus"
 
-    samples: int = setting(96, "random minimal sets of RANSAC", at_least=1)
+    samples: int = setting(96, "random minimal sets of RANSAC", at_least=1, at_most=10000)
     sure_share: float = setting(
         0.7,
         "share of inliers of the refined expected motion above which RANSAC is skipped",
@@ -56,7 +60,7 @@ class ConsensusSettings(Section):
         "inliers of the prior motion only, over those of the consensus, above which it replaces the consensus",
         at_least=0,
     )
-    seed: int = setting(0, "seed of the sampling; equal seeds give identical results", at_least=0)
+    seed: int = setting(0, "seed of the sampling; equal seeds give identical results", at_least=0, at_most=2**32 - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +84,15 @@ class KltSettings(Section):
         at_least=0,
     )
     spare_corners: float = setting(
-        1.5, "extra corners tried, over the number of missing features; the best stereo matches are kept", at_least=0
+        1.5,
+        "extra corners tried, over the number of missing features; the best stereo matches are kept",
+        at_least=0,
+        at_most=20,
     )
     mask: Path | None = setting(None, "image of the recording's size; black pixels are excluded from corner detection")
     equalise: Literal["none", "clahe"] = setting("none", "local contrast equalisation of the input images")
     window_px: int = setting(
-        11, "side of the tracking window, in pixels of the half-resolution image", unit="px", at_least=3
+        11, "side of the tracking window, in pixels of the half-resolution image", unit="px", at_least=3, at_most=101
     )
     pyramid_levels: int = setting(
         2, "image levels coarser than half resolution when tracking in time", at_least=0, at_most=8
@@ -93,13 +100,13 @@ class KltSettings(Section):
     trusted_levels: int = setting(
         1, "the same where the pixels are predicted by the last motion or the filter", at_least=0, at_most=8
     )
-    iterations: int = setting(20, "largest number of Lucas-Kanade iterations per level", at_least=1)
+    iterations: int = setting(20, "largest number of Lucas-Kanade iterations per level", at_least=1, at_most=1000)
     max_forward_backward_px: float = setting(1.5, "largest forward-backward error", unit="px", above=0)
     consensus_px: float = setting(
         1.0, "inlier threshold on the reprojection error under the consensus motion", unit="px", above=0
     )
     anchor_radius_px: int = setting(
-        7, "half side of the anchor patch that a feature is aligned with", unit="px", at_least=2
+        7, "half side of the anchor patch that a feature is aligned with", unit="px", at_least=2, at_most=50
     )
     min_anchor_correlation: float = setting(
         0.8, "smallest normalised correlation with the anchor; below, the anchor is replaced", at_least=-1, at_most=1
@@ -110,12 +117,15 @@ class KltSettings(Section):
     min_peak_margin: float = setting(
         0.03, "smallest lead in correlation over the second-best match in the row", at_least=0
     )
-    circle_check: bool = setting(False, "also track the right pixels in time; right matches that disagree are dropped")
-    max_circle_px: float = setting(2.0, "largest disagreement for the circle check", unit="px", above=0)
     probation_frames: int = setting(
-        1, "frames for which a new corner must be tracked, in time and stereo, before it is output", at_least=0
+        1,
+        "frames for which a new corner must be tracked, in time and stereo, before it is output",
+        at_least=0,
+        at_most=1000,
     )
-    wanted_life_frames: int = setting(7, "frames for which a new corner should stay in the image", at_least=0)
+    wanted_life_frames: int = setting(
+        7, "frames for which a new corner should stay in the image", at_least=0, at_most=1000
+    )
     least_features: float = setting(
         0.7,
         "share of target_features below which corners that leave the image sooner are added, too",
@@ -136,7 +146,7 @@ class MatchSettings(Section):
 
     section: ClassVar[str] = "frontend.match"
 
-    max_keypoints: int = setting(1200, "key points extracted from each image", at_least=1)
+    max_keypoints: int = setting(1200, "key points extracted from each image", at_least=1, at_most=20000)
     ratio: float = setting(0.8, "largest distance of descriptors, over that of the second-nearest", above=0, at_most=1)
     search_radius: float = setting(
         0.06, "half side of the search window around the predicted pixel, over the image width", above=0, at_most=1

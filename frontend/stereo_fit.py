@@ -16,7 +16,6 @@ from vio.records import BoolArray, Image, IntArray
 
 from .align import align, on_peak
 from .columns import take
-from .flow import circle_errors, match_brightness
 from .patches import View
 from .settings import DisparitySettings, KltSettings
 from .stereo_match import RowField, match_rows, shifted_rows
@@ -53,13 +52,12 @@ class StereoFit:
         self._rows = RowField(*size)
         self._unmatched = 0  # frames in a row with hardly any match
 
-    def track_right(self, tracks: Tracks, right: View, last_half: Image, moved: bool) -> Tracks:
+    def track_right(self, tracks: Tracks, right: View, moved: bool) -> Tracks:
         """Match features of known depth; with a consensus motion (`moved`), check the disparity against the depth.
 
         Args:
             tracks: features at their new left pixels; right pixels are still those of the last frame.
             right: the right image.
-            last_half: the last right image at half resolution.
             moved: whether the depths were propagated with a consensus motion.
         """
         rows = np.flatnonzero(tracks.has_point & (tracks.point[:, 2] > _MIN_DEPTH_M))
@@ -68,8 +66,6 @@ class StereoFit:
         pixels, skew, valid = self._fit(known, right, expected)
         if moved:
             valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= self._settings.consensus_px
-        if self._settings.circle_check:
-            valid &= self._closes_circle(known, pixels, last_half, right)
         return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
 
     def match_near(self, tracks: Tracks, right: View, rows: IntArray, disparity: FloatArray) -> Tracks:
@@ -107,6 +103,14 @@ class StereoFit:
         disparity, unique = self._search(a, b, flipped, self._settings.min_correlation)
         return int((unique & (disparity >= 1.0)).sum())
 
+    def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:
+        """Count the left pixels (N, 2) that match well on their row between two images at half resolution."""
+        return int(self._search(left_half, right_half, points, _GOOD_MATCH)[1].sum())
+
+    def restart_rows(self) -> None:
+        """Forget the row differences."""
+        self._rows.restart(0.0)
+
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
         few = len(tracks) >= _LEAST_POINTS and tracks.has_right.mean() < _FEW_MATCHES
@@ -143,18 +147,6 @@ class StereoFit:
             & (found <= self.max_disparity_px)
         )
         return pixels, skew, valid
-
-    def _closes_circle(self, tracks: Tracks, pixels: FloatArray, last_half: Image, right: View) -> BoolArray:
-        """Mask (N,) of right pixels (N, 2) that agree with temporal tracking from the last right image.
-
-        Features without a right match in the last frame cannot be checked, and pass.
-        """
-        closes = tracks.left_only_frames > 0
-        rows = np.flatnonzero(~closes)
-        last = match_brightness(last_half, right.half)
-        gap = circle_errors(last, right.half, tracks.right[rows], pixels[rows], self._settings)
-        closes[rows] = gap <= self._settings.max_circle_px
-        return closes
 
     def _with_right_pixels(self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray) -> Tracks:
         """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of the given rows (K,)."""

@@ -6,16 +6,14 @@ half resolution, left to right and back; `frontend.align` then finds the sub-pix
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import numpy.typing as npt
-from numpy.lib.stride_tricks import sliding_window_view
 
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
 from .align import FLAT_RMS
-from .patches import integer_patches
 
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
@@ -87,31 +85,53 @@ def row_correlation(
     Candidate k of point n is centred at column `first_column[n] + k`. Candidates whose patch leaves the image, and
     patches without contrast, score -1. The source patches must lie inside the source image.
     """
-    side = 2 * radius + 1
-    template = integer_patches(source, centres - radius, side, side)
-    template -= template.mean(axis=(1, 2), keepdims=True)
-    norm = np.sqrt(np.einsum("nhw,nhw->n", template, template))
-    width = target.shape[1]
-    columns = first_column[:, None] + np.arange(count)
-    pad_left = max(0, -int(columns.min(initial=0)) + radius)
-    pad_right = max(0, int(columns.max(initial=0)) + radius + 1 - width)
-    padded = np.asarray(cv2.copyMakeBorder(target, 0, 0, pad_left, pad_right, cv2.BORDER_REPLICATE), dtype=np.uint8)
-    corner = np.stack([first_column + pad_left - radius, centres[:, 1] - radius], axis=1)
-    strip = integer_patches(padded, corner, side, count + side - 1)
-    product = np.zeros((len(centres), count), dtype=np.float32)
-    for column in range(side):
-        product += np.einsum("nhk,nh->nk", strip[:, :, column : column + count], template[:, :, column])
-    target_norm = sliding_window_view(_window_norms(padded, side), count, axis=1)[centres[:, 1], corner[:, 0] + radius]
-    flat = FLAT_RMS * side
-    good = (norm[:, None] > flat) & (target_norm > flat) & (columns >= radius) & (columns < width - radius)
-    return np.where(good, product / np.where(good, norm[:, None] * target_norm, 1.0), -1.0).astype(np.float32)
+    out = np.empty((len(centres), count), dtype=np.float32)
+    _correlate(np.ascontiguousarray(source), np.ascontiguousarray(target), centres, first_column, radius, out)
+    return out
 
 
-def _window_norms(image: Image, side: int) -> npt.NDArray[np.float32]:
-    """Norm (H, W) of the window around each pixel after its mean is subtracted."""
-    total = cv2.boxFilter(image, cv2.CV_32F, (side, side), normalize=False)
-    square = cv2.sqrBoxFilter(image, cv2.CV_32F, (side, side), normalize=False)
-    return np.asarray(np.sqrt(np.maximum(square - total * total / side**2, 0.0)), dtype=np.float32)
+@compiled
+def _correlate(
+    source: Image, target: Image, centres: IntArray, first_column: IntArray, radius: int, out: npt.NDArray[np.float32]
+) -> None:
+    """Write the correlations (N, count); the sums run over whole gray levels, and are exact."""
+    width, count, side = target.shape[1], out.shape[1], 2 * radius + 1
+    size, flat = side * side, FLAT_RMS**2 * side * side
+    strip = np.empty(count + side - 1, np.int32)
+    product, total, squares = np.empty(count, np.int32), np.empty(len(strip), np.int32), np.empty(len(strip), np.int32)
+    for n in range(len(centres)):
+        column, row = centres[n, 0], centres[n, 1]
+        own_total, own_squares = 0, 0
+        for k in range(len(strip)):
+            total[k] = squares[k] = 0  # of the columns
+        for k in range(count):
+            product[k] = 0
+        for y in range(row - radius, row + radius + 1):
+            for k in range(len(strip)):
+                strip[k] = target[y, min(max(first_column[n] - radius + k, 0), width - 1)]
+                total[k] += strip[k]
+                squares[k] += strip[k] * strip[k]
+            for x in range(side):
+                gray = int(source[y, column - radius + x])
+                own_total += gray
+                own_squares += gray * gray
+                for k in range(count):
+                    product[k] += gray * strip[x + k]
+        energy = own_squares - own_total**2 / size
+        other_total, other_squares = 0, 0  # of the window, which moves along the columns
+        for k in range(side - 1):
+            other_total += total[k]
+            other_squares += squares[k]
+        for k in range(count):
+            other_total += total[k + side - 1]
+            other_squares += squares[k + side - 1]
+            other = other_squares - float(other_total) ** 2 / size
+            inside = radius <= first_column[n] + k < width - radius
+            out[n, k] = -1.0
+            if inside and energy > flat and other > flat:
+                out[n, k] = (product[k] - float(own_total) * other_total / size) / np.sqrt(energy * other)
+            other_total -= total[k]
+            other_squares -= squares[k]
 
 
 def _search(
@@ -122,21 +142,34 @@ def _search(
     Returns:
         The best shift (N,), sub-pixel; its score (N,), -1 too close to the border; the best score outside its peak.
     """
-    rows = np.arange(len(points))
     centres = np.rint(points).astype(np.int64)
     safe = np.clip(centres, _RADIUS, np.array([source.shape[1], source.shape[0]]) - _RADIUS - 1)
     score = row_correlation(source, target, safe, safe[:, 0] + low, high - low + 1, _RADIUS)
-    best = np.argmax(score, axis=1)
-    top = score[rows, best].astype(np.float64)
-    near = np.abs(np.arange(score.shape[1]) - best[:, None]) <= _PEAK_HALF_WIDTH
-    second = np.where(near, np.float32(-1.0), score).max(axis=1, initial=-1.0).astype(np.float64)
-    before = score[rows, np.maximum(best - 1, 0)].astype(np.float64)
-    after = score[rows, np.minimum(best + 1, score.shape[1] - 1)].astype(np.float64)
-    bend = before - 2 * top + after
-    peaked = (best > 0) & (best < score.shape[1] - 1) & (bend < 0)
-    offset: FloatArray = np.where(peaked, (before - after) / (2 * np.where(peaked, bend, -1.0)), 0.0)
+    offset, top, second = np.empty((3, len(points)))
+    _peaks(score, offset, top, second)
     # The patches were cut at whole pixels; the shift carries over to the sub-pixel point.
-    return low + best + np.clip(offset, -0.5, 0.5), np.where((safe == centres).all(axis=1), top, -1.0), second
+    return low + offset, np.where((safe == centres).all(axis=1), top, -1.0), second
+
+
+@compiled
+def _peaks(score: npt.NDArray[np.float32], offset: FloatArray, top: FloatArray, second: FloatArray) -> None:
+    """Write each row's best candidate (N,), sub-pixel by a parabola, its score, and the best score outside its peak."""
+    last = score.shape[1] - 1
+    for n in range(len(score)):
+        best = 0
+        for k in range(1, last + 1):
+            if score[n, k] > score[n, best]:
+                best = k
+        second[n] = -1.0
+        for k in range(last + 1):
+            if abs(k - best) > _PEAK_HALF_WIDTH:
+                second[n] = max(second[n], score[n, k])
+        offset[n], top[n] = best, score[n, best]
+        if 0 < best < last:
+            before, after = float(score[n, best - 1]), float(score[n, best + 1])
+            bend = before - 2.0 * top[n] + after
+            if bend < 0.0:
+                offset[n] += min(max((before - after) / (2.0 * bend), -0.5), 0.5)
 
 
 def match_rows(

@@ -35,6 +35,18 @@ def data_dir() -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered flight as an EuRoC folder: 16 frames of 160 pixels with an IMU."""
+    from vio.cli import main
+
+    folder = tmp_path_factory.mktemp("flight") / "flight"
+    options = {"rig": "small", "width": "160", "rate": "20", "duration": "0.8", "workers": "1", "format": "euroc"}
+    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
+    assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
+    return folder
+
+
 @pytest.fixture(autouse=True)
 def _no_make_around_us(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where `make` runs the tests, a `make` that a test runs must not take itself for a part of that one."""

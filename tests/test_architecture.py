@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.draw_structure import layers, read_packages
+from tools.research.draw_structure import layers, read_packages
 
 ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])
@@ -125,6 +125,12 @@ def test_pycolmap_stays_in_its_package() -> None:
     assert all(_within(name, "vio.colmap") for name in users), users
 
 
+def test_rosbags_stays_in_its_package() -> None:
+    users = [_name(f) for f in FILES if "rosbags" in _heads(f, top_level_only=False)]
+    assert users
+    assert all(_within(name, "vio.datasets.bags") for name in users), users
+
+
 def test_matplotlib_stays_out_of_import_time() -> None:
     assert not [_name(f) for f in FILES if "matplotlib" in _heads(f, top_level_only=True)]
 
@@ -136,7 +142,8 @@ def _loaded(code: str, suspects: set[str]) -> set[str]:
     return set(done.stderr.split())
 
 
-HEAVY = {"numpy", "scipy", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
+HEAVY = {"numpy", "scipy", "numba", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
+HEAVY |= {"rosbags"}
 HELP = """
 import contextlib, vio.cli
 with contextlib.suppress(SystemExit):

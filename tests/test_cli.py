@@ -15,6 +15,7 @@ import pytest
 
 from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_kitti, make_npz
 from vio.cli import main
+from vio.config import BASIC, Config, describe
 from vio.errors import DataError
 from vio.trajectory_io import read_trajectory
 
@@ -302,16 +303,22 @@ def test_reports_and_skips_truncated_images_up_to_a_limit(
     assert "000003.png" in _error(capsys, *run, "--set", "dataset.max_bad_frames=0")
 
 
-def test_interrupted_run_writes_nothing(
+def test_run_interrupted_while_its_picture_is_drawn_goes_on(
     recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def stop(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vio.plotting.plot_run", stop)
-    assert main(["run", str(recording), "--out", str(tmp_path / "deep" / "out")]) == 130
-    assert "interrupted" in capsys.readouterr().err
-    assert not (tmp_path / "deep").exists()
+    out = tmp_path / "deep" / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr("vio.plotting.plot_run", stop)
+        assert main(["run", str(recording), "--out", str(out)]) == 130
+    assert f"interrupted; what was flushed is in {out}" in capsys.readouterr().err
+    assert len(read_trajectory(out / "trajectory.tum")) > 0
+    assert main(["run", "--resume", str(out)]) == 0
+    assert not (out / "unfinished").exists()
+    assert main(["run", "--resume", str(out)]) == 1
+    assert "is complete" in capsys.readouterr().err
 
 
 def test_debug_raises_the_expected_error(tmp_path: Path) -> None:
@@ -351,11 +358,21 @@ def test_wrong_usage_exits_with_status_2() -> None:
 
 
 def test_config_shows_every_setting_with_unit_and_default(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["config", "--show"]) == 0
+    assert main(["config", "--all"]) == 0
     out = capsys.readouterr().out
     assert "vislam.pixel_sigma_px = 0.75 px" in out
     assert "frontend.klt.window_px" in out
     assert "one of: consistent, literal" in out
+
+
+def test_config_shows_the_basic_settings_in_groups(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "--show", "--set", "msckf.clones=9"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    keys = [line.partition(" = ")[0] for line in lines if line[0] not in " #"]
+    assert keys == list(BASIC)
+    assert "msckf.clones = 9" in lines
+    assert "# The sliding-window filter (docs/math.md, section 3)" in lines
+    assert lines[-1] == f"# {len(list(describe(Config()))) - len(BASIC)} more: vio config --all"
 
 
 def test_config_prints_the_effective_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

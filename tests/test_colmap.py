@@ -250,7 +250,7 @@ def test_an_interrupted_refinement_leaves_nothing(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vio.run_folder.landmarks_ply", interrupted)  # while writing
+    monkeypatch.setattr("vio.run_folder.write_landmarks_ply", interrupted)  # while writing
     assert main(["refine", str(folder)]) == 130
     capsys.readouterr()
     assert _contents(folder) == before

@@ -18,12 +18,12 @@ def _write(tmp_path: Path, text: str) -> Path:
 
 
 def test_defaults_then_file_then_command_line(tmp_path: Path) -> None:
-    path = _write(tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: grid\n")
+    path = _write(tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: information\n")
     config = load_config(path, ["vislam.iterations=5", "selector.keep_fraction=0.5"])
     assert config.vislam.pixel_sigma_px == 2.0
     assert isinstance(config.vislam.pixel_sigma_px, float)
     assert config.vislam.iterations == 5
-    assert config.selector.name == "grid"
+    assert config.selector.name == "information"
     assert config.selector.keep_fraction == 0.5
     assert config.frontend == Config().frontend
 
@@ -55,6 +55,8 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("vislam:\n  iterations: 2.5\n", r"vislam\.iterations takes a whole number, got 2\.5"),
         ("vislam:\n  iterations: true\n", r"takes a whole number, got True"),
         ("vislam:\n  pixel_sigma_px: 1e-3\n", r"to YAML 1\.1 this is text; write 0\.001"),
+        ("vislam:\n  pixel_sigma_px: 1e300\n", r"got '1e300' \(to YAML 1\.1 this is text; write 1\.0e\+300\)"),
+        ("vislam:\n  pixel_sigma_px: nan\n", r"got 'nan'$"),
         ("vislam:\n  pixel_sigma_px: .nan\n", r"must be a number, got nan"),
         ("vislam:\n  use_stale: 1\n", r"takes true or false, got 1"),
         ("vislam:\n  noise: litral\n", r"is one of consistent, literal, not 'litral'; did you mean 'literal'"),
@@ -128,7 +130,7 @@ def test_every_number_has_a_range_and_other_values_are_rejected(info: SettingInf
 def test_rejects_infinite_numbers_and_checks_ranges_in_code() -> None:
     with pytest.raises(ConfigError, match=r"msckf\.gravity_mps2 must be finite"):
         load_config(None, ["msckf.gravity_mps2=.inf"])
-    with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3, got 2"):
+    with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3 and at most 100, got 2"):
         MsckfSettings(clones=2)
     with pytest.raises(ConfigError, match=r"pixel_sigma_min_px, 3, must not be above"):
         MsckfSettings(pixel_sigma_min_px=3.0)

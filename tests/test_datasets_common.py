@@ -261,7 +261,7 @@ def test_a_place_that_may_not_be_read_is_an_error_in_one_line(
     with pytest.raises(DataError, match=f"{message} .*{target}: Permission denied"):
         open_dataset(path)
     if target != "folder":
-        monkeypatch.setattr(np, "load", denied)
+        monkeypatch.setattr("zipfile.ZipFile", denied)
         monkeypatch.setattr("zipfile.is_zipfile", lambda _: True)
         with pytest.raises(DataError, match="Permission denied; give a readable file"):
             read_npz(path)

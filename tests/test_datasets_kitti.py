@@ -209,7 +209,7 @@ def test_too_many_unreadable_images_are_an_error(prefetch: int, tmp_path: Path) 
     for k in (2, 4, 5):
         cut(folder / "image_1" / f"{k:06d}.png")
     assert len(frames_of(folder, DatasetSettings(max_bad_frames=3, prefetch_frames=prefetch))) == 5
-    with pytest.raises(DataError, match=r"000005\.png: the PNG is truncated.*\(3 unreadable frames, .* allows 2\)"):
+    with pytest.raises(DataError, match=r"000005\.png: the PNG is truncated.*\(3 unusable frames, .* allows 2\)"):
         frames_of(folder, DatasetSettings(max_bad_frames=2, prefetch_frames=prefetch))
 
 
@@ -221,13 +221,34 @@ def test_all_images_unreadable_is_an_error_at_once(tmp_path: Path) -> None:
         read_kitti(folder, DEFAULT)
 
 
+def test_unreadable_frames_have_no_limit_but_all_of_them(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Seven of eight frames are damaged: the run goes on with the one left; five are named, all are counted."""
+    folder = make_kitti(tmp_path / "seq", frames=8)
+    for k in range(7):
+        cut(folder / "image_1" / f"{k:06d}.png")
+    assert len(frames_of(folder)) == 1
+    lines = [record.getMessage() for record in caplog.records]
+    assert [line.split(":")[0] for line in lines[:5]] == [f"frame {k} is skipped" for k in range(5)]
+    assert lines[5:] == ["7 of 8 frames were skipped; the first 5 are named above"]
+    cut(folder / "image_1" / "000007.png")
+    with pytest.raises(
+        DataError, match=r"none of 8 frames can be used; the first: .*000000\.png: the PNG is truncated"
+    ):
+        frames_of(folder)
+
+
 @pytest.mark.parametrize("camera", ["image_1", "both"])
-def test_error_names_images_of_different_size(camera: str, tmp_path: Path) -> None:
-    folder = make_kitti(tmp_path / "seq")
+def test_a_frame_of_another_size_is_skipped_and_named(
+    camera: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = make_kitti(tmp_path / "seq", frames=4)
     for name in ("image_0", "image_1") if camera == "both" else (camera,):
         assert cv2.imwrite(str(folder / name / "000002.png"), np.zeros((24, 30), dtype=np.uint8))
-    with pytest.raises(DataError, match=r"000002\.png is 30 x 24 pixels but .*image_0.000000\.png specifies 32 x 24"):
-        frames_of(folder)
+    assert [frame.index for frame in frames_of(folder)] == [0, 1, 3]
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert "frame 2 is skipped" in line
+    assert "000002.png is 30 x 24 pixels but" in line
+    assert "000000.png specifies 32 x 24" in line
 
 
 def test_sixteen_bits_are_noted(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from vio.records import ImuSample, StereoFrame
 ROOT = Path(__file__).resolve().parent.parent
 README = "README.md"
 DOCS = (README, "CHANGELOG.md", *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))))
+NOTES = tuple(f"docs/notes/{path.name}" for path in sorted((ROOT / "docs" / "notes").glob("*.md")))
 
 # Options behind a command of the README that make it small; the command itself is run as written.
 _SMALLER = {
@@ -213,6 +214,15 @@ def test_readme_python_runs(
     assert float(printed.group(2)) > 5
 
 
+def test_live_use_runs(
+    readme_folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(readme_folder)
+    (block,) = [block for block in _blocks("docs/live.md") if block.language == "python"]
+    _execute("docs/live.md", block, {})
+    assert len(capsys.readouterr().out.splitlines()) > 5
+
+
 def test_readme_names_the_output_files_of_a_run(readme_folder: Path) -> None:
     text = _text(README).partition("## Output of a run")[2].partition("```")[0]
     named = set(re.findall(r"`(\w+\.\w+)`", text))
@@ -275,7 +285,7 @@ def test_inertial_check_runs(simulation: dict[str, object], caplog: pytest.LogCa
 
 def test_every_python_block_is_run_by_one_of_the_tests_above() -> None:
     counts = {name: sum(block.language == "python" for block in _blocks(name)) for name in DOCS}
-    tested = {README: 1, "docs/simulation.md": 2, "docs/inertial.md": 1, "docs/conventions.md": 8}
+    tested = {README: 1, "docs/live.md": 1, "docs/simulation.md": 2, "docs/inertial.md": 1, "docs/conventions.md": 8}
     assert {name: count for name, count in counts.items() if count} == tested
 
 
@@ -370,7 +380,7 @@ def test_yaml_of_the_docs_is_a_configuration(name: str) -> None:
             merge(Config(), yaml.safe_load(block.text), where=name)
 
 
-@pytest.mark.parametrize("name", DOCS)
+@pytest.mark.parametrize("name", [*DOCS, *NOTES])
 def test_links_are_valid(name: str) -> None:
     broken = []
     for target in re.findall(r"\]\(([^)\s]+)\)", _text(name)):
@@ -381,6 +391,11 @@ def test_links_are_valid(name: str) -> None:
         if not file.is_file() or (heading and heading not in _anchors(file)):
             broken.append(target)
     assert not broken
+
+
+def test_every_page_is_reached_from_the_readme() -> None:
+    linked = {target for name in (README, *DOCS) for target in re.findall(r"\]\(([^)\s#]+\.md)", _text(name))}
+    assert {Path(name).name for name in (*DOCS[2:], *NOTES)} <= {Path(target).name for target in linked}
 
 
 def _anchors(file: Path) -> set[str]:

@@ -13,16 +13,12 @@ import numpy as np
 import pytest
 
 from frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
-from frontend.detect import detect_corners
-from frontend.flow import lucas_kanade
-from frontend.patches import half_image
-from frontend.settings import FrontendSettings, GridSettings, KltSettings, LearnedSettings, MatchSettings
+from frontend.settings import FrontendSettings, GridSettings, LearnedSettings, MatchSettings
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
 from tools.bench_frontend import kornia_options
-from vio.datasets.images import load_gray
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.geometry.lie import FloatArray
-from vio.records import Image, StereoFrame
+from vio.records import StereoFrame
 
 REASON = "not installed: pip install 'stereo-vio[learned]'"
 MATCH = MatchSettings(max_keypoints=250)
@@ -57,20 +53,16 @@ def small_frame(index: int, pose: FloatArray) -> StereoFrame:
 
 
 def test_importing_the_packages_does_not_import_torch() -> None:
-    modules = "vio, frontend, frontend.klt, frontend.descriptors, frontend.learned, frontend.learned.torch_flow"
+    modules = "vio, frontend, frontend.klt, frontend.descriptors, frontend.learned"
     code = f"import sys, {modules}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 
 
 def test_error_without_torch_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    from frontend.learned.torch_flow import TorchFlow
-
     for module in ("torch", "kornia", "kornia.feature"):
         monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(MissingDependencyError, match=r"stereo-vio\[learned\]"):
         build(LearnedSettings())
-    with pytest.raises(MissingDependencyError, match=r"stereo-vio\[learned\]"):
-        TorchFlow()
 
 
 def test_rejects_kornia_without_the_networks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,14 +133,10 @@ def test_rejects_weights_of_another_network(torch: Any, tmp_path: Path) -> None:
 
 
 def test_rejects_absent_cuda(torch: Any) -> None:
-    from frontend.learned.torch_flow import TorchFlow
-
     if torch.cuda.is_available():
         pytest.skip("this machine has CUDA")
     with pytest.raises(ConfigError, match="no CUDA device here; set it to cpu"):
         build(LearnedSettings(device="cuda"))
-    with pytest.raises(ConfigError, match="no CUDA device"):
-        TorchFlow(device="cuda")
 
 
 def test_lightglue_rejects_unsupported_detectors(torch: Any) -> None:
@@ -284,60 +272,3 @@ def test_binary_descriptors_use_hamming_distance() -> None:
     a, b = rng.integers(0, 256, (5, 32), dtype=np.uint8), rng.integers(0, 256, (7, 32), dtype=np.uint8)
     expected = [[sum(bin(int(x) ^ int(y)).count("1") for x, y in zip(p, q, strict=True)) for q in b] for p in a]
     np.testing.assert_array_equal(distances(a, b), expected)
-
-
-# --- Lucas-Kanade in torch --------------------------------------------------------------------------------------------
-
-
-def compare(images: list[Image]) -> None:
-    """Time, left to right and right to left in one call, against OpenCV call by call: [left, next left, right]."""
-    from frontend.learned.torch_flow import TorchFlow
-
-    points = detect_corners(half_image(images[0]), np.zeros((0, 2)), 200, GridSettings(), KltSettings())
-    legs = [(0, 1), (0, 2), (2, 0)]
-    search: Any = {"window_px": 15, "levels": 3, "iterations": 30, "epsilon_px": 0.01}
-    engine = TorchFlow(**search)
-    n = len(points)
-    source, target = (np.repeat([leg[i] for leg in legs], n) for i in (0, 1))
-    found, seen = engine.track(engine.pyramid(images), source, target, np.tile(points, (3, 1)), np.tile(points, (3, 1)))
-    for k, (a, b) in enumerate(legs):
-        expected, status = lucas_kanade(images[a], images[b], points, points, **search)
-        back, _ = lucas_kanade(images[b], images[a], expected, points, **search)
-        # Only tracks that pass OpenCV's own forward-backward check are compared.
-        settled = status & (np.linalg.norm(back - points, axis=1) < 0.5)
-        rows = slice(k * n, (k + 1) * n)
-        assert settled.sum() > 0.3 * n
-        assert seen[rows][settled].mean() > 0.97
-        error = np.linalg.norm(found[rows] - expected, axis=1)[settled & seen[rows]]
-        assert np.median(error) < 0.005
-        assert np.percentile(error, 95) < 0.05
-
-
-def test_torch_flow_agrees_with_opencv_on_rendered_images(torch: Any) -> None:
-    a, b = (stereo_frame(k, pose) for k, pose in enumerate(flight(2)))
-    assert a.left is not None
-    assert b.left is not None
-    assert a.right is not None
-    compare([a.left, b.left, a.right])
-
-
-def test_torch_flow_agrees_with_opencv_on_a_real_drive(torch: Any, data_dir: Path) -> None:
-    folder = data_dir / "kitti_0039"
-    compare(
-        [load_gray(folder / path)[0] for path in ("image_0/000000.png", "image_0/000001.png", "image_1/000000.png")]
-    )
-
-
-def test_torch_flow_of_no_points_and_of_flat_images(torch: Any) -> None:
-    from frontend.learned.torch_flow import TorchFlow
-
-    engine = TorchFlow(levels=1)
-    flat = np.full((60, 80), 90, dtype=np.uint8)
-    pyramid = engine.pyramid([flat, flat])
-    none = np.zeros(0, dtype=np.int64)
-    found, seen = engine.track(pyramid, none, none, np.zeros((0, 2)), np.zeros((0, 2)))
-    assert found.shape == (0, 2)
-    assert seen.shape == (0,)
-    point = np.array([[40.0, 30.0]])
-    _, seen = engine.track(pyramid, np.array([0]), np.array([1]), point, point)
-    assert not seen.any()

@@ -37,6 +37,17 @@ def test_reports_when_features_are_missing_and_when_they_are_back() -> None:
     assert back == "frame 55: features again, after 2.3 s without"
 
 
+def test_a_restart_is_one_event_and_its_jump_is_not_reported_as_a_speed() -> None:
+    health = RunHealth()
+    assert health.frame(0, GOOD, _estimate(0)) == ()
+    (line,) = health.restarted(1, "msckf diverged at frame 1", _estimate(1, x=50.0))
+    assert line.startswith("frame 1: msckf diverged at frame 1; started again from the last good pose")
+    assert "standard deviation of its position is 0.02 m" in line
+    assert health.frame(1, GOOD, _estimate(1, x=50.0)) == ()
+    assert health.restarted(5, "again", _estimate(5, x=50.0)) == ()
+    assert len(health.restarted(40, "again", _estimate(40, x=50.0))) == 1
+
+
 def test_new_landmarks_alone_do_not_end_a_gap_without_features() -> None:
     fresh = replace(EMPTY, initialised=5)
     _, back = _lines([GOOD] * 10 + [EMPTY] * 30 + [fresh] * 10 + [GOOD])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.numerics import numeric_jacobian
-from vio.errors import ConfigError, EstimationError
+from vio.errors import ConfigError, DivergedError, EstimationError
 from vio.evaluation import nees, nees_bounds
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import (
@@ -22,6 +22,7 @@ from vio.filters.multiview import (
     track_information,
 )
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
+from vio.filters.restart import restarted
 from vio.filters.settings import MsckfSettings
 from vio.filters.tracks import TrackTable, latest_pixels
 from vio.filters.window import Window, posterior
@@ -467,6 +468,7 @@ class Flight:
         bias: FloatArray | None = None,
         spoil: object = None,
         limit: int = 60,
+        filter_class: type[Msckf] = Msckf,
     ) -> tuple[FloatArray, FloatArray, Msckf]:
         """Return pose errors xi (frames, 6) and covariances (frames, 6, 6), as `Estimate` defines them, and the filter.
 
@@ -474,7 +476,7 @@ class Flight:
         its position and yaw alone, as the world is then upright and the first tilt is an estimate like any other.
         """
         noise = np.random.default_rng(seed)
-        filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion=motion)  # type: ignore[arg-type]
+        filt = filter_class(CAMERA, T_CAM0_IMU, settings, motion=motion)  # type: ignore[arg-type]
         samples = self.imu(noise, settings, np.zeros(6) if bias is None else bias) if motion == "imu" else []
         errors, covariances = [], []
         fed = 0
@@ -816,6 +818,60 @@ def test_no_landmark_without_a_well_determined_depth(monkeypatch: pytest.MonkeyP
 def test_settings_out_of_range(change: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="msckf"):
         Msckf(CAMERA, T_CAM0_IMU, replace(MsckfSettings(), **change), motion=None)
+
+
+@pytest.mark.parametrize("motion", [None, "imu"])
+def test_restarts_from_the_last_good_pose_after_a_divergence(motion: str | None) -> None:
+    """Frame 12 leaves a state of NaN: the filter raises, restarts, and its error stays within its covariance."""
+    flight = Flight(frames=40)
+    events: list[str] = []
+
+    class Fragile(Msckf):
+        def update(self, observations: Observations) -> UpdateReport:
+            if observations.frame_index == 12 and not events:
+                assert self._window is not None
+                self._window.P[0, 0] = np.nan
+            try:
+                return super().update(observations)
+            except DivergedError as error:
+                events.append(str(error))
+                return self.restart(observations)
+
+    errors, covariances, filt = flight.run(MsckfSettings(start_tilt_sigma_deg=1.0), motion, filter_class=Fragile)
+    assert [event[:27] for event in events] == ["msckf diverged at frame 12:"]
+    assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.15
+    assert np.sqrt(covariances[12, 0, 0]) > 3 * np.sqrt(covariances[11, 0, 0])
+    chi_square = np.einsum("ki,kij,kj->k", errors[12:], np.linalg.inv(covariances[12:]), errors[12:])
+    assert np.mean(chi_square < 22.5) > 0.9  # the 99.9 % quantile for six degrees of freedom
+    assert filt.estimate().velocity_world is not None
+    assert np.isfinite(filt.landmarks().p_world).all()
+
+
+def test_a_restart_carries_the_pose_on_and_grows_its_covariance_with_the_time_in_between() -> None:
+    filt = Flight(frames=12).run(MsckfSettings(), None)[2]
+    good = filt._good
+    assert good is not None
+    sigmas = []
+    for elapsed_s in (0.05, 0.2):
+        nav, P = restarted(good, good.time_ns + round(1e9 * elapsed_s), TwistMotion(MsckfSettings()), MsckfSettings())
+        moved = nav.T_world_imu[:3, 3] - good.nav.T_world_imu[:3, 3]
+        expected = elapsed_s * (good.nav.T_world_imu[:3, :3] @ good.nav.velocity)
+        np.testing.assert_allclose(moved, expected, rtol=0.1, atol=1e-3)
+
+        def body_position(xi: FloatArray, T: FloatArray = nav.T_world_imu) -> FloatArray:
+            return (se3_exp(xi) @ T)[:3, 3]
+
+        J = numeric_jacobian(body_position, np.zeros(6))
+        sigmas.append(np.sqrt(np.diag(J @ (P[:6, :6] - good.covariance[:6, :6]) @ J.T)))
+        speed = np.linalg.norm(good.nav.velocity)
+        np.testing.assert_allclose(sigmas[-1], (speed + 1.0) * elapsed_s, rtol=1e-6)
+    assert (sigmas[1] > 3.9 * sigmas[0]).all()
+
+
+def test_without_a_good_update_there_is_nothing_to_restart_from() -> None:
+    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion=None)
+    with pytest.raises(EstimationError, match="no good state"):
+        filt.restart(Flight(frames=1).observe(0, 0.1, np.random.default_rng(0)))
 
 
 def test_samples_of_another_kind_are_refused() -> None:

@@ -20,7 +20,7 @@ from vio.config import Config
 from vio.errors import CalibrationError, ConfigError, DataError, VioError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_log
 from vio.odometry import Odometry
-from vio.records import Estimate, ImuSample, StereoFrame
+from vio.records import Estimate, FrontendOutput, ImuSample, StereoFrame
 from vio.rig import Rig
 from vio.sim.effects import CLEAN
 from vio.sim.imu import ImuNoise
@@ -237,7 +237,7 @@ def test_wrong_calls_are_refused_and_change_nothing(
         ([1, 1], np.ones((2, 4)), "an id occurs twice"),
         ([1], np.ones((2, 4)), "disagree in length"),
         ([1], [[1, 2, np.nan, 2]], "1 pixels are not finite"),
-        (["a"], np.ones((1, 4)), "observations at 5 ns"),
+        (["a"], np.ones((1, 4)), "ids are whole numbers"),
     ],
 )
 def test_wrong_observations_are_refused(ids: Any, z: Any, message: str) -> None:
@@ -252,18 +252,23 @@ def test_a_pixel_that_is_not_seen_may_be_anything() -> None:
     assert odometry.add_observations(5, [1], [[1, 2, np.nan, np.nan]], [False]) is not None
 
 
-def test_a_frame_that_the_front_end_refuses_is_skipped_and_said(rig: Rig, events: list[Any]) -> None:
-    """Left and right exchanged for five frames: the front end is sure at the third."""
-    frames = [e for e in events if isinstance(e, StereoFrame)]
-    odometry = Odometry(rig, IMAGES_ALONE)
-    given = []
-    for k, frame in enumerate(frames):
-        images = (frame.right, frame.left) if 3 <= k < 8 else (frame.left, frame.right)
-        given.append(odometry.add_stereo(frame.time_ns, *images) is not None)
-    assert given[:3] == [True] * 3
-    assert given[-1]
-    assert odometry.frames_refused == given.count(False) > 0
-    assert [line for line in odometry.warnings if "left and right images look swapped" in line]
+class Picky:
+    """A front end that refuses five frames."""
+
+    def process(self, frame: StereoFrame, prior: Any = None) -> FrontendOutput:
+        if 3 <= frame.index < 8:
+            raise DataError(f"frame {frame.index}: too dark")
+        seen = Flight().observe(frame.index, 0.3, np.random.default_rng(frame.index))
+        return FrontendOutput(replace(seen, time_ns=frame.time_ns), 0, 0, 0)
+
+
+def test_frames_that_the_front_end_refuses_are_skipped_and_said() -> None:
+    odometry = Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, frontend=Picky())
+    images = np.random.default_rng(0).integers(0, 255, (12, 480, 752), dtype=np.uint8)
+    given = [odometry.add_stereo(k * STEP_NS, images[k], images[k]) is not None for k in range(12)]
+    assert given == [not 3 <= k < 8 for k in range(12)]
+    assert odometry.frames_refused == 5
+    assert [line for line in odometry.warnings if "skipped" in line] == ["frame skipped: frame 3: too dark"]
 
 
 def test_colour_images_are_taken(rig: Rig, events: list[Any]) -> None:

@@ -276,6 +276,7 @@ def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
         "config.yaml",
         "trajectory.tum",
         "trajectory.kitti",
+        "estimates.npy",
         "dead_reckoning.tum",
         "landmarks.ply",
         "frames.csv",

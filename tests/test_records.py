@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vio.errors import DataError
 from vio.records import Trajectory, feature_tracks, observations
 
 
@@ -30,9 +31,9 @@ def test_no_observations_are_a_table_too() -> None:
 
 
 def test_observations_that_contradict_themselves_are_refused() -> None:
-    with pytest.raises(ValueError, match="disagree in length: 2 ids, 1 z"):
+    with pytest.raises(DataError, match="disagree in length: 2 ids, 1 z"):
         observations(0, 0, [1, 2], [[1, 2, 3, 4]])
-    with pytest.raises(ValueError, match="frame 5: an id occurs twice among 3 observations"):
+    with pytest.raises(DataError, match="frame 5: an id occurs twice among 3 observations"):
         observations(5, 0, [1, 2, 1], np.zeros((3, 4)))
 
 

@@ -14,7 +14,7 @@ from vio.records import MotionPrior, Observations, observations
 from vio.selectors import Selector, SelectorSettings, build_selector
 
 CAMERA = StereoCamera(430.0, 430.0, 320.0, 180.0, 0.11, 640, 360)
-BUDGETED = ("visibility", "grid", "random", "information")
+BUDGETED = ("visibility", "information")
 
 
 def _frame(index: int, ids: list[int], seed: int = 0) -> Observations:
@@ -38,7 +38,7 @@ def _build(
         budget=budget,
         sticky=sticky,
     )
-    return build_selector(settings, image_size=(640, 360), whole_record=lambda: record, camera=CAMERA)
+    return build_selector(settings, whole_record=lambda: record, camera=CAMERA)
 
 
 def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
@@ -54,7 +54,7 @@ def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
     return record
 
 
-@pytest.mark.parametrize("name", ["all", "visibility", "visibility_whole", "grid", "random", "information"])
+@pytest.mark.parametrize("name", ["all", "visibility", "visibility_whole", "information"])
 @settings(max_examples=40)
 @given(seen=st.lists(st.lists(st.integers(0, 40), unique=True, max_size=30), min_size=1, max_size=8))
 def test_contract(name: str, seen: list[list[int]]) -> None:
@@ -65,7 +65,7 @@ def test_contract(name: str, seen: list[list[int]]) -> None:
         a, b = first.select(frame), second.select(frame)
         assert a.chosen.shape == a.score.shape == (len(frame),)
         np.testing.assert_array_equal(a.chosen, b.chosen)
-        if name in ("visibility", "grid", "random"):
+        if name == "visibility":
             assert a.chosen.sum() == min(len(frame), max(int(np.ceil(0.3 * len(frame))), 2))
         if name == "information":
             assert a.chosen.sum() <= min(len(frame), max(int(np.ceil(0.3 * len(frame))), 2))
@@ -89,42 +89,15 @@ def test_whole_record_keeps_the_first_share_of_all_features() -> None:
         assert frame.ids[selector.select(frame).chosen].tolist() == [6]
 
 
-def test_grid_selects_from_every_cell() -> None:
-    """Forty long-lived features are in one corner, three young ones elsewhere: all cells keep a feature."""
-    z = np.zeros((43, 4))
-    z[:40, :2] = [10, 10]
-    z[40:, :2] = [[600, 10], [10, 350], [600, 350]]
-    selector = _build("grid", [], fraction=0.1, minimum=4)
-    for k in range(5):
-        selector.select(observations(k, k, np.arange(40), z[:40]))
-    chosen = selector.select(observations(5, 5, np.arange(43), z)).chosen
-    assert chosen[40:].all()
-    assert chosen.sum() == 5
-    crowd_only = _build("visibility", [], fraction=0.1, minimum=4)
-    for k in range(5):
-        crowd_only.select(observations(k, k, np.arange(40), z[:40]))
-    assert not crowd_only.select(observations(5, 5, np.arange(43), z)).chosen[40:].any()
-
-
 def test_whole_record_without_a_record_states_the_remedy() -> None:
     with pytest.raises(ConfigError, match="--save-observations"):
-        build_selector(SelectorSettings(name="visibility_whole"), image_size=None, whole_record=None)
-
-
-def test_grid_without_image_size_states_the_remedy() -> None:
-    with pytest.raises(ConfigError, match="image size"):
-        build_selector(SelectorSettings(name="grid"), image_size=None, whole_record=None)
+        build_selector(SelectorSettings(name="visibility_whole"), whole_record=None)
 
 
 @pytest.mark.parametrize("fraction", [0.0, -0.1, 1.5])
 def test_fraction_out_of_range(fraction: float) -> None:
     with pytest.raises(ConfigError, match="keep_fraction"):
-        build_selector(SelectorSettings(keep_fraction=fraction), image_size=None, whole_record=None)
-
-
-def test_cells_out_of_range() -> None:
-    with pytest.raises(ConfigError, match="grid_columns"):
-        build_selector(SelectorSettings(name="grid", grid_columns=0), image_size=(2, 2), whole_record=None)
+        build_selector(SelectorSettings(keep_fraction=fraction), whole_record=None)
 
 
 @pytest.mark.parametrize("sticky", [False, True])
@@ -159,18 +132,6 @@ def test_sticky_respects_a_smaller_budget(name: str) -> None:
     few = record[1].take(np.isin(record[1].ids, sorted(first)))
     chosen = selector.select(few).chosen
     assert chosen.sum() == int(np.ceil(0.5 * len(few)))
-
-
-def test_random_depends_on_seed_and_frame_alone() -> None:
-    record = _scene(3)
-    build = [
-        build_selector(SelectorSettings(name="random", budget=9, seed=seed), image_size=None, whole_record=None)
-        for seed in (0, 0, 1)
-    ]
-    a, b, c = ([s.select(frame).chosen for frame in record] for s in build)
-    np.testing.assert_array_equal(np.concatenate(a), np.concatenate(b))
-    assert (np.concatenate(a) != np.concatenate(c)).any()
-    np.testing.assert_array_equal(build[0].select(record[1]).chosen, a[1])
 
 
 def test_information_spreads_over_the_image_and_chooses_near_points() -> None:
@@ -224,7 +185,7 @@ def test_information_skips_stale_and_invalid_rows() -> None:
 
 def test_information_without_calibration_states_the_remedy() -> None:
     with pytest.raises(ConfigError, match="calibration"):
-        build_selector(SelectorSettings(name="information"), image_size=None, whole_record=None)
+        build_selector(SelectorSettings(name="information"), whole_record=None)
 
 
 @pytest.mark.parametrize(
@@ -233,4 +194,4 @@ def test_information_without_calibration_states_the_remedy() -> None:
 )
 def test_settings_out_of_range(change: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        build_selector(SelectorSettings(**change), image_size=None, whole_record=None)  # type: ignore[arg-type]
+        build_selector(SelectorSettings(**change), whole_record=None)  # type: ignore[arg-type]

@@ -81,6 +81,11 @@ def test_field_jacobian_equals_central_differences_of_distorted_projections() ->
     np.testing.assert_allclose(field_jacobian(CAMERA, z), numeric, atol=1e-4)
 
 
+def _right_columns(rows: RowField, states: FloatArray, z: FloatArray) -> FloatArray:
+    """The field (M,) of the right columns at pixels (M, 4)."""
+    return (z - StereoField(CAMERA, rows, states).corrected(Views(z, np.ones(z.shape))).z)[:, 2]
+
+
 def _turned_right(z: FloatArray, camera: StereoCamera, w: FloatArray) -> FloatArray:
     """Stereo pixels (N, 4) where the right camera is turned: its points p are seen as `exp(w) p`."""
     p = _rays(camera, z[:, 2:]) @ so3_exp(w).T
@@ -105,7 +110,7 @@ def test_rows_and_three_states_describe_a_turn_of_the_right_camera(axis: int) ->
 
     rows = _learned(z + moved)
     states = np.array([w[1], 0, w[1], 0, 0, 0])
-    field = field_jacobian(CAMERA, z)[:, 2] @ states + rows.columns(z)
+    field = _right_columns(rows, states, z)
     np.testing.assert_allclose(field, moved[:, 2], atol=1e-3)
 
 
@@ -115,7 +120,7 @@ def test_rows_and_three_states_describe_tangential_distortion_of_the_right_lens(
     moved = z.copy()
     moved[:, 2:] = _distorted(_rays(CAMERA, z[:, 2:]), 0.0, (p1, p2))
     states = np.array([0, 0, 3 * p2, 0, 0, 0])
-    field = field_jacobian(CAMERA, z)[:, 2] @ states + _learned(moved).columns(z)
+    field = _right_columns(_learned(moved), states, z)
     np.testing.assert_allclose(field, (moved - z)[:, 2], atol=1e-3)
     assert np.abs((moved - z)[:, 2]).max() > 0.1
 

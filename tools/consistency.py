@@ -7,7 +7,7 @@
 Monte-Carlo flights through exact points, with exact noise: pixels, IMU and its biases, velocities, and the place and
 yaw of the start are drawn from the very distributions that the filter assumes. Each flight is flown once by every
 variant, with the same noise. Writes FOLDER/table.md (also printed), FOLDER/figures.json and FOLDER/consistency.png.
-docs/consistency.md says what the variants are; its equation numbers are cited here.
+docs/notes/consistency.md says what the variants are; its equation numbers are cited here.
 """
 
 from __future__ import annotations

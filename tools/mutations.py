@@ -44,11 +44,56 @@ _SCORE = ("tests/test_evaluation.py",)
 _PIPELINE = ("tests/test_pipeline.py",)
 _REPRODUCE = ("tests/test_reproduce.py",)
 _RANSAC = ("tests/test_frontend_outliers.py",)
+_RESTART = ("tests/test_msckf.py",)
+_RIGHT_CAMERA = ("tests/test_right_camera.py",)
+_DELAY = ("tests/test_right_delay.py",)
+_FLICKER = ("tests/test_flicker.py",)
+_EXCHANGE = ("tests/test_exchange.py",)
+_MOVING_OBJECT = ("tests/test_moving_object.py",)
+_ODOMETRY = ("tests/test_odometry.py",)
+_UNFINISHED = ("tests/test_unfinished_runs.py",)
+_INPUTS = ("tests/test_filter_inputs.py",)
+_FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
 MUTATIONS = (
     # --- vio/geometry ---
+    Mutation(
+        "bags: right images in the place of left ones where the left came first",
+        "vio/datasets/bags/reader.py",
+        "((first, fields) if side == 1 else (fields, first))",
+        "((first, fields) if side == 0 else (fields, first))",
+        ("tests/test_datasets_bags.py",),
+    ),
+    Mutation(
+        "bags: static frames not inverted towards the child",
+        "vio/datasets/bags/index.py",
+        "append((child, se3_inverse(T)))",
+        "append((child, T))",
+        ("tests/test_datasets_bags.py",),
+    ),
+    Mutation(
+        "plain folders: clock offset added instead of subtracted",
+        "vio/datasets/companions.py",
+        "times_ns=record.times_ns - shift_ns",
+        "times_ns=record.times_ns + shift_ns",
+        ("tests/test_datasets_plain.py",),
+    ),
+    Mutation(
+        "ground truth of a raw camera not turned to the rectified one",
+        "vio/datasets/overlap.py",
+        "se3_inverse(se3_from_parts(R_rect_cam0, np.zeros(3)))",
+        "se3_from_parts(R_rect_cam0, np.zeros(3))",
+        ("tests/test_datasets_plain.py",),
+    ),
+    Mutation(
+        "inspection: Allan deviation of neighbouring averages without their distance",
+        "vio/inspection/inertial.py",
+        "second = total[2 * m :] - 2 * total[m:-m] + total[: -2 * m]",
+        "second = total[2 * m :] - total[: -2 * m]",
+        ("tests/test_inspection.py",),
+    ),
     Mutation(
         "double sphere: the first sphere's distance left out of the depth",
         "vio/geometry/sphere_models.py",
@@ -219,10 +264,17 @@ MUTATIONS = (
         _WINDOW,
     ),
     Mutation(
+        "restart: the position's variance does not grow with the time in between",
+        "vio/filters/restart.py",
+        "np.diag(np.repeat([position, rotation], 3) ** 2)",
+        "np.diag(np.repeat([0.0, rotation], 3) ** 2)",
+        _RESTART,
+    ),
+    Mutation(
         "tracks: eliminated points still count",
-        "vio/filters/multiview.py",
-        "b -= flat.T @",
-        "b -= 0 * flat.T @",
+        "vio/filters/track_loops.py",
+        "b[k] += gradient[f, k] - v0 * y[0]",
+        "b[k] += gradient[f, k] + v0 * y[0]",
         _WINDOW,
     ),
     Mutation(
@@ -248,16 +300,16 @@ MUTATIONS = (
     ),
     Mutation(
         "many views: no prior on the disparity of a point",
-        "vio/filters/multiview.py",
-        "2, 2] += _PRIOR",
-        "2, 2] += 0 * _PRIOR",
+        "vio/filters/track_loops.py",
+        "C_i[2, 2] += prior",
+        "C_i[2, 2] += 0 * prior",
         _WINDOW,
     ),
     Mutation(
         "many views: the prior on a disparity hangs on another camera",
-        "vio/filters/multiview.py",
-        "C_i[np.arange(F), q.anchor,",
-        "C_i[np.arange(F), q.anchor - 1,",
+        "vio/filters/track_loops.py",
+        "if n == anchor[f]:",
+        "if n == anchor[f] - 1:",
         _WINDOW,
     ),
     Mutation(
@@ -325,9 +377,9 @@ MUTATIONS = (
     ),
     Mutation(
         "IMU: a frame does not wait for the sample after it",
-        "vio/pipeline.py",
-        "latest_ns >= held.time_ns",
-        "latest_ns >= 0",
+        "vio/event_order.py",
+        "self._newest_ns >= frame.time_ns",
+        "self._newest_ns >= 0",
         _IMU_GAPS,
     ),
     Mutation(
@@ -536,8 +588,8 @@ MUTATIONS = (
     Mutation(
         "window: new anchor with the sign of the old one",
         "vio/filters/window.py",
-        "A[rows, newest : newest + 3] += p_cross[k]",
-        "A[rows, newest : newest + 3] -= p_cross[k]",
+        "p_cross @ (P[turn] - P[before])",
+        "p_cross @ (P[before] - P[turn])",
         _WINDOW,
     ),
     Mutation(
@@ -571,8 +623,8 @@ MUTATIONS = (
     Mutation(
         "window: posterior without the prior",
         "vio/filters/window.py",
-        "inner = np.eye(len(P)) + L.T",
-        "inner = 1e-6 * np.eye(len(P)) + L.T",
+        'np.einsum("ii->i", inner)[:] += 1.0',
+        'np.einsum("ii->i", inner)[:] += 0.01',
         _WINDOW,
     ),
     Mutation(
@@ -761,22 +813,22 @@ MUTATIONS = (
     Mutation(
         "stereo field: linearised at the pixels that were seen",
         "vio/filters/window_tracks.py",
-        "self._views(rows, at.r.shape[1], field).z - at.r)",
-        "self._views(rows, at.r.shape[1], field).z)",
+        "field_jacobian(self._camera, z - at.r)",
+        "field_jacobian(self._camera, z)",
         _STEREO_FIELD,
     ),
     Mutation(
         "stereo field: sign of a term that follows from the rows",
-        "vio/filters/stereo_calibration.py",
-        "(-c[1] * y + (c[5] - c[4]) * x * y - c[3] * y * y)",
-        "(-c[1] * y + (c[4] - c[5]) * x * y - c[3] * y * y)",
+        "vio/filters/track_loops.py",
+        "(rows[5] - rows[4]) * xr * y",
+        "(rows[4] - rows[5]) * xr * y",
         _STEREO_FIELD,
     ),
     Mutation(
         "stereo field: eliminated points still count",
-        "vio/filters/stereo_calibration.py",
-        "H.reshape(-1, S) - flat_G.T @ flat_CG",
-        "H.reshape(-1, S)",
+        "vio/filters/track_loops.py",
+        "A[s, t] -= own[0, s] * X[t, 0]",
+        "A[s, t] -= 0 * own[0, s] * X[t, 0]",
         _STEREO_FIELD,
     ),
     Mutation(
@@ -957,10 +1009,66 @@ MUTATIONS = (
     ),
     # --- frontend ---
     Mutation(
+        "right camera: an image that was repeated with noise counts as new",
+        "frontend/right_camera.py",
+        "return change < _MOST_NOISE and other_change >",
+        "return change < 0 and other_change >",
+        _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "right camera: features are dropped while it cannot be used",
+        "frontend/klt.py",
+        "return tracks, *nothing",
+        "return take(tracks, tracks.has_right), *nothing",
+        _RIGHT_CAMERA,
+    ),
+    Mutation(
+        "right delay: depths stay those of the exposure",
+        "frontend/right_delay.py",
+        "moved = transform_points(se3_exp(delay * se3_log(T_curr_prev)), then.point)",
+        "moved = then.point",
+        _DELAY,
+    ),
+    Mutation(
+        "right delay: a wrong rectification counts as a delay",
+        "frontend/right_delay.py",
+        "weight * rows)",
+        "weight * (rows + 0.5 * flow[:, 1]))",
+        _DELAY,
+    ),
+    Mutation(
+        "flicker: bands are seen and left in the images",
+        "frontend/flicker.py",
+        "image.astype(np.float32) - off[:, None]",
+        "image.astype(np.float32) - 0 * off[:, None]",
+        _FLICKER,
+    ),
+    Mutation(
+        "exchange: frames that do not fit are put back, too",
+        "frontend/exchange.py",
+        'return "exchanged" if found.negative >= _MANY * found.points else "refused"',
+        'return "exchanged"',
+        _EXCHANGE,
+    ),
+    Mutation(
+        "moving object: the larger group is the scene whatever is predicted",
+        "frontend/moving_object.py",
+        "if first_agrees or not (second_agrees or in_event):",
+        "if not in_event:",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
+        "moving object: a wrong prediction overrides the consensus",
+        "frontend/moving_object.py",
+        "second_agrees = large and _agrees(",
+        "second_agrees = True or _agrees(",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
         "RANSAC: step on the wrong side of the motion",
         "frontend/outliers.py",
-        "T = se3_exp(xi) @ T",
-        "T = T @ se3_exp(xi)",
+        "xi[i] = min(max(xi[i], -5.0), 5.0)",
+        "xi[i] = min(max(-xi[i], -5.0), 5.0)",
         _RANSAC,
     ),
     Mutation(
@@ -1029,22 +1137,22 @@ MUTATIONS = (
     Mutation(
         "alignment of patches: step not undone",
         "frontend/align.py",
-        "np.stack([d, -b, -c, a], axis=1)",
-        "np.stack([a, b, c, d], axis=1)",
+        "warp[i, 2] -= x * du + y * dv",
+        "warp[i, 2] += x * du + y * dv",
         _PATCHES,
     ),
     Mutation(
         "alignment of patches: gain ignored",
         "frontend/align.py",
-        "fit /= np.maximum(fit[:, 2:3], 0.1)",
-        "fit /= 1.0",
+        "gain = max(fit[2], 0.1)",
+        "gain = 1.0",
         _PATCHES,
     ),
     Mutation(
         "stereo search: sub-pixel offset of the wrong sign",
         "frontend/stereo_match.py",
-        "(before - after) / (2 *",
-        "(after - before) / (2 *",
+        "(before - after) / (2.0 *",
+        "(after - before) / (2.0 *",
         _PATCHES,
     ),
     Mutation(
@@ -1060,5 +1168,113 @@ MUTATIONS = (
         "_FIELD_MEMORY * self._normal + prior",
         "self._normal + prior",
         _PATCHES,
+    ),
+    # --- vio/compiled.py ---
+    Mutation(
+        "compiled loops: no folder for the cache ends the run",
+        "vio/compiled.py",
+        "except RuntimeError:",
+        "except KeyError:",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "compiled loops: a pixel outside the image is read from beyond its row",
+        "frontend/align.py",
+        "width - 1.001 - reach_u",
+        "width + 1.001 - reach_u",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "compiled loops: twist without the coupling of rotation and translation",
+        "vio/compiled.py",
+        "T[1, 3] += py + b * cy + c * dy",
+        "T[1, 3] += py",
+        ("tests/test_compiled.py",),
+    ),
+    # --- live use, unfinished runs ---
+    Mutation(
+        "events: a frame waits for an IMU that is silent",
+        "vio/event_order.py",
+        "return self._frames[-1].time_ns - frame.time_ns >= LONGEST_WAIT_NS",
+        "return False",
+        _IMU_GAPS,
+    ),
+    Mutation(
+        "live use: the caller's image buffer is kept",
+        "vio/odometry.py",
+        'return np.array(array, dtype=np.uint8, order="C")',
+        "return np.asarray(array)",
+        _ODOMETRY,
+    ),
+    Mutation(
+        "poses between frames: gravity left out",
+        "vio/pose_prediction.py",
+        "force = R @ (sample.accel - self._bias[1]) + self._gravity",
+        "force = R @ (sample.accel - self._bias[1])",
+        _ODOMETRY,
+    ),
+    Mutation(
+        "resume: samples of the last second taken twice",
+        "vio/pipeline.py",
+        "return known is None or event.time_ns > known",
+        "return known is None or event.time_ns >= 0",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "resume: rows written after the checkpoint stay",
+        "vio/tables.py",
+        "self._file.truncate(start + keep * self.dtype.itemsize)",
+        "pass",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "checkpoint: any function may be called",
+        "vio/checkpoint.py",
+        "if not ours and (module, name) not in _OTHERS:",
+        "if False:",
+        _UNFINISHED,
+    ),
+    Mutation(
+        "run folder: points put away are lost",
+        "vio/run_recorder.py",
+        "if not len(stored):",
+        "if True:",
+        _UNFINISHED,
+    ),
+    # --- input ---
+    Mutation(
+        "input: a doubled sample accepted",
+        "vio/filters/inputs.py",
+        "now <= self._sample_ns",
+        "now < self._sample_ns",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: a doubled frame accepted",
+        "vio/filters/inputs.py",
+        "now <= before",
+        "now < before",
+        _INPUTS,
+    ),
+    Mutation(
+        "input: NaN among the right pixels accepted",
+        "vio/filters/inputs.py",
+        "finite[seen.has_right].all()",
+        "finite[~seen.has_right].all()",
+        _INPUTS,
+    ),
+    Mutation(
+        "images: the most bits that hold the levels, not the fewest",
+        "vio/datasets/images.py",
+        "_SENSOR_BITS = (10, 12, 14)",
+        "_SENSOR_BITS = (14, 12, 10)",
+        _FILES,
+    ),
+    Mutation(
+        "archives: the header believed",
+        "vio/datasets/common.py",
+        "math.prod(shape) * dtype.itemsize > info.file_size",
+        "math.prod(shape) * dtype.itemsize < 0",
+        _FILES,
     ),
 )

@@ -34,7 +34,7 @@ def _sibling(path: Path, kind: str) -> Path:
     return path.with_name(f".{path.name}.{uuid.uuid4().hex[:12]}.{kind}")
 
 
-def _locked(path: Path) -> int | None:
+def lock_path(path: Path) -> int | None:
     """Lock a file or folder for this process; return the descriptor that holds the lock, None if another holds it."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
@@ -64,7 +64,7 @@ def _remove_leftovers(target: Path) -> None:
         if path.suffix == ".old" and not target.exists():  # killed between two renames: the only copy there is
             logger.warning("%s is the earlier content of %s, kept when a process was killed", path, target)
             continue
-        descriptor = None if path.is_symlink() else _locked(path)
+        descriptor = None if path.is_symlink() else lock_path(path)
         if descriptor is None:
             continue
         if path.is_dir():
@@ -80,7 +80,7 @@ def _new_partial_folder(target: Path) -> tuple[Path, int | None]:
     while True:
         partial = _sibling(target, "partial")
         partial.mkdir(parents=True)
-        lock = _locked(partial)
+        lock = lock_path(partial)
         if partial.is_dir():  # another process may have taken it for a leftover before it was locked
             return partial, lock
 
@@ -216,6 +216,32 @@ def check_writable(path: str | os.PathLike[str]) -> None:
                     parent.rmdir()
     except OSError as error:
         raise _unwritable(target, error) from error
+
+
+@contextlib.contextmanager
+def locked_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Create a folder if it is missing and lock it for this process; one that is empty at the end is removed again.
+
+    Raises:
+        VioError: another process holds the lock.
+        DataError: the folder cannot be created.
+    """
+    target = Path(path).absolute()
+    missing = [folder for folder in (target, *target.parents) if not folder.exists()]
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _unwritable(target, error) from error
+    lock = lock_path(target)
+    if lock is None:
+        raise VioError(f"{target}: another process is writing into this folder; choose another path, or wait for it")
+    try:
+        yield target
+    finally:
+        os.close(lock)
+        for folder in missing:
+            with contextlib.suppress(OSError):  # not empty
+                folder.rmdir()
 
 
 def _swap_in(partial: Path, target: Path) -> None:

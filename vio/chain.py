@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, field
 
 from vio.config import BackendName, Config
-from vio.errors import DataError
+from vio.errors import DataError, DivergedError
 from vio.filters.late_imu import LateImuMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
@@ -18,6 +18,7 @@ from vio.records import (
     FrontendOutput,
     MotionSample,
     MotionSource,
+    Observations,
     Selection,
     StereoFrame,
     UpdateReport,
@@ -125,20 +126,31 @@ class Chain:
             self.watch.refused(frame.index, str(error))
             return None
         timer.end("frontend")
-        self.watch.observations(output.observations)
+        self.watch.observations(output.observations, output.warnings)
         timer.end("watch")
         seen = output.observations
         if self.backend.stereo_only:
             seen = seen.take(seen.has_right)
         selection = self.selector.select(seen, expected.motion if expected else None)
         timer.end("select")
-        report = self.backend.update(seen.take(selection.chosen))
+        report = self._update(seen.take(selection.chosen))
         estimate = self.backend.estimate()
         timer.end("update")
         self.watch.update(frame.index, report, estimate)
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
         self._propagate_ms = 0.0
         return FrameResult(output, report, estimate, _frame_log(frame, timer.ms, output, selection, report))
+
+    def _update(self, seen: Observations) -> UpdateReport:
+        """Update with a frame; a back end that can start again does so where it diverges."""
+        try:
+            return self.backend.update(seen)
+        except DivergedError as error:
+            if not isinstance(self.backend, Msckf):
+                raise
+            report = self.backend.restart(seen)
+            self.watch.restarted(seen.frame_index, str(error), self.backend.estimate())
+            return report
 
 
 def build_backend(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import math
 import types
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,8 +22,10 @@ from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError
 from vio.filters.settings import MsckfSettings, VislamSettings
 from vio.frontend_package import frontend_module
+from vio.input_files import read_input
 from vio.selectors import SelectorSettings
 from vio.setting import Range, Section, setting
+from vio.yaml_text import MOST_BYTES, read_yaml
 
 if TYPE_CHECKING:
     from frontend.settings import FrontendSettings
@@ -31,6 +34,33 @@ else:
 
 BackendName = Literal["vislam", "msckf"]
 MotionName = Literal["auto", "imu", "velocity", "none"]
+# The settings that a user may want to change first; `vio config --show` hides the others.
+BASIC = (
+    "motion",
+    "backend",
+    "lag_frames",
+    "dataset.colour",
+    "frontend.name",
+    "frontend.features",
+    "frontend.grid.target_features",
+    "frontend.disparity.max_disparity",
+    "frontend.klt.mask",
+    "frontend.klt.equalise",
+    "selector.name",
+    "selector.budget",
+    "msckf.clones",
+    "msckf.max_landmarks",
+    "msckf.max_features",
+    "msckf.gravity_mps2",
+    "msckf.gyro_noise_density",
+    "msckf.accel_noise_density",
+    "msckf.gyro_bias_walk",
+    "msckf.accel_bias_walk",
+    "msckf.calibrate",
+    "msckf.calibrate_stereo",
+)
+_MOST_NAMED = 8  # settings in the message on an unknown one
+_MOST_SHOWN = 200  # characters of a wrong value in a message
 
 _Section = TypeVar("_Section")
 
@@ -51,6 +81,7 @@ class Config(Section):
         0,
         "output each pose this many frames late, smoothed by the window (msckf, up to its clones); 0: causal",
         at_least=0,
+        at_most=100,
     )
     dataset: DatasetSettings = field(default_factory=DatasetSettings)
     frontend: FrontendSettings = field(default_factory=FrontendSettings)
@@ -69,7 +100,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     if path is not None:
         config = merge(config, _read_yaml(path), where=str(path))
     for override in overrides:
-        config = merge_override(config, override, example="selector.name=grid")
+        config = merge_override(config, override, example="selector.budget=40")
     return config
 
 
@@ -83,12 +114,12 @@ def merge_override(section: _Section, override: str, *, example: str) -> _Sectio
     if not equals or not key.strip():
         raise ConfigError(f"--set takes key=value, got '{override}'; for example --set {example}")
     try:
-        nested: Any = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {override}: the value is not valid YAML ({_first_line(error)})") from error
+        nested: Any = read_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"--set {_short(override)}: the value is not valid YAML ({error})") from error
     for part in reversed(key.strip().split(".")):
         nested = {part: nested}
-    return merge(section, nested, where=f"--set {override}")
+    return merge(section, nested, where=f"--set {_short(override)}")
 
 
 def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: str = "", root: Any = None) -> _Section:
@@ -109,9 +140,9 @@ def merge(section: _Section, values: Mapping[str, Any], *, where: str, prefix: s
     names = [f.name for f in fields(section)]  # type: ignore[arg-type]
     changes: dict[str, Any] = {}
     for key, value in values.items():
-        path = f"{prefix}{key}"
+        path = f"{prefix}{_short(str(key))}"
         if key not in names:
-            raise ConfigError(f"{where}: unknown setting '{path}'{_suggestion(str(key), names, prefix, root)}")
+            raise ConfigError(f"{where}: unknown setting '{path}'{_suggestion(_short(str(key)), names, prefix, root)}")
         current = getattr(section, key)
         if is_dataclass(current):
             if not isinstance(value, Mapping):
@@ -145,6 +176,7 @@ class SettingInfo:
     """One row of `vio config --show`."""
 
     key: str
+    group: str  # what the section of the setting is about
     default: Any
     unit: str
     choices: tuple[str, ...]
@@ -155,6 +187,7 @@ class SettingInfo:
 def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
     """Yield every setting with its default, unit and meaning."""
     hints = get_type_hints(type(section))
+    group = (type(section).__doc__ or "").partition("\n")[0].rstrip(".")
     for f in fields(section):
         value = getattr(section, f.name)
         if is_dataclass(value):
@@ -163,33 +196,21 @@ def describe(section: Any, prefix: str = "") -> Iterator[SettingInfo]:
             hint = hints[f.name]
             choices = tuple(map(str, get_args(hint))) if get_origin(hint) is Literal else ()
             unit, doc = f.metadata.get("unit", ""), f.metadata.get("doc", "")
-            yield SettingInfo(f"{prefix}{f.name}", value, unit, choices, str(f.metadata.get("range", Range())), doc)
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """YAML loader that rejects duplicate keys, of which YAML itself would use the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Reject a duplicate key."""
-        seen: set[str] = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is given twice", key.start_mark)
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
+            allowed = str(f.metadata.get("range", Range()))
+            yield SettingInfo(f"{prefix}{f.name}", group, value, unit, choices, allowed, doc)
 
 
 def _read_yaml(path: Path) -> Mapping[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_input(path, MOST_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration ({error.strerror}); check the path") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: the configuration is not UTF-8 text") from error
     try:
-        values = yaml.load(text, Loader=_StrictLoader)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{path}: not valid YAML ({_first_line(error)})") from error
+        values = read_yaml(text)
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid YAML ({error})") from error
     if values is None:
         return {}
     if not isinstance(values, dict):
@@ -209,27 +230,29 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
         choices = get_args(hint)
         if value in choices and type(value) in {type(c) for c in choices}:
             return value
-        hint_text = (
-            f"; did you mean '{near[0]}'?" if (near := difflib.get_close_matches(str(value), choices, 1)) else ""
-        )
-        raise ConfigError(f"{where}: {path} is one of {', '.join(choices)}, not {value!r}{hint_text}")
+        near = difflib.get_close_matches(_short(str(value)), choices, 1)
+        hint_text = f"; did you mean '{near[0]}'?" if near else ""
+        raise ConfigError(f"{where}: {path} is one of {', '.join(choices)}, not {_short(repr(value))}{hint_text}")
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        return float(value) if abs(value) < 2**1000 else math.inf  # which no range allows
     if hint is Path and isinstance(value, str):
         return Path(value)
     if isinstance(value, hint) and not (isinstance(value, bool) and hint is not bool):
         if hint is float and value != value:
             raise ConfigError(f"{where}: {path} must be a number, got nan")
         return value
-    raise ConfigError(f"{where}: {path} takes {_type_name(hint)}, got {value!r}{_number_hint(value, hint)}")
+    raise ConfigError(f"{where}: {path} takes {_type_name(hint)}, got {_short(repr(value))}{_number_hint(value, hint)}")
 
 
 def _number_hint(value: Any, hint: Any) -> str:
     if hint is float and isinstance(value, str):
         try:
-            return f" (to YAML 1.1 this is text; write {float(value)!r} with a decimal point)"
+            number = float(value)
         except ValueError:
             return ""
+        if math.isfinite(number):
+            plain = yaml.safe_dump(number).split()[0]  # 1.0e+300, where Python writes 1e+300
+            return f" (to YAML 1.1 this is text; write {plain})"
     return ""
 
 
@@ -250,7 +273,8 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
     for found in (siblings, similar, same_name):
         if found:
             return f"; did you mean '{found[0]}'?"
-    return f"; valid here: {', '.join(prefix + name for name in names)}"
+    more = f" and {len(names) - _MOST_NAMED} more, see vio config --all" if len(names) > _MOST_NAMED else ""
+    return f"; valid here: {', '.join(prefix + name for name in names[:_MOST_NAMED])}{more}"
 
 
 def _first(section: Any) -> str:
@@ -263,5 +287,7 @@ def _plain(value: Any) -> Any:
     return list(value) if isinstance(value, tuple) else value
 
 
-def _first_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+def _short(value: Any) -> str:
+    """Return a value for a message, cut where it is long."""
+    text = value if isinstance(value, str) else repr(value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}…"

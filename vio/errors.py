@@ -23,9 +23,21 @@ class EstimationError(VioError):
     """The estimator cannot continue (divergence, failed initialisation)."""
 
 
+class DivergedError(EstimationError):
+    """The filter's state is no longer usable; a filter that can restart goes on from its last good state."""
+
+
 class EvaluationError(VioError):
     """Two trajectories cannot be compared."""
 
 
 class MissingDependencyError(VioError):
     """An optional package is needed; the message names the extra to install."""
+
+
+class StoppedError(VioError):
+    """A run ended before its recording, in order; its results so far are written."""
+
+    def __init__(self, message: str, status: int) -> None:
+        super().__init__(message)
+        self.status = status  # exit status of a command

@@ -1,6 +1,6 @@
 """The information of features on the camera's motion, and a greedy choice of the most informative subset.
 
-Notation as in docs/selection.md. A motion of the camera is `T_curr_prev = exp(xi) T_hat` with `xi = [rho; phi]`;
+Notation as in docs/notes/selection.md. A motion of the camera is `T_curr_prev = exp(xi) T_hat` with `xi = [rho; phi]`;
 a feature at `p` in the current camera frame moves with it as `p <- exp(xi) p`. The information of N features on K
 motions is stored as factors `L` (N, K, 3, 6) with `L' L` the information matrix of xi.
 References: Carlone & Karaman, Attention and anticipation in fast visual-inertial navigation (2019); Zhao & Vela, Good

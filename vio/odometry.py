@@ -261,6 +261,16 @@ class Odometry:
                 raise DataError("there is no map before the first frame")
             return self._chain.backend.landmarks()
 
+    def take_landmarks(self) -> Landmarks:
+        """Return the points of the map that will not change any more, and forget them, so that memory stays flat.
+
+        `landmarks` then returns the others.
+        """
+        with self._lock:
+            if self._chain is None:
+                return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+            return self._chain.backend.take_landmarks()
+
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where the window no longer holds it."""
         with self._lock:
@@ -359,8 +369,7 @@ class Odometry:
             name = "klt" if config.frontend.name == "auto" else config.frontend.name
             frontend = frontend_module().build_frontend(name, camera, config.frontend)
         if selector is None:
-            size = None if camera.width is None or camera.height is None else (camera.width, camera.height)
-            selector = build_selector(config.selector, image_size=size, whole_record=None, camera=camera)
+            selector = build_selector(config.selector, whole_record=None, camera=camera)
         if backend is None:
             backend = build_backend(camera, self.T_cam0_body, config, self.motion)
         return Chain(

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NoReturn
 
 import numpy as np
 
 from vio.chain import BACKENDS, STAGES, FrameLog, FrameResult, build_backend
 from vio.config import BackendName, Config
-from vio.errors import ConfigError, DataError
+from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
@@ -31,7 +33,9 @@ from vio.records import (
     Trajectory,
     UpdateReport,
 )
+from vio.run_recorder import GrowingFolder, RunRecorder
 from vio.selectors import build_selector
+from vio.tables import Records
 from vio.threads import one_blas_thread
 
 log = logging.getLogger(__name__)
@@ -50,19 +54,23 @@ class RunResult:
     motion: MotionSource | None  # what carried the pose between frames
     body: BodyFrame  # what the trajectory describes
     T_cam0_body: FloatArray  # (4, 4)
-    estimates: tuple[Estimate, ...]
+    estimates: Records[Estimate]
     dead_reckoning: Trajectory | None
     landmarks: Landmarks
-    frames: tuple[FrameLog, ...]
-    observations: tuple[Observations, ...] | None  # kept on request
-    motion_samples: tuple[MotionSample, ...] | None  # kept on request
+    frames: Records[FrameLog]
+    observations: Sequence[Observations] | None  # kept on request
+    motion_samples: Sequence[MotionSample] | None  # kept on request
     warnings: tuple[str, ...]  # what went wrong in the run, or with its IMU
     wall_s: float
+    stopped: str | None = None  # why the run ended before the recording; None: it did not
 
     @property
     def trajectory(self) -> Trajectory:
         """The estimated poses of the body, one per frame."""
-        return _trajectory([e.T_world_imu for e in self.estimates], self.frames, self.body)
+        T_world_body, times_ns, indices = (
+            np.array(self.estimates.column(name)) for name in ("T_world_imu", "time_ns", "index")
+        )
+        return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=self.body, frame_indices=indices)
 
 
 class NullViewer:
@@ -87,6 +95,9 @@ def run(
     frontend: Frontend | None = None,
     selector: Selector | None = None,
     backend: Backend | None = None,
+    folder: GrowingFolder | None = None,
+    resume: bool = False,
+    should_stop: Callable[[], str | None] = lambda: None,
 ) -> RunResult:
     """Process a recording from its frame `start` to before frame `stop`, with BLAS pinned to one thread meanwhile.
 
@@ -100,65 +111,163 @@ def run(
         frontend: used in place of the configured front end.
         selector: used in place of the configured selector.
         backend: used in place of the configured back end.
+        folder: where to write while the run goes on; None: everything stays in memory.
+        resume: go on from the checkpoint in `folder`.
+        should_stop: asked after each event; a reason ends the run in order, and the result names it.
 
     Raises:
-        VioError: the configuration, the data or the estimation is at fault; the message says which.
+        VioError: the configuration, the data or the estimation is at fault; the message says which. With a folder, a
+            fault after the first frame ends the run in order instead, and the result names it.
     """
     recording = dataset.recording
     _check(recording, config, start, stop)
     motion = resolve_motion(recording, config)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
     T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
-
+    began = time.perf_counter()
+    recorder = RunRecorder(body, lag_frames=config.lag_frames, keep_observations=keep_observations, folder=folder)
     features = _feature_source(dataset, config)
-    odometry = Odometry(
-        recording.camera,
-        replace(config, motion=motion or "none"),
-        T_cam0_imu=T_cam0_body,
-        frontend=frontend or _build_frontend(features, config),
-        selector=selector or _build_selector(features, config),
-        backend=backend or build_backend(recording.camera, T_cam0_body, config, motion),
-    )
-    viewer = viewer or NullViewer()
-    dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
-    recorder = _RunRecorder(odometry, config.lag_frames, keep_observations=keep_observations)
-    began, reading = time.perf_counter(), _ReadTimer()
-    try:
-        for event in reading.timed(dataset.events(start, stop, images=_needs_images(dataset, config))):
-            if dead_reckoning is not None:
-                dead_reckoning.add(event)
-            if not isinstance(event, StereoFrame):
-                recorder.sample(event)
-            for result in odometry.add_event(event):
-                recorder.frame(result, reading.take_ms())
-                viewer.frame(result.output, result.estimate, result.report)
-            if _LEAST_REFUSED <= odometry.frames_refused > len(recorder.frames):
+    if resume:
+        state = recorder.restore(features)
+        viewer = _skipped(viewer, len(recorder))
+    else:
+        odometry = Odometry(
+            recording.camera,
+            replace(config, motion=motion or "none"),
+            T_cam0_imu=T_cam0_body,
+            frontend=frontend or _build_frontend(features, config),
+            selector=selector or _build_selector(features, config),
+            backend=backend or build_backend(recording.camera, T_cam0_body, config, motion),
+        )
+        dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
+        state = _RunState(odometry, dead_reckoning, start)
+    stopped = None
+    with contextlib.closing(recorder), contextlib.closing(viewer or NullViewer()) as shown:
+        loop = _Loop(state, recorder, shown)
+        try:
+            events = dataset.events(state.next_frame, stop, images=_needs_images(dataset, config))
+            stopped = loop.run(events, features, should_stop)
+        except VioError as error:
+            if folder is None or not len(recorder):
+                raise
+            stopped = str(error)
+        odometry = state.odometry
+        if not len(recorder):
+            _nothing_done(recording, odometry, stopped)
+        reckoned = state.dead_reckoning is not None
+        return RunResult(
+            recording=recording,
+            config=config,
+            motion=motion,
+            body=body,
+            T_cam0_body=T_cam0_body,
+            estimates=recorder.estimates,
+            dead_reckoning=_trajectory(recorder.dead_reckoned(), recorder, body) if reckoned else None,
+            landmarks=recorder.landmarks(odometry.landmarks()),
+            frames=recorder.frames,
+            observations=recorder.observations,
+            motion_samples=recorder.samples,
+            warnings=odometry.warnings,
+            wall_s=time.perf_counter() - began,
+            stopped=stopped,
+        )
+
+
+def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:
+    """Say why a run has no frame.
+
+    Raises:
+        StoppedError: it was asked to stop.
+        DataError: its frames could not be read, or were refused.
+    """
+    if stopped is not None:
+        raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
+    if odometry.frames_refused:
+        raise DataError(odometry.warnings[-1])
+    raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
+
+
+@dataclass(slots=True)
+class _RunState:
+    """What a checkpoint holds of a run."""
+
+    odometry: Odometry
+    dead_reckoning: _DeadReckoning | None
+    next_frame: int  # where to take up the recording's events: the last frame taken, or the first one
+    frame_ns: int | None = None  # newest time of a frame that was taken
+    sample_ns: int | None = None  # newest time of a motion sample that was taken
+
+    def is_new(self, event: Event) -> bool:
+        """Whether an event of a recording that is read again has not been taken before."""
+        known = self.frame_ns if isinstance(event, StereoFrame) else self.sample_ns
+        return known is None or event.time_ns > known
+
+    def note(self, event: Event) -> None:
+        """Note that an event was taken."""
+        if isinstance(event, StereoFrame):
+            self.frame_ns, self.next_frame = event.time_ns, event.index
+        else:
+            self.sample_ns = event.time_ns
+
+
+class _Loop:
+    """Takes a recording's events through the odometry into the recorder."""
+
+    def __init__(self, state: _RunState, recorder: RunRecorder, viewer: Viewer) -> None:
+        self._state, self._recorder, self._viewer = state, recorder, viewer
+        self._reading = _ReadTimer()
+
+    def run(self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]) -> str | None:
+        """Take events to their end; return why they ended before.
+
+        Raises:
+            VioError: data or estimation are at fault.
+        """
+        state, recorder, odometry = self._state, self._recorder, self._state.odometry
+        stopped = None
+        resumed = state.frame_ns is not None
+        for event in self._reading.timed(events):
+            if resumed and not state.is_new(event):
+                continue
+            self._take(event)
+            state.note(event)
+            if _LEAST_REFUSED <= odometry.frames_refused > len(recorder):
                 break
-        for result in odometry.finish():
-            recorder.frame(result, reading.take_ms())
-            viewer.frame(result.output, result.estimate, result.report)
-    finally:
-        viewer.close()
-    if not recorder.frames and not odometry.frames_refused:
-        raise DataError(f"{recording.path}: no frame could be read between {start} and {stop}; see the warnings above")
-    if odometry.frames_refused > len(recorder.frames):
-        raise DataError(f"most frames were refused: {odometry.warnings[-1]}")
-    recorder.finish()
-    return RunResult(
-        recording=recording,
-        config=config,
-        motion=motion,
-        body=body,
-        T_cam0_body=T_cam0_body,
-        estimates=tuple(recorder.estimates),
-        dead_reckoning=_trajectory(dead_reckoning.poses, recorder.frames, body) if dead_reckoning is not None else None,
-        landmarks=odometry.landmarks(),
-        frames=tuple(recorder.frames),
-        observations=tuple(recorder.observations) if keep_observations else None,
-        motion_samples=tuple(recorder.samples) if keep_observations else None,
-        warnings=odometry.warnings,
-        wall_s=time.perf_counter() - began,
-    )
+            if recorder.wants_checkpoint:
+                recorder.save(state, dataset, odometry.take_landmarks())
+            stopped = should_stop()
+            if stopped:
+                recorder.save(state, dataset, odometry.take_landmarks())
+                break
+        self._record(odometry.finish())
+        recorder.revise(odometry.smoothed)
+        if odometry.frames_refused > len(recorder):
+            raise DataError(f"most frames were refused: {odometry.warnings[-1]}")
+        return stopped
+
+    def _take(self, event: Event) -> None:
+        state = self._state
+        if not isinstance(event, StereoFrame):
+            self._recorder.sample(event)
+        self._record(state.odometry.add_event(event))
+        if state.dead_reckoning is not None:
+            state.dead_reckoning.add(event)
+
+    def _record(self, results: list[FrameResult]) -> None:
+        state = self._state
+        for result in results:
+            self._recorder.frame(result, self._reading.take_ms(), state.odometry.smoothed)
+            if state.dead_reckoning is not None:
+                self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
+            self._viewer.frame(result.output, result.estimate, result.report)
+
+
+def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:
+    """Tell a viewer that knows it of frames that an earlier process has done."""
+    skip = getattr(viewer, "skip", None)
+    if skip is not None:
+        skip(frames)
+    return viewer
 
 
 def _check(recording: Recording, config: Config, start: int, stop: int | None) -> None:
@@ -239,61 +348,22 @@ class _ReadTimer:
         return taken
 
 
-class _RunRecorder:
-    """What a run keeps: an estimate and a row of the log per frame and, on request, what went in."""
-
-    def __init__(self, odometry: Odometry, lag_frames: int, *, keep_observations: bool) -> None:
-        self._odometry, self._lag, self._keep = odometry, lag_frames, keep_observations
-        self.estimates: list[Estimate] = []
-        self.frames: list[FrameLog] = []
-        self.observations: list[Observations] = []
-        self.samples: list[MotionSample] = []
-
-    def sample(self, sample: MotionSample) -> None:
-        if self._keep:
-            self.samples.append(sample)
-
-    def frame(self, result: FrameResult, read_ms: float) -> None:
-        if self._lag:
-            self._revise(len(self.estimates) - self._lag, len(self.estimates) - self._lag + 1)
-        self.estimates.append(result.estimate)
-        self.frames.append(replace(result.log, read_ms=read_ms))
-        if self._keep:
-            self.observations.append(result.output.observations)
-
-    def finish(self) -> None:
-        if self._lag:
-            self._revise(len(self.estimates) - self._lag, len(self.estimates))
-
-    def _revise(self, first: int, end: int) -> None:
-        """Replace estimates by the smoothed ones: pose, covariance, velocity and biases."""
-        for k in range(max(first, 0), end):
-            smoothed = self._odometry.smoothed(self.frames[k].index)
-            if smoothed is not None:
-                self.estimates[k] = replace(
-                    self.estimates[k],
-                    T_world_imu=smoothed.T_world_imu,
-                    covariance=smoothed.covariance,
-                    velocity_world=smoothed.velocity_world,
-                    gyro_bias=smoothed.gyro_bias,
-                    accel_bias=smoothed.accel_bias,
-                )
-
-
 class _DeadReckoning:
     """The paper's first result: prediction alone, beside the filter."""
 
     def __init__(self, recording: Recording, config: Config, T_cam0_body: FloatArray) -> None:
         settings = replace(config.vislam, mode="dead_reckoning", motion_model="input")
         self._filter = Vislam(recording.camera, T_cam0_body, settings, motion_sensor=True)
-        self.poses: list[FloatArray] = []
 
     def add(self, event: Event) -> None:
-        if isinstance(event, StereoFrame):
-            self._filter.advance(event.time_ns)
-            self.poses.append(self._filter.estimate().T_world_imu)
-        else:
+        """Take a motion sample."""
+        if not isinstance(event, StereoFrame):
             self._filter.propagate(event)
+
+    def pose_at(self, time_ns: int) -> FloatArray:
+        """The pose (4, 4) of the body at a frame, which may not be older than the last one."""
+        self._filter.advance(time_ns)
+        return self._filter.estimate().T_world_imu
 
 
 def _feature_source(dataset: Dataset, config: Config) -> Dataset:
@@ -324,16 +394,14 @@ def _build_selector(features: Dataset, config: Config) -> Selector:
     recording = features.recording
     indices = range(len(recording.frame_times_ns))
     precomputed = features.observations(0) is not None
-    camera = recording.camera
 
     def whole_record() -> list[Observations]:
         return [o for o in map(features.observations, indices) if o is not None]
 
     return build_selector(
         config.selector,
-        image_size=None if camera.width is None or camera.height is None else (camera.width, camera.height),
         whole_record=whole_record if precomputed else None,
-        camera=camera,
+        camera=recording.camera,
     )
 
 
@@ -342,10 +410,6 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
     return dataset.recording.has_images and front.name != "precomputed" and front.features is None
 
 
-def _trajectory(poses: list[FloatArray], frames: list[FrameLog] | tuple[FrameLog, ...], body: BodyFrame) -> Trajectory:
-    return Trajectory(
-        T_world_body=np.array(poses),
-        times_ns=np.array([f.time_ns for f in frames], dtype=np.int64),
-        body=body,
-        frame_indices=np.array([f.index for f in frames], dtype=np.int64),
-    )
+def _trajectory(T_world_body: FloatArray, rows: RunRecorder, body: BodyFrame) -> Trajectory:
+    times_ns, indices = (np.asarray(rows.estimates.column(name)) for name in ("time_ns", "index"))
+    return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=body, frame_indices=indices)

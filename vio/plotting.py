@@ -58,7 +58,7 @@ def _figure(result: RunResult, evaluation: Evaluation | None, dead_reckoning: Ev
     figure = Figure(figsize=(13, 7.2), dpi=110, layout="constrained")
     grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
     _draw_map(figure.add_subplot(grid[:, 0]), result, evaluation, dead_reckoning)
-    seconds = np.array([f.time_ns - result.frames[0].time_ns for f in result.frames]) * 1e-9
+    seconds = np.array(result.frames.column("time_ns") - result.frames[0].time_ns) * 1e-9
     _draw_error(figure.add_subplot(grid[0, 1]), seconds, result, evaluation, dead_reckoning)
     _draw_counts(figure.add_subplot(grid[1, 1]), seconds, result)
     _draw_time(figure.add_subplot(grid[2, 1]), seconds, result)

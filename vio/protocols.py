@@ -98,7 +98,10 @@ class Backend(Protocol):
         """Return the estimate at a past frame with all frames since taken into account; None where it is not kept."""
 
     def landmarks(self) -> Landmarks:
-        """Return the current map."""
+        """Return the current map, less what `take_landmarks` has returned."""
+
+    def take_landmarks(self) -> Landmarks:
+        """Return the points that will not change any more, and forget them."""
 
 
 class Viewer(Protocol):

@@ -14,6 +14,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 
@@ -25,6 +26,24 @@ BodyFrame: TypeAlias = Literal["imu", "cam0"]
 MotionSource: TypeAlias = Literal["imu", "velocity"]
 RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
 
+_INT64, _FLOAT64, _BOOL = np.dtype(np.int64), np.dtype(np.float64), np.dtype(np.bool_)
+
+
+def _type_text(value: object) -> str:
+    if isinstance(value, np.ndarray):
+        return f"an array {value.shape} of {value.dtype}"
+    return f"a {type(value).__name__}"
+
+
+def _check_sample(name: str, time_ns: object, **vectors: object) -> None:
+    if not isinstance(time_ns, (int, np.integer)):
+        raise DataError(f"{name}: time_ns is {_type_text(time_ns)}, not whole nanoseconds")
+    for key, value in vectors.items():
+        if not isinstance(value, np.ndarray) or value.shape != (3,) or value.dtype != _FLOAT64:
+            raise DataError(
+                f"{name}: {key} is {_type_text(value)}, not an array (3,) of float64; use numpy.array(…, float)"
+            )
+
 
 @dataclass(frozen=True, slots=True)
 class ImuSample:
@@ -33,6 +52,10 @@ class ImuSample:
     time_ns: int
     gyro: FloatArray  # (3,) rad/s, imu frame
     accel: FloatArray  # (3,) m/s^2, imu frame, specific force (about +9.81 up at rest)
+
+    def __post_init__(self) -> None:
+        """Raise DataError unless the types are those above; the filters check the values."""
+        _check_sample("ImuSample", self.time_ns, gyro=self.gyro, accel=self.accel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +87,10 @@ class VelocitySample:
     linear: FloatArray  # (3,) m/s, imu frame
     angular: FloatArray  # (3,) rad/s, imu frame
 
+    def __post_init__(self) -> None:
+        """Raise DataError unless the types are those above; the filters check the values."""
+        _check_sample("VelocitySample", self.time_ns, linear=self.linear, angular=self.angular)
+
 
 @dataclass(frozen=True, slots=True)
 class StereoFrame:
@@ -90,6 +117,24 @@ class Observations:
     has_right: BoolArray  # (N,) False: seen in the left image only
     stale: BoolArray  # (N,) True: the pixels are known to be old (repeated by the source) and must not be trusted
 
+    def __post_init__(self) -> None:
+        """Raise DataError unless types and lengths are those above; the filters check the values."""
+        shape = getattr(self.ids, "shape", None)
+        for name, dtype, expected in (
+            ("ids", _INT64, shape if shape is not None and len(shape) == 1 else ("N",)),
+            ("z", _FLOAT64, (*shape, 4) if shape is not None else ("N", 4)),
+            ("has_right", _BOOL, shape),
+            ("stale", _BOOL, shape),
+        ):
+            value = getattr(self, name)
+            if not isinstance(value, np.ndarray) or value.dtype != dtype or value.shape != expected:
+                raise DataError(
+                    f"Observations of frame {self.frame_index}: {name} is {_type_text(value)}, not an array {expected} "
+                    f"of {dtype}; vio.records.observations builds them from lists"
+                )
+        if not isinstance(self.time_ns, (int, np.integer)):
+            raise DataError(f"Observations: time_ns is {_type_text(self.time_ns)}, not whole nanoseconds")
+
     def __len__(self) -> int:
         return len(self.ids)
 
@@ -115,17 +160,33 @@ def observations(
     """Build `Observations` from array-likes; without masks, every row is a fresh stereo observation.
 
     Raises:
-        ValueError: shapes disagree or an id occurs twice.
+        DataError: shapes disagree, an id occurs twice, or a value is no number.
     """
-    ids_ = np.asarray(ids, dtype=np.int64).reshape(-1)
+    try:
+        given = np.asarray(ids).reshape(-1)
+        if given.size and given.dtype.kind not in "iu":
+            raise DataError(f"frame {frame_index}: ids are whole numbers, got {given.dtype}")
+        return _observations(frame_index, time_ns, given.astype(np.int64), z, has_right, stale)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DataError(f"frame {frame_index}: no observations can be made of this ({error})") from error
+
+
+def _observations(
+    frame_index: int,
+    time_ns: int,
+    ids_: IntArray,
+    z: npt.ArrayLike,
+    has_right: npt.ArrayLike | None,
+    stale: npt.ArrayLike | None,
+) -> Observations:
     n = len(ids_)
     z_ = np.asarray(z, dtype=np.float64).reshape(-1, 4)
     right = np.ones(n, dtype=np.bool_) if has_right is None else np.asarray(has_right, dtype=np.bool_)
     old = np.zeros(n, dtype=np.bool_) if stale is None else np.asarray(stale, dtype=np.bool_)
     if not (len(z_) == n and right.shape == (n,) and old.shape == (n,)):
-        raise ValueError(f"observations disagree in length: {n} ids, {len(z_)} z, {right.shape}, {old.shape} masks")
+        raise DataError(f"observations disagree in length: {n} ids, {len(z_)} z, {right.shape}, {old.shape} masks")
     if len(np.unique(ids_)) != n:
-        raise ValueError(f"frame {frame_index}: an id occurs twice among {n} observations")
+        raise DataError(f"frame {frame_index}: an id occurs twice among {n} observations")
     return Observations(int(frame_index), int(time_ns), ids_, z_, right, old)
 
 
@@ -172,6 +233,7 @@ class TrackPrior:
     ids: IntArray  # (N,)
     z: FloatArray  # (N, 4) predicted pixels
     R_cam_prev: FloatArray | None = None  # (3, 3) rotation that maps the previous cam0 frame into the coming one
+    motion: MotionPrior | None = None  # the whole motion since the previous frame, with its covariance
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,6 +261,7 @@ class FrontendOutput:
     matched: int  # features with a right match
     detected: int  # features new in this frame
     stages_ms: dict[str, float] = field(default_factory=dict)  # wall time per stage
+    warnings: tuple[str, ...] = ()  # what is wrong with the images, one line an event
 
 
 def no_features(frame: StereoFrame) -> FrontendOutput:

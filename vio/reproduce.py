@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.atomic import atomic_folder
+from vio.atomic import atomic_folder, check_writable
 from vio.config import BackendName, Config, MotionName
 from vio.datasets import DatasetSettings, open_dataset
 from vio.errors import DataError
@@ -151,6 +151,7 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> Table:
     if "velocity" not in recording.motion or dataset.observations(0) is None:
         raise DataError(f"{file}: the experiment needs features and velocities; this is a {recording.kind} recording")
     truth = recording.reference if reference is None else read_trajectory(reference)
+    check_writable(out / file.stem)
     results: list[tuple[Variant, RunResult, Evaluation | None]] = []
     with one_blas_thread():
         for variant in VARIANTS:

@@ -177,7 +177,7 @@ class Rig:
             CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
         """
         pair = rectified_pair(self.stereo)
-        return rectified_cameras(self.stereo).camera if pair is None else pair
+        return rectified_cameras(self.stereo).camera if pair is None else self._exact(pair)
 
     @property
     def T_rect0_imu(self) -> FloatArray | None:
@@ -192,7 +192,17 @@ class Rig:
         Raises:
             CalibrationError: as `camera`.
         """
-        return rectifier_of(self.stereo, interpolation)
+        made = rectifier_of(self.stereo, interpolation)
+        if made.maps is not None:
+            return made
+        T = made.T_rect0_imu if self.T_cam0_imu is None else self.T_cam0_imu
+        return replace(made, camera=self._exact(made.camera), T_rect0_imu=T)
+
+    def _exact(self, pair: StereoCamera) -> StereoCamera:
+        """Return a rectified pair with the baseline as stated, which the way through the body would round."""
+        x, y, z = self.T_cam1_cam0[:3, 3].tolist()
+        stated = not np.any(self.T_cam1_cam0[:3, :3] != np.eye(3)) and y == z == 0
+        return replace(pair, baseline_m=-x) if stated else pair
 
     def noting(self, *notes: str) -> Rig:
         """Return the rig with further notes."""

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import logging
 import platform
-from collections.abc import Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -17,24 +16,33 @@ import numpy as np
 
 from vio._version import __version__
 from vio.atomic import atomic_folder
-from vio.config import to_yaml
+from vio.config import Config, to_yaml
 from vio.datasets.common import checked_transform
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, transform_points
+from vio.input_files import read_input
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.printable import json_text
+from vio.protocols import Dataset
 from vio.records import Landmarks, Trajectory
+from vio.run_recorder import UNFINISHED, GrowingFolder
+from vio.run_tables import frames_csv
+from vio.tables import Records
 from vio.trajectory_io import in_first_cam0, read_trajectory, write_kitti, write_tum
 
 log = logging.getLogger(__name__)
 
 MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
+REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
+_CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 FILES = (
     MARKER,
+    UNFINISHED,
     "config.yaml",
     "trajectory.tum",
     "trajectory.kitti",
+    "estimates.npy",
     "dead_reckoning.tum",
     "landmarks.ply",
     "frames.csv",
@@ -63,22 +71,115 @@ def write_run_folder(
     Raises:
         VioError: the folder cannot be written, or contains something else.
     """
+    with atomic_folder(folder, replace=True, marker=MARKER, own=FILES) as temporary:
+        np.save(temporary / "estimates.npy", result.estimates.rows)
+        return _write_files(temporary, folder, result, reference, lengths_m, save_observations=save_observations)
+
+
+def finish_run_folder(
+    folder: Path,
+    result: RunResult,
+    reference: Trajectory | None,
+    *,
+    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    save_observations: bool = False,
+) -> dict[str, Any]:
+    """Write the results of a run into the folder in which it grew, and return the metrics.
+
+    What a run that ended early needs to go on stays in `unfinished/`. The arguments are those of `write_run_folder`.
+
+    Raises:
+        VioError: the folder cannot be written.
+    """
+    unfinished = folder / UNFINISHED
+    final = unfinished / "final"
+    try:
+        final.mkdir(exist_ok=True)
+        metrics = _write_files(final, folder, result, reference, lengths_m, save_observations=save_observations)
+        if result.stopped is None:
+            (unfinished / "estimates.npy").replace(folder / "estimates.npy")
+        else:
+            shutil.copyfile(unfinished / "estimates.npy", folder / "estimates.npy")
+        for name in sorted(path.name for path in final.iterdir() if path.name != MARKER):
+            (final / name).replace(folder / name)
+        (final / MARKER).replace(folder / MARKER)
+        shutil.rmtree(unfinished if result.stopped is None else final)
+    except OSError as error:
+        raise DataError(f"cannot write {folder}: {error.strerror or error}; the trajectory so far is there") from error
+    return metrics
+
+
+def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapping[str, Any]) -> GrowingFolder:
+    """Describe a run before its first frame, as its folder says it while the run goes on.
+
+    Args:
+        folder: of the run.
+        dataset: the recording.
+        config: every setting.
+        request: what `vio run --resume` needs to repeat the command.
+    """
+    recording = dataset.recording
+    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    metrics = {
+        "out": str(folder),
+        "complete": False,
+        "source": str(recording.path),
+        "kind": recording.kind,
+        "version": __version__,
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "T_cam0_imu": T_cam0_body.tolist(),
+    }
+    texts = {
+        "config.yaml": to_yaml(config),
+        MARKER: json_text(metrics, indent=2) + "\n",
+        f"{UNFINISHED}/{REQUEST}": json.dumps(request, indent=2) + "\n",  # names of files as they are
+    }
+    return GrowingFolder(folder, texts, replaces=FILES)
+
+
+def read_request(folder: Path) -> dict[str, Any]:
+    """Read what an unfinished run was asked to do.
+
+    Raises:
+        DataError: the folder is no run's, the run is complete, or the file is damaged.
+    """
+    path = folder / UNFINISHED / REQUEST
+    if not path.is_file():
+        read_metrics(folder)
+        raise DataError(f"{folder}: its run is complete; there is nothing to go on with")
+    try:
+        request: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        request["source"], request["start"]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise DataError(f"{path}: is damaged ({error}); repeat the run from its start") from error
+    return request
+
+
+def _write_files(
+    target: Path,
+    folder: Path,
+    result: RunResult,
+    reference: Trajectory | None,
+    lengths_m: Sequence[float],
+    *,
+    save_observations: bool,
+) -> dict[str, Any]:
+    """Write all results but `estimates.npy` into `target`, and return the metrics, which name `folder`."""
     evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
     metrics = metrics_of(result, evaluation, dead_reckoning, folder)
-    with atomic_folder(folder, replace=True, marker=MARKER, own=FILES) as temporary:
-        (temporary / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
-        write_tum(temporary / "trajectory.tum", result.trajectory)
-        write_kitti(temporary / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
-        if result.dead_reckoning is not None:
-            write_tum(temporary / "dead_reckoning.tum", result.dead_reckoning)
-        (temporary / "landmarks.ply").write_bytes(landmarks_ply(result.landmarks))
-        (temporary / "frames.csv").write_text(frames_csv(result.frames), encoding="utf-8")
-        if save_observations:
-            _write_observations(temporary / "observations.npz", result)
-        from vio.plotting import plot_run
+    (target / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
+    write_tum(target / "trajectory.tum", result.trajectory)
+    write_kitti(target / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
+    if result.dead_reckoning is not None:
+        write_tum(target / "dead_reckoning.tum", result.dead_reckoning)
+    write_landmarks_ply(target / "landmarks.ply", result.landmarks)
+    _write_frames(target / "frames.csv", result.frames)
+    if save_observations:
+        _write_observations(target / "observations.npz", result)
+    from vio.plotting import plot_run
 
-        plot_run(temporary / "trajectory.png", result, evaluation, dead_reckoning)
-        (temporary / MARKER).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
+    plot_run(target / "trajectory.png", result, evaluation, dead_reckoning)
+    (target / MARKER).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
     return metrics
 
 
@@ -114,6 +215,8 @@ def metrics_of(
     scores = None if evaluation is None else evaluation.as_dict()
     return {
         "out": str(folder),
+        "complete": result.stopped is None,
+        "stopped": result.stopped,
         "source": str(result.recording.path),
         "kind": result.recording.kind,
         "version": __version__,
@@ -199,41 +302,41 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
     if not path.is_file():
         raise DataError(f"{folder}: no run folder (it has no {MARKER}); give a folder that `vio run` wrote")
     try:
-        metrics = json.loads(path.read_text(encoding="utf-8"))
+        metrics = json.loads(read_input(path))
         T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
-    except (OSError, ValueError, TypeError, KeyError) as error:
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
+    if metrics.get("complete") is False:
+        log.warning("%s: the run has not reached the end of its recording; these are its results so far", folder)
     return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
 
 
-def landmarks_ply(landmarks: Landmarks) -> bytes:
-    """Return the map as a binary PLY: x y z in metres, and the largest standard deviation of any direction."""
-    points = np.zeros(len(landmarks.ids), dtype=[(name, "<f4") for name in ("x", "y", "z", "sigma")])
-    points["x"], points["y"], points["z"] = landmarks.p_world.T
-    points["sigma"] = np.sqrt(np.maximum(np.linalg.eigvalsh(landmarks.covariance)[:, -1], 0.0))
+def write_landmarks_ply(path: Path, landmarks: Landmarks) -> None:
+    """Write the map as a binary PLY: x y z in metres, and the largest standard deviation of any direction."""
+    count = len(landmarks.ids)
     header = (
         f"ply\nformat binary_little_endian 1.0\ncomment landmarks in the world frame, metres\n"
-        f"element vertex {len(points)}\n"
+        f"element vertex {count}\n"
         + "".join(f"property float {name}\n" for name in ("x", "y", "z", "sigma"))
         + "end_header\n"
     )
-    return header.encode("ascii") + points.tobytes()
+    with path.open("wb") as stream:
+        stream.write(header.encode("ascii"))
+        for start in range(0, count, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            points = np.zeros(min(_CHUNK, count - start), dtype=[(name, "<f4") for name in ("x", "y", "z", "sigma")])
+            points["x"], points["y"], points["z"] = landmarks.p_world[part].T
+            largest = np.linalg.eigvalsh(landmarks.covariance[part])[:, -1]
+            points["sigma"] = np.sqrt(np.maximum(largest, 0.0))
+            stream.write(points.tobytes())
 
 
-def frames_csv(frames: tuple[FrameLog, ...]) -> str:
-    """Return the per-frame log as CSV text; the front end's stages are the last columns."""
-    stages = sorted({name for f in frames for name in f.stages_ms})
-    text = io.StringIO()
-    writer: csv.DictWriter[str] | None = None
-    for frame in frames:
-        row = asdict(frame)
-        own = row.pop("stages_ms")
-        row |= {f"frontend_{name}_ms": own.get(name) for name in stages}
-        if writer is None:
-            writer = csv.DictWriter(text, list(row), lineterminator="\n")
-            writer.writeheader()
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
-    return text.getvalue()
+def _write_frames(path: Path, frames: Records[FrameLog]) -> None:
+    """Write the log of all frames as CSV; the front end's stages are the last columns."""
+    stages = sorted({name for frame in frames for name in frame.stages_ms})
+    with path.open("w", encoding="utf-8", newline="\n") as stream:
+        for start in range(0, len(frames), _CHUNK_FRAMES):
+            stream.write(frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0))
 
 
 def _with_times(reference: Trajectory, result: RunResult) -> Trajectory:

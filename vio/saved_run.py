@@ -62,12 +62,12 @@ def read_saved_run(folder: Path) -> SavedRun:
 
 def _original_source(log: Path) -> str:
     """Return the recording of the images, through any number of replayed logs."""
-    source = str(read_npz(log)["source"])
+    source = str(read_npz(log, ["source"])["source"])
     kind, _, path = source.partition(":")
     seen = {log.resolve()}
     while kind == "log" and Path(path).is_file() and Path(path).resolve() not in seen:
         seen.add(Path(path).resolve())
-        source = str(read_npz(Path(path))["source"])
+        source = str(read_npz(Path(path), ["source"])["source"])
         kind, _, path = source.partition(":")
     return source
 

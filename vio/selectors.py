@@ -2,7 +2,7 @@
 
 The paper sorts features by how often they are seen and keeps the first seventh. `visibility` does that frame by
 frame with the counts so far; `visibility_whole` counts over the whole record first, as the paper does. `information`
-keeps the features that together add most information on the camera's motion. docs/selection.md compares them.
+keeps the features that together add most information on the camera's motion. docs/notes/selection.md compares them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from vio.protocols import Selector
 from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selection
 from vio.setting import Section, setting
 
-SelectorName = Literal["all", "visibility", "visibility_whole", "grid", "random", "information"]
+SelectorName = Literal["all", "visibility", "visibility_whole", "information"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +33,8 @@ class SelectorSettings(Section):
     name: SelectorName = setting(
         "all",
         "all; visibility: the most often seen so far; visibility_whole: the most often seen in the whole record, as "
-        "the paper does (precomputed features only); grid: the most often seen of each image cell; random: any; "
-        "information: those that together add most information on the camera's motion now and in the next frames",
+        "the paper does (precomputed features only); information: those that together add most information on the "
+        "camera's motion now and in the next frames",
     )
     budget: int | None = setting(None, "observations kept of a frame; null: the share below", at_least=1)
     keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7", above=0, at_most=1)
@@ -42,15 +42,13 @@ class SelectorSettings(Section):
     sticky: bool = setting(
         False, "a chosen feature stays chosen while it is tracked; new ones only fill the remaining budget"
     )
-    grid_columns: int = setting(8, "cells across the image for the grid selector", at_least=1)
-    grid_rows: int = setting(4, "cells down the image for the grid selector", at_least=1)
     horizon_frames: int = setting(
         4,
         "information: the gain is summed over the last motion, the next one and the one this many frames ahead",
         at_least=1,
+        at_most=100,
     )
     pixel_sigma_px: float = setting(0.5, "information: standard deviation of one pixel coordinate", unit="px", above=0)
-    seed: int = setting(0, "random: seed of the random choice", at_least=0)
 
 
 class _VisibilityCount:
@@ -145,49 +143,8 @@ class WholeRecordVisibility:
         return Selection(rank < self._kept, -rank, f"most seen in the record, {self._kept} of {len(self._rank)}")
 
 
-class GridVisibility:
-    """The most often observed features of each image cell, so that no image region is empty."""
-
-    def __init__(self, settings: SelectorSettings, width: int, height: int) -> None:
-        self._seen, self._settings, self._size = _VisibilityCount(), settings, (width, height)
-        self._budget = _Budget(settings)
-
-    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
-        """Choose rows in rounds: the best of each cell, then the second best of each, until the budget is met."""
-        s, (width, height), ids = self._settings, self._size, observations.ids
-        score = self._seen.add(ids)
-        fresh = ~self._budget.kept(ids)
-        column = np.clip(observations.z[:, 0] * s.grid_columns // width, 0, s.grid_columns - 1)
-        row = np.clip(observations.z[:, 1] * s.grid_rows // height, 0, s.grid_rows - 1)
-        order = np.lexsort((ids, -score, fresh, row * s.grid_columns + column))
-        cell = (row * s.grid_columns + column)[order]
-        starts = np.flatnonzero(np.diff(cell, prepend=-1))
-        place_in_cell = np.arange(len(cell)) - np.repeat(starts, np.diff(starts, append=len(cell)))
-        round_of = np.empty(len(score))
-        round_of[order] = place_in_cell
-        # Kept rows, then earlier rounds; within a round the most often observed.
-        by_round = np.lexsort((ids, -score, round_of, fresh))
-        chosen = np.zeros(len(score), dtype=np.bool_)
-        chosen[by_round[: self._budget.rows(len(score))]] = True
-        self._budget.store(ids, chosen)
-        return Selection(chosen, score, f"most seen of each cell, {chosen.sum()} of {len(score)}")
-
-
-class RandomChoice:
-    """Random features, as a baseline: the same ones for the same seed and frame."""
-
-    def __init__(self, settings: SelectorSettings) -> None:
-        self._seed, self._budget = settings.seed, _Budget(settings)
-
-    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
-        """Choose rows at random."""
-        score = np.random.default_rng((self._seed, observations.frame_index)).random(len(observations))
-        chosen = self._budget.best(score, observations.ids)
-        return Selection(chosen, score, f"random, {chosen.sum()} of {len(score)}")
-
-
 class InformationGain:
-    """The features with the largest joint information on the last and the coming motions (docs/selection.md)."""
+    """The features with the largest joint information on the last and the coming motions (docs/notes/selection.md)."""
 
     def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
         self._settings, self._budget = settings, _Budget(settings)
@@ -214,7 +171,6 @@ class InformationGain:
 def build_selector(
     settings: SelectorSettings,
     *,
-    image_size: tuple[int, int] | None,
     whole_record: Callable[[], Iterable[Observations]] | None,
     camera: StereoCamera | None = None,
 ) -> Selector:
@@ -222,7 +178,6 @@ def build_selector(
 
     Args:
         settings: the selector's section of the configuration.
-        image_size: width and height in pixels; None where unknown (feature files).
         whole_record: yields all observations of the record; None where they are not available in advance.
         camera: the rectified pair, which the information selector needs.
 
@@ -236,16 +191,10 @@ def build_selector(
                 "and process that file, or use selector.name=visibility"
             )
         return WholeRecordVisibility(whole_record(), settings)
-    if settings.name == "grid":
-        if image_size is None:
-            raise ConfigError("selector grid needs the image size, which this recording lacks; use visibility")
-        return GridVisibility(settings, *image_size)
     if settings.name == "information":
         if camera is None:
             raise ConfigError("selector information needs the calibration of the cameras; use visibility")
         return InformationGain(settings, camera)
     if settings.name == "visibility":
         return CausalVisibility(settings)
-    if settings.name == "random":
-        return RandomChoice(settings)
     return KeepAll()

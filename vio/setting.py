@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from typing import Any, ClassVar, TypeVar
+from functools import cache
+from numbers import Integral, Real
+from types import UnionType
+from typing import Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from vio.errors import ConfigError
 
 T = TypeVar("T")
+
+# No setting means anything beyond these sizes, in its unit; their squares would overflow, vanish or fill the memory.
+_LARGEST, _SMALLEST = 10**6, 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,7 +38,11 @@ class Range:
     def __str__(self) -> str:
         """Return `at least 3`, `above 0 and below 1`, …; empty without bounds."""
         bounds = ((f.name.replace("_", " "), getattr(self, f.name)) for f in fields(self))
-        return " and ".join(f"{name} {bound:g}" for name, bound in bounds if bound is not None)
+        return " and ".join(
+            f"{name} {bound}" if isinstance(bound, int) else f"{name} {bound:g}"
+            for name, bound in bounds
+            if bound is not None
+        )
 
 
 def setting(
@@ -60,19 +70,57 @@ class Section:
     section: ClassVar[str] = ""  # its path in the configuration, as used by --set
 
     def __post_init__(self) -> None:
-        """Check every number.
+        """Check the type of every value, and the range of every number.
 
         Raises:
-            ConfigError: a value is out of range.
+            ConfigError: a value has the wrong type or is out of range.
         """
+        hints = _hints(type(self))  # type: ignore[arg-type] # a dataclass is hashable
         for f in fields(self):  # type: ignore[arg-type]
+            if not _fits(value := getattr(self, f.name), hints[f.name]):
+                key = f"{self.section}.{f.name}".lstrip(".")
+                raise ConfigError(f"{key} does not take {repr(value)[:100]}; it takes {_wanted(hints[f.name])}")
             _check(f"{self.section}.{f.name}".lstrip("."), getattr(self, f.name), f.metadata.get("range", Range()))
+
+
+@cache
+def _hints(section: type) -> dict[str, Any]:
+    return get_type_hints(section)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value is of a setting's type; a whole number is a number, and NumPy's numbers are."""
+    if get_origin(hint) in (Union, UnionType):
+        return any(_fits(value, member) for member in get_args(hint))
+    if get_origin(hint) is Literal:
+        return isinstance(value, str) and value in get_args(hint)
+    if hint in (int, float):
+        return isinstance(value, Integral if hint is int else Real) and not isinstance(value, bool)
+    return isinstance(value, hint)
+
+
+def _wanted(hint: Any) -> str:
+    if get_origin(hint) in (Union, UnionType):
+        return " or ".join(_wanted(member) for member in get_args(hint))
+    if get_origin(hint) is Literal:
+        return f"one of {', '.join(get_args(hint))}"
+    return {int: "a whole number", float: "a number", bool: "True or False", type(None): "None"}.get(
+        hint, hint.__name__
+    )
 
 
 def _check(key: str, value: Any, allowed: Range) -> None:
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return
-    if not math.isfinite(value):
+    if isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(f"{key} must be finite, got {value:g}")
     if not allowed.holds(value):
-        raise ConfigError(f"{key} must be {allowed}, got {value:g}")
+        raise ConfigError(f"{key} must be {allowed}, got {_number(value)}")
+    if allowed.at_most is None and abs(value) > _LARGEST:
+        raise ConfigError(f"{key} must be at most {_LARGEST} in size, got {_number(value)}")
+    if 0 < abs(value) < _SMALLEST:
+        raise ConfigError(f"{key} must be at least {_SMALLEST:g} in size, or 0 where that is allowed, got {value:g}")
+
+
+def _number(value: float) -> str:
+    return f"{value:g}" if isinstance(value, float) or abs(value) < 2**1000 else "a larger number"

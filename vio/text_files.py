@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
+from vio.input_files import read_input
 from vio.records import NS_PER_S, IntArray
 
 INT64_MAX = 2**63 - 1
@@ -22,7 +23,7 @@ def text_lines(path: Path) -> list[tuple[int, str]]:
         DataError: the file is missing or is no text.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
+        lines = read_input(path).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: not a text file ({error.reason}); give the original file") from error
     except OSError as error:

@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
 
 ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one accepted as rounding
+_LARGEST = 1e12  # of a coordinate, in metres: beyond, squares overflow
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _MAX_S = Decimal(INT64_MAX).scaleb(-9)
 _COLUMNS: dict[TrajectoryFormat, str] = {
@@ -102,16 +103,30 @@ def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
     """
     if trajectory.times_ns is None:
         raise DataError(f"cannot write {path}: a TUM file needs times and this trajectory has none; write KITTI form")
-    lines = [f"# body: {trajectory.body}"]
-    if trajectory.frame_indices is not None and len(trajectory):
-        lines.append(f"# frames: {_format_frames(trajectory.frame_indices)}")
-    lines.append("# timestamp tx ty tz qx qy qz qw")
-    q_xyzw = quat_xyzw_from_rotation(trajectory.T_world_body[:, :3, :3])
-    values = np.concatenate([trajectory.positions, q_xyzw], axis=1)
-    lines += [
-        f"{seconds_text(t)} {exact_text(row)}" for t, row in zip(trajectory.times_ns.tolist(), values, strict=True)
-    ]
-    atomic_write_text(path, "\n".join(lines) + "\n")
+    text = tum_text(trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices)
+    atomic_write_text(path, text)
+
+
+def tum_text(
+    times_ns: IntArray, T_world_body: FloatArray, *, body: BodyFrame | None = None, frames: IntArray | None = None
+) -> str:
+    """Return the lines of `write_tum`.
+
+    Args:
+        times_ns: (N,)
+        T_world_body: (N, 4, 4)
+        body: what the poses describe, for the comments; None: no comments, as lines to append.
+        frames: (N,) numbers for the comments, where known.
+    """
+    lines = []
+    if body is not None:
+        lines.append(f"# body: {body}")
+        if frames is not None and len(frames):
+            lines.append(f"# frames: {_format_frames(frames)}")
+        lines.append("# timestamp tx ty tz qx qy qz qw")
+    values = np.concatenate([T_world_body[:, :3, 3], quat_xyzw_from_rotation(T_world_body[:, :3, :3])], axis=1)
+    lines += [f"{seconds_text(t)} {exact_text(row)}" for t, row in zip(times_ns.tolist(), values, strict=True)]
+    return "".join(f"{line}\n" for line in lines)
 
 
 def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
@@ -182,7 +197,7 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
             out[row] = [float(field) for field in fields[first:last]]
         except ValueError as error:
             table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
-    bad = ~np.isfinite(out).all(axis=1)
+    bad = ~(np.abs(out) < _LARGEST).all(axis=1)
     if bad.any():
         table.fail(int(np.argmax(bad)), f"a pose is not finite (first of {int(bad.sum())}); remove such lines")
     return out

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import errno
 import io
 import logging
 import os
@@ -19,13 +18,42 @@ from collections.abc import Iterator, Sequence
 from types import FrameType
 
 from vio._version import __version__
-from vio.cli import calibrate, check, config, demo, evaluate, export, rectify, refine, render, reproduce, run
-from vio.errors import VioError
+from vio.cli import (
+    calibrate,
+    check,
+    config,
+    convert,
+    demo,
+    evaluate,
+    export,
+    inspect,
+    rectify,
+    refine,
+    render,
+    reproduce,
+    run,
+)
+from vio.errors import StoppedError, VioError
 from vio.printable import printable
 
-_COMMANDS = (run, evaluate, check, refine, export, calibrate, demo, render, rectify, reproduce, config)
+_COMMANDS = (
+    run,
+    inspect,
+    convert,
+    evaluate,
+    check,
+    refine,
+    export,
+    calibrate,
+    demo,
+    render,
+    rectify,
+    reproduce,
+    config,
+)
 
 
+_MOST_SHOWN = 200  # characters of a path in a message
 _ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
@@ -91,6 +119,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with _orderly_end():
             status: int = args.execute(args)
             sys.stdout.flush()
+    except StoppedError as stop:
+        print(printable(" ".join(str(stop).split())), file=sys.stderr)
+        return stop.status
     except VioError as error:
         if args.debug:
             raise
@@ -107,9 +138,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        if error.filename is not None or error.errno != errno.ENOSPC:
+        if args.debug:
             raise
-        print(f"error: cannot write the output: {error.strerror}", file=sys.stderr)
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        # A path that no check foresaw: too long a name, a folder that may not be entered, a disk that fails.
+        where = (
+            "cannot write the output" if error.filename is None else f"cannot use {str(error.filename)[:_MOST_SHOWN]}"
+        )
+        print("error:", printable(f"{where}: {error.strerror or error}"), file=sys.stderr)
+        if error.filename is None:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except MemoryError as error:
+        if args.debug:
+            raise
+        print(
+            f"error: out of memory ({str(error)[:_MOST_SHOWN] or 'no details'}); process less at once", file=sys.stderr
+        )
         return 1
     return status

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from vio.config import Config
+    from vio.datasets.span import Seconds
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
@@ -20,7 +21,16 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--motion", metavar="NAME", help="imu, velocity, none or auto: same as --set motion=NAME")
     parser.add_argument("--backend", metavar="NAME", help="same as --set backend=NAME")
+    parser.add_argument("--calibration", metavar="F", help="same as --set dataset.calibration=F")
+    parser.add_argument("--topics", metavar="A=/B,…", help="topics of a bag: same as --set dataset.topics=A=/B,…")
     parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
+
+
+def bound(text: str) -> int | Seconds:
+    """Parse a frame number, or a time after the first frame such as 12.5s."""
+    from vio.datasets.span import parse_bound
+
+    return parse_bound(text)
 
 
 def lengths(text: str) -> tuple[float, ...]:
@@ -36,7 +46,14 @@ def config_from(args: argparse.Namespace) -> Config:
     from vio.config import load_config
 
     overrides = list(args.set)
-    for key, value in (("motion", args.motion), ("backend", args.backend), ("frontend.name", args.frontend)):
+    named = {
+        "motion": args.motion,
+        "backend": args.backend,
+        "frontend.name": args.frontend,
+        "dataset.calibration": args.calibration,
+        "dataset.topics": args.topics,
+    }
+    for key, value in named.items():
         if value is not None:
             # Quoted: to YAML a bare `none` is text but `null`, `on` or `no` would not be.
             overrides.append(f'{key}="{value}"')

@@ -1,34 +1,50 @@
-"""`vio config`: every setting with unit and default."""
+"""`vio config`: the settings with unit and default."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
 
 from vio.cli.arguments import add_config_arguments, config_from
+
+if TYPE_CHECKING:
+    from vio.config import SettingInfo
 
 
 def add_parser(commands: Any) -> None:
     """Add the subcommand."""
     parser = commands.add_parser(
-        "config", help="show or check settings", description="Show every setting, or check and print a configuration."
+        "config", help="show or check settings", description="Show the settings, or check and print a configuration."
     )
-    parser.add_argument("--show", action="store_true", help="a table of every setting: default, unit, meaning")
+    parser.add_argument("--show", action="store_true", help="the basic settings: value, unit, meaning")
+    parser.add_argument("--all", action="store_true", help="every setting, in groups")
     add_config_arguments(parser)
     parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
-    """Run the subcommand: a table with --show, else the effective configuration as YAML."""
-    from vio.config import describe, to_yaml
+    """Run the subcommand: a table with --show or --all, else the effective configuration as YAML."""
+    from vio.config import BASIC, describe, to_yaml
 
     config = config_from(args)
-    if not args.show:
+    if not (args.show or args.all):
         print(to_yaml(config), end="")
         return 0
+    rows = list(describe(config))
+    shown = rows if args.all else [row for row in rows if row.key in BASIC]
+    for group in dict.fromkeys(row.group for row in shown):
+        print(f"# {group}")
+        _print_rows(row for row in shown if row.group == group)
+    if len(shown) < len(rows):
+        print(f"# {len(rows) - len(shown)} more: vio config --all")
+    return 0
+
+
+def _print_rows(rows: Iterable[SettingInfo]) -> None:
     import textwrap
 
-    for row in describe(config):
+    for row in rows:
         value = f"{row.default:g}" if isinstance(row.default, float) else str(row.default)
         unit = f" {row.unit}" if row.unit else ""
         print(f"{row.key} = {value}{unit}")
@@ -39,4 +55,3 @@ def execute(args: argparse.Namespace) -> int:
             lines.append(row.range)
         for line in lines:
             print(f"    {line}")
-    return 0

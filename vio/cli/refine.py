@@ -97,13 +97,13 @@ def _write(out: Path, run: SavedRun, done: Refinement, metrics: dict[str, Any]) 
 
     from vio.atomic import atomic_folder
     from vio.printable import json_text
-    from vio.run_folder import MARKER, landmarks_ply
+    from vio.run_folder import MARKER, write_landmarks_ply
     from vio.trajectory_io import write_tum
 
     with atomic_folder(out, replace=True, marker=MARKER) as folder:
         in_body = done.trajectory.in_imu(run.T_cam0_imu) if run.metrics["body"] == "imu" else done.trajectory
         write_tum(folder / "trajectory.tum", in_body)
-        (folder / "landmarks.ply").write_bytes(landmarks_ply(done.landmarks))
+        write_landmarks_ply(folder / "landmarks.ply", done.landmarks)
         (folder / MARKER).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_config_arguments, config_from, lengths
+from vio.cli.arguments import add_config_arguments, bound, config_from, lengths
 
 
 def add_parser(commands: Any) -> None:
@@ -15,13 +15,19 @@ def add_parser(commands: Any) -> None:
         "run",
         help="process a recording",
         description="Process a recording and write a folder of results. The kind of SOURCE is detected from its "
-        "content; 'kind:path' sets it (kitti, kitti_raw, euroc, ece276a, utias, log).",
+        "content; 'kind:path' sets it (kitti, kitti_raw, euroc, plain, bag, video, ece276a, utias, log).",
     )
-    parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("source", metavar="SOURCE", nargs="?", help="a recording: folder or file, or kind:path")
+    what.add_argument("--resume", type=Path, metavar="RUN", help="go on with the unfinished run in this folder")
     add_config_arguments(parser)
     parser.add_argument("--reference", type=Path, metavar="F", help="ground truth (TUM, KITTI or EuRoC format)")
-    parser.add_argument("--start", type=int, default=0, metavar="N", help="first frame (default 0)")
-    parser.add_argument("--stop", type=int, metavar="N", help="frame after the last one")
+    parser.add_argument(
+        "--start", type=bound, default=0, metavar="N", help="first frame, or time such as 12s (default 0)"
+    )
+    parser.add_argument(
+        "--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time such as 60s"
+    )
     parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
@@ -30,11 +36,35 @@ def add_parser(commands: Any) -> None:
     parser.set_defaults(execute=execute)
 
 
+_OF_A_NEW_RUN = (
+    "reference",
+    "start",
+    "stop",
+    "lengths",
+    "out",
+    "save_observations",
+    "set",
+    "config",
+    "motion",
+    "backend",
+    "frontend",
+    "calibration",
+    "topics",
+)
+
+
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
-    from vio.cli.running import process, rows_of
+    from vio.cli.running import process, resume, rows_of
+    from vio.errors import ConfigError
 
+    if args.resume is not None:
+        given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
+        if given:
+            raise ConfigError(f"--resume goes on as the run began; leave out {', '.join(given)}")
+        metrics = resume(args.resume, progress=not args.quiet)
+        return print_result(metrics, rows_of(metrics), as_json=args.json)
     metrics = process(
         args.source,
         config_from(args),

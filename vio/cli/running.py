@@ -7,15 +7,19 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vio.atomic import check_replaceable, check_writable
+from vio.atomic import check_replaceable, check_writable, locked_folder
 from vio.cli.progress import ProgressBar
-from vio.config import Config
+from vio.cli.stopping import StopRequest
+from vio.config import Config, load_config
 from vio.datasets import open_dataset
-from vio.errors import VioError
+from vio.datasets.span import Seconds, frames_between
+from vio.errors import StoppedError, VioError
 from vio.evaluation import KITTI_LENGTHS_M
 from vio.pipeline import run
+from vio.protocols import Dataset
 from vio.records import Estimate, FrontendOutput, UpdateReport
-from vio.run_folder import FILES, MARKER, write_run_folder
+from vio.run_folder import FILES, MARKER, finish_run_folder, growing_folder, read_request
+from vio.run_recorder import CHECKPOINT, UNFINISHED
 from vio.trajectory_io import read_trajectory
 
 log = logging.getLogger(__name__)
@@ -31,6 +35,10 @@ class ProgressViewer:
         """Advance by one frame."""
         self._bar.advance()
 
+    def skip(self, frames: int) -> None:
+        """Count frames that an earlier process has done."""
+        self._bar.update(frames)
+
     def close(self) -> None:
         """Close the bar."""
         self._bar.close()
@@ -42,26 +50,84 @@ def process(
     *,
     out: Path | None,
     reference: Path | None = None,
-    start: int = 0,
-    stop: int | None = None,
+    start: int | Seconds = 0,
+    stop: int | Seconds | None = None,
     lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
     progress: bool = True,
 ) -> dict[str, Any]:
-    """Process a source into a run folder and return its metrics."""
+    """Process a source into a run folder, which grows meanwhile, and return its metrics."""
     dataset = open_dataset(source, config.dataset)
-    recording = dataset.recording
-    for note in recording.notes:
+    for note in dataset.recording.notes:
         log.warning("%s", note)
-    truth = recording.reference if reference is None else read_trajectory(reference)
-    folder = check_out(out if out is not None else free_folder(recording.path))
+    folder = check_out(out if out is not None else free_folder(dataset.recording.path))
+    first, end = frames_between(dataset.recording, start, stop)
+    request = {
+        "source": f"{dataset.recording.kind}:{dataset.recording.path.absolute()}",
+        "reference": None if reference is None else str(reference.absolute()),
+        "start": first,
+        "stop": end,
+        "lengths_m": None if lengths_m is None else list(lengths_m),
+        "save_observations": save_observations,
+    }
+    return _process(dataset, config, folder, request, progress=progress, resume=False)
+
+
+def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
+    """Go on with an unfinished run and return its metrics.
+
+    Raises:
+        VioError: the folder holds no unfinished run, or one that another program began.
+    """
+    request = read_request(folder)
+    config = load_config(folder / "config.yaml")
+    dataset = open_dataset(request["source"], config.dataset)
+    saved = (folder / UNFINISHED / CHECKPOINT).is_file()
+    if not saved:
+        log.warning("%s: the run ended before its first checkpoint; it begins again", folder)
+    return _process(dataset, config, folder, request, progress=progress, resume=saved)
+
+
+def _process(
+    dataset: Dataset, config: Config, folder: Path, request: dict[str, Any], *, progress: bool, resume: bool
+) -> dict[str, Any]:
+    """Run, write the results and return the metrics; a run that was interrupted says so and how to go on."""
+    recording, reference = dataset.recording, request["reference"]
+    truth = recording.reference if reference is None else read_trajectory(Path(reference))
+    start, stop, save_observations = request["start"], request["stop"], request["save_observations"]
     total = len(recording.frame_times_ns)
     frames = max(min(total, total if stop is None else stop) - start, 0)
-    viewer = ProgressViewer(frames, recording.path.name) if progress else None
-    result = run(dataset, config, start=start, stop=stop, keep_observations=save_observations, viewer=viewer)
-    return write_run_folder(
-        folder, result, truth, lengths_m=lengths_m or KITTI_LENGTHS_M, save_observations=save_observations
-    )
+    with locked_folder(folder), StopRequest() as asked:
+        try:
+            result = run(
+                dataset,
+                config,
+                start=start,
+                stop=stop,
+                keep_observations=save_observations,
+                viewer=ProgressViewer(frames, recording.path.name) if progress else None,
+                folder=growing_folder(folder, dataset, config, request),
+                resume=resume,
+                should_stop=asked.reason,
+            )
+            metrics = finish_run_folder(
+                folder,
+                result,
+                truth,
+                lengths_m=request["lengths_m"] or KITTI_LENGTHS_M,
+                save_observations=save_observations,
+            )
+        except KeyboardInterrupt as error:
+            if not (folder / UNFINISHED).is_dir():
+                raise
+            text = f"interrupted; what was flushed is in {folder}; go on with: vio run --resume {folder}"
+            raise StoppedError(text, status=130) from error
+    if result.stopped is not None:
+        text = f"{result.stopped}; the results of {len(result.frames)} of {frames} frames are in {folder}"
+        if asked.number is None:
+            raise StoppedError(f"error: {text}", status=1)
+        raise StoppedError(f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number)
+    return metrics
 
 
 def check_out(folder: Path) -> Path:
@@ -112,5 +178,6 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         score = metrics["landmark_error"]
         rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
     rows.append(("results", metrics["out"]))
-    rows.append(("plot", str(Path(metrics["out"]) / "trajectory.png")))
+    plot = Path(metrics["out"]) / "trajectory.png"
+    rows.append(("plot", str(plot) if plot.is_file() else "could not be drawn"))
     return rows

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
+from vio.input_files import check_regular
 from vio.protocols import Dataset
 
 __all__ = ["READERS", "DatasetSettings", "open_dataset"]
@@ -31,6 +32,24 @@ def _kitti_raw(path: Path, settings: DatasetSettings) -> Dataset:
     from vio.datasets.kitti_raw import read_kitti_raw
 
     return read_kitti_raw(path, settings)
+
+
+def _plain(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.plain import read_plain
+
+    return read_plain(path, settings)
+
+
+def _bag(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.bags.reader import read_bag
+
+    return read_bag(path, settings)
+
+
+def _video(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.videos import read_video
+
+    return read_video(path, settings)
 
 
 def _ece276a(path: Path, settings: DatasetSettings) -> Dataset:
@@ -55,13 +74,17 @@ READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
     "kitti": _kitti,
     "kitti_raw": _kitti_raw,
     "euroc": _euroc,
+    "plain": _plain,
+    "bag": _bag,
+    "video": _video,
     "ece276a": _ece276a,
     "utias": _utias,
     "log": _log,
 }
 _LOOKED_FOR = (
     "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
-    "(mav0), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
+    "(mav0), a plain folder (left right and a calibration), a ROS bag (.bag, .db3, .mcap), two videos (left.mp4 "
+    "right.mp4), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
 )
 
 
@@ -77,9 +100,27 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
         CalibrationError: the recording's calibration is invalid.
     """
     kind, path = _parse(os.fspath(source))
+    if path.is_symlink() and not path.exists():
+        raise DataError(f"{path} is a link to {os.readlink(path)}, which leads nowhere; give {_LOOKED_FOR}")
     if not path.exists():
         raise DataError(f"{path} does not exist; give {_LOOKED_FOR}")
-    return READERS[kind or _detect(path)](path, options or DatasetSettings())
+    settings = options or DatasetSettings()
+    return READERS[_for_settings(kind or _detect(path), path, settings)](path, settings)
+
+
+def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
+    """Return the kind that reads a recording with another calibration or named topics.
+
+    Raises:
+        DataError: the recording's kind takes no such setting.
+    """
+    if settings.topics is not None and kind != "bag":
+        raise DataError(f"{path}: --topics names topics of a ROS bag, but this is of kind {kind}; leave it out")
+    if settings.calibration is None or kind in ("plain", "bag", "video"):
+        return kind
+    if kind in ("kitti", "kitti_raw", "euroc"):
+        return "plain"  # which reads these folders, too, with any calibration
+    raise DataError(f"{path}: --calibration takes the place of a camera's calibration, but kind {kind} has its own")
 
 
 def _parse(source: str) -> tuple[str | None, Path]:
@@ -109,9 +150,12 @@ def _detect(path: Path) -> str:
 
 
 def _folder_kind(path: Path) -> str | None:
+    from vio.datasets.bags import is_bag
     from vio.datasets.euroc import is_euroc_folder
     from vio.datasets.kitti import is_kitti_folder
     from vio.datasets.kitti_raw import is_kitti_raw_folder
+    from vio.datasets.plain import holds_more_than_kitti, is_plain_folder, lacks_sensor_yaml
+    from vio.datasets.videos import video_files
 
     try:
         names = sorted(child.name for child in path.iterdir())
@@ -119,27 +163,37 @@ def _folder_kind(path: Path) -> str | None:
         raise DataError(f"cannot list {path}: {error.strerror or error}") from error
     if not names:
         raise DataError(f"{path} is empty; give {_LOOKED_FOR}")
+    if is_bag(path):
+        return "bag"
     if is_kitti_folder(path):
-        return "kitti"
+        return "plain" if holds_more_than_kitti(path) else "kitti"
     if is_kitti_raw_folder(path):
         return "kitti_raw"
     if is_euroc_folder(path):
-        return "euroc"
+        return "plain" if lacks_sensor_yaml(path) else "euroc"
+    if is_plain_folder(path):
+        return "plain"
+    if video_files(path) is not None:
+        return "video"
     if "sequences" in names:
         raise DataError(f"{path} holds several KITTI sequences; name one of them, such as {path / 'sequences' / '00'}")
     return None
 
 
 def _file_kind(path: Path) -> str | None:
+    from vio.datasets.bags import is_bag
     from vio.datasets.observation_log import is_observation_log
 
     try:
+        check_regular(path)
         with path.open("rb") as stream:
             start = stream.read(128)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}") from error
     if start.startswith(b"MATLAB"):
         return "utias"
+    if is_bag(path):
+        return "bag"
     if not start.startswith(b"PK"):
         return None
     try:

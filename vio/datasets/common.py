@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import lzma
+import math
+import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from vio.errors import CalibrationError, DataError
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts
+from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
+from vio.input_files import check_regular
 from vio.records import (
     NS_PER_S,
     BoolArray,
@@ -27,8 +31,10 @@ from vio.records import (
 )
 from vio.text_files import check_increasing
 
-_ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
+_MOST_ARRAY_BYTES = 2**31  # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
+# What a damaged or encrypted archive also raises: an unknown compression, a header that is no literal.
+_DAMAGE = (NotImplementedError, RuntimeError, MemoryError, TypeError, SyntaxError, lzma.LZMAError, struct.error)
 _EXACT_ENTRY = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
 
 
@@ -70,16 +76,10 @@ def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
     T_ = np.asarray(T, dtype=np.float64)
     if T_.shape not in ((3, 4), (4, 4)) or not np.isfinite(T_).all():
         raise CalibrationError(f"{where}: not a finite 3x4 or 4x4 transform (shape {T_.shape}); check the calibration")
-    if T_.shape == (4, 4) and not np.allclose(T_[3], [0, 0, 0, 1], atol=1e-9):
-        raise CalibrationError(f"{where}: the last row of the transform is {T_[3].tolist()}, not 0 0 0 1")
+    if fault := rigid_fault(T_):
+        raise CalibrationError(f"{where}: {fault}")
     R = T_[:3, :3]
     deviation = float(np.abs(R.T @ R - np.eye(3)).max())
-    if not deviation <= _ROTATION_TOLERANCE:
-        raise CalibrationError(
-            f"{where}: not a rotation (R^T R differs from identity by {deviation:.2g}); check the calibration"
-        )
-    if np.linalg.det(R) < 0:
-        raise CalibrationError(f"{where}: not a rotation but a reflection (determinant -1); check the axes' order")
     return se3_from_parts(R if deviation <= _EXACT else nearest_rotation(R), T_[:3, 3])
 
 
@@ -106,8 +106,10 @@ def numbers_in(text: str, count: int, where: str) -> FloatArray:
         values = np.array([float(value) for value in text.split()])
     except ValueError as error:
         raise CalibrationError(f"{where} holds no number ({error}); copy the calibration again") from error
-    if values.shape != (count,) or not np.isfinite(values).all():
-        raise CalibrationError(f"{where} holds {len(values)} values, expected {count} finite ones; copy it again")
+    if values.shape != (count,):
+        raise CalibrationError(f"{where} holds {len(values)} values, expected {count}; copy it again")
+    if not np.isfinite(values).all():
+        raise CalibrationError(f"{where} holds values that are not finite; copy it again")
     return values
 
 
@@ -217,20 +219,68 @@ def merge_events(
         yield from samples
 
 
-def read_npz(path: Path) -> Mapping[str, np.ndarray]:
-    """Read all arrays of an `.npz`, without pickle.
+def npz_names(path: Path) -> frozenset[str]:
+    """Return the names of the arrays in an `.npz`.
 
     Raises:
-        DataError: the file is missing, corrupt, no archive, or holds pickled objects.
+        DataError: the file is missing, corrupt or no archive.
     """
+    with _open_npz(path) as archive:
+        return frozenset(name.removesuffix(".npy") for name in archive.namelist())
+
+
+def read_npz(path: Path, keys: Iterable[str] | None = None) -> Mapping[str, np.ndarray]:
+    """Read those of some arrays that an `.npz` holds, without pickle; others are not read at all.
+
+    Args:
+        path: the archive.
+        keys: names of the arrays; None: all.
+
+    Raises:
+        DataError: the file is missing, corrupt, no archive, holds pickled objects, or its arrays would take more than
+            2 GiB.
+    """
+    with _open_npz(path) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        wanted = {key: members[key] for key in (members if keys is None else keys) if key in members}
+        check_array_bytes({key: info.file_size for key, info in wanted.items()}, path)
+        return {key: _read_member(archive, info) for key, info in wanted.items()}
+
+
+def check_array_bytes(sizes: Mapping[str, int], path: Path) -> None:
+    """Raise DataError if arrays of these sizes in bytes take more memory than a recording may."""
+    if (total := sum(sizes.values())) > _MOST_ARRAY_BYTES:
+        largest = max(sizes, key=lambda key: sizes[key])
+        raise DataError(
+            f"{path}: its arrays take {total / 2**30:.1f} GiB ({largest} alone {sizes[largest] / 2**30:.1f}), more "
+            f"than {_MOST_ARRAY_BYTES / 2**30:g} GiB; split the recording"
+        )
+
+
+def _read_member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    """Read one array; its header must not state more than the archive says that it holds."""
+    with archive.open(info) as stream:
+        major = np.lib.format.read_magic(stream)[0]
+        read_header = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read_header(stream)
+        if math.prod(shape) * dtype.itemsize > info.file_size:
+            raise ValueError(f"{info.filename} states the shape {shape}, but has {info.file_size} bytes")
+    with archive.open(info) as stream:
+        return np.asarray(np.lib.format.read_array(stream, allow_pickle=False))
+
+
+@contextlib.contextmanager
+def _open_npz(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an archive; what goes wrong inside the block is a DataError that names the file."""
     try:
+        check_regular(path)
         if not zipfile.is_zipfile(path) and path.is_file():
             raise DataError(
                 f"{path}: is damaged or no .npz archive of named arrays; copy it again, or give another file"
             )
-        with np.load(path, allow_pickle=False) as archive:
-            return {key: archive[key] for key in archive.files}
-    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError) as error:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except (ValueError, zipfile.BadZipFile, zlib.error, EOFError, KeyError, *_DAMAGE) as error:
         why = "holds pickled objects" if "pickle" in str(error) else "is damaged"
         remedy = "save it again as plain numeric arrays with numpy.savez" if "pickle" in str(error) else "copy it again"
         raise DataError(f"{path}: {why} ({' '.join(str(error).split())}); {remedy}") from error

@@ -24,6 +24,7 @@ from vio.datasets.common import (
     clock_ns,
     finite_rows,
     naming,
+    npz_names,
     read_npz,
     shape_text,
     velocity_samples,
@@ -57,7 +58,7 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
         DataError: keys, shapes, clocks or values are wrong; the message names which and the expected form.
         CalibrationError: the calibration is invalid.
     """
-    arrays = read_npz(path)
+    arrays = read_npz(path, (*OLD_KEYS, *NEW_KEYS))
     if set(OLD_KEYS) <= set(arrays):
         time_key, linear_key, angular_key = "time_stamps", "linear_velocity", "rotational_velocity"
         calibration = _old_calibration(arrays, path)
@@ -67,7 +68,7 @@ def read_ece276a(path: Path, settings: DatasetSettings) -> FeatureDataset:
     else:
         raise DataError(
             f"{path}: an ECE276A file needs the keys {' '.join(OLD_KEYS)} (or {' '.join(NEW_KEYS)}); "
-            f"found {' '.join(sorted(arrays)) or 'none'}"
+            f"found {' '.join(sorted(npz_names(path))) or 'none'}"
         )
     features = _array(arrays, "features", path, lambda s: len(s) == 3 and s[0] == 4 and s[2] > 1, "4 x M x T")
     count = features.shape[2]

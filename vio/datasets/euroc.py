@@ -24,13 +24,16 @@ from vio.datasets.euroc_files import (
     TUM_FILE,
     camera_yaml,
     image_list_csv,
+    image_name,
     median_rate_hz,
     read_camera_yaml,
     read_imu_csv,
     read_imu_yaml,
     stamped_rows,
 )
+from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import list_images
+from vio.datasets.pairing import PAIRED_NS, pair_stamps
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
@@ -41,9 +44,6 @@ from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recordi
 from vio.text_files import write_text
 from vio.trajectory_io import read_trajectory
 from vio.watch.clocks import judge_clocks
-
-_PAIRED_NS = 3_000_000  # stamps further apart belong to different exposures
-_JITTER_NS = 1_000_000  # allowed deviation of the offset between paired stamps from its median
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +94,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
             "remove imu0"
         )
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
+    pairs = tuple((left.files[a], right.files[b]) for a, b in zip(of_left.tolist(), of_right.tolist(), strict=True))
+    white, depth_notes = full_scale(pairs)
     recording = Recording(
         kind="euroc",
         path=path,
@@ -103,16 +105,17 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=motion,
         reference=_read_reference(mav, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes),
+        notes=(*notes, *imu.notes, *depth_notes),
     )
     return RectifiedDataset(
         recording=recording,
-        pairs=tuple((left.files[a], right.files[b]) for a, b in zip(of_left.tolist(), of_right.tolist(), strict=True)),
+        pairs=pairs,
         motion=imu.samples,
         rectifier=rectifier,
         sizes=rig_sizes(rig, (mav / "cam0" / "sensor.yaml", mav / "cam1" / "sensor.yaml")),
         settings=settings,
         imu_noise=imu.noise,
+        white=white,
     )
 
 
@@ -162,7 +165,7 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
     if not len(a):
         spans = [f"{c.times_ns[0]} to {c.times_ns[-1]} ns" for c in (left, right)]
         raise DataError(
-            f"{mav}: no image of cam0 ({spans[0]}) has one of cam1 ({spans[1]}) within {_PAIRED_NS / 1e6:g} ms; "
+            f"{mav}: no image of cam0 ({spans[0]}) has one of cam1 ({spans[1]}) within {PAIRED_NS / 1e6:g} ms; "
             "both data.csv must use one clock and come from one recording"
         )
     notes: list[str] = []
@@ -178,27 +181,6 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
             "with the nearest right one"
         )
     return a, b, tuple(notes)
-
-
-def pair_stamps(left_ns: IntArray, right_ns: IntArray) -> tuple[IntArray, IntArray]:
-    """Indices (F,), (F,) of paired stamps: equal ones, or nearest ones at a small, constant offset."""
-    _, equal_a, equal_b = np.intersect1d(left_ns, right_ns, assume_unique=True, return_indices=True)
-    b = _nearest(left_ns, right_ns)
-    a = np.arange(len(left_ns))
-    offset = right_ns[b] - left_ns
-    near = (np.abs(offset) < _PAIRED_NS) & (_nearest(right_ns, left_ns)[b] == a)
-    if 2 * len(equal_a) >= near.sum():
-        return equal_a.astype(np.int64), equal_b.astype(np.int64)
-    steady = near & (np.abs(offset - np.median(offset[near])) <= _JITTER_NS)
-    return a[steady], b[steady]
-
-
-def _nearest(of: IntArray, among: IntArray) -> IntArray:
-    """Index (N,) of the nearest of sorted times (M,) for each of (N,) times."""
-    after = np.clip(np.searchsorted(among, of), 1, max(len(among) - 1, 1))
-    after = np.minimum(after, len(among) - 1)
-    before = np.maximum(after - 1, 0)
-    return np.where(np.abs(among[after] - of) < np.abs(of - among[before]), after, before)
 
 
 # --- inertial record and ground truth -------------------------------------------------------------------------------
@@ -255,7 +237,8 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progre
         (folder / "data").mkdir(parents=True)
 
     def name(frame: StereoFrame, count: int) -> tuple[Path, Path]:
-        return folders[0] / "data" / f"{frame.time_ns}.png", folders[1] / "data" / f"{frame.time_ns}.png"
+        file = image_name(frame.time_ns, int(dataset.recording.frame_times_ns[-1]))
+        return folders[0] / "data" / file, folders[1] / "data" / file
 
     times_ns = write_frames(dataset, name, progress)
     for folder, model, T_imu_cam in zip(folders, (rig.cam0, rig.cam1), (rig.T_imu_cam0, rig.T_imu_cam1), strict=True):

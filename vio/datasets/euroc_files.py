@@ -150,9 +150,15 @@ def _T_BS_yaml(T_body_sensor: FloatArray) -> str:
 # --- data.csv -------------------------------------------------------------------------------------------------------
 
 
+def image_name(time_ns: int, last_ns: int) -> str:
+    """The file name of an image by its time, with the digits of the last one's, so that names sort by time as text."""
+    return f"{time_ns:0{len(str(last_ns))}d}.png"
+
+
 def image_list_csv(times_ns: IntArray) -> str:
     """The text of a camera's `data.csv` for images named by their times (N,), nanoseconds."""
-    return "\n".join([_IMAGES_HEADER, *(f"{t},{t}.png" for t in times_ns.tolist())]) + "\n"
+    last_ns = int(times_ns[-1])
+    return "\n".join([_IMAGES_HEADER, *(f"{t},{image_name(t, last_ns)}" for t in times_ns.tolist())]) + "\n"
 
 
 def read_imu_csv(path: Path) -> ImuRecord:

@@ -1,22 +1,26 @@
-"""Recordings of two image folders: paired by name, prefetched, with a few unreadable frames skipped."""
+"""Recordings of two image folders: paired by name, prefetched, with unusable frames skipped."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 from collections.abc import Callable, Generator, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeVar
 
 from vio.datasets.common import frame_range, merge_events
-from vio.datasets.images import UnreadableImageError, list_images, load_gray, prefetch
+from vio.datasets.images import WHITE_16, UnreadableImageError, list_images, load_gray, prefetch, white_level
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
 from vio.records import Event, Image, MotionSample, Observations, Recording, StereoFrame
 
 logger = logging.getLogger(__name__)
 
+Item = TypeVar("Item")
 ImagePairs = tuple[tuple[Path, Path], ...]  # left and right image of each frame
+
+_NAMED = 5  # skipped frames that get a line each; the others are counted in one at the end
 
 
 def pair_images(left: Path, right: Path) -> ImagePairs:
@@ -38,44 +42,63 @@ def pair_images(left: Path, right: Path) -> ImagePairs:
 
 @dataclass(frozen=True, slots=True)
 class BadFrame:
-    """A frame with an unreadable image, and the reason."""
+    """A frame with an image that is unreadable or of another size, and the reason."""
 
     index: int
     why: str
 
 
 def readable_frames(
-    load: Callable[[int], StereoFrame | BadFrame], chosen: Iterable[int], settings: DatasetSettings
+    load: Callable[[Item], StereoFrame | BadFrame], chosen: Iterable[Item], settings: DatasetSettings
 ) -> Generator[StereoFrame]:
-    """Prefetch frames in a thread, and skip unreadable ones with a warning up to the limit of the settings.
+    """Prefetch frames in a thread, and skip unusable ones with a warning.
 
     Raises:
-        DataError: too many frames are unreadable, or whatever `load` raises.
+        DataError: every frame is unusable, more are than the settings allow, or whatever `load` raises.
     """
-    bad = 0
+    good, first_bad, bad = 0, "", 0
     with contextlib.closing(prefetch(load, chosen, settings.prefetch_frames)) as loaded:
         for frame in loaded:
             if isinstance(frame, StereoFrame):
+                good += 1
                 yield frame
                 continue
-            bad += 1
-            if bad > settings.max_bad_frames:
+            bad, first_bad = bad + 1, first_bad or frame.why
+            if settings.max_bad_frames is not None and bad > settings.max_bad_frames:
                 raise DataError(
-                    f"{frame.why} ({bad} unreadable frames, dataset.max_bad_frames allows {settings.max_bad_frames})"
+                    f"{frame.why} ({bad} unusable frames, dataset.max_bad_frames allows {settings.max_bad_frames})"
                 )
-            logger.warning("frame %d is skipped: %s", frame.index, frame.why)
+            if bad <= _NAMED:
+                logger.warning("frame %d is skipped: %s", frame.index, frame.why)
+    if bad and not good:
+        raise DataError(f"none of {bad} frames can be used; the first: {first_bad}")
+    if bad > _NAMED:
+        logger.warning("%d of %d frames were skipped; the first %d are named above", bad, bad + good, _NAMED)
 
 
-def first_readable(pairs: ImagePairs, max_bad_frames: int) -> tuple[Path, Image, int]:
+_WHITE_FRAMES = 8  # that tell the level of white, spread over the recording: the first may be dark
+
+
+def full_scale(pairs: ImagePairs) -> tuple[int, tuple[str, ...]]:
+    """Return the level of white of a recording's 16-bit images, for `load_gray`, with a note where it is not 65535."""
+    chosen = {(len(pairs) - 1) * k // (_WHITE_FRAMES - 1) for k in range(_WHITE_FRAMES)} if pairs else set()
+    white = white_level([path for k in sorted(chosen) for path in pairs[k]])
+    if white == WHITE_16:
+        return white, ()
+    note = f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits"
+    return white, (note,)
+
+
+def first_readable(pairs: ImagePairs) -> tuple[Path, Image, int]:
     """The first left image that can be read: its file, its pixels (H, W) and its bits per channel.
 
     Raises:
-        UnreadableImageError: the first `max_bad_frames` images are all unreadable.
+        UnreadableImageError: all left images are unreadable.
     """
-    for path, _ in pairs[:max_bad_frames]:
+    for path, _ in pairs[:-1]:
         with contextlib.suppress(UnreadableImageError):
             return path, *load_gray(path)
-    last = pairs[min(max_bad_frames, len(pairs) - 1)][0]
+    last = pairs[-1][0]
     return last, *load_gray(last)
 
 
@@ -88,9 +111,9 @@ class ImageSize:
     stated_by: Path  # a calibration, or the image that was measured
 
     def check(self, image: Image, path: Path) -> None:
-        """Raise DataError unless an image (H, W) has this size."""
+        """Raise UnreadableImageError unless an image (H, W) has this size."""
         if image.shape != (self.height, self.width):
-            raise DataError(
+            raise UnreadableImageError(
                 f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} specifies {self.width} x "
                 f"{self.height}; give images of one size, and the calibration of these images"
             )
@@ -105,14 +128,15 @@ class ImageDataset:
     motion: tuple[MotionSample, ...]  # in time order
     sizes: tuple[ImageSize, ImageSize]  # of the left and the right files
     settings: DatasetSettings
+    white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
 
-        A frame with an unreadable image is skipped with a warning, up to `max_bad_frames` of them.
+        A frame with an image that is unreadable or of another size is skipped with a warning.
 
         Raises:
-            DataError: the range holds no frame, an image has another size, or too many are unreadable.
+            DataError: the range holds no frame, or none that can be used, or more are unusable than the settings allow.
         """
         chosen = frame_range(self.recording, start, stop)
         if images:
@@ -136,9 +160,9 @@ class ImageDataset:
         """Read one frame; runs in the prefetch thread."""
         paths = self.pairs[index]
         try:
-            left, right = (load_gray(path)[0] for path in paths)
+            left, right = (load_gray(path, self.white)[0] for path in paths)
+            for size, image, path in zip(self.sizes, (left, right), paths, strict=True):
+                size.check(image, path)
         except UnreadableImageError as error:
             return BadFrame(index, str(error))
-        for size, image, path in zip(self.sizes, (left, right), paths, strict=True):
-            size.check(image, path)
         return self._frame(index, *self.prepared(left, right))

@@ -6,24 +6,34 @@ is decoded.
 
 from __future__ import annotations
 
+import contextlib
+import re
 import struct
 import zlib
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
+from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
 from vio.errors import DataError
+from vio.input_files import check_regular, read_input
 from vio.records import Image
 
-SUFFIXES = (".png", ".jpg", ".jpeg")
+SUFFIXES = (".png", ".jpg", ".jpeg", *OTHER_SUFFIXES)
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 _JPEG_START, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
-_FULL_16_TO_8 = 257  # 65535 / 255
+WHITE_16 = 65535  # the level of white in an image that uses all of its 16 bits
+MOST_PIXELS = 2**26  # 8192 x 8192; a header may state 2^62, and decoding would try to get the memory
+_MOST_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
+_SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
+_WHITE_SHARE = 0.999  # of the pixels are no brighter than the level that tells the bits in use
+_JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})  # start-of-frame markers, with the image size
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
 
 Item = TypeVar("Item")
@@ -31,36 +41,83 @@ Loaded = TypeVar("Loaded")
 
 
 class UnreadableImageError(DataError):
-    """An image file is missing, truncated or corrupt; a reader may skip its frame."""
+    """An image file is missing, truncated, corrupt or of another size; a reader may skip its frame."""
 
 
-def load_gray(path: Path) -> tuple[Image, int]:
+def load_gray(path: Path, white: int = WHITE_16) -> tuple[Image, int]:
     """Read a PNG or JPEG as 8-bit gray (H, W); return it with the file's own bits per channel (8 or 16).
 
-    Colour is converted to gray with OpenCV's weights (.299 R + .587 G + .114 B); 16 bits are scaled to 8 by 1/257.
+    Colour is converted to gray with OpenCV's weights (.299 R + .587 G + .114 B).
+
+    Args:
+        path: the file.
+        white: the level of a file of 16 bits that becomes 255; brighter pixels do, too. See `white_level`.
 
     Raises:
-        UnreadableImageError: the file cannot be read, is truncated, or does not decode.
+        UnreadableImageError: the file cannot be read, is truncated or too large, or does not decode.
     """
-    import cv2
+    return _as_gray(_load(path), white)
 
+
+def decode_gray(data: bytes, path: Path | str, white: int = WHITE_16) -> tuple[Image, int]:
+    """Decode an image file in memory as `load_gray` does; `path` names it in messages."""
+    return _as_gray(_decoded(data, path), white)
+
+
+def _as_gray(pixels: npt.NDArray[Any], white: int) -> tuple[Image, int]:
+    bits = pixels.dtype.itemsize * 8
+    if bits == 16:
+        pixels = np.minimum(np.rint(pixels / (white / 255)), 255)
+    gray: Image = np.ascontiguousarray(pixels, dtype=np.uint8)
+    return gray, bits
+
+
+def white_level(paths: Sequence[Path]) -> int:
+    """Return the level of white of 16-bit images: that of 10, 12, 14 or 16 bits, the fewest that hold the images.
+
+    Cameras of 12 bits store 0 to 4095 in 16 bits, which full scale would make almost black. One level serves all frames
+    of a recording, so that its brightness does not jump. Images of 8 bits, and unreadable ones, are passed over.
+
+    Args:
+        paths: some images of the recording, spread over it.
+    """
+    level = 0.0
+    for path in paths:
+        with contextlib.suppress(UnreadableImageError, OSError):
+            check_regular(path)
+            with path.open("rb") as stream:
+                start = stream.read(25)
+            if start.startswith(_PNG_START) and start[24:] == b"\x10":  # the depth in the header
+                level = max(level, float(np.quantile(_load(path), _WHITE_SHARE)))
+    fitting = (2**bits - 1 for bits in _SENSOR_BITS if level <= 2**bits - 1)
+    return next(fitting, WHITE_16) if level > 0 else WHITE_16
+
+
+def _load(path: Path) -> npt.NDArray[Any]:
+    """Read a file as gray (H, W) of its own depth."""
     try:
-        data = path.read_bytes()
+        data = read_input(path, _MOST_BYTES)
     except OSError as error:
         raise UnreadableImageError(f"cannot read {path}: {error.strerror or error}") from error
+    return _decoded(data, path)
+
+
+def _decoded(data: bytes, path: Path | str) -> npt.NDArray[Any]:
+    """Decode a file in memory as gray (H, W) of its own depth."""
+    import cv2
+
     if problem := _damage(data):
         raise UnreadableImageError(f"{path}: {problem}; copy the image again")
-    pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except (cv2.error, MemoryError) as error:
+        raise UnreadableImageError(f"{path}: does not decode ({' '.join(str(error).split())})") from error
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise UnreadableImageError(f"{path}: does not decode as an image of 8 or 16 bits; copy the image again")
-    bits = pixels.dtype.itemsize * 8
     if pixels.ndim == 3:
         code = {1: None, 3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}[pixels.shape[2]]
         pixels = pixels[..., 0] if code is None else cv2.cvtColor(pixels, code)
-    if bits == 16:
-        pixels = np.rint(pixels / _FULL_16_TO_8).astype(np.uint8)
-    gray: Image = np.ascontiguousarray(pixels, dtype=np.uint8)
-    return gray, bits
+    return np.asarray(pixels)
 
 
 def write_png(path: Path, image: Image) -> None:
@@ -78,8 +135,53 @@ def _damage(data: bytes) -> str | None:
     if data.startswith(_PNG_START):
         return _png_damage(data)
     if data.startswith(_JPEG_START):
-        return None if data.rstrip(b"\0").endswith(_JPEG_END) else "the JPEG is truncated"
-    return "neither PNG nor JPEG"
+        return _jpeg_damage(data)
+    return other_damage(data)
+
+
+def _too_large(width: int, height: int) -> str | None:
+    if width * height <= MOST_PIXELS:
+        return None
+    return f"its header states {width} x {height} pixels, more than {MOST_PIXELS / 2**20:g} Mpx"
+
+
+def _jpeg_damage(data: bytes) -> str | None:
+    """Check the segments up to the end of the image; what follows it (a preview, a video) is not looked at.
+
+    Reference: ITU-T T.81, annex B.
+    """
+    at = len(_JPEG_START)
+    while 0 <= at <= len(data) - 4:
+        if data[at] != 0xFF:
+            break
+        kind = data[at + 1]
+        if kind == 0xFF:  # fill bytes may precede a marker
+            at += 1
+            continue
+        if kind == _JPEG_END[1]:
+            return None
+        (size,) = struct.unpack_from(">H", data, at + 2)
+        if kind in _JPEG_FRAMES and at + 9 <= len(data):
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            if problem := _too_large(width, height):
+                return problem
+        at += 2 + size
+        if kind == 0xDA:  # the compressed pixels of a scan, up to a marker
+            if data.rstrip(b"\0").endswith(_JPEG_END):
+                return None
+            at = _end_of_scan(data, at)
+    return None if at >= 0 and data[at : at + 2] == _JPEG_END else "the JPEG is truncated"
+
+
+def _end_of_scan(data: bytes, at: int) -> int:
+    """Return where the marker after a scan begins; -1: there is none."""
+    while True:
+        at = data.find(b"\xff", at)
+        if at < 0 or at + 1 >= len(data):
+            return -1
+        if data[at + 1] != 0 and not 0xD0 <= data[at + 1] <= 0xD7:  # neither a data byte of 255 nor a restart
+            return at
+        at += 2
 
 
 def _png_damage(data: bytes) -> str | None:
@@ -92,6 +194,8 @@ def _png_damage(data: bytes) -> str | None:
             break
         if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             return f"the PNG is damaged (wrong checksum in its {kind.decode('latin-1')!r} chunk)"
+        if kind == b"IHDR" and size >= 8 and (problem := _too_large(*struct.unpack_from(">II", data, at + 8))):
+            return problem
         if kind == b"IEND":
             return None
         at = end
@@ -99,20 +203,25 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def list_images(folder: Path) -> tuple[Path, ...]:
-    """The image files of a folder, sorted by name.
+    """The image files of a folder, sorted by name, numbers as numbers: `left2.png` before `left10.png`.
 
     Raises:
         DataError: the folder is missing or holds no image.
     """
     try:
-        found = sorted(
-            path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and not path.name.startswith(".")
-        )
+        images = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+        found = sorted(images, key=natural_key)
     except OSError as error:
         raise DataError(f"cannot list {folder}: {error.strerror or error}; give a folder of images") from error
     if not found:
         raise DataError(f"{folder}: holds no image ({', '.join(SUFFIXES)})")
     return tuple(found)
+
+
+def natural_key(path: Path) -> tuple[tuple[tuple[int, str], ...], str]:
+    """Sort key of a name with its runs of digits as numbers; equal ones (`1.png`, `01.png`) by their text."""
+    parts = re.split(r"(\d+)", path.stem)
+    return tuple((int(p), "") if k % 2 else (-1, p) for k, p in enumerate(parts)), path.name
 
 
 def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) -> Generator[Loaded]:

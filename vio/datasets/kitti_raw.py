@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
-from vio.datasets.image_pairs import ImagePairs, first_readable, pair_images
+from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pair_images
 from vio.datasets.kitti import write_calibration, write_times
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
@@ -84,6 +84,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     numbers = _frame_numbers(pairs)
     times_ns, time_notes = _read_times(path / "image_00" / "timestamps.txt", numbers)
     rectifier = _rectifier(calibration, T_cam0_imu, pairs, settings, calibration_path)
+    white, depth_notes = full_scale(pairs)
     recording = Recording(
         kind="kitti_raw",
         path=path,
@@ -93,10 +94,10 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=frozenset(),
         reference=None,
-        notes=(*time_notes, *imu_notes),
+        notes=(*time_notes, *imu_notes, *depth_notes),
     )
     sizes = rig_sizes(rectifier.rig, (calibration_path, calibration_path))
-    return RectifiedDataset(recording, pairs, (), sizes, settings, rectifier)
+    return RectifiedDataset(recording, pairs, (), sizes, settings, rectifier, white=white)
 
 
 def _find(path: Path, name: str) -> Path | None:
@@ -117,7 +118,7 @@ def _rectifier(
     c = calibration
     T_imu_cam0 = np.eye(4) if T_cam0_imu is None else se3_inverse(T_cam0_imu)
     raw, rectified = (c.cam0.width, c.cam0.height), (c.rect0.width, c.rect0.height)
-    size = first_readable(pairs, settings.max_bad_frames)[1].shape[::-1]
+    size = first_readable(pairs)[1].shape[::-1]
     if size == rectified and raw != rectified:
         T_imu_rect0 = T_imu_cam0 @ se3_from_parts(c.R_rect_cam0.T, np.zeros(3))
         rig = StereoRig(c.rect0, c.rect1, T_imu_rect0, T_imu_rect0 @ se3_inverse(c.T_rect1_rect0))

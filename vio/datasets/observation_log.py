@@ -53,6 +53,18 @@ _REQUIRED: dict[str, tuple[str, int]] = {  # array kinds (numpy's letters) and d
     "motion_is_imu": ("b", 1),
     "motion_values": ("f", 2),
 }
+_OPTIONAL = (
+    "format",
+    "run_motion",
+    "T_cam0_imu",
+    "reference_T_world_body",
+    "reference_body",
+    "reference_times_ns",
+    "reference_frame_indices",
+    "landmark_ids",
+    "landmark_p_world",
+    "landmark_covariance",
+)
 _GROUPS = {  # keys that need others
     "reference_T_world_body": ("reference_body",),
     "landmark_ids": ("landmark_p_world", "landmark_covariance"),
@@ -152,7 +164,7 @@ def read_observation_log(path: Path) -> FeatureDataset:
     Raises:
         DataError: the file is no log, was written by a newer version, or is inconsistent.
     """
-    arrays = read_npz(path)
+    arrays = read_npz(path, (*_REQUIRED, *_OPTIONAL))
     _check_format(arrays, path)
     frames, offsets, times_ns = arrays["frame_indices"], arrays["offsets"], arrays["frame_times_ns"]
     dense_offsets = offsets[np.searchsorted(frames, np.arange(len(times_ns) + 1))]

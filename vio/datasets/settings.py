@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
 from vio.geometry.rectify import Interpolation
@@ -33,13 +34,23 @@ class DatasetSettings(Section):
         "id from there on (split), mark them and keep the id (flag), use them as they are (literal), or decide by the "
         "motion of the pixels afterwards whether the track switched to another point (auto: split if so, else flag)",
     )
+    calibration: Path | None = setting(
+        None,
+        "plain folders, bags and videos: the calibration file, in the place of the recording's own",
+    )
+    topics: str | None = setting(
+        None, "bags: topics by name, such as left=/a,right=/b,imu=/c, in the place of those found by type"
+    )
     interpolation: Interpolation = setting(
         "linear",
         "unrectified images: how gray values between pixels are interpolated in rectifying (cubic and lanczos4 cost 5 "
         "and 15 times as much for barely better tracks)",
     )
-    max_bad_frames: int = setting(
-        5, "image folders: unreadable stereo frames skipped before the reader stops with an error", at_least=0
+    max_bad_frames: int | None = setting(
+        None,
+        "image folders: stereo frames with unreadable images or images of another size that are skipped before the "
+        "reader stops with an error; null: all but the last usable one",
+        at_least=0,
     )
     prefetch_frames: int = setting(
         4, "image folders: stereo frames decoded ahead in a thread; 0: no thread", at_least=0, at_most=1000

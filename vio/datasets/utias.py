@@ -6,19 +6,30 @@ of `R_i_v`, which maps the vehicle's axes to the inertial frame.
 
 from __future__ import annotations
 
+import errno
+import math
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import checked_transform, clock_ns, finite_rows, naming, shape_text, velocity_samples
+from vio.datasets.common import (
+    check_array_bytes,
+    checked_transform,
+    clock_ns,
+    finite_rows,
+    naming,
+    shape_text,
+    velocity_samples,
+)
 from vio.datasets.features import FeatureDataset, SensorVariances
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
+from vio.input_files import check_regular
 from vio.records import IntArray, Landmarks, Recording, Trajectory
 
 KEYS = ("y_k_j", "t", "v_vk_vk_i", "w_vk_vk_i", "fu", "fv", "cu", "cv", "b", "C_c_v", "rho_v_c_v")
@@ -63,23 +74,29 @@ def read_utias(path: Path, settings: DatasetSettings) -> FeatureDataset:
 
 
 def _read_mat(path: Path) -> Mapping[str, FloatArray]:
-    from scipy.io import loadmat
+    from scipy.io import loadmat, whosmat
     from scipy.io.matlab import MatReadError
 
     try:
-        raw = loadmat(path, mat_dtype=True)
+        check_regular(path)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        shapes = {name: shape for name, shape, _ in whosmat(path)}
+        wanted = [name for name in (*KEYS, *OPTIONAL_KEYS) if name in shapes]
+        check_array_bytes({name: 8 * math.prod(shapes[name]) for name in wanted}, path)
+        raw = loadmat(path, mat_dtype=True, variable_names=wanted)
     except NotImplementedError as error:
         raise DataError(f"{path}: a MATLAB 7.3 file; save it again with `save -v7`") from error
-    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError, zlib.error) as error:
+    except (MatReadError, ValueError, TypeError, KeyError, IndexError, EOFError, MemoryError, zlib.error) as error:
         raise DataError(f"{path}: is damaged or no MATLAB file ({error}); copy it again") from error
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror or error}; copy it again") from error
-    names = [name for name in raw if not name.startswith("__")]
+    names = [name for name in shapes if not name.startswith("__")]
     if missing := [key for key in KEYS if key not in names]:
         raise DataError(
             f"{path}: lacks {' '.join(missing)}; a UTIAS file needs {' '.join(KEYS)}, found {' '.join(sorted(names))}"
         )
-    arrays = {name: raw[name] for name in names if isinstance(raw[name], np.ndarray)}
+    arrays = {name: raw[name] for name in wanted if isinstance(raw.get(name), np.ndarray)}
     for key in (*KEYS, *(key for key in OPTIONAL_KEYS if key in names)):
         if key not in arrays or arrays[key].dtype.kind not in "fiu":
             raise DataError(f"{path}: {key} is not an array of real numbers; save it again as one")

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import yaml
 
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray
 from vio.text_files import text_lines
+from vio.yaml_text import read_yaml as read_yaml_text
 
 Entries: TypeAlias = Mapping[str, object]
 
@@ -31,13 +31,11 @@ def read_yaml(path: Path, what: str = "the sensor's calibration") -> dict[str, o
     # OpenCV's writer begins with '%YAML:1.0', which is no YAML directive, and tags its matrices.
     lines = [line for _, line in text_lines(path) if not line.startswith("%YAML")]
     try:
-        entries = yaml.safe_load("\n".join(lines).replace("!!opencv-matrix", ""))
-    except yaml.constructor.ConstructorError as error:
+        entries = read_yaml_text("\n".join(lines).replace("!!opencv-matrix", ""))
+    except ValueError as error:
         raise CalibrationError(
-            f"{path}: holds a tag ({' '.join(str(error.problem).split())}); write plain numbers"
+            f"{path}: not a YAML file of plain values ({error}); write plain numbers, or copy it again"
         ) from error
-    except (yaml.YAMLError, RecursionError) as error:
-        raise CalibrationError(f"{path}: not a YAML file ({' '.join(str(error).split())}); copy it again") from error
     if not isinstance(entries, dict):
         raise CalibrationError(f"{path}: holds no calibration (expected 'key: value' lines); copy it again")
     return {str(key): value for key, value in entries.items()}

@@ -47,6 +47,10 @@ class LateImuMsckf(Msckf):
         self._follow_handover()
         return report
 
+    def restart(self, observations: Observations) -> UpdateReport:
+        """Start again at a frame after a divergence, see `Msckf`."""
+        return super().restart(observations) if self._early is None else self._early.restart(observations)
+
     def _follow_handover(self) -> None:
         """Keep the pose at the handover that of the images alone, while the filter still corrects its own."""
         if self._handover is None:

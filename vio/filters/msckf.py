@@ -17,7 +17,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import block_diag
 
-from vio.errors import ConfigError, EstimationError
+from vio.errors import ConfigError, DivergedError, EstimationError
+from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
     MIN_DEPTH,
@@ -30,6 +31,7 @@ from vio.filters.multiview import (
 from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, Transition, TwistMotion
 from vio.filters.noise import MotionNoise, StepErrors
 from vio.filters.online_calibration import calibration_covariance, first_calibration
+from vio.filters.restart import GoodState, restarted
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
     TERMS,
@@ -41,7 +43,7 @@ from vio.filters.stereo_calibration import (
     landmark_columns,
 )
 from vio.filters.tracks import latest_pixels
-from vio.filters.window import Clone, Window, posterior
+from vio.filters.window import Clone, Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
@@ -78,6 +80,7 @@ _MAP_DEPTH_SIGMA = 0.2  # by all views; a point of the map is reported with its 
 _LEAST_MERGE = 1000  # stored points up to which the map is not merged
 _USELESS_RAD = 0.2  # standard deviation of a predicted rotation beyond which its pixels start no search
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
+_MOST_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
 _MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
 
 
@@ -104,12 +107,17 @@ class Msckf:
             motion: which motion samples will come; None: images alone.
 
         Raises:
-            ConfigError: the calibration is to be estimated without an IMU.
+            ConfigError: the calibration is to be estimated without an IMU, or an argument is of another kind.
+            CalibrationError: the extrinsics are no rigid transform.
         """
+        check_parts("msckf", camera, settings, MsckfSettings)
+        if motion not in (None, *self.motion_sources):
+            raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
         if settings.calibrate != "none" and motion != "imu":
             raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to none")
         self._camera, self._settings = camera, settings
-        self._calibration = first_calibration(T_cam0_imu, settings)
+        self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings)
+        self._order = InputOrder("msckf")
         self._source = motion
         self._motion: ImuMotion | TwistMotion = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
         self._window: Window | None = None
@@ -128,6 +136,7 @@ class Msckf:
         self._since_frame = NO_STEP  # how the error has grown since the last frame
         self._predicted_step: tuple[int, Transition] | None = None  # integrated by `predict`, with its end
         self._tilted: FloatArray = np.eye(3)  # (3, 3) how the first attitude has been corrected, on the world's side
+        self._good: GoodState | None = None  # after the last plausible update
         self._map: list[Landmarks] = []
         self._points_stored = 0  # points in the map since it was merged
 
@@ -136,10 +145,12 @@ class Msckf:
 
         Raises:
             ConfigError: the sample is not of the kind that was announced.
+            DataError: it is out of order or not finite; the filter is unchanged.
         """
         expected = {"imu": ImuSample, "velocity": VelocitySample}.get(self._source or "")
         if expected is None or not isinstance(sample, expected):
             raise ConfigError(f"msckf was built for motion {self._source or 'none'}, got a {type(sample).__name__}")
+        self._order.sample(sample)
         self._motion.take(sample)
         self._predicted_step = None  # the sample may change what the step looks like
         if isinstance(sample, VelocitySample) and self._window is not None:
@@ -167,7 +178,7 @@ class Msckf:
         motion = MotionPrior(T_curr_prev, A @ self._expected_error(growth) @ A.T)
         if np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1] > _USELESS_RAD**2:
             return None
-        return Prediction(self._expected_tracks(window, T_cam0_world, T_curr_prev[:3, :3]), motion)
+        return Prediction(self._expected_tracks(window, T_cam0_world, motion), motion)
 
     def _expected_error(self, growth: Growth) -> FloatArray:
         """Covariance (6, 6) of `xi_curr - xi_prev` where the error at the last frame, xi_prev, has grown to xi_curr."""
@@ -175,21 +186,27 @@ class Msckf:
         out: FloatArray = M @ self._output[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
         return out
 
-    def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, R_cam_prev: FloatArray) -> TrackPrior:
+    def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
         table = self._tracks.table
         rows = table.rows()
         rows = rows[table.has_point[rows]]
         ids = np.concatenate([table.ids(rows), window.landmark_ids])
         p_cam = transform_points(T_cam0_world, np.concatenate([table.points[rows], window.landmarks]))
         ahead = p_cam[:, 2] > MIN_DEPTH * self._camera.baseline_m
-        return TrackPrior(ids[ahead], project(self._camera, p_cam[ahead]), R_cam_prev)
+        return TrackPrior(ids[ahead], project(self._camera, p_cam[ahead]), motion.T_curr_prev[:3, :3], motion)
 
     def update(self, observations: Observations) -> UpdateReport:
         """Propagate to the time of the frame and update with its observations.
 
         Raises:
-            EstimationError: the motion samples do not cover the step, or the filter diverged.
+            EstimationError: the motion samples do not cover the step.
+            DivergedError: the filter diverged; `restart` goes on from the last good state.
+            DataError: the frame is out of order, or its observations are impossible; the filter is unchanged.
         """
+        self._order.frame(observations, self._time_ns)
+        return self._update(observations)
+
+    def _update(self, observations: Observations) -> UpdateReport:
         seen = observations.take(~observations.stale)
         if self._window is None:
             if not self._motion.ready:
@@ -210,6 +227,8 @@ class Msckf:
         if window.clones and not len(seen):
             # A frame that shows nothing ends no track; what is seen next decides.
             self._blind = True
+            if not self._is_sane(window):
+                raise DivergedError(self._lost(observations.frame_index))
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         self._blind = False
         late_s = (self._body_ns - observations.time_ns) * 1e-9
@@ -219,10 +238,50 @@ class Msckf:
             report = self._use(window, seen)
             self._keep_first_yaw(window, before)
         except np.linalg.LinAlgError as error:
-            raise EstimationError(self._lost(observations.frame_index)) from error
-        if not np.isfinite(window.P).all() or not np.isfinite(window.nav.T_world_imu).all():
-            raise EstimationError(self._lost(observations.frame_index))
+            raise DivergedError(self._lost(observations.frame_index)) from error
+        if not self._is_sane(window):
+            raise DivergedError(self._lost(observations.frame_index))
+        if report.used >= report.gated:
+            self._good = GoodState(
+                observations.frame_index, self._time_ns, window.nav, self._output, window.calibration
+            )
         return report
+
+    def restart(self, observations: Observations) -> UpdateReport:
+        """Start again at a frame after a divergence, from the state after the last good update.
+
+        The pose is carried on with an inflated covariance, velocity and biases are uncertain as at the start, and the
+        window is emptied; the map's points stay, and so does what is known of the calibration.
+
+        Args:
+            observations: of the frame at which `update` failed, or of a later one.
+
+        Raises:
+            EstimationError: there was no good update.
+            DivergedError: the filter diverges again at once.
+        """
+        good = self._good
+        if good is None:
+            raise EstimationError("msckf has no good state to start again from; check calibration and first frames")
+        nav, P = restarted(good, observations.time_ns, self._motion, self._settings)
+        P_calibration, _ = calibration_covariance(good.calibration, self._settings)
+        self._window = Window(self._motion, nav, np.asarray(block_diag(P, P_calibration)), good.calibration)
+        self._calibration = good.calibration
+        self._time_ns = self._body_ns = observations.time_ns
+        self._tracks = WindowTracks(self._camera, self._settings)
+        self._landmark_gate = LandmarkGate(self._settings.gate_probability)
+        self._smoothed, self._gyro, self._blind = None, None, False
+        self._since_frame, self._predicted_step = NO_STEP, None
+        self._noise = MotionNoise(*_IMU_FACTORS) if self._source == "imu" else MotionNoise(*_TWIST_FACTORS)
+        self._output = self._window.P.copy()
+        self._map = [part for part in self._map if np.isfinite(part.p_world).all()]
+        return self._update(observations)
+
+    def _is_sane(self, window: Window) -> bool:
+        """Whether the state is made of numbers, and with an IMU of a possible speed."""
+        if not np.isfinite(window.P).all() or not np.isfinite(window.nav.T_world_imu).all():
+            return False
+        return self._source != "imu" or float(np.linalg.norm(window.nav.velocity)) < _MOST_SPEED_MPS
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last event."""
@@ -272,6 +331,17 @@ class Msckf:
         return _newest(
             [*self._map, Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))]
         )
+
+    def take_landmarks(self) -> Landmarks:
+        """Return the points that have left the state since the last call, and forget them; `landmarks` has the others.
+
+        None as long as the first tilt may still turn the map.
+        """
+        window = self._started()
+        if not self._map or not window.clones or window.clones[0].time_ns == self._began_ns:
+            return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        taken, self._map, self._points_stored = _newest(self._map), [], 0
+        return taken
 
     def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
@@ -488,7 +558,7 @@ class Msckf:
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
-            P = self._move_to_optimum(window, tracks, A, b)
+            P = self._move_to_optimum(window, tracks, A, b, len(A))
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go.
@@ -497,7 +567,9 @@ class Msckf:
             innovation = residual
         return tracks, P
 
-    def _move_to_optimum(self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray) -> FloatArray:
+    def _move_to_optimum(
+        self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int
+    ) -> FloatArray:
         """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
 
         Args:
@@ -505,12 +577,12 @@ class Msckf:
             tracks: whose points are moved.
             A: information (D, D).
             b: its vector (D,).
+            size: how many errors, the first ones, it is about.
 
         Returns:
-            The covariance (D, D) there.
+            Their covariance (size, size) there.
         """
-        P, shift = posterior(window.P, A, b + A @ window.prior_delta)
-        error = shift - window.prior_delta
+        P, error = window.optimum(A, b, size)
         self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
         window.relinearise(error)
         return P
@@ -581,7 +653,8 @@ class Msckf:
         window.absorb(*self._information(window, tracks, ending & good, pixels))
         promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
 
-        P = self._move_to_optimum(window, tracks, *self._information(window, tracks, good & ~ending, None))
+        A, b = self._information(window, tracks, good & ~ending, None)
+        P = self._move_to_optimum(window, tracks, A, b, window.first_landmark)  # no landmark is in it
         own = slice(0, window.first_clone)
         self._output = P[own, own]
         self._smoothed = WindowPosterior.of(window, P)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray, so3_hat, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
 from vio.records import BoolArray, IntArray
@@ -35,7 +36,7 @@ class Views:
 
     def take(self, index: BoolArray) -> Views:
         """Return the tracks of a mask (F,)."""
-        return Views(self.z[index], self.weight[index])
+        return self if index.all() else Views(self.z[index], self.weight[index])
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ class Residuals:
 
     def take(self, index: BoolArray) -> Residuals:
         """Return the tracks of a mask (F,)."""
-        return Residuals(self.r[index], self.z_D_p[index], self.ahead[index])
+        return self if index.all() else Residuals(self.r[index], self.z_D_p[index], self.ahead[index])
 
 
 def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views) -> Residuals:
@@ -60,17 +61,20 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
         p_world: (F, 3).
         views: what was seen.
     """
-    R, t = T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]
     F, N = len(p_world), len(T_cam0_world)
-    p_cam = (p_world @ R.reshape(-1, 3).T).reshape(F, N, 3) + t
-    seen = views.weight[..., 0] > 0
-    ok = p_cam[..., 2] > MIN_DEPTH * camera.baseline_m
-    safe = np.where((ok & seen)[..., None], p_cam, [0.0, 0.0, 1.0])
-    usable = views.weight * ok[..., None]
-    r = (np.where(usable > 0, views.z, 0.0) - project(camera, safe)) * usable
-    J = (z_D_p_cam(camera, safe) * usable[..., None]) @ R
-    ahead: BoolArray = np.all(ok | ~seen, axis=1)
-    return Residuals(r, J, ahead)
+    at = Residuals(np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_))
+    least = MIN_DEPTH * camera.baseline_m
+    loops.compare_views(
+        loops.lens_of(camera), least, T_cam0_world, p_world, views.z, views.weight, at.r, at.z_D_p, at.ahead
+    )
+    return at
+
+
+def measured_pixels(at: Residuals) -> BoolArray:
+    """Which pixel coordinates (F, N, 4) of tracks were measured."""
+    out: BoolArray = np.empty(at.r.shape, dtype=np.bool_)
+    loops.mark_measured(at.z_D_p, out)
+    return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,18 +108,14 @@ def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: Float
         p_world: (F, 3).
         seen: (F, N) which camera saw which point.
     """
-    anchor = np.argmax(seen, axis=1)
-    R, t = T_cam0_world[anchor, :3, :3], T_cam0_world[anchor, :3, 3]
-    centre = -np.einsum("nji,nj->ni", T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3])[anchor]
-    p_cam = np.einsum("fij,fj->fi", R, p_world) + t
-    z = np.maximum(p_cam[:, 2], MIN_DEPTH * camera.baseline_m)
-    disparity = camera.fu * camera.baseline_m / z
-    p_D_q, q_D_p = np.empty((len(z), 3, 3)), np.empty((len(z), 3, 3))
-    p_D_q[:, :, :2] = np.swapaxes(R[:, :2], 1, 2) * (z / camera.fu)[:, None, None]
-    p_D_q[:, :, 2] = (centre - p_world) / disparity[:, None]
-    q_D_p[:, :2] = (R[:, :2] - (p_cam[:, :2] / z[:, None])[:, :, None] * R[:, 2:]) * (camera.fu / z)[:, None, None]
-    q_D_p[:, 2] = R[:, 2] * (-disparity / z)[:, None]
-    return InverseDepth(anchor, centre, disparity, p_D_q, q_D_p)
+    F = len(p_world)
+    q = InverseDepth(
+        np.empty(F, dtype=np.int64), np.empty((F, 3)), np.empty(F), np.empty((F, 3, 3)), np.empty((F, 3, 3))
+    )
+    least = MIN_DEPTH * camera.baseline_m
+    columns = q.anchor, q.centre, q.disparity, q.p_D_q, q.q_D_p
+    loops.anchor_points(loops.lens_of(camera), least, T_cam0_world, p_world, np.ascontiguousarray(seen), *columns)
+    return q
 
 
 def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -> tuple[FloatArray, BoolArray]:
@@ -175,16 +175,11 @@ def refine_points(
 
     Steps are taken in the coordinates (M5), damped by their prior, and end ahead of all cameras that saw the point.
     """
-    p, seen = p_world, views.weight[..., 0] > 0
-    shape = (len(p), 4 * len(T_cam0_world))
+    p, seen, dq = p_world, views.weight[..., 0] > 0, np.empty((len(p_world), 3))
     for _ in range(steps):
         p = _ahead_of_first(camera, T_cam0_world, p, views, seen)
         at, q = residuals(camera, T_cam0_world, p, views), inverse_depth(camera, T_cam0_world, p, seen)
-        weight = 1 / (1 + np.sum(at.r**2, axis=2) / (4 * scale_px**2))
-        J = at.z_D_p.reshape(*shape, 3) @ q.p_D_q
-        Jt = np.swapaxes(J * np.repeat(weight, 4, axis=1)[..., None], 1, 2)
-        C = Jt @ J + np.diag([_TINY, _TINY, _PRIOR])
-        dq = np.linalg.solve(C, Jt @ at.r.reshape(*shape, 1))[..., 0]
+        loops.step_points(at.r, at.z_D_p, q.p_D_q, scale_px**2, _TINY, _PRIOR, dq)
         p = q.moved(dq, _most_disparity(camera, T_cam0_world, q, p, seen))
     return p
 
@@ -223,7 +218,7 @@ def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
         sigma2: the pixel noise's variance, the smallest scale.
     """
     squares = np.sum(at.r**2, axis=2)
-    used: BoolArray = np.any(at.z_D_p[:, :, 1, :], axis=2)  # the row of vl is measured in every view
+    used = measured_pixels(at)[:, :, 1]  # the row of vl is measured in every view
     if not used.any():
         return np.zeros(squares.shape)
     count, clones = used.sum(axis=0), np.arange(used.shape[1])
@@ -329,17 +324,12 @@ def track_information(
         weight: (F, N) robust weight of each view.
     """
     F, N = at.r.shape[:2]
-    q = inverse_depth(camera, T_cam0_world, p_world, np.any(at.z_D_p[:, :, 1, :], axis=2))
-    J = (at.z_D_p.reshape(F, 4 * N, 3) @ q.p_D_q).reshape(F, N, 4, 3)
-    Jt = np.swapaxes(J * weight[..., None, None], 2, 3)
-    C_i = Jt @ J
-    C_i[np.arange(F), q.anchor, 2, 2] += _PRIOR
-    g_i = (Jt @ at.r[..., None])[..., 0]
+    q = inverse_depth(camera, T_cam0_world, p_world, measured_pixels(at)[:, :, 1])
     B = q.q_D_p @ point_D_pose(p_world)
-    Bt = np.swapaxes(B, 1, 2)
-    G_i = Bt[:, None] @ C_i
-    gradient = (Bt[:, None] @ g_i[..., None]).reshape(F, 6 * N)
-    return TrackInformation(q, G_i.reshape(F, 6 * N, 3), C_i.sum(axis=1), B, gradient, g_i.sum(axis=1))
+    info = TrackInformation(q, np.empty((F, 6 * N, 3)), np.empty((F, 3, 3)), B, np.empty((F, 6 * N)), np.empty((F, 3)))
+    columns = info.G, info.C, info.gradient, info.point_gradient
+    loops.collect_tracks(at.r, at.z_D_p, weight, q.p_D_q, B, q.anchor, _PRIOR, *columns)
+    return info
 
 
 def relative_stereo_sigma(at: Residuals, q: InverseDepth) -> FloatArray:
@@ -347,7 +337,7 @@ def relative_stereo_sigma(at: Residuals, q: InverseDepth) -> FloatArray:
 
     Infinite without a right view.
     """
-    views = np.any(at.z_D_p[:, :, 2, :], axis=2).sum(axis=1)
+    views = measured_pixels(at)[:, :, 2].sum(axis=1)
     out: FloatArray = np.sqrt(np.divide(_STEREO_VARIANCE, views, out=np.full(len(views), np.inf), where=views > 0))
     return out / q.disparity
 
@@ -376,17 +366,10 @@ def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatAr
 
     `sum_f blkdiag(D_f) - G_f C_f^-1 G_f'`: exact elimination of each point.
     """
-    G, N = info.G[chosen], info.G.shape[1] // 6
-    L = np.linalg.cholesky(np.linalg.inv(info.C[chosen]))
-    V = G @ L  # (F, 6N, 3)
-    flat = np.swapaxes(V, 1, 2).reshape(-1, 6 * N)
-    A = -flat.T @ flat
-    blocks = np.swapaxes(G, 0, 1).reshape(6 * N, -1) @ info.q_D_clone[chosen].reshape(-1, 6)  # sum of G_i B
-    for i in range(N):
-        A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += blocks[6 * i : 6 * i + 6]
-    b = info.gradient[chosen].sum(axis=0)
-    b -= flat.T @ (np.swapaxes(L, 1, 2) @ info.point_gradient[chosen][..., None]).reshape(-1)
-    return A, b
+    rows, size = np.flatnonzero(chosen), info.G.shape[1]
+    V, A, b = np.empty((3 * len(rows), size)), np.zeros((size, size)), np.zeros(size)
+    loops.eliminate_tracks(rows, info.G, info.C, info.q_D_clone, info.gradient, info.point_gradient, V, A, b)
+    return A - V.T @ V, b
 
 
 def point_D_pose(p_world: FloatArray) -> FloatArray:

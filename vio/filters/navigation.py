@@ -142,6 +142,12 @@ class ImuMotion:
         P[3:6, 3:6] += tilt_D_accel @ tilt_D_accel.T * (begin.accel_sigma_mps2**2 + s.accel_bias_sigma_mps2**2)
         return nav, P
 
+    def start_covariance(self, settings: MsckfSettings) -> FloatArray:
+        """Covariance (15, 15) of velocity and biases of which nothing is known; that of the pose is zero."""
+        s = settings
+        sigmas = [0.0, 0.0, s.start_velocity_sigma_mps, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
+        return np.diag(np.repeat(sigmas, 3) ** 2)
+
     def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
         """Integrate from one time to another, equations (N1) to (N4); factors (2,) scale accelerometer and gyro noise.
 
@@ -322,17 +328,14 @@ class TwistMotion:
 
     def start(self, time_ns: int) -> tuple[NavState, FloatArray]:
         """Return the state at the first frame and its covariance (15, 15): the world is where the body is."""
-        s = self._settings
         zero = np.zeros(3)
-        sigmas = np.concatenate(
-            [
-                np.zeros(6),
-                np.full(3, s.start_velocity_sigma_mps),
-                np.full(3, _START_RATE_SIGMA_RADPS),
-                np.full(3, s.rate_bias_sigma_radps),
-            ]
-        )
-        return NavState(np.eye(4), zero, zero, zero, zero), np.diag(sigmas**2)
+        return NavState(np.eye(4), zero, zero, zero, zero), self.start_covariance(self._settings)
+
+    def start_covariance(self, settings: MsckfSettings) -> FloatArray:
+        """Covariance (15, 15) of twist and rate bias of which nothing is known; that of the pose is zero."""
+        s = settings
+        sigmas = [0.0, 0.0, s.start_velocity_sigma_mps, _START_RATE_SIGMA_RADPS, s.rate_bias_sigma_radps]
+        return np.diag(np.repeat(sigmas, 3) ** 2)
 
     def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
         """Carry pose and twist over a time, equations (N5) and (N6); factors (2,) scale linear and angular noise."""

@@ -38,7 +38,7 @@ class Calibration:
     @property
     def dim(self) -> int:
         """Error dimensions C, 0 to 13."""
-        return len(self.columns)
+        return self.stereo_dim + 6 * self.extrinsics + self.timing
 
     @property
     def stereo_dim(self) -> int:

@@ -65,6 +65,7 @@ class VislamSettings(Section):
         3,
         "Gauss-Newton iterations of the pose update; 1 is the paper's filter, more help a start in motion",
         at_least=1,
+        at_most=100,
     )
     use_stale: bool = setting(False, "take in observations flagged as stale; the paper knows no such flag")
     max_landmark_distance_m: float = setting(
@@ -78,16 +79,18 @@ class MsckfSettings(Section):
 
     section: ClassVar[str] = "msckf"
 
-    clones: int = setting(11, "poses kept in the window", at_least=3)
-    max_landmarks: int = setting(30, "long-lived landmarks kept in the state", at_least=0)
-    max_features: int = setting(150, "tracks without a landmark of their own that enter one update", at_least=1)
+    clones: int = setting(11, "poses kept in the window", at_least=3, at_most=100)
+    max_landmarks: int = setting(30, "long-lived landmarks kept in the state", at_least=0, at_most=1000)
+    max_features: int = setting(
+        150, "tracks without a landmark of their own that enter one update", at_least=1, at_most=5000
+    )
     pixel_sigma_px: float = setting(
         0.5, "noise of one pixel coordinate at the start; then estimated", unit="px", above=0
     )
     pixel_sigma_min_px: float = setting(0.03, "the estimated noise stays above this", unit="px", above=0)
     pixel_sigma_max_px: float = setting(2.0, "the estimated noise stays below this", unit="px", above=0)
     gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected", above=0, below=1)
-    gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2", above=0)
+    gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2", above=0, at_most=100)
     gyro_noise_density: float = setting(
         2.0e-4, "gyro white noise by its data sheet; what a rig adds to it is learned", unit="rad/s/sqrt(Hz)", above=0
     )

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.filters import track_loops as loops
 from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -34,16 +35,11 @@ def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
 
     The row of `vr` is zero: right rows are not measured.
     """
-    x, y = (z[..., 0] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
-    xr = (z[..., 2] - camera.cu) / camera.fu
-    out = np.zeros((*z.shape[:-1], 4, TERMS))
-    for row, u in ((0, x), (2, xr)):
-        r2 = u * u + y * y
-        out[..., row, 3], out[..., row, 4], out[..., row, 5] = u * r2, 2 * u * y, r2 + 2 * u * u
-    r2 = x * x + y * y
-    out[..., 1, 3], out[..., 1, 4], out[..., 1, 5] = y * r2, r2 + 2 * y * y, 2 * x * y
-    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 1.0, xr, xr * xr + y * y
-    return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
+    out = np.empty((*z.shape[:-1], 4, TERMS))
+    loops.stereo_field_jacobian(
+        loops.lens_of(camera), np.ascontiguousarray(z).reshape(-1, 4), out.reshape(-1, 4, TERMS)
+    )
+    return out
 
 
 class RowField:
@@ -89,13 +85,6 @@ class RowField:
         noise = self._squares / max(self._count, 1.0)
         return self.rms_px**2 > max(_LEAST_ROWS_PX**2 + _ROW_SIGNIFICANCE * uncertainty, _ROW_DOMINANCE * noise)
 
-    def columns(self, z: FloatArray) -> FloatArray:
-        """Return the part of `du` (...) that follows from the rows at stereo pixels (..., 4), pixels."""
-        camera, c = self._camera, self.coefficients
-        x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
-        out: FloatArray = camera.fu * (-c[1] * y + (c[5] - c[4]) * x * y - c[3] * y * y)
-        return out
-
 
 def _centred(values: FloatArray) -> FloatArray:
     return np.asarray(values - np.median(values), dtype=np.float64)
@@ -111,9 +100,11 @@ class StereoField:
 
     def corrected(self, views: Views) -> Views:
         """Return views (..., 4) without the field."""
-        z = views.z - field_jacobian(self.camera, views.z) @ self.coefficients
-        z[..., 2] -= self.rows.columns(views.z)
-        return Views(np.where(views.weight > 0, z, views.z), views.weight)
+        z, weight = np.ascontiguousarray(views.z), np.ascontiguousarray(views.weight)
+        out = np.empty(z.shape)
+        flat = z.reshape(-1, 4), weight.reshape(-1, 4), out.reshape(-1, 4)
+        loops.correct_pixels(loops.lens_of(self.camera), self.coefficients, self.rows.coefficients, *flat)
+        return Views(out, views.weight)
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,15 +138,10 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
         weight: robust weights (F, N).
     """
     F, N, _, S = H.shape
-    J = at.z_D_p
-    H = H * np.any(J, axis=3)[..., None]
-    WH = H * weight[..., None, None]
-    by_point = np.asarray(sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3)))
-    by_q = np.swapaxes(p_D_q, 1, 2) @ np.swapaxes(by_point, 1, 2).reshape(F, 3, N * S)
+    H, WH, by_point = H.copy(), np.empty(H.shape), np.empty((F, N, 3, S))
+    loops.collect_columns(at.z_D_p, H, weight, p_D_q, by_point, WH)
     flat = (F, 4 * N, S)
-    return StereoColumns(
-        np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2), H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N)
-    )
+    return StereoColumns(by_point, H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N))
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,19 +172,12 @@ def eliminate_points_from_columns(
     columns: StereoColumns, info: TrackInformation, chosen: BoolArray
 ) -> StereoInformation:
     """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does."""
-    by_point = columns.by_point[chosen]
-    F, N, _, S = by_point.shape
-    H, WH, r = (a[chosen] for a in (columns.H, columns.WH, columns.r))
-    G = by_point.sum(axis=1)  # (F, 3, S)
-    CG = np.linalg.solve(info.C[chosen], G)  # (F, 3, S)
-    flat_G, flat_CG = G.reshape(3 * F, S), CG.reshape(3 * F, S)
-    A = WH.reshape(-1, S).T @ H.reshape(-1, S) - flat_G.T @ flat_CG
-    B = info.q_D_clone[chosen].reshape(3 * F, 6)
-    per_view = np.swapaxes(by_point, 1, 2).reshape(3 * F, N * S)
-    cross = (B.T @ per_view).reshape(6, N, S).transpose(1, 0, 2).reshape(6 * N, S)
-    cross = cross - np.swapaxes(info.G[chosen], 1, 2).reshape(3 * F, 6 * N).T @ flat_CG
-    b = WH.reshape(-1, S).T @ r.reshape(-1) - flat_CG.T @ info.point_gradient[chosen].reshape(-1)
-    return StereoInformation(A, cross.T, b)
+    size, S = info.G.shape[1], columns.H.shape[2]
+    out = StereoInformation(np.zeros((S, S)), np.zeros((S, size)), np.zeros(S))
+    points = info.G, info.C, info.q_D_clone, info.point_gradient
+    own = columns.by_point, columns.H, columns.WH, columns.r
+    loops.eliminate_columns(np.flatnonzero(chosen), *own, *points, out.A, out.cross, out.b)
+    return out
 
 
 def landmark_columns(at: LandmarkResiduals, H: FloatArray, clones: int) -> StereoInformation:

@@ -32,8 +32,8 @@ class TrackTable:
 
     def rows(self) -> IntArray:
         """Rows (F,) of all tracks, in order of their ids, so that no result depends on the table's history."""
-        ids = np.array(sorted(self._row_of), dtype=np.int64)
-        return np.array([self._row_of[i] for i in ids.tolist()], dtype=np.int64)
+        rows = np.fromiter(self._row_of.values(), dtype=np.int64, count=len(self._row_of))
+        return rows[np.argsort(self._ids[rows])]
 
     def ids(self, rows: IntArray) -> IntArray:
         """Ids (F,) of rows."""

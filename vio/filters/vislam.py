@@ -11,6 +11,7 @@ from typing import ClassVar
 import numpy as np
 
 from vio.errors import ConfigError, EstimationError
+from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
 from vio.filters.settings import VislamSettings
 from vio.filters.vislam_motion import DriftingTwist, HeldInput
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
@@ -136,14 +137,17 @@ class Vislam:
             T_world_imu: start pose (4, 4); identity if None.
 
         Raises:
-            ConfigError: the settings need a motion sensor and there is none.
+            ConfigError: the settings need a motion sensor and there is none, or an argument is of another kind.
+            CalibrationError: the extrinsics are no rigid transform.
         """
+        check_parts("vislam", camera, settings, VislamSettings)
         if not motion_sensor and (settings.motion_model == "input" or settings.mode == "dead_reckoning"):
             raise ConfigError(
                 "the paper's motion model needs velocities, and there are none: use vislam.motion_model=twist, "
                 "and a mode other than dead_reckoning"
             )
-        self._camera, self._T_cam0_imu, self._settings = camera, np.asarray(T_cam0_imu, dtype=np.float64), settings
+        self._camera, self._T_cam0_imu, self._settings = camera, checked_extrinsics(T_cam0_imu), settings
+        self._order = InputOrder("vislam")
         dead_reckoning = settings.mode == "dead_reckoning"
         self._motion: HeldInput | DriftingTwist = (
             HeldInput(settings) if dead_reckoning or settings.motion_model == "input" else DriftingTwist(settings)
@@ -160,9 +164,11 @@ class Vislam:
 
         Raises:
             ConfigError: the sample is raw IMU, which this filter has no model for.
+            DataError: it is out of order or not finite; the filter is unchanged.
         """
         if not isinstance(sample, VelocitySample):
             raise ConfigError("backend vislam takes body velocities, not raw IMU; use --backend msckf or --motion none")
+        self._order.sample(sample)
         if self._motion.measures_at_once:
             self.advance(sample.time_ns)
         self._state = self._motion.take(self._state, sample)
@@ -182,7 +188,9 @@ class Vislam:
 
         Raises:
             EstimationError: no velocity covers the step, or the pose is not finite any more.
+            DataError: the frame is out of order, or its observations are impossible; the filter is unchanged.
         """
+        self._order.frame(observations, self._time_ns or 0)
         step_s = 0.0 if self._frame_time_ns is None else (observations.time_ns - self._frame_time_ns) * 1e-9
         self._frame_time_ns = observations.time_ns
         self.advance(observations.time_ns)
@@ -226,6 +234,10 @@ class Vislam:
         T_world_imu = se3_inverse(U)
         velocity = None if twist is None else T_world_imu[:3, :3] @ twist[:3]
         return Estimate(self._time_ns or 0, T_world_imu, self._state.Sigma[:6, :6].copy(), velocity)
+
+    def take_landmarks(self) -> Landmarks:
+        """Return nothing: all points stay in the state."""
+        return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
 
     def landmarks(self) -> Landmarks:
         """Return every landmark ever initialised."""

@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import blas, lapack
 
+from vio.compiled import move_poses
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.filters.online_calibration import Calibration, body_twists, pose_D_calibration, with_calibration
 from vio.filters.stereo_calibration import TERMS, StereoInformation
@@ -153,15 +154,14 @@ class Window:
             g: its vector (M, 3).
         """
         first = 6 * len(self.clones)
-        rho = slice(first - 6, first - 3)
+        rho, blocks = slice(first - 6, first - 3), C.reshape(-1, 3)
         A[rho, rho] += C.sum(axis=0)
         b[rho] -= g.sum(axis=0)
-        for k in range(len(C)):
-            own = slice(first + 3 * k, first + 3 * k + 3)
-            A[own, own] += C[k]
-            A[own, rho] -= C[k]
-            A[rho, own] -= C[k]
-            b[own] += g[k]
+        own = first + np.arange(len(blocks)).reshape(-1, 3)
+        A[own[:, :, None], own[:, None]] += C
+        A[first:, rho] -= blocks
+        A[rho, first:] -= blocks.T
+        b[first:] += g.reshape(-1)
 
     def lift_information(
         self, A: FloatArray, b: FloatArray, stereo: StereoInformation | None = None
@@ -204,10 +204,11 @@ class Window:
 
     def landmark_covariance(self, P: FloatArray) -> FloatArray:
         """Covariance (M, 3, 3) of `xi_f - xi_rho`, landmarks relative to the newest exposure, for errors P (D, D)."""
-        D, M, first = len(P), len(self.landmarks), self.first_landmark
         exposure = self.chain(np.eye(6 * len(self.clones))[-6:-3])  # (3, D)
-        E = np.eye(D)[first : first + 3 * M].reshape(M, 3, D) - exposure
-        out: FloatArray = E @ P @ np.swapaxes(E, 1, 2)
+        with_exposure = P @ exposure.T
+        own = self.first_landmark + np.arange(3 * len(self.landmarks)).reshape(-1, 3)
+        cross = with_exposure[own]  # (M, 3, 3)
+        out: FloatArray = P[own[:, :, None], own[:, None]] - cross - np.swapaxes(cross, 1, 2) + exposure @ with_exposure
         return out
 
     def propagate(self, step: Transition) -> None:
@@ -287,20 +288,23 @@ class Window:
     def _anchor_to_newest(self, previous_rotation: int) -> None:
         """Measure the landmarks' errors from the newest exposure's rotation: xi_f += p^ (phi_new - phi_old)."""
         first, newest = self.first_landmark, self.clone_rows(len(self.clones) - 1).start + 3
-        A = np.eye(len(self.P))
-        p_cross = so3_hat(self.landmarks)
-        for k in range(len(self.landmarks)):
-            rows = slice(first + 3 * k, first + 3 * k + 3)
-            A[rows, newest : newest + 3] += p_cross[k]
-            A[rows, previous_rotation : previous_rotation + 3] -= p_cross[k]
+        turn, before = slice(newest, newest + 3), slice(previous_rotation, previous_rotation + 3)
+        p_cross = so3_hat(self.landmarks).reshape(-1, 3)
+        P, delta = self.P, self.prior_delta
+        move = p_cross @ (P[turn] - P[before])  # (3M, D)
+        delta_move = p_cross @ (delta[turn] - delta[before])
         if self.calibration.dim:
             M = self._pose_D_calibration()
-            A[first:, DIM : self.first_clone] += p_cross.reshape(-1, 3) @ (M[-3:] - M[-9:-6])
-        changed = A[first:]
-        moved = changed @ self.P
-        self.P[first:] = moved
-        self.P[:, first:] = np.concatenate([moved.T[:first], moved @ changed.T])
-        self.prior_delta[first:] = changed @ self.prior_delta
+            own, J = slice(DIM, self.first_clone), p_cross @ (M[-3:] - M[-9:-6])
+            move += J @ P[own]
+            delta_move += J @ delta[own]
+        P[first:] += move
+        corner = (P[first:, turn] - P[first:, before]) @ p_cross.T
+        if self.calibration.dim:
+            corner += P[first:, own] @ J.T
+        P[first:, first:] += corner
+        P[:first, first:] = P[first:, :first].T
+        delta[first:] += delta_move
 
     def drop_oldest_clone(self) -> None:
         """Forget the oldest clone."""
@@ -333,6 +337,24 @@ class Window:
         self.landmark_ids = np.concatenate([self.landmark_ids, ids])
         self.landmarks = np.concatenate([self.landmarks, p_world])
 
+    def optimum(self, information: FloatArray, vector: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
+        """Where the prior and given information agree best.
+
+        Args:
+            information: about the first `size` errors alone; the rest of (D, D) is zero.
+            vector: (D,) likewise, at the present means.
+            size: `k`.
+
+        Returns:
+            The covariance (k, k) of the first errors there, and the error vector (D,) that moves the means there.
+        """
+        own = slice(0, size)
+        A, b = information[own, own], vector[own] + information[own, own] @ self.prior_delta[own]
+        P, shift = posterior(self.P[own, own], A, b)
+        if size < len(self.P):  # P (b - A shift) is the shift; the others follow by their correlation
+            shift = np.concatenate([shift, self.P[size:, own] @ (b - A @ shift)])
+        return P, shift - self.prior_delta
+
     def absorb(self, information: FloatArray, vector: FloatArray) -> None:
         """Absorb measurements into the prior.
 
@@ -360,19 +382,21 @@ class Window:
     def relinearise(self, error: FloatArray) -> None:
         """Move the means by an error vector (D,); the prior stays where it is."""
         self.nav = self.motion.corrected(self.nav, error[:DIM])
-        moves = se3_exp(error[self.first_clone : self.first_landmark].reshape(-1, 6))
+        T = np.array([c.T_world_imu for c in self.clones])
+        move_poses(error[self.first_clone : self.first_landmark].reshape(-1, 6), T)
         if len(self.landmarks):
             phi = self.exposure_errors(error)[-3:]
             own = error[self.first_landmark :].reshape(-1, 3)
             self.landmarks = self.landmarks @ so3_exp(phi).T + own @ so3_left_jacobian(phi).T
+        velocities, rate_error = [c.velocity for c in self.clones], np.zeros(3)
+        if isinstance(self.motion, ImuMotion):
+            velocities, rate_error = self._corrected_velocities(self.motion, T, error[:DIM]), error[9:12]
         self.clones = [
-            Clone(c.frame_index, c.time_ns, move @ c.T_world_imu, c.velocity, c.rate, c.late_s)
-            for c, move in zip(self.clones, moves, strict=True)
+            Clone(c.frame_index, c.time_ns, pose, velocity, c.rate - rate_error, c.late_s)
+            for c, pose, velocity in zip(self.clones, T, velocities, strict=True)
         ]
         if self.calibration.dim:
             self.calibration = self.calibration.corrected(error[DIM : self.first_clone])
-        if isinstance(self.motion, ImuMotion):
-            self._correct_twists(self.motion, error[:DIM])
         self.prior_delta = self.prior_delta + error
 
     def turn_world(self, yaw: float, yaw_D_tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -402,35 +426,31 @@ class Window:
         self.P, self.prior_delta = 0.5 * (P + P.T), turn @ self.prior_delta
         return R, M
 
-    def _correct_twists(self, motion: ImuMotion, error: FloatArray) -> None:
-        """Let the clones' velocities and rates follow the navigation state's error (15,)."""
+    def _corrected_velocities(self, motion: ImuMotion, T_world_imu: FloatArray, error: FloatArray) -> list[FloatArray]:
+        """The clones' velocities (3,), moved by the navigation state's error (15,), at corrected poses (N, 4, 4)."""
         ages = np.array([self.clones[-1].time_ns - c.time_ns for c in self.clones]) * 1e-9
-        R = np.array([c.T_world_imu[:3, :3] for c in self.clones])
-        earlier = np.array([c.velocity for c in self.clones])
-        velocities = motion.corrected_earlier(earlier, 0.5 * (R + R[-1]), ages, error)
-        self.clones = [
-            replace(c, velocity=v, rate=c.rate - error[9:12]) for c, v in zip(self.clones, velocities, strict=True)
-        ]
+        R, earlier = T_world_imu[:, :3, :3], np.array([c.velocity for c in self.clones])
+        return list(motion.corrected_earlier(earlier, 0.5 * (R + R[-1]), ages, error))
 
 
 def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the covariance (D, D) and the shift of the mean (D,) after a measurement in information form.
 
     `(P^-1 + A)^-1` without an inverse of P, which is singular where states are copies or known: with `P = L L'`, it is
-    `L (I + L' A L)^-1 L'`, symmetric and positive by construction.
+    `L (I + L' A L)^-1 L'`, symmetric and positive by construction. Of `I + L' A L = K K'`, only the triangle of K' is
+    computed, in LAPACK's order of columns, in which the transpose of an array is free.
     """
-    L = _square_root(P)
-    inner = np.eye(len(P)) + L.T @ information @ L
-    K = np.linalg.cholesky(0.5 * (inner + inner.T))
-    W: FloatArray = solve_triangular(K, L.T, lower=True, check_finite=False)
-    P_new: FloatArray = W.T @ W
-    return P_new, P_new @ vector
-
-
-def _square_root(P: FloatArray) -> FloatArray:
-    """Some L (D, D) with L L' = P, also for singular P."""
     try:
-        return np.asarray(np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24)), dtype=np.float64)
+        L = np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24))
+        inner, _ = lapack.dsygst(information.T, L.T, itype=2, lower=0)
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(P)
-        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64)
+        L = vectors * np.sqrt(np.maximum(values, 0.0))
+        inner = np.asfortranarray(L.T @ information @ L)
+    np.einsum("ii->i", inner)[:] += 1.0
+    K_transposed, failed = lapack.dpotrf(inner, lower=0, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("the information is not positive")
+    W: FloatArray = blas.dtrsm(1.0, K_transposed, L.T, lower=0, trans_a=1)
+    P_new: FloatArray = W.T @ W
+    return P_new, P_new @ vector

@@ -17,6 +17,7 @@ from vio.filters.multiview import (
     Views,
     first_points,
     has_parallax,
+    measured_pixels,
     refine_points,
     residuals,
     robust_weights,
@@ -51,7 +52,7 @@ class LinearTracks:
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
-        r, used = self.at.r[:, -1], np.any(self.at.z_D_p[:, -1] != 0, axis=2)
+        r, used = self.at.r[:, -1], measured_pixels(self.at)[:, -1]
         return float(np.median(np.abs(r[used]))) if used.any() else None
 
 
@@ -100,7 +101,7 @@ class WindowTracks:
         keep = at.ahead & np.isfinite(p).all(axis=1)
         keep[keep] = has_parallax(camera, T, p[keep], views.take(keep), at.take(keep))
         table.points[rows], table.has_point[rows] = p, keep
-        return self._linear(T, rows[keep], p[keep], at.take(keep), field)
+        return self._linear(T, rows[keep], p[keep], at.take(keep), field, views.z[keep])
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track permanently, and linearise what is left."""
@@ -115,17 +116,25 @@ class WindowTracks:
         )
         enough = np.any(at.z_D_p[:, :, 1, :], axis=2).sum(axis=1) >= 2
         T = tracks.T_cam0_world
-        return self._linear(T, tracks.rows[enough], tracks.p_world[enough], at.take(enough), tracks.field)
+        rows = tracks.rows[enough]
+        z = self._views(rows, len(T), tracks.field).z
+        return self._linear(T, rows, tracks.p_world[enough], at.take(enough), tracks.field, z)
 
     def _linear(
-        self, T_cam0_world: FloatArray, rows: IntArray, p_world: FloatArray, at: Residuals, field: StereoField | None
+        self,
+        T_cam0_world: FloatArray,
+        rows: IntArray,
+        p_world: FloatArray,
+        at: Residuals,
+        field: StereoField | None,
+        z: FloatArray,
     ) -> LinearTracks:
         weight = robust_weights(at, self.variance)
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
         columns = None
         if field is not None:
             # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-            H = field_jacobian(self._camera, self._views(rows, at.r.shape[1], field).z - at.r)
+            H = field_jacobian(self._camera, z - at.r)
             columns = stereo_columns(at, H, information.q.p_D_q, weight)
         return LinearTracks(T_cam0_world, rows, p_world, at, information, columns, field)
 
@@ -179,12 +188,6 @@ class WindowTracks:
         ended = rows[~self.table.seen(rows)[:, newest]]
         self.table.forget_views(spent)
         self.table.remove(ended)
-
-
-def measured_pixels(at: Residuals) -> BoolArray:
-    """Which pixel coordinates (F, N, 4) of tracks were measured."""
-    out: BoolArray = np.any(at.z_D_p, axis=3)
-    return out
 
 
 @lru_cache(maxsize=8)

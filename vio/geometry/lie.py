@@ -210,3 +210,21 @@ def nearest_rotation(R: npt.ArrayLike) -> FloatArray:
     U[..., :, -1] *= np.sign(np.linalg.det(U @ Vt))[..., None]
     out: FloatArray = U @ Vt
     return out
+
+
+_ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
+
+
+def rigid_fault(T: FloatArray) -> str | None:
+    """Describe why a matrix (4, 4), or its first three rows, is no rigid transform; None: it is one, to rounding."""
+    if not np.isfinite(T).all():
+        return "not finite; check the calibration"
+    if T.shape == (4, 4) and not np.allclose(T[3], [0, 0, 0, 1], atol=1e-9):
+        return f"the last row of the transform is {T[3].tolist()}, not 0 0 0 1"
+    R = T[:3, :3]
+    deviation = float(np.abs(R.T @ R - np.eye(3)).max())
+    if not deviation <= _ROTATION_TOLERANCE:
+        return f"not a rotation (R^T R differs from identity by {deviation:.2g}); check the calibration"
+    if np.linalg.det(R) < 0:
+        return "not a rotation but a reflection (determinant -1); check the axes' order"
+    return None

@@ -6,6 +6,7 @@ Pixels: u right, v down, the centre of the top-left pixel is (0, 0). `z = [ul vl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral, Real
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,11 @@ class StereoCamera:
 
     def __post_init__(self) -> None:
         values = (self.fu, self.fv, self.cu, self.cv, self.baseline_m)
+        if not all(isinstance(value, Real) for value in values):
+            raise CalibrationError(f"camera intrinsics are single numbers, got {values!r}"[:300])
+        for name, size in (("width", self.width), ("height", self.height)):
+            if size is not None and not (isinstance(size, Integral) and size > 0):
+                raise CalibrationError(f"the image {name} is a positive whole number of pixels, got {size!r}")
         if not np.all(np.isfinite(values)):
             raise CalibrationError(f"camera intrinsics are not finite: {values}; check the calibration file")
         if self.fu <= 0 or self.fv <= 0:

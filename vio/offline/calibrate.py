@@ -27,6 +27,7 @@ from vio.calibration.stereo import (
 from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo, judge_velocity_lever_arm
 from vio.colmap.adjustment import adjust_rig_in_motion
 from vio.colmap.pairs import adjust_rig, relative_pose, sift_matches
+from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import load_gray
 from vio.errors import EstimationError
 from vio.geometry.distortion import StereoRig, unproject_pixel
@@ -151,9 +152,10 @@ def _match_images(source: CalibrationSource, pairs: int, progress: Callable[[int
     rays: list[RayMatches] = []
     exchanged: list[RayMatches] = []
     z: list[FloatArray] = [np.zeros((0, 4))]
-    chosen = np.unique(np.linspace(0, len(source.raw_pairs) - 1, pairs).astype(int))
+    white, _ = full_scale(source.raw_pairs)
+    chosen = np.unique(np.linspace(0, len(source.raw_pairs) - 1, min(pairs, len(source.raw_pairs))).astype(int))
     for done, k in enumerate(chosen.tolist()):
-        left, right = (load_gray(path)[0] for path in source.raw_pairs[k])
+        left, right = (load_gray(path, white)[0] for path in source.raw_pairs[k])
         uv0, uv1 = sift_matches(left, right)
         matches, valid = _rays(rig, uv0, uv1, k)
         rays.append(matches)

@@ -8,18 +8,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from vio.colmap.adjustment import Adjustment, PositionPriors, adjust
 from vio.config import Config, merge
 from vio.errors import ConfigError, EvaluationError
 from vio.evaluation import evaluate
+from vio.input_files import read_input
 from vio.mapping.keyframes import choose_keyframes
 from vio.mapping.points import build_tracks, landmarks_of
 from vio.mapping.poses import fill_between, position_covariances, position_difference_m
 from vio.pipeline import run as process
 from vio.records import IntArray, Landmarks, Trajectory
 from vio.saved_run import SavedRun
+from vio.yaml_text import MOST_BYTES, read_yaml
 
 log = logging.getLogger(__name__)
 
@@ -116,8 +117,10 @@ def _priors(run: SavedRun, keyframes: IntArray) -> PositionPriors | None:
 def _estimator_settings(path: Path) -> Config:
     """Return the settings of a run without those of front end and reader, which the replay does not need."""
     try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
+        values = read_yaml(read_input(path, MOST_BYTES).decode("utf-8"))
+    except (OSError, ValueError) as error:
         raise ConfigError(f"cannot read {path} ({error}); repeat the run") from error
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path} holds no settings; repeat the run")
     kept = {key: value for key, value in values.items() if key not in ("frontend", "dataset")}
     return merge(Config(), kept, where=str(path))

@@ -15,6 +15,7 @@ from vio.datasets.euroc_files import (
     STATE_CSV,
     camera_yaml,
     image_list_csv,
+    image_name,
     imu_csv,
     imu_yaml,
     median_rate_hz,
@@ -82,7 +83,8 @@ def export_euroc(
         calibration = imu_yaml(np.eye(4), noise, comment=f"{origin} imu0", rate_hz=median_rate_hz(record.times_ns))
         write_text(mav / "imu0" / "sensor.yaml", calibration)
         write_text(folder / MARKER, _description(recording))
-        files = [tuple(mav / name / "data" / f"{t}.png" for name in ("cam0", "cam1")) for t in stamps]
+        names = [image_name(t, int(stamps[-1])) for t in stamps.tolist()]
+        files = [tuple(mav / camera / "data" / name for camera in ("cam0", "cam1")) for name in names]
         _write_images(recording, files, progress)
 
 

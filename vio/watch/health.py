@@ -14,6 +14,7 @@ _GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many ti
 _LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
 _REJECTING_FRAMES = 20
 _ROWS_OFF_PX = 0.2
+_RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
 _MAX_SPEED_MPS = 100.0
 _MAX_GYRO_BIAS_RADPS = 0.5
 _MAX_ACCEL_BIAS_MPS2 = 3.0
@@ -30,6 +31,25 @@ class RunHealth:
         self._last_index = 0
         self._rejecting = 0
         self._reported: set[str] = set()
+        self._restarted_ns: int | None = None  # time of the last restart
+
+    def restarted(self, index: int, why: str, estimate: Estimate) -> tuple[str, ...]:
+        """Return the line on a restart after a divergence; none if the last one was less than a second before.
+
+        Args:
+            index: frame number.
+            why: what the estimator said.
+            estimate: the state that it goes on from.
+        """
+        last_ns, self._restarted_ns = self._restarted_ns, estimate.time_ns
+        self._last = estimate.time_ns, estimate.T_world_imu[:3, 3].copy()
+        if last_ns is not None and (estimate.time_ns - last_ns) * 1e-9 < _RESTART_EVENT_S:
+            return ()
+        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        return (
+            f"frame {index}: {why}; started again from the last good pose, the standard deviation of its position is "
+            f"{sigma:.2f} m",
+        )
 
     def frame(self, index: int, report: UpdateReport, estimate: Estimate) -> tuple[str, ...]:
         """Return the warnings of this frame.

@@ -71,8 +71,9 @@ class RunWatch:
         self._report(self._repeats.frame(frame, repeated))
         return self._repeated
 
-    def observations(self, seen: Observations) -> None:
-        """Add the front end's observations, before feature selection."""
+    def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
+        """Add the front end's observations, before feature selection, and what it says of the images."""
+        self._report(warnings)
         self._frames += 1
         self._features += len(seen)
         if self._silence is not None:
@@ -91,6 +92,10 @@ class RunWatch:
             self._report([f"frame skipped: {reason}"])
         self._refused_last = index
         self.frames_refused += 1
+
+    def restarted(self, index: int, why: str, estimate: Estimate) -> None:
+        """Report that the back end diverged in a frame and was started again; repeats within a second are one event."""
+        self._report(self._health.restarted(index, why, estimate))
 
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""

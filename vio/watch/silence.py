@@ -61,6 +61,8 @@ class ImuSilence:
         if not self._times:
             return ()
         length_s = (until_ns - self._times[-1]) * _NS
+        if length_s <= GAP_S:  # as for nearly every sample; the median below is slow
+            return ()
         usual_s = float(np.median(np.diff(self._times))) * _NS if len(self._times) > 1 else 0.0
         if length_s <= max(GAP_S, GAP_STEPS * usual_s):
             return ()

@@ -19,6 +19,7 @@ from vio.datasets.yaml_files import read_yaml
 from vio.errors import CalibrationError
 from vio.geometry.lie import se3_from_parts, se3_inverse
 from vio.rig import Rig
+from vio.text_files import text_lines
 
 __all__ = ["find_calibration", "load_rig"]
 
@@ -119,7 +120,7 @@ def _euroc(path: Path) -> Rig:
 
 def _kitti(path: Path, image_size: Size | None) -> Rig:
     """Read KITTI's `calib.txt` of the gray pair (else of the colour pair), and `T_cam0_imu.txt` beside it."""
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = [line for _, line in text_lines(path)]
     gray = any(line.startswith("P0:") for line in lines)
     calibration = read_calibration(path, (0, 1) if gray else (2, 3))
     if image_size is None:

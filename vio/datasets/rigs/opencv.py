@@ -154,8 +154,9 @@ def _raw(entries: Entries, where: str, width: int, height: int) -> Rig:
             cameras.append(
                 camera_from_matrix(K, width, height, model, trimmed_coefficients(D) if model == "radtan" else D)
             )
+    pose = _stereo_pose(entries, where)
     with naming(where):
-        return Rig(cameras[0], cameras[1], _stereo_pose(entries, where), notes=tuple(dict.fromkeys(notes)))
+        return Rig(cameras[0], cameras[1], pose, notes=tuple(dict.fromkeys(notes)))
 
 
 def _stereo_pose(entries: Entries, where: str) -> FloatArray:

@@ -1,8 +1,8 @@
 """Every setting halved and doubled: what happens to the error, to the time, and whether anything happens at all.
 
-    python tools/sweep_settings.py run --drive FOLDER --flight FOLDER --second-flight FOLDER --course 0027.npz=POSES
-        --tracks DRIVE.mat --out sweep.jsonl
-    python tools/sweep_settings.py report sweep.jsonl --out docs/settings.md
+    python tools/research/sweep_settings.py run --drive FOLDER --flight FOLDER --second-flight FOLDER
+        --course 0027.npz=POSES --tracks DRIVE.mat --out sweep.jsonl
+    python tools/research/sweep_settings.py report sweep.jsonl --out docs/notes/settings_sweep.md
 
 Each setting is changed alone, in a context in which it can count (the table _CONTEXTS_OF), and the run is compared with
 that context's own base run. Settings of the filter replay features that were logged once; settings of the front end see
@@ -113,7 +113,6 @@ _CONTEXTS = {
     "orb": Context(_FEWER, ("frontend.name=orb",)),
     "kornia": Context(_FEWER, ("frontend.name=kornia",)),
     "no prior": Context(_FEWER, ("frontend.prior=false",)),
-    "circle check": Context(_FEWER, ("frontend.klt.circle_check=true",)),
     "IMU": Context(_FLIGHTS, ("motion=imu",)),
     "no sensor": Context(_LOGS, ("motion=none",)),
     "velocities": Context(_VELOCITIES, ("motion=velocity",)),
@@ -121,8 +120,6 @@ _CONTEXTS = {
     "calibrating": Context(_FLIGHTS, ("motion=imu", "msckf.calibrate=both")),
     "visibility": Context(_LOGS, ("selector.name=visibility",)),
     "visibility, few": Context(_LOGS, ("selector.name=visibility", "selector.keep_fraction=0.02")),
-    "random": Context(_LOGS, ("selector.name=random", "selector.budget=60")),
-    "grid": Context(_LOGS, ("selector.name=grid", "selector.budget=60")),
     "information": Context(_LOGS, ("selector.name=information", "selector.budget=60")),
     "vislam": Context(_VELOCITIES, ("backend=vislam", "motion=velocity")),
     "vislam input": Context(_VELOCITIES, ("backend=vislam", "motion=velocity", "vislam.motion_model=input")),
@@ -142,16 +139,13 @@ _CONTEXTS_OF: dict[str, str | tuple[str, ...]] = {
     "frontend.grid.*": ("front end", "orb"),
     "frontend.disparity.*": ("front end", "orb"),
     "frontend.consensus.*": ("front end", "orb"),
-    "frontend.klt.max_circle_px": "circle check",
     "frontend.klt.pyramid_levels": ("front end", "no prior"),
     "frontend.*": "front end",
     "selector.name": "filter",
     "selector.budget": "visibility",
     "selector.keep_fraction": "visibility",
     "selector.minimum": "visibility, few",
-    "selector.sticky": "random",
-    "selector.seed": "random",
-    "selector.grid_*": "grid",
+    "selector.sticky": "visibility",
     "selector.*": "information",
     "vislam.noise": "vislam input",
     "vislam.input_at": "vislam input",
@@ -178,11 +172,12 @@ _TRIED: dict[str, tuple[Any, ...]] = {
     "dataset.colour": (False, True),
     "frontend.consensus.seed": (1, 2),
     "selector.budget": (30, 120),
-    "selector.seed": (1, 2),
     "dataset.prefetch_frames": (2, 8, 0),
 }
 _NOT_SWEPT = {
     "frontend.features": "names a file; the filter's contexts replay one",
+    "dataset.calibration": "names a file",
+    "dataset.topics": "names topics",
     "frontend.klt.mask": "names a picture",
     "frontend.learned.descriptor": "all others need weights",
     "frontend.learned.detector_weights": "names a file",
@@ -208,11 +203,11 @@ _RECORDINGS = {
     "tracks": "UTIAS 0005",
 }
 _NOTED_TIME, _MEANING, _NEIGHBOURS = 1.25, 110, 6
-_INTRODUCTION = """# Settings
+_INTRODUCTION = """# Settings, halved and doubled
 
 All {settings} settings, and what happens when each alone is halved and doubled: {runs} runs of
-`tools/sweep_settings.py`, which also writes this page. The drive is real; the flights are rendered along real flights
-and carry their real IMU.
+`tools/research/sweep_settings.py`, which also writes this page. The drive is real; the flights are rendered along real
+flights and carry their real IMU.
 
 **How to read it.** *Where* names the context in which the setting was changed (the table below). A figure is the ATE
 (root mean square, after SE(3) alignment) over that of the same run with the default, first recording / second
@@ -252,7 +247,7 @@ _READINGS = {
     "`tests/test_frontend_klt.py` and `test_frontend_patches.py` are there",
     "frontend.klt.max_blind_frames": "guard: no image here is black; `tests/test_frontend_klt.py` blackens some",
     "msckf.pixel_sigma_max_px": "guard: the noise here stays below a pixel; Starry Night's does not "
-    "([results](results.md)); `tests/test_window_tracks.py` reaches it",
+    "([results](../results.md)); `tests/test_window_tracks.py` reaches it",
 }
 
 

@@ -1,8 +1,8 @@
 """Check rectification: rows of matched points on real recordings, and tracking accuracy on rendered images.
 
-    python tools/check_rectification.py rows FOLDER...      # |vl - vr| of matched points
-    python tools/check_rectification.py tracking            # rectified against raw images, with exact ground truth
-    python tools/check_rectification.py resampling          # error and time of the interpolation
+    python tools/research/check_rectification.py rows FOLDER...      # |vl - vr| of matched points
+    python tools/research/check_rectification.py tracking            # rectified against raw images, exact truth
+    python tools/research/check_rectification.py resampling          # error and time of the interpolation
 
 All print a table, or JSON with --json. The figures in docs/rectification.md are from this tool.
 """

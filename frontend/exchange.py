@@ -1,0 +1,104 @@
+"""Left and right images that are exchanged for a while: put back, or refused where they do not fit each other then.
+
+Each image is compared with both of the last frame. The camera's motion shifts both images alike, so they differ from
+their own last images by about the same; from the other camera's last image, one differs by motion plus disparity and
+the other by motion minus disparity. Where it is the other way round, matches decide: exchanged images match with
+negative disparities only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import cv2
+import numpy as np
+
+from vio.records import Image
+
+from .right_camera import image_change
+
+Order: TypeAlias = Literal["given", "exchanged", "refused"]
+
+_THUMBNAIL = (48, 30)  # width and height, so coarse that a shift of the image by some pixels changes little
+_LEAST_POINTS = 20
+_MANY = 0.4  # share of points with a negative disparity that proves an exchange
+_SOME = 0.2  # share of them above which a frame that looks exchanged is refused: its rows do not fit when put back
+
+
+@dataclass(frozen=True, slots=True)
+class MatchCounts:
+    """How many points of a frame match, with disparities of either sign."""
+
+    points: int
+    positive: int
+    negative: int
+
+
+class ExchangeDetector:
+    """Compares the images of consecutive frames, and collects lines for the log."""
+
+    def __init__(self) -> None:
+        self._last: tuple[Image, Image] | None = None  # left and right, sparsely sampled, in their right order
+        self._since: int | None = None  # first frame of a run of exchanged ones
+        self._lines: list[str] = []
+
+    def take_lines(self) -> tuple[str, ...]:
+        """Return the lines since the last call."""
+        lines, self._lines = tuple(self._lines), []
+        return lines
+
+    def order(
+        self, index: int, left: Image, right: Image, count: Callable[[], MatchCounts], *, suspicious: bool
+    ) -> Order:
+        """Return whether the images (H/2, W/2) of a frame are to be used as given, exchanged, or not at all.
+
+        Args:
+            index: frame number.
+            left: left image as given, at half resolution.
+            right: right image as given.
+            count: counts matches; called where the images look exchanged.
+            suspicious: whether to count in any case, as the images of the last frame contradicted each other.
+        """
+        now: tuple[Image, Image] = (_thumbnail(left), _thumbnail(right))
+        order: Order = "given"
+        if suspicious or self._since is not None or (self._last is not None and self._looks_exchanged(now)):
+            order = _judge(count(), "given" if self._since is None else "exchanged")
+        if order != "refused":
+            self._last = now if order == "given" else now[::-1]
+        self._report(index, order)
+        return order
+
+    def _looks_exchanged(self, now: tuple[Image, Image]) -> bool:
+        assert self._last is not None
+        own = [image_change(a, b) for a, b in zip(now, self._last, strict=True)]
+        other = [image_change(a, b) for a, b in zip(now, self._last[::-1], strict=True)]
+        return abs(own[0] - own[1]) > abs(other[0] - other[1])
+
+    def _report(self, index: int, order: Order) -> None:
+        if order == "given":
+            if self._since is not None:
+                self._lines.append(f"frame {index}: left and right images are in order again")
+            self._since = None
+        elif self._since is None:
+            self._since = index
+            done = "they are put back" if order == "exchanged" else "the frames are skipped"
+            self._lines.append(
+                f"frame {index}: left and right images are exchanged from here on, as they match with negative "
+                f"disparities only; {done}"
+            )
+
+
+def _thumbnail(image: Image) -> Image:
+    """A small copy of an image, averaged over areas."""
+    return np.asarray(cv2.resize(image, _THUMBNAIL, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _judge(found: MatchCounts, likely: Order) -> Order:
+    """Decide by matches about a frame that looks exchanged; where they say too little, it is as likely before."""
+    if found.points < _LEAST_POINTS or max(found.negative, found.positive) < _SOME * found.points:
+        return likely
+    if found.negative < 2 * found.positive:
+        return "given"
+    return "exchanged" if found.negative >= _MANY * found.points else "refused"

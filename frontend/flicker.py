@@ -1,0 +1,71 @@
+"""Bands of brightness that move through the images, as flickering light makes with a rolling shutter: taken out.
+
+The bands are constant along a row. Rectified cameras see the same rows, so the difference of their row means changes
+slowly, whatever the scene and the motion; bands that differ between the cameras change it from frame to frame. Once
+they have been seen, each image's smoothed row means are replaced by the image's mean.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.records import Image
+
+_CHANGE = 6.0  # gray levels (root mean square over the rows), by which the difference of row means changes in a frame
+_FRAMES = 3  # such frames among the last ones before bands are taken out
+_MEMORY = 10  # frames
+_LEAST_CONTRAST = 0.3  # of an image over the other's: a camera that goes dark now and then has no bands
+_STRIDE = 8  # of the pixels that the contrast is computed from
+_SMOOTH_ROWS = 3.0  # standard deviation: bands are wider, and horizontal edges of the scene are narrower
+
+
+class BandRemoval:
+    """Detects bands and takes them out from then on, and collects a line for the log."""
+
+    def __init__(self) -> None:
+        self._last: FloatArray | None = None  # (H,) difference of row means in the last frame
+        self._changed: list[int] = []  # frames with a change beyond the limit
+        self._active = False
+        self._lines: list[str] = []
+
+    def take_lines(self) -> tuple[str, ...]:
+        """Return the lines since the last call."""
+        lines, self._lines = tuple(self._lines), []
+        return lines
+
+    def __call__(self, index: int, left: Image, right: Image) -> tuple[Image, Image]:
+        """Return both images (H, W) of a frame, without bands where there are such."""
+        rows_left, rows_right = _row_means(left), _row_means(right)
+        contrast = sorted(float(image[::_STRIDE, ::_STRIDE].std()) for image in (left, right))
+        if not self._active and contrast[0] > _LEAST_CONTRAST * contrast[1]:
+            self._detect(index, rows_left - rows_right)
+        if not self._active:
+            return left, right
+        return _flattened(left, rows_left), _flattened(right, rows_right)
+
+    def _detect(self, index: int, difference: FloatArray) -> None:
+        centred = difference - difference.mean()
+        if self._last is not None and self._last.shape == centred.shape:
+            change = float(np.sqrt(np.mean((centred - self._last) ** 2)))
+            self._changed = [k for k in self._changed if index - k < _MEMORY] + [index] * (change > _CHANGE)
+        self._last = centred
+        if len(self._changed) >= _FRAMES:
+            self._active = True
+            self._lines.append(
+                f"frame {index}: bands of brightness move through the images, differently in both cameras (flickering "
+                "light, or an unstable exposure); they are taken out row by row"
+            )
+
+
+def _row_means(image: Image) -> FloatArray:
+    """Mean gray level (H,) of each row, smoothed over a few rows."""
+    means = cv2.reduce(image, 1, cv2.REDUCE_AVG, dtype=cv2.CV_64F)
+    return np.asarray(cv2.GaussianBlur(means, (1, 0), sigmaX=1.0, sigmaY=_SMOOTH_ROWS), dtype=np.float64)[:, 0]
+
+
+def _flattened(image: Image, rows: FloatArray) -> Image:
+    """The image with rows of equal mean."""
+    off = (rows - rows.mean()).astype(np.float32)
+    return np.clip(np.rint(image.astype(np.float32) - off[:, None]), 0, 255).astype(np.uint8)

@@ -1,0 +1,134 @@
+"""Which of two motions is the camera's, where an object that moves on its own covers much of the image.
+
+The larger consensus wins RANSAC, and that may be the object's. The filter's prediction decides: each motion is tested
+by chi-square against the predicted one, with the covariance of the prediction and that of the fit. With an IMU the
+prediction is known to millimetres and the test decides nearly always; without one the prediction is that of a body
+that goes on as before, and where both motions are possible the larger consensus is used, and it is said.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
+from vio.geometry.stereo import StereoCamera, z_D_p_cam
+from vio.records import MotionPrior
+from vio.statistics import chi_square_quantile
+
+from .outliers import Consensus, RansacProblem, best_motion, pixel_errors
+
+Decision: TypeAlias = Literal["predicted", "undecided"]
+
+_PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
+_LEAST_POINTS = 12  # of a second motion
+_LEAST_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
+_LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
+_PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
+_INDEPENDENT_POINTS = 50  # errors of neighbours have much in common: a fit is no better than that of so many points
+_SCALE_SIGMA = 0.01  # of the length of a fitted translation: depths of one frame have errors in common
+_FRAMES = 5  # in a row before an object is reported
+_CLEAR_FRAMES = 20  # without one before the next is another event
+
+
+@dataclass(frozen=True, slots=True)
+class TwoMotions:
+    """The camera's motion, and that of the other large group of points if there is one."""
+
+    motion: Consensus
+    object_share: float  # share of the points that follow another motion; 0: no large group does
+    decision: Decision | None  # what chose between the two; None: there is one motion only
+
+
+def choose_motion(
+    problem: RansacProblem,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    found: Consensus,
+    predicted: MotionPrior | None,
+    *,
+    in_event: bool = False,
+) -> TwoMotions:
+    """Choose between the consensus motion and that of its outliers.
+
+    Args:
+        problem: camera, thresholds and random generator.
+        p_prev: points (N, 3) triangulated in the previous frame, metres, previous cam0 frame.
+        pixels: left pixels (N, 2) of the same points in the current frame.
+        found: the consensus over them.
+        predicted: the motion that the filter expects, with its covariance; None: it expects nothing.
+        in_event: whether an object has been seen in the frames before. It may hide all but a few points of the scene,
+            and then the prediction itself is taken in place of a consensus that contradicts it.
+    """
+    others = np.flatnonzero(~found.inliers)
+    least = max(_LEAST_POINTS, _LEAST_SUPPORT * found.inliers.sum())
+    if len(others) < least and not (in_event and predicted is not None):
+        return TwoMotions(found, 0.0, None)
+    second, support = np.eye(4), np.zeros(len(others), dtype=np.bool_)
+    if len(others) >= least:
+        starts = np.stack([np.eye(4) if predicted is None else predicted.T_curr_prev, np.eye(4)])
+        second, support = best_motion(problem, p_prev[others], pixels[others], starts)
+    large, share = support.sum() >= least, float(support.sum()) / len(p_prev)
+    reported = share if large and share >= _LARGE_SHARE else 0.0
+    if predicted is None:
+        return TwoMotions(found, reported, "undecided" if reported else None)
+    first_agrees = _agrees(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
+    second_agrees = large and _agrees(problem.camera, second, p_prev[others[support]], predicted)
+    if first_agrees or not (second_agrees or in_event):
+        return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
+    T = second if second_agrees else predicted.T_curr_prev
+    inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
+    share = float(found.inliers.mean())
+    return TwoMotions(Consensus(T, inliers), share if share >= _LARGE_SHARE else 0.0, "predicted")
+
+
+def _agrees(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: MotionPrior) -> bool:
+    """Chi-square test of a motion (4, 4) fitted to points (N, 3) against the prediction."""
+    p = transform_points(T, p_prev)
+    J = (z_D_p_cam(camera, p)[:, :2] @ circledot(p)[:, :3]).reshape(-1, 6)
+    points = min(len(p), _INDEPENDENT_POINTS)
+    fit = _PIXEL_SIGMA**2 * np.linalg.inv(points * J.T @ J / len(p) + 1e-9 * np.eye(6))
+    fit[:3, :3] += _SCALE_SIGMA**2 * float(T[:3, 3] @ T[:3, 3]) * np.eye(3)
+    xi = se3_log(T @ se3_inverse(predicted.T_curr_prev))
+    squared = float(xi @ np.linalg.solve(predicted.covariance + fit, xi))
+    return squared <= float(chi_square_quantile(_PROBABILITY, 6))
+
+
+class ObjectReport:
+    """Says once per event that an object covers much of the image, and what decided which motion is the camera's."""
+
+    def __init__(self) -> None:
+        self._frames = self._clear = 0  # in a row
+        self._said = self._active = False
+
+    @property
+    def active(self) -> bool:
+        """Whether the prediction has told an object from the scene in some of the last frames."""
+        return self._active
+
+    def frame(self, index: int, motions: TwoMotions | None) -> tuple[str, ...]:
+        """Return the line of a frame, if any; None: no motion was found."""
+        if motions is None or motions.object_share == 0.0:
+            self._frames, self._clear = 0, self._clear + 1
+            self._said = self._said and self._clear < _CLEAR_FRAMES
+            self._active = self._active and self._clear < _FRAMES
+            return ()
+        self._frames, self._clear = self._frames + 1, 0
+        self._active = self._active or (self._frames >= _FRAMES and motions.decision == "predicted")
+        if self._frames < _FRAMES or self._said:
+            return ()
+        self._said = True
+        share = round(100 * motions.object_share)
+        if motions.decision == "predicted":
+            return (
+                f"frame {index}: {share} % of the points move together, but not as the camera does by its predicted "
+                "motion: an object that moves on its own covers much of the image; its points are left out",
+            )
+        rest = round(100 * float(motions.motion.inliers.mean()))
+        return (
+            f"frame {index}: two groups of points move differently, {rest} % and {share} % of all: an object that "
+            "moves on its own covers much of the image, and the predicted motion does not tell which group it is; the "
+            "larger one is taken for the scene",
+        )

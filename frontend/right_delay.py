@@ -1,0 +1,187 @@
+"""How late the right camera exposes against the left one, by the rows of matches, and stereo matches at one time.
+
+A right image that is late by `delay` frames shows a feature where it was then: its row differs from the left one by
+`-delay` times the feature's motion along v in the last frame. The differences that a wrong rectification makes are
+constant over time instead, so both are fitted together: six terms over the image, and the delay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
+from vio.geometry.stereo import StereoCamera, left_rays
+
+from .tracks import Tracks
+
+_MEMORY = 0.97  # per frame, of the normal equations
+_LEAST_MATCHES = 30  # in a frame that is learned from
+_LEAST_FRAMES = 10  # before a delay is believed
+_LEAST_DELAY = 0.25  # frames; less does little harm, and small errors of the rows look like it
+_EXPLAINS = 0.5  # share of the rows' scatter about the constant field that the delay must explain
+_SIGMAS = 10.0  # standard deviations of the delay: errors of a feature's rows last for as long as the feature
+_ROW_SIGMA_PX = 0.5  # of the rows, beyond which a match counts less (Cauchy)
+_WHOLE = 0.15  # a delay this near to whole frames is one of whole frames: an image was paired with the wrong one
+_FORGET = 0.1  # delay below which the images are taken to be simultaneous again
+_SUSPECT_SHARE = 0.4  # least share of features that match in another pairing …
+_CLEARLY = 1.5  # … over those that match in this one
+_SUSPECT_FRAMES = 2  # in a row
+_TERMS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class PairingCounts:
+    """How many features match in three pairings of left and right images."""
+
+    points: int  # that were tried
+    same: int  # left and right image of this frame
+    late: int  # the left image before, and this right one
+    early: int  # this left image, and the right one before
+
+
+class RightDelay:
+    """Estimates the right camera's delay from the matches of all frames, and collects lines for the log."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._camera = camera
+        self._normal: FloatArray = np.zeros((_TERMS + 1, _TERMS + 1))
+        self._moment: FloatArray = np.zeros(_TERMS + 1)
+        self._square = self._count = 0.0  # sums of squared rows and of weights
+        self._frames = 0
+        self._solution: FloatArray = np.zeros(_TERMS + 1)
+        self._lines: list[str] = []
+        self._suspected = (0.0, 0)  # delay by the pairings, and in how many frames in a row
+        self.frames = 0.0  # the delay in frames to be taken out; 0: none is significant
+
+    def take_lines(self) -> tuple[str, ...]:
+        """Return the lines since the last call."""
+        lines, self._lines = tuple(self._lines), []
+        return lines
+
+    def update(self, index: int, left: FloatArray, flow: FloatArray, rows: FloatArray, frame_s: float) -> bool:
+        """Learn from the matches of a frame; return whether a delay has just begun or ended.
+
+        Args:
+            index: frame number.
+            left: left pixels (N, 2).
+            flow: their motion (N, 2) since the last frame, pixels.
+            rows: right rows minus left rows (N,), pixels, as measured.
+            frame_s: time since the last frame.
+        """
+        if len(left) < _LEAST_MATCHES:
+            return False
+        camera = self._camera
+        x, y = (left[:, 0] - camera.cu) / camera.fu, (left[:, 1] - camera.cv) / camera.fv
+        terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y, flow[:, 1]], axis=1)
+        weight = 1 / (1 + ((rows - terms @ self._solution) / _ROW_SIGMA_PX) ** 2) if self._frames else np.ones(len(x))
+        self._normal = _MEMORY * self._normal + (terms * weight[:, None]).T @ terms
+        self._moment = _MEMORY * self._moment + terms.T @ (weight * rows)
+        self._square = _MEMORY * self._square + float(weight @ rows**2)
+        self._count = _MEMORY * self._count + float(weight.sum())
+        self._frames += 1
+        self._solution = np.asarray(np.linalg.solve(self._normal + 1e-6 * np.eye(_TERMS + 1), self._moment), np.float64)
+        before = self.frames
+        self._decide(index, frame_s)
+        return (before == 0.0) != (self.frames == 0.0)
+
+    def _decide(self, index: int, frame_s: float) -> None:
+        """Take a delay out where it is significant, and say so once."""
+        delay, sigma, explained = self._significance()
+        if self._frames < _LEAST_FRAMES or _SIGMAS * sigma > _LEAST_DELAY:
+            return
+        whole = float(np.rint(delay))
+        rounded = whole if abs(delay - whole) < _WHOLE else delay
+        if self.frames != 0.0:
+            if abs(delay) < _FORGET:
+                self.frames = 0.0
+                self._lines.append(f"frame {index}: the right camera is no longer late or early")
+            elif rounded != 0.0:
+                self.frames = rounded
+        elif abs(delay) > _LEAST_DELAY and explained > _EXPLAINS:
+            self._begin(index, rounded, delay, frame_s)
+
+    def suspect(self, index: int, counts: PairingCounts, frame_s: float) -> bool:
+        """Test whether a right image that contradicts the left one belongs to the frame before, or to the next one.
+
+        Args:
+            index: frame number.
+            counts: matches of the frame in the three pairings.
+            frame_s: time since the last frame.
+
+        Returns:
+            Whether a delay has just begun: two frames in a row say the same.
+        """
+        best = max(counts.late, counts.early)
+        clear = best >= _SUSPECT_SHARE * counts.points and best >= _CLEARLY * counts.same
+        clear &= counts.points >= _LEAST_MATCHES and best >= _CLEARLY * min(counts.late, counts.early)
+        delay = 1.0 if counts.late == best else -1.0
+        self._suspected = (delay, self._suspected[1] + 1 if self._suspected[0] == delay else 1) if clear else (0.0, 0)
+        if self._suspected[1] < _SUSPECT_FRAMES or self.frames != 0.0:
+            return False
+        self._normal, self._moment = np.zeros_like(self._normal), np.zeros_like(self._moment)
+        self._square = self._count = 0.0
+        self._frames, self._solution = 0, np.zeros(_TERMS + 1)
+        self._begin(index, delay, delay, frame_s)
+        return True
+
+    def _begin(self, index: int, rounded: float, delay: float, frame_s: float) -> None:
+        self.frames = rounded
+        late = "late" if delay > 0 else "early"
+        self._lines.append(
+            f"frame {index}: the right camera is {late} by {1e3 * abs(delay) * frame_s:.0f} ms ({abs(delay):.2f} "
+            "frames) against the left one, by how its image moves; it is taken out of the matches; pair the images by "
+            "their times of exposure, or synchronise the cameras"
+        )
+
+    def _significance(self) -> tuple[float, float, float]:
+        """The delay in frames, its standard deviation, and the share of the rows' scatter that it explains."""
+        A, b = self._normal + 1e-6 * np.eye(_TERMS + 1), self._moment
+        constant = np.linalg.solve(A[:_TERMS, :_TERMS], np.column_stack([A[:_TERMS, _TERMS], b[:_TERMS]]))
+        information = float(A[_TERMS, _TERMS] - A[_TERMS, :_TERMS] @ constant[:, 0])
+        scatter = max(self._square - float(b[:_TERMS] @ constant[:, 1]), 1e-12)
+        delay = -float(self._solution[_TERMS])
+        explained = min(delay**2 * information / scatter, 1.0)
+        variance = scatter * (1 - explained) / max(self._count, 1.0)
+        return delay, float(np.sqrt(variance / max(information, 1e-12))), explained
+
+
+def at_exposure(tracks: Tracks, flow: FloatArray, T_curr_prev: FloatArray, delay: float) -> Tracks:
+    """Return tracks as they were when the right image was exposed, by their motion in the last frame.
+
+    Args:
+        tracks: now.
+        flow: their motion (N, 2) since the last frame, pixels.
+        T_curr_prev: motion (4, 4) of the camera since then.
+        delay: of the right camera, frames.
+    """
+    left, warp = tracks.left - delay * flow, tracks.warp.copy()
+    warp[:, :, 2] -= delay * flow
+    T_then_curr = se3_exp(-delay * se3_log(T_curr_prev))
+    return replace(tracks, left=left, warp=warp, point=transform_points(T_then_curr, tracks.point))
+
+
+def at_present(camera: StereoCamera, tracks: Tracks, then: Tracks, T_curr_prev: FloatArray, delay: float) -> Tracks:
+    """Return tracks with the right pixels that they would have now, given their matches when the image was exposed.
+
+    Args:
+        camera: rectified pair.
+        tracks: now, without matches.
+        then: `at_exposure`, matched.
+        T_curr_prev: motion (4, 4) of the camera in the last frame.
+        delay: of the right camera, frames.
+    """
+    moved = transform_points(se3_exp(delay * se3_log(T_curr_prev)), then.point)
+    ahead = moved[:, 2] > 1e-2
+    depth = np.where(ahead, moved[:, 2], 1.0)
+    right = tracks.left + np.stack([-camera.fu * camera.baseline_m / depth, then.right[:, 1] - then.left[:, 1]], axis=1)
+    matched = then.has_right & then.has_point & ahead
+    return replace(
+        tracks,
+        right=np.where(matched[:, None], right, tracks.right),
+        has_right=matched,
+        skew=then.skew,
+        point=np.where(matched[:, None], left_rays(camera, tracks.left) * depth[:, None], tracks.point),
+        has_point=tracks.has_point | matched,
+    )

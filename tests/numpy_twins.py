@@ -1,0 +1,240 @@
+"""The compiled loops once more in NumPy, many at a time: slower and, for an eye used to arrays, easier to check."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from frontend.align import FLAT_RMS, Templates, offsets
+from vio.filters.multiview import MIN_DEPTH, InverseDepth, Residuals, TrackInformation, Views, point_D_pose
+from vio.filters.stereo_calibration import StereoColumns, StereoInformation
+from vio.geometry.lie import FloatArray, circledot, se3_exp
+from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
+from vio.records import BoolArray
+
+PRIOR = 1e-6  # per px^2, on a disparity: that of `vio.filters.multiview`
+ROW_WEIGHT = (4.0 / 0.3) ** 2  # gray levels and pixels: those of `frontend.align`
+
+
+def sampled(image: FloatArray, warp: FloatArray, radius: int) -> FloatArray:
+    """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated."""
+    x, y = offsets(radius).astype(np.float64)
+    u, v = np.moveaxis(warp @ np.stack([x, y, np.ones_like(x)]), 1, 0)
+    u, v = np.clip(u, 0, image.shape[1] - 1), np.clip(v, 0, image.shape[0] - 1)
+    i, j = np.minimum(u.astype(int), image.shape[1] - 2), np.minimum(v.astype(int), image.shape[0] - 2)
+    a, b = u - i, v - j
+    above = (1 - a) * image[j, i] + a * image[j, i + 1]
+    below = (1 - a) * image[j + 1, i] + a * image[j + 1, i + 1]
+    out: FloatArray = (1 - b) * above + b * below
+    return out
+
+
+def prepared(wide: FloatArray) -> Templates:
+    """Templates of patches (N, 2r+3, 2r+3), in double precision."""
+    n, radius = len(wide), wide.shape[1] // 2 - 1
+    flat = (n, (2 * radius + 1) ** 2)
+    patch = wide[:, 1:-1, 1:-1].reshape(flat)
+    gu = ((wide[:, 1:-1, 2:] - wide[:, 1:-1, :-2]) / 2).reshape(flat)
+    gv = ((wide[:, 2:, 1:-1] - wide[:, :-2, 1:-1]) / 2).reshape(flat)
+    x, y = offsets(radius).astype(np.float64)
+    centred = patch - patch.mean(axis=1, keepdims=True)
+    basis = np.stack([gu, gv, centred, np.ones(flat), gu * x, gu * y, gv * x, gv * y], axis=1)
+    normal = basis @ basis.transpose(0, 2, 1)
+    normal += (1e-6 * np.einsum("nii->ni", normal) + 1e-6)[:, :, None] * np.eye(8)
+    on_row = normal[:, :6, :6].copy()
+    on_row[:, 1, 1] += ROW_WEIGHT
+    energy = np.sum(centred**2, axis=1)
+    columns = (centred, np.stack([gu, gv], axis=1), energy, np.linalg.inv(normal), np.linalg.inv(on_row))
+    return Templates(*columns)  # type: ignore[arg-type]  # float64
+
+
+def aligned(
+    store: Templates, image: FloatArray, warp: FloatArray, iterations: int, rows: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Warps (N, 2, 3) and correlations (N,) of `frontend.align.align`, all templates in step."""
+    size, radius = store.patch.shape[1], int(store.patch.shape[1] ** 0.5) // 2
+    x, y = offsets(radius).astype(np.float64)
+    warp, score, active = warp.copy(), np.full(len(warp), -1.0), np.arange(len(warp))
+    inverse = store.inverse if rows is None else store.row_inverse
+    for _ in range(iterations):
+        view, here = sampled(image, warp[active], radius), warp[active]
+        patch, energy = store.patch[active], store.energy[active]
+        gu, gv = np.moveaxis(store.gradient[active] * view[:, None], 1, 0)
+        terms = [gu, gv, patch * view, view, gu * x, gu * y, gv * x, gv * y]
+        moments = np.stack([term.sum(axis=1) for term in terms], axis=1)
+        other = np.sum((view - view.mean(axis=1, keepdims=True)) ** 2, axis=1)
+        flat = (other <= FLAT_RMS**2 * size) | (energy <= FLAT_RMS**2 * size)
+        score[active] = np.where(flat, -1.0, moments[:, 2] / np.sqrt(np.where(flat, 1.0, other * energy)))
+        if rows is not None:
+            gain = np.maximum(moments[:, 2] / np.maximum(energy, 1.0), 0.1)
+            moments[:, 1] += ROW_WEIGHT * gain * (here[:, 1, 2] - rows[active])
+        parameters = inverse.shape[1]
+        fit = np.zeros((len(active), 8))
+        fit[:, :parameters] = (inverse[active] @ moments[:, :parameters, None])[:, :, 0]
+        fit /= np.maximum(fit[:, 2:3], 0.1)
+        step = np.eye(3) + np.zeros((len(active), 1, 1))
+        step[:, :2, 2] = np.clip(fit[:, :2], -1.0, 1.0)
+        step[:, :2, :2] += np.clip(fit[:, 4:], -0.3, 0.3).reshape(-1, 2, 2)
+        warp[active] = here @ np.linalg.inv(step)
+        active = active[np.abs(fit[:, :2]).max(axis=1) > 0.05]
+    return warp, score
+
+
+def moved_errors(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray) -> FloatArray:
+    """Distances (..., N) between points (N, 3) moved by motions (..., 4, 4) and left pixels (N, 2)."""
+    p = p_prev @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
+    ahead = p[..., 2] > 0.05
+    distance = np.linalg.norm(project(camera, np.where(ahead[..., None], p, 1.0))[..., :2] - pixels, axis=-1)
+    return np.where(ahead, distance, np.inf)
+
+
+def gauss_newton(
+    camera: StereoCamera,
+    T: FloatArray,
+    p_prev: FloatArray,
+    pixels: FloatArray,
+    weight: FloatArray,
+    *,
+    iterations: int,
+    free: slice,
+) -> FloatArray:
+    """Motions (H, 4, 4), each refined on its own points (H, K, 3), pixels (H, K, 2) and weights (H, K)."""
+    for _ in range(iterations):
+        p = p_prev @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        ahead = p[..., 2] > 0.05
+        p = np.where(ahead[..., None], p, np.array([0.0, 0.0, 1.0]))
+        w = np.where(ahead, weight, 0.0)
+        residual = pixels - project(camera, p)[..., :2]
+        pixel_D_xi = z_D_p_cam(camera, p)[..., :2, :] @ circledot(p)[..., :3, free]
+        n = pixel_D_xi.shape[-1]
+        J = (pixel_D_xi * w[..., None, None]).reshape(len(T), -1, n)
+        r = (residual * w[..., None]).reshape(len(T), -1, 1)
+        A = np.swapaxes(J, 1, 2) @ J
+        A = A + (1e-4 * np.trace(A, axis1=1, axis2=2)[:, None, None] / n + 1e-9) * np.eye(n)
+        xi = np.zeros((len(T), 6))
+        xi[:, free] = np.clip(np.linalg.solve(A, np.swapaxes(J, 1, 2) @ r)[..., 0], -5.0, 5.0)
+        T = se3_exp(xi) @ T
+    return T
+
+
+# --- tracks and their views --------------------------------------------------------------------------------------
+
+
+def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views) -> Residuals:
+    """Compare predicted with seen pixels, equation (M1)."""
+    R, t = T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3]
+    F, N = len(p_world), len(T_cam0_world)
+    p_cam = (p_world @ R.reshape(-1, 3).T).reshape(F, N, 3) + t
+    seen = views.weight[..., 0] > 0
+    ok = p_cam[..., 2] > MIN_DEPTH * camera.baseline_m
+    safe = np.where((ok & seen)[..., None], p_cam, [0.0, 0.0, 1.0])
+    usable = views.weight * ok[..., None]
+    r = (np.where(usable > 0, views.z, 0.0) - project(camera, safe)) * usable
+    J = (z_D_p_cam(camera, safe) * usable[..., None]) @ R
+    ahead: BoolArray = np.all(ok | ~seen, axis=1)
+    return Residuals(r, J, ahead)
+
+
+def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, seen: BoolArray) -> InverseDepth:
+    """Return the coordinates (M5) of points (F, 3) that lie ahead of the first camera that saw them."""
+    anchor = np.argmax(seen, axis=1)
+    R, t = T_cam0_world[anchor, :3, :3], T_cam0_world[anchor, :3, 3]
+    centre = -np.einsum("nji,nj->ni", T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3])[anchor]
+    p_cam = np.einsum("fij,fj->fi", R, p_world) + t
+    z = np.maximum(p_cam[:, 2], MIN_DEPTH * camera.baseline_m)
+    disparity = camera.fu * camera.baseline_m / z
+    p_D_q, q_D_p = np.empty((len(z), 3, 3)), np.empty((len(z), 3, 3))
+    p_D_q[:, :, :2] = np.swapaxes(R[:, :2], 1, 2) * (z / camera.fu)[:, None, None]
+    p_D_q[:, :, 2] = (centre - p_world) / disparity[:, None]
+    q_D_p[:, :2] = (R[:, :2] - (p_cam[:, :2] / z[:, None])[:, :, None] * R[:, 2:]) * (camera.fu / z)[:, None, None]
+    q_D_p[:, 2] = R[:, 2] * (-disparity / z)[:, None]
+    return InverseDepth(anchor, centre, disparity, p_D_q, q_D_p)
+
+
+def track_information(
+    camera: StereoCamera, T_cam0_world: FloatArray, at: Residuals, p_world: FloatArray, weight: FloatArray
+) -> TrackInformation:
+    """Collect the normal equations of tracks, equations (M2), (M3), (M5) and (M6)."""
+    F, N = at.r.shape[:2]
+    q = inverse_depth(camera, T_cam0_world, p_world, np.any(at.z_D_p[:, :, 1, :], axis=2))
+    J = (at.z_D_p.reshape(F, 4 * N, 3) @ q.p_D_q).reshape(F, N, 4, 3)
+    Jt = np.swapaxes(J * weight[..., None, None], 2, 3)
+    C_i = Jt @ J
+    C_i[np.arange(F), q.anchor, 2, 2] += PRIOR
+    g_i = (Jt @ at.r[..., None])[..., 0]
+    B = q.q_D_p @ point_D_pose(p_world)
+    Bt = np.swapaxes(B, 1, 2)
+    G_i = Bt[:, None] @ C_i
+    gradient = (Bt[:, None] @ g_i[..., None]).reshape(F, 6 * N)
+    return TrackInformation(q, G_i.reshape(F, 6 * N, 3), C_i.sum(axis=1), B, gradient, g_i.sum(axis=1))
+
+
+def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Information matrix (6N, 6N) and vector (6N,) about the clones of the chosen tracks, equation (M4)."""
+    G, N = info.G[chosen], info.G.shape[1] // 6
+    L = np.linalg.cholesky(np.linalg.inv(info.C[chosen]))
+    V = G @ L  # (F, 6N, 3)
+    flat = np.swapaxes(V, 1, 2).reshape(-1, 6 * N)
+    A = -flat.T @ flat
+    blocks = np.swapaxes(G, 0, 1).reshape(6 * N, -1) @ info.q_D_clone[chosen].reshape(-1, 6)  # sum of G_i B
+    for i in range(N):
+        A[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += blocks[6 * i : 6 * i + 6]
+    b = info.gradient[chosen].sum(axis=0)
+    b -= flat.T @ (np.swapaxes(L, 1, 2) @ info.point_gradient[chosen][..., None]).reshape(-1)
+    return A, b
+
+
+def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
+    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the six coefficients of (R3), (..., 4, 6), pixels."""
+    x, y = (z[..., 0] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
+    xr = (z[..., 2] - camera.cu) / camera.fu
+    out = np.zeros((*z.shape[:-1], 4, 6))
+    for row, u in ((0, x), (2, xr)):
+        r2 = u * u + y * y
+        out[..., row, 3], out[..., row, 4], out[..., row, 5] = u * r2, 2 * u * y, r2 + 2 * u * u
+    r2 = x * x + y * y
+    out[..., 1, 3], out[..., 1, 4], out[..., 1, 5] = y * r2, r2 + 2 * y * y, 2 * x * y
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 1.0, xr, xr * xr + y * y
+    return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
+
+
+def corrected(
+    camera: StereoCamera, rows: FloatArray, coefficients: FloatArray, z: FloatArray, weight: FloatArray
+) -> FloatArray:
+    """Pixels (..., 4) without the field (6,) of (R3) and without what follows from the rows (6,) of (R2)."""
+    x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
+    out = z - field_jacobian(camera, z) @ coefficients
+    out[..., 2] -= camera.fu * (-rows[1] * y + (rows[5] - rows[4]) * x * y - rows[3] * y * y)
+    return np.where(weight > 0, out, z)
+
+
+def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: FloatArray) -> StereoColumns:
+    """Collect the normal equations of `r = J (B xi_i + dp) + H s`."""
+    F, N, _, S = H.shape
+    J = at.z_D_p
+    H = H * np.any(J, axis=3)[..., None]
+    WH = H * weight[..., None, None]
+    by_point = np.asarray(sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3)))
+    by_q = np.swapaxes(p_D_q, 1, 2) @ np.swapaxes(by_point, 1, 2).reshape(F, 3, N * S)
+    flat = (F, 4 * N, S)
+    return StereoColumns(
+        np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2), H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N)
+    )
+
+
+def eliminate_points_from_columns(
+    columns: StereoColumns, info: TrackInformation, chosen: BoolArray
+) -> StereoInformation:
+    """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does."""
+    by_point = columns.by_point[chosen]
+    F, N, _, S = by_point.shape
+    H, WH, r = (a[chosen] for a in (columns.H, columns.WH, columns.r))
+    G = by_point.sum(axis=1)  # (F, 3, S)
+    CG = np.linalg.solve(info.C[chosen], G)  # (F, 3, S)
+    flat_G, flat_CG = G.reshape(3 * F, S), CG.reshape(3 * F, S)
+    A = WH.reshape(-1, S).T @ H.reshape(-1, S) - flat_G.T @ flat_CG
+    B = info.q_D_clone[chosen].reshape(3 * F, 6)
+    per_view = np.swapaxes(by_point, 1, 2).reshape(3 * F, N * S)
+    cross = (B.T @ per_view).reshape(6, N, S).transpose(1, 0, 2).reshape(6 * N, S)
+    cross = cross - np.swapaxes(info.G[chosen], 1, 2).reshape(3 * F, 6 * N).T @ flat_CG
+    b = WH.reshape(-1, S).T @ r.reshape(-1) - flat_CG.T @ info.point_gradient[chosen].reshape(-1)
+    return StereoInformation(A, cross.T, b)

@@ -1,0 +1,83 @@
+"""`vio convert`: what it writes is the same recording again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.dataset_makers import ece276a_arrays, make_drive, make_npz
+from tests.euroc_maker import make_euroc
+from tests.same_events import assert_same_events
+from vio.cli import main
+from vio.datasets import open_dataset
+from vio.records import VelocitySample
+
+
+@pytest.mark.parametrize("form", ["euroc", "plain", "kitti"])
+def test_a_converted_flight_is_the_same_recording(form: str, flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert main(["convert", str(flight), "--to", form, "--out", str(out)]) == 0
+    before, after = open_dataset(flight), open_dataset(out)
+    a, b = before.recording, after.recording
+    assert b.kind == {"euroc": "euroc", "plain": "plain", "kitti": "plain"}[form]
+    assert a.camera.baseline_m == pytest.approx(b.camera.baseline_m, abs=1e-15)
+    np.testing.assert_allclose(a.T_cam0_imu, b.T_cam0_imu, atol=1e-15)
+    assert a.motion == b.motion
+    moved = []
+    for recording in (a, b):
+        assert recording.reference is not None
+        assert recording.reference.times_ns is not None
+        at = np.searchsorted(recording.reference.times_ns, recording.frame_times_ns)
+        moved.append(np.linalg.norm(recording.reference.positions[at[9]] - recording.reference.positions[at[0]]))
+    assert moved[0] == pytest.approx(moved[1], rel=1e-9)
+    if form != "kitti":  # whose clock begins at zero
+        assert a.camera == b.camera
+        assert_same_events(before, after)
+        assert after.imu_noise == before.imu_noise  # type: ignore[attr-defined]
+
+
+def test_a_raw_recording_is_written_rectified(tmp_path: Path) -> None:
+    source = make_euroc(tmp_path / "raw")
+    out = tmp_path / "out"
+    assert main(["convert", str(source), "--to", "plain", "--out", str(out), "--start", "1", "--stop", "3"]) == 0
+    before, after = open_dataset(source), open_dataset(out)
+    assert after.recording.camera == before.recording.camera
+    ours, theirs = list(before.events(1, 3)), list(after.events())
+    assert [event.time_ns for event in ours] == [event.time_ns for event in theirs]
+    for x, y in zip(ours, theirs, strict=True):
+        if hasattr(x, "left") and hasattr(y, "left"):
+            np.testing.assert_array_equal(x.left, y.left)
+
+
+def test_names_of_rendered_images_sort_by_time_as_text(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    assert main(["convert", str(flight), "--to", "plain", "--out", str(out)]) == 0
+    names = sorted(path.name for path in (out / "left").iterdir())
+    assert names == sorted(names, key=lambda name: int(name.split(".")[0]))
+
+
+def test_velocities_and_poses_at_the_frames_go_to_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from tests.dataset_makers import make_kitti
+
+    source = make_kitti(tmp_path / "kitti")
+    out = tmp_path / "out"
+    assert main(["convert", str(source), "--to", "kitti", "--out", str(out), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    before, after = open_dataset(source), open_dataset(out)
+    assert (after.recording.kind, facts["notes"]) == ("kitti", [])
+    a, b = ([event for event in dataset.events() if isinstance(event, VelocitySample)] for dataset in (before, after))
+    np.testing.assert_array_equal([s.linear for s in a], [s.linear for s in b])
+    assert before.recording.reference is not None
+    assert after.recording.reference is not None
+    assert len(after.recording.reference) == len(before.recording.reference)
+    assert main(["convert", str(source), "--to", "euroc", "--out", str(tmp_path / "e")]) == 0
+    assert "velocities have no place in EuRoC's form" in capsys.readouterr().out
+
+
+def test_features_cannot_be_converted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = make_npz(tmp_path / "a.npz", ece276a_arrays(make_drive(6)))
+    assert main(["convert", str(path), "--to", "plain", "--out", str(tmp_path / "out")]) == 1
+    assert "holds no images, so there is nothing to convert" in capsys.readouterr().err

@@ -1,0 +1,375 @@
+"""Plain folders: names, numbers, times, samples, calibrations, what is not used, and one-line errors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.dataset_makers import calib_text, make_kitti
+from tests.euroc_maker import KITTI_RIG, RADTAN_RIG, RECTIFIED_RIG, make_euroc, make_kitti_raw, truth_poses
+from tests.plain_maker import STEP_S, make_plain, rig_of
+from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.image_formats import other_damage
+from vio.datasets.images import UnreadableImageError, load_gray
+from vio.datasets.plain import read_plain
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.datasets.tables import parse_stamps, read_imu_table
+from vio.errors import CalibrationError, DataError, VioError
+from vio.records import ImuSample, StereoFrame
+
+DEFAULT = DatasetSettings()
+
+
+def frames_of(path: Path) -> list[StereoFrame]:
+    return [event for event in open_dataset(path).events() if isinstance(event, StereoFrame)]
+
+
+# --- images ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "folders",
+    [("left", "right"), ("image_0", "image_1"), ("cam0/images", "cam1/images"), ("image_00/data", "image_01/data")],
+    ids=lambda f: f[0],
+)
+def test_usual_folder_names_are_found(folders: tuple[str, str], tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, folders=folders)
+    dataset = open_dataset(folder if folders[0] != "image_00/data" else f"plain:{folder}")
+    recording = dataset.recording
+    assert recording.kind == "plain"
+    assert recording.motion == {"imu"}
+    np.testing.assert_allclose(np.diff(recording.frame_times_ns), STEP_S * 1e9)
+    assert recording.frame_times_ns[0] == 1700000000_000000000
+    assert recording.reference is not None
+    np.testing.assert_allclose(recording.reference.T_world_body, truth_poses(4), atol=1e-12)
+    assert recording.notes == ()
+
+
+def test_the_same_pixels_as_the_reader_of_euroc_folders(tmp_path: Path) -> None:
+    """An EuRoC folder and a plain one with the same images and numbers give the same rectified bits."""
+    euroc = make_euroc(tmp_path / "euroc", rig=RECTIFIED_RIG)
+    plain = tmp_path / "plain"
+    for name, side in (("cam0", "left"), ("cam1", "right")):
+        (plain / side).parent.mkdir(exist_ok=True)
+        (euroc / "mav0" / name / "data").rename(plain / side)
+        (plain / side).rename(euroc / "mav0" / name / "data")
+        (plain / side).mkdir(parents=True)
+        for image in (euroc / "mav0" / name / "data").iterdir():
+            (plain / side / image.name).write_bytes(image.read_bytes())
+    (plain / "calibration.yaml").write_text(kalibr_text(rig_of(RECTIFIED_RIG)))
+    (plain / "imu.csv").write_bytes((euroc / "mav0" / "imu0" / "data.csv").read_bytes())
+    a, b = open_dataset(euroc), open_dataset(plain)
+    assert a.recording.camera == b.recording.camera
+    np.testing.assert_allclose(a.recording.T_cam0_imu, b.recording.T_cam0_imu, atol=1e-15)
+    for x, y in zip(a.events(), b.events(), strict=True):
+        assert type(x) is type(y)
+        assert x.time_ns == y.time_ns
+        if isinstance(x, StereoFrame) and isinstance(y, StereoFrame):
+            np.testing.assert_array_equal(x.left, y.left)
+            np.testing.assert_array_equal(x.right, y.right)
+        elif isinstance(x, ImuSample) and isinstance(y, ImuSample):
+            np.testing.assert_array_equal([x.gyro, x.accel], [y.gyro, y.accel])
+
+
+def test_numbers_without_padding_are_sorted_as_numbers(tmp_path: Path) -> None:
+    """left1, left2, …, left12: as text, left10 would come second."""
+    folder = make_plain(tmp_path, 12, name=lambda side, k: f"{('left', 'right')[side]}{k + 1}.jpg", imu=False)
+    pairs = read_plain(folder, DEFAULT).pairs
+    assert [left.name for left, _ in pairs] == [f"left{k + 1}.jpg" for k in range(12)]
+    assert [right.name for _, right in pairs] == [f"right{k + 1}.jpg" for k in range(12)]
+
+
+def test_kitti_folders_without_padding_are_sorted_as_numbers(tmp_path: Path) -> None:
+    folder = make_kitti(tmp_path, frames=11)
+    for image in sorted(folder.glob("image_?/*.png")):
+        image.rename(image.with_name(f"{int(image.stem)}.png"))
+    dataset = open_dataset(folder)
+    assert [left.stem for left, _ in dataset.pairs] == [str(k) for k in range(11)]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".tif", ".pgm", ".webp"])
+def test_other_image_types_are_read_and_truncated_ones_refused(suffix: str, tmp_path: Path) -> None:
+    pixels = np.tile(np.arange(0, 248, 8, dtype=np.uint8), (24, 1))
+    options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == ".webp" else []
+    assert cv2.imwrite(str(tmp_path / f"a{suffix}"), pixels, options)
+    image, bits = load_gray(tmp_path / f"a{suffix}")
+    assert bits == 8
+    np.testing.assert_allclose(image.astype(int), pixels, atol=2)
+    data = (tmp_path / f"a{suffix}").read_bytes()
+    (tmp_path / f"b{suffix}").write_bytes(data[: len(data) // 2])
+    with pytest.raises(UnreadableImageError, match=r"truncated|does not decode"):
+        load_gray(tmp_path / f"b{suffix}")
+
+
+def test_unknown_image_data_is_named() -> None:
+    assert other_damage(b"GIF89a") == "neither PNG nor JPEG, BMP, TIFF, PGM, PPM or WebP"
+    assert other_damage(b"P5 nothing") == "the PGM or PPM has no valid header"
+
+
+def test_images_without_a_partner_are_skipped_and_said(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, times=False, imu=False, reference=False)
+    (folder / "right" / "2.png").unlink()
+    (folder / "left" / "3.png").unlink()
+    recording = open_dataset(folder).recording
+    assert len(recording.frame_times_ns) == 2
+    assert "1 left and 1 right images have no partner and are skipped" in recording.notes
+
+
+def test_stamps_of_two_clocks_in_names_are_paired(tmp_path: Path) -> None:
+    stamp = 1700000000_000000000
+    folder = make_plain(
+        tmp_path, times=False, name=lambda side, k: f"{stamp + 50_000_000 * k + 1_000_000 * side}.png", reference=False
+    )
+    dataset = read_plain(folder, DEFAULT)
+    assert dataset.recording.frame_times_ns.tolist() == [stamp + 50_000_000 * k for k in range(4)]
+    assert [int(b.stem) - int(a.stem) for a, b in dataset.pairs] == [1_000_000] * 4
+
+
+# --- times and samples ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("texts", "expected"),
+    [
+        (["0", "0.1"], [0, 100_000_000]),
+        (["1700000000.000000001", "1700000000.1"], [1700000000_000000001, 1700000000_100000000]),
+        (["1700000000123", "1700000000223"], [1700000000_123000000, 1700000000_223000000]),
+        (["1700000000123456", "1700000000223456"], [1700000000_123456000, 1700000000_223456000]),
+        (["1700000000123456789", "1700000000223456789"], [1700000000_123456789, 1700000000_223456789]),
+        (["1.7e9", "1.7000000001e9"], [1700000000_000000000, 1700000000_100000000]),
+    ],
+)
+def test_stamps_keep_every_digit_in_any_unit(texts: list[str], expected: list[int]) -> None:
+    assert parse_stamps(texts, str).tolist() == expected
+
+
+def test_times_may_name_the_images(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, times=False)
+    (folder / "times.txt").write_text("# name time\n" + "".join(f"{k}.png 1700000000.{5 * k:02d}\n" for k in range(9)))
+    assert np.diff(open_dataset(folder).recording.frame_times_ns).tolist() == [50_000_000] * 3
+
+
+def test_without_times_images_alone_are_read_and_it_is_said(tmp_path: Path) -> None:
+    recording = open_dataset(make_plain(tmp_path, times=False, imu=False, reference=False)).recording
+    assert np.diff(recording.frame_times_ns).tolist() == [100_000_000] * 3
+    assert "frames are taken to be 0.1 s apart" in recording.notes[0]
+
+
+@pytest.mark.parametrize(
+    "header", ["# timestamp[ns] a.x a.y a.z w.x w.y w.z", "time_ns,ax_mps2,ay_mps2,az_mps2,gyro_x,gyro_y,gyro_z"]
+)
+def test_a_header_names_the_order_of_the_readings(header: str, tmp_path: Path) -> None:
+    separator = "," if "," in header else " "
+    rows = [separator.join(map(str, [10**18 + 5_000_000 * k, 1, 2, 9.8, 0.1, 0.2, 0.3])) for k in range(3)]
+    (tmp_path / "imu.csv").write_text("\n".join([header, *rows]) + "\n")
+    record, notes = read_imu_table(tmp_path / "imu.csv")
+    assert notes == ()
+    np.testing.assert_array_equal(record.gyro[0], [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(record.accel[0], [1, 2, 9.8])
+
+
+def test_units_of_the_header_are_converted_and_said(tmp_path: Path) -> None:
+    header = "timestamp [s],w_x [deg/s],w_y [deg/s],w_z [deg/s],a_x [g],a_y [g],a_z [g]"
+    rows = [f"{0.005 * k},90,0,0,0,0,1" for k in range(3)]
+    (tmp_path / "imu.csv").write_text("\n".join([header, *rows]) + "\n")
+    record, notes = read_imu_table(tmp_path / "imu.csv")
+    np.testing.assert_allclose(record.gyro[0], [np.pi / 2, 0, 0])
+    np.testing.assert_allclose(record.accel[0], [0, 0, 9.80665])
+    assert len(notes) == 2
+    assert np.diff(record.times_ns).tolist() == [5_000_000] * 2
+
+
+def test_the_clock_offset_of_the_calibration_moves_the_imu(tmp_path: Path) -> None:
+    """Kalibr: t_imu = t_cam + shift, so a sample's time on the camera's clock is its stamp less the shift."""
+    folder = make_plain(tmp_path)
+    path = folder / "camchain-imucam.yaml"
+    path.write_text(path.read_text().replace("timeshift_cam_imu: 0.0", "timeshift_cam_imu: 0.0025"))
+    dataset = open_dataset(folder)
+    first = next(iter(dataset.events()))
+    assert isinstance(first, ImuSample)
+    assert first.time_ns == 1700000000_000000000 - 12_500_000
+    assert "the IMU's stamps are moved by -2.500 ms, as the calibration states" in dataset.recording.notes
+
+
+def test_a_slow_imu_is_said(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, 40)
+    lines = (folder / "imu.csv").read_text().splitlines()
+    (folder / "imu.csv").write_text("\n".join([lines[0], *lines[1::20]]) + "\n")
+    assert (
+        "the IMU has 10 Hz, too few to integrate the motion between images" in open_dataset(folder).recording.notes[0]
+    )
+
+
+def test_velocities_and_kitti_calibration(tmp_path: Path) -> None:
+    """KITTI's names with an IMU, which the KITTI reader does not read: nothing is left out."""
+    folder = make_kitti(tmp_path)
+    times = [float(x) for x in (folder / "times.txt").read_text().split()]
+    rows = [f"{times[0] + 0.005 * k},0,0,0.1,0,0,9.8" for k in range(-2, 80)]
+    (folder / "imu.csv").write_text("time_s,wx,wy,wz,ax,ay,az\n" + "\n".join(rows) + "\n")
+    recording = open_dataset(folder).recording
+    assert recording.kind == "plain"
+    assert recording.motion == {"imu", "velocity"}
+    assert recording.notes == ()
+    assert recording.reference is not None
+
+
+def test_poses_of_a_raw_camera_are_turned_to_the_rectified_one(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path, imu=False)
+    (folder / "camchain-imucam.yaml").write_text(kalibr_text(rig_of(RADTAN_RIG, imu=False)))
+    truth = (folder / "reference.tum").read_text()
+    (folder / "reference.tum").write_text(truth.replace("# body: imu", "# body: cam0"))
+    dataset = read_plain(folder, DEFAULT)
+    assert dataset.recording.reference is not None
+    R_rect_cam0 = dataset.rectifier.T_rect0_imu[:3, :3]
+    assert np.abs(R_rect_cam0 - np.eye(3)).max() > 1e-3
+    expected = truth_poses(4)[:, :3, :3] @ R_rect_cam0.T
+    np.testing.assert_allclose(dataset.recording.reference.T_world_body[:, :3, :3], expected, atol=1e-12)
+
+
+# --- what is used and what is not -----------------------------------------------------------------------------------
+
+
+def test_what_is_not_used_is_named_once(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    (folder / "lidar").mkdir()
+    (folder / "gps.csv").write_text("1,2\n")
+    (folder / "README.md").write_text("hello\n")
+    assert open_dataset(folder).recording.notes == ("not used: gps.csv, lidar/",)
+
+
+def test_another_calibration_may_be_named(tmp_path: Path) -> None:
+    for kind, folder in (
+        ("plain", make_plain(tmp_path / "a", calibration=False)),
+        ("euroc", make_euroc(tmp_path / "b")),
+        ("kitti_raw", make_kitti_raw(tmp_path / "c")),
+    ):
+        rig = rig_of(KITTI_RIG if kind == "kitti_raw" else RADTAN_RIG)
+        (tmp_path / "mine.yaml").write_text(kalibr_text(rig))
+        recording = open_dataset(folder, DatasetSettings(calibration=tmp_path / "mine.yaml")).recording
+        assert recording.kind == "plain", kind
+        assert recording.camera.baseline_m == pytest.approx(rig.camera.baseline_m), kind
+
+
+def test_tumvi_export_without_sensor_yaml_is_read(tmp_path: Path) -> None:
+    folder = make_euroc(tmp_path)
+    for sensor in ("cam0", "cam1", "imu0"):
+        (folder / "mav0" / sensor / "sensor.yaml").unlink()
+    (folder / "dso").mkdir()
+    (folder / "dso" / "camchain.yaml").write_text(kalibr_text(rig_of(RADTAN_RIG)))
+    recording = open_dataset(folder).recording
+    assert (recording.kind, recording.motion, len(recording.frame_times_ns)) == ("plain", {"imu"}, 4)
+    assert recording.reference is not None
+
+
+# --- bad folders ----------------------------------------------------------------------------------------------------
+
+
+def _break(change: Callable[[Path], object], **options: bool) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        change(make_plain(folder, **options))  # type: ignore[arg-type]
+        return folder
+
+    return make
+
+
+def _edit(name: str, old: str, new: str) -> Callable[[Path], Path]:
+    def change(folder: Path) -> None:
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+
+    return _break(change)
+
+
+def _write(name: str, text: str, **options: bool) -> Callable[[Path], Path]:
+    return _break(lambda f: (f / name).write_text(text), **options)
+
+
+def _without_extrinsics(folder: Path) -> None:
+    (folder / "camchain-imucam.yaml").write_text(kalibr_text(rig_of(RADTAN_RIG, imu=False)))
+
+
+def _shifted(folder: Path) -> None:
+    lines = (folder / "imu.csv").read_text().splitlines()
+    moved = [",".join([str(int(line.split(",")[0]) // 1000), *line.split(",")[1:]]) for line in lines[1:]]
+    (folder / "imu.csv").write_text("\n".join([lines[0], *moved]) + "\n")
+
+
+BAD = {
+    "no calibration": (lambda f: make_plain(f, calibration=False), "no calibration; add one as calibration.yaml"),
+    "names that fit nothing": (
+        lambda f: make_plain(f, name=lambda side, k: f"{'ab'[side]}.png", frames=1),
+        "no name of the one fits one of the other",
+    ),
+    "too few times": (_write("times.txt", "1\n2\n"), r"times\.txt holds 2 times for 4 image pairs"),
+    "times that run backwards": (_write("times.txt", "1\n3\n2\n4\n"), "line 3: the clock runs backwards"),
+    "times that are no numbers": (_write("times.txt", "1\nx\n2\n4\n"), "line 2: 'x' is no time"),
+    "times out of range": (_write("times.txt", "1\n2\n3\n1e99\n"), "line 4: '1e99' is out of range"),
+    "an IMU without times": (lambda f: make_plain(f, times=False), r"imu\.csv: needs the times of the images"),
+    "an IMU without its pose": (_break(_without_extrinsics), r"imu\.csv: needs the pose of its sensor; add T_cam0_imu"),
+    "unsorted IMU stamps": (_edit("imu.csv", "1699999999995000000", "1699999999985000000"), "runs backwards"),
+    "an IMU of another epoch": (_break(_shifted), "no sample is within the time of the images; clocks without overlap"),
+    "an IMU with six columns": (_edit("imu.csv", ",0.25,9.81,0", ",0.25,9.81"), "line 2: 6 values instead of 7"),
+    "an IMU with a NaN": (_edit("imu.csv", "9.81", "nan"), "line 2: a reading is not a finite number"),
+    "an IMU with other names": (_edit("imu.csv", "wx,wy,wz", "mx,my,mz"), "does not name gyro and accel"),
+    "an empty IMU": (_write("imu.csv", "#timestamp,wx,wy,wz,ax,ay,az\n"), "holds no line of data"),
+    "gravity among the gyro's columns": (
+        _write("imu.csv", "".join(f"{1700000000 + k / 200:.3f},0,0,9.8,0,0,0.1\n" for k in range(40))),
+        "gravity is in the columns 2 to 4",
+    ),
+    "a velocity without header": (_write("velocity.csv", "0,1,2,3,4,5,6\n"), "line 1: expected the header time_s"),
+    "more poses than images": (
+        _break(
+            lambda f: ((f / "reference.tum").unlink(), (f / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 9))
+        ),
+        "holds 9 poses for 4 pairs",
+    ),
+    "images of another size": (
+        _break(lambda f: [cv2.imwrite(str(p), np.zeros((40, 50), np.uint8)) for p in f.glob("*/*.png")]),
+        r"is 50 x 40 pixels but .*camchain-imucam\.yaml specifies 64 x 48",
+    ),
+    "a calibration that is missing": (
+        lambda f: make_plain(f) and f / "none",
+        "none does not exist",
+    ),
+    "swapped cameras": (
+        _write("calib.txt", calib_text(0.0, -0.5), calibration=False),
+        r"calib\.txt: P0 and P1 imply a stereo baseline of -0.5 m",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_folders_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
+    make, message = BAD[name]
+    with pytest.raises(VioError, match=message) as caught:
+        list(open_dataset(make(tmp_path / "r")).events())
+    assert "\n" not in str(caught.value).strip()
+    assert isinstance(caught.value, (DataError, CalibrationError))
+
+
+def test_settings_that_a_recording_cannot_take_are_refused(tmp_path: Path) -> None:
+    folder = make_plain(tmp_path)
+    with pytest.raises(DataError, match="--topics names topics of a ROS bag, but this is of kind plain"):
+        open_dataset(folder, DatasetSettings(topics="left=/a"))
+    with pytest.raises(CalibrationError, match=r"none\.yaml does not exist"):
+        open_dataset(folder, DatasetSettings(calibration=tmp_path / "none.yaml"))
+
+
+def test_tumvi(data_dir: Path) -> None:
+    """The `dso` form: 16 bits, fisheye, stamps in the names, Kalibr's files beside."""
+    recording = open_dataset(data_dir / "tumvi_room1_head").recording
+    assert (recording.kind, len(recording.frame_times_ns), recording.motion) == ("plain", 5, {"imu"})
+    assert recording.reference is not None
+    assert len(recording.reference) > 16000
+    assert recording.notes[-1].startswith("not used: cam0/camera_left.txt, cam0/pcalib.txt")
+
+
+def test_boofcv_library(data_dir: Path) -> None:
+    """Numbers without padding and BoofCV's XML."""
+    dataset = read_plain(data_dir / "boofcv_library", DEFAULT)
+    assert [left.name for left, _ in dataset.pairs] == [f"left{k + 1}.jpg" for k in range(346)]

@@ -1,0 +1,149 @@
+"""Two video files: the same recording to the bit where they are lossless, times, and one-line errors."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from tests.plain_maker import rig_of
+from tests.same_events import assert_same_events
+from vio.cli import main
+from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.rigs import load_rig
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.datasets.span import Seconds, frames_between, parse_bound
+from vio.errors import DataError, VioError
+from vio.geometry.distortion import rig_from_rectified
+from vio.records import StereoFrame
+
+
+def write_video(path: Path, images: list[np.ndarray], rate_hz: float = 20.0) -> None:
+    """Write gray images without loss."""
+    size = images[0].shape[1], images[0].shape[0]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"FFV1"), rate_hz, size, isColor=True)
+    assert writer.isOpened(), "this OpenCV has no FFV1"
+    for image in images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+
+
+@pytest.fixture(scope="module")
+def videos(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The rendered flight as two videos."""
+    return make_videos(flight, tmp_path_factory.mktemp("videos") / "videos")
+
+
+def make_videos(flight: Path, folder: Path) -> Path:
+    """Write a flight's images as two videos, with Kalibr's calibration and the IMU."""
+    folder.mkdir()
+    for camera, side in (("cam0", "left"), ("cam1", "right")):
+        files = sorted((flight / "mav0" / camera / "data").iterdir(), key=lambda f: int(f.stem))
+        write_video(folder / f"{side}.avi", [cv2.imread(str(f), cv2.IMREAD_GRAYSCALE) for f in files])
+        (folder / "times.txt").write_text("# [ns]\n" + "".join(f"{int(f.stem) / 1e9:.9f}\n" for f in files))
+    (folder / "camchain-imucam.yaml").write_text(kalibr_text(load_rig(flight)))
+    shutil.copyfile(flight / "mav0" / "imu0" / "data.csv", folder / "imu.csv")
+    return folder
+
+
+def test_two_lossless_videos_are_the_same_recording_to_the_bit(videos: Path, flight: Path) -> None:
+    euroc, video = open_dataset(flight), open_dataset(videos)
+    assert video.recording.kind == "video"
+    assert euroc.recording.camera == video.recording.camera
+    np.testing.assert_array_equal(euroc.recording.T_cam0_imu, video.recording.T_cam0_imu)
+    assert_same_events(euroc, video)
+    assert_same_events(euroc, video, 3, 7)
+
+
+def test_a_plain_folder_with_kalibrs_file_is_the_same_recording_to_the_bit(
+    videos: Path, flight: Path, tmp_path: Path
+) -> None:
+    for camera, side in (("cam0", "left"), ("cam1", "right")):
+        shutil.copytree(flight / "mav0" / camera / "data", tmp_path / side)
+    for name in ("camchain-imucam.yaml", "imu.csv", "times.txt"):
+        shutil.copyfile(videos / name, tmp_path / name)
+    euroc, plain = open_dataset(flight), open_dataset(tmp_path)
+    assert (euroc.recording.camera, plain.recording.kind) == (plain.recording.camera, "plain")
+    np.testing.assert_array_equal(euroc.recording.T_cam0_imu, plain.recording.T_cam0_imu)
+    assert_same_events(euroc, plain)
+
+
+def copy_of(videos: Path, folder: Path, *leave_out: str) -> Path:
+    """A copy of the videos' folder without some files."""
+    return Path(shutil.copytree(videos, folder, ignore=shutil.ignore_patterns(*leave_out)))
+
+
+def test_without_times_the_rate_of_the_file_counts_and_it_is_said(videos: Path, tmp_path: Path) -> None:
+    recording = open_dataset(copy_of(videos, tmp_path / "v", "times.txt", "imu.csv")).recording
+    assert np.diff(recording.frame_times_ns).tolist() == [50_000_000] * (len(recording.frame_times_ns) - 1)
+    assert "no times.txt: frames are 50 ms apart, as left.avi states; real cameras jitter" in recording.notes
+
+
+def _truncate(folder: Path) -> None:
+    data = (folder / "right.avi").read_bytes()
+    (folder / "right.avi").write_bytes(data[: len(data) // 2])
+
+
+def _other_rate(folder: Path) -> None:
+    write_video(folder / "right.avi", [np.zeros((100, 160), np.uint8)] * 3, 25.0)
+
+
+def _other_size(folder: Path) -> None:
+    camera = load_rig(folder).camera
+    assert camera.width is not None
+    other = rig_of(rig_from_rectified(camera, np.eye(4)))
+    text = kalibr_text(other).replace(f"resolution: [{camera.width},", "resolution: [99,")
+    (folder / "camchain-imucam.yaml").write_text(text)
+
+
+BAD = {
+    "no calibration": (lambda f: (f / "camchain-imucam.yaml").unlink(), "no calibration; add one"),
+    "not a video": (lambda f: (f / "left.avi").write_bytes(b"no video" * 99), r"left\.avi: no frame can be decoded"),
+    "a truncated video": (_truncate, r"right\.avi: (frame \d+ of 16 cannot be decoded|no frame can be decoded)"),
+    "another rate": (_other_rate, r"left\.avi has 20 and right\.avi 25 frames per second"),
+    "another size": (_other_size, "is 160 x .* pixels but .* specifies 99 x"),
+    "an IMU without times": (lambda f: (f / "times.txt").unlink(), r"imu\.csv: needs the times of the images"),
+    "too many times": (lambda f: (f / "times.txt").write_text("1\n" * 99), "holds 99 times for 16 image pairs"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_videos_are_refused_in_one_line(
+    name: str, videos: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    change: Callable[[Path], object]
+    change, message = BAD[name]
+    folder = copy_of(videos, tmp_path / "v")
+    change(folder)
+    with pytest.raises(VioError, match=message) as caught:
+        list(open_dataset(folder).events())
+    assert "\n" not in str(caught.value).strip()
+
+
+# --- seconds instead of frames --------------------------------------------------------------------------------------
+
+
+def test_bounds_in_seconds(videos: Path) -> None:
+    recording = open_dataset(videos, DatasetSettings()).recording  # 20 Hz
+    assert parse_bound("12") == 12
+    assert parse_bound("0.25s") == Seconds(0.25)
+    assert frames_between(recording, Seconds(0.25), Seconds(0.5)) == (5, 10)
+    assert frames_between(recording, Seconds(0.26), None) == (6, None)
+    assert frames_between(recording, 2, 4) == (2, 4)
+    with pytest.raises(ValueError, match="invalid literal"):
+        parse_bound("12m")
+    with pytest.raises(DataError, match=r"--start 9s lies after its last frame at 0.7\d* s"):
+        frames_between(recording, Seconds(9.0), None)
+
+
+def test_run_takes_seconds(flight: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    arguments = ["run", str(flight), "--start", "0.1s", "--end", "0.25s", "--out", str(out), "--quiet"]
+    assert main(arguments) == 0
+    text = (out / "trajectory.tum").read_text()
+    assert "# frames: 2-4" in text
+    assert len([e for e in open_dataset(flight).events(2, 5) if isinstance(e, StereoFrame)]) == 3

@@ -1,0 +1,65 @@
+"""Bands of brightness that move through the images: named and taken out; images without them stay as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from frontend.flicker import BandRemoval
+from frontend.klt import KltFrontend
+from frontend.settings import FrontendSettings, GridSettings
+from tests.test_frontend_klt import FRAMES, step_errors
+from tests.test_frontend_scene import CAMERA
+from tests.test_right_camera import pair
+from vio.records import FrontendOutput, Image, StereoFrame
+
+
+def banded(image: Image | None, frame: int, camera: int, gray: float = 50.0) -> Image:
+    """An image with three bands at a phase of its own."""
+    assert image is not None
+    phase = np.random.default_rng((frame, camera)).uniform()
+    bands = gray * np.sin(2 * np.pi * (3 * np.arange(len(image)) / len(image) + phase))
+    return np.clip(image + bands[:, None], 0, 255).astype(np.uint8)
+
+
+def test_images_without_bands_are_returned_as_they_are() -> None:
+    removal, dark = BandRemoval(), np.zeros_like(pair(0)[0])
+    for k in range(12):
+        left, right = pair(k)
+        right = dark if k % 3 == 2 else right  # a camera that loses frames makes no bands
+        assert removal(k, left, right)[0] is left
+    assert removal.take_lines() == ()
+
+
+def test_bands_are_named_once_and_taken_out() -> None:
+    removal, lines = BandRemoval(), []
+    for k in range(12):
+        images = tuple(banded(image, k, camera) for camera, image in enumerate(pair(k)))
+        out = removal(k, *images)
+        lines += removal.take_lines()
+    (line,) = lines
+    assert line.startswith("frame 3: bands of brightness move through the images")
+    for image, flat in zip(images, out, strict=True):
+        assert image.mean(axis=1).std() > 15.0
+        assert flat.mean(axis=1).std() < 6.0
+
+
+@pytest.mark.parametrize("removed", [True, False], ids=["removed", "control"])
+def test_features_are_tracked_through_bands(removed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not removed:
+        monkeypatch.setattr(BandRemoval, "__call__", lambda self, index, left, right: (left, right))
+    frontend = KltFrontend(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
+
+    def process(frame: StereoFrame) -> FrontendOutput:
+        k = frame.index
+        return frontend.process(replace(frame, left=banded(frame.left, k, 0), right=banded(frame.right, k, 1)))
+
+    outputs = [process(frame) for frame in FRAMES]
+    tracked = outputs[-1].tracked
+    if removed:
+        assert tracked > 100
+        assert np.median(step_errors(outputs, len(FRAMES) - 2)) < 0.1
+    else:
+        assert tracked < 75

@@ -1,0 +1,176 @@
+"""`vio inspect`: what it says of sound recordings, and that each fault is found, with exit status 1 and a remedy."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from vio.cli import main
+from vio.inspection.inertial import allan_deviation, noise_part, rest_part
+from vio.inspection.times import clock_facts
+from vio.records import ImuDensities, ImuRecord
+
+
+def inspect(folder: Path, capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, dict[str, Any]]:
+    """Run the command and return its status and facts."""
+    capsys.readouterr()
+    status = main(["inspect", str(folder), "--json", "--pairs", "3", "--frames", "8", *options])
+    facts: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return status, facts
+
+
+def test_a_sound_recording(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, facts = inspect(flight, capsys)
+    assert (status, facts["faults"], facts["kind"]) == (0, [], "euroc")
+    parts = facts["parts"]
+    assert parts["frames"]["rate_hz"] == pytest.approx(20)
+    assert parts["IMU"]["rate_hz"] == pytest.approx(200)
+    assert parts["IMU"]["gaps"] == 0
+    assert abs(parts["stereo"]["rows_median_px"]) < 0.1
+    assert parts["stereo"]["positive_disparity"] == 1.0
+    assert parts["rest"]["force_norm_mps2"] == pytest.approx(9.8, abs=0.5)
+    assert parts["tracking"]["tracked_median"] > 50
+    assert parts["missing"]["missing"] == []
+
+
+def test_one_screen_for_people(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inspect", str(flight), "--pairs", "2", "--frames", "0"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 24
+    assert lines[-1] == "verdict              nothing speaks against a run"
+
+
+def _imu(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    def mend(folder: Path) -> None:
+        file = folder / "mav0" / "imu0" / "data.csv"
+        lines = file.read_text().splitlines()
+        rows = change(np.array([[float(x) for x in line.split(",")] for line in lines[1:]]))
+        text = "\n".join(",".join([str(int(row[0])), *map(repr, row[1:].tolist())]) for row in rows)
+        file.write_text(f"{lines[0]}\n{text}\n")
+
+    return mend
+
+
+def _scaled_accel(row: np.ndarray) -> np.ndarray:
+    return np.hstack([row[:, :4], row[:, 4:] / 9.81])
+
+
+def _black(folder: Path) -> None:
+    for file in folder.glob("mav0/cam?/data/*.png"):
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        assert cv2.imwrite(str(file), np.zeros_like(image))
+
+
+def _swapped(folder: Path) -> None:
+    a, b = (folder / "mav0" / name / "data" for name in ("cam0", "cam1"))
+    a.rename(folder / "x")
+    b.rename(a)
+    (folder / "x").rename(b)
+
+
+def _same(folder: Path) -> None:
+    shutil.rmtree(folder / "mav0" / "cam1" / "data")
+    shutil.copytree(folder / "mav0" / "cam0" / "data", folder / "mav0" / "cam1" / "data")
+
+
+def _shifted_rows(folder: Path) -> None:
+    for file in (folder / "mav0" / "cam1" / "data").iterdir():
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        assert cv2.imwrite(str(file), np.roll(image, 6, axis=0))
+
+
+FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "accelerometer in g": (
+        _imu(_scaled_accel),
+        "rest: accelerometer units: .* in g: multiply by 9.81",
+    ),
+    "IMU at 10 Hz": (_imu(lambda rows: rows[::20]), "IMU: 10 Hz are too few to integrate .*; record at least 50 Hz"),
+    "black images": (_black, "images: .* are black, white or without content; mend the exposure"),
+    "exchanged cameras": (_swapped, "stereo: .* left and right images are exchanged; exchange the folders"),
+    "one camera twice": (_same, "images: left and right are the same images"),
+    "rows shifted": (_shifted_rows, r"stereo: rows differ by -6\.. px .*; run `vio calibrate`"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_faults_are_found_with_their_remedy(
+    name: str, flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    change, message = FAULTS[name]
+    folder = tmp_path / "flight"
+    shutil.copytree(flight, folder)
+    change(folder)
+    status, facts = inspect(folder, capsys, "--frames", "0")
+    assert status == 1
+    assert any(re.search(message, fault) for fault in facts["faults"]), facts["faults"]
+    assert all("\n" not in fault for fault in facts["faults"])
+
+
+# --- figures --------------------------------------------------------------------------------------------------------
+
+
+def test_rates_jitter_and_gaps() -> None:
+    times = np.arange(100, dtype=np.int64) * 50_000_000
+    facts = clock_facts(np.delete(times, [40, 41, 80]))
+    assert facts["rate_hz"] == pytest.approx(20)
+    assert (facts["gaps"], facts["longest_gap_s"]) == (2, pytest.approx(0.15))
+    assert facts["jitter_ms"] == 0
+    noisy = times + np.random.default_rng(0).normal(0, 1e6, 100).astype(np.int64)
+    assert clock_facts(noisy)["jitter_ms"] == pytest.approx(np.sqrt(2), rel=0.3)
+
+
+def test_allan_deviation_of_white_noise_falls_with_the_root_of_time() -> None:
+    """White noise of density d has a deviation of d / sqrt(tau); the estimate is within a few percent."""
+    density, step_s = 2e-3, 0.005
+    values = np.random.default_rng(1).normal(0, density / np.sqrt(step_s), (20000, 3))
+    for tau in (0.05, 0.2, 1.0):
+        assert allan_deviation(values, step_s, tau) == pytest.approx(density / np.sqrt(tau), rel=0.1)
+
+
+def record_at_rest(density: float, seconds: float = 6.0) -> ImuRecord:
+    """A resting IMU of 200 Hz with white noise."""
+    rng = np.random.default_rng(2)
+    count = int(200 * seconds)
+    noise = rng.normal(0, density / np.sqrt(0.005), (2, count, 3))
+    return ImuRecord(np.arange(count, dtype=np.int64) * 5_000_000, noise[0], noise[1] + [0, 0, 9.81])
+
+
+def test_noise_at_rest_is_compared_with_the_data_sheet() -> None:
+    part = noise_part(record_at_rest(5e-4), ImuDensities(1e-4, 1e-5, 5e-4, 1e-4))
+    assert part is not None
+    assert part.facts["gyro_density"] == pytest.approx(5e-4, rel=0.2)
+    assert re.search(r"gyro .* \([45]\.\d times the stated\); state the measured one, accel [^;]*, at rest", part.text)
+    assert noise_part(record_at_rest(5e-4, 2.0), None) is None, "too short"
+
+
+def test_rest_and_the_direction_of_gravity() -> None:
+    upright = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # the IMU's z is the camera's -y
+    part = rest_part(record_at_rest(5e-4), upright)
+    assert part.facts["still_share"] == 1.0
+    assert part.facts["camera_tilt_deg"] == pytest.approx(0, abs=0.1)
+    assert part.faults == []
+    moving = record_at_rest(5e-4)
+    shaken = ImuRecord(moving.times_ns, moving.gyro + np.sin(np.arange(1200) / 9)[:, None], moving.accel)
+    assert rest_part(shaken, None).facts["still_share"] == 0.0
+
+
+@pytest.mark.parametrize("name", ["tumvi_room1_head", "ros2_s3e_db3"])
+def test_real_recordings(name: str, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    if name == "ros2_s3e_db3":
+        pytest.importorskip("rosbags", reason="needs the extra bags")
+        assert main(["inspect", str(data_dir / name)]) == 1
+        assert "holds no CameraInfo" in capsys.readouterr().err
+        return
+    status, facts = inspect(data_dir / name, capsys, "--frames", "0", "--pairs", "1")
+    assert status == 0, facts["faults"]
+    assert facts["parts"]["IMU"]["count"] > 500

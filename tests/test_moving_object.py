@@ -1,0 +1,117 @@
+"""An object over most of the image: the predicted motion tells it from the scene, and it is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from frontend.moving_object import ObjectReport, TwoMotions, choose_motion
+from frontend.outliers import Consensus, rigid_consensus
+from frontend.prediction import usable_prior
+from tests.test_frontend_outliers import T_TRUE, make_problem, pixels, scene
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
+from vio.records import BoolArray, MotionPrior, TrackPrior
+
+T_OBJECT = se3_exp([0.4, 0.1, -0.6, 0.0, 0.01, 0.0])  # what the camera would have done by the object's points
+IMU = np.diag(np.repeat([0.003, 0.0003], 3) ** 2)  # covariance of a prediction over one frame, m and rad
+NOTHING = np.diag(np.repeat([3.0, 0.3], 3) ** 2)
+
+
+def prediction(T: FloatArray = T_TRUE, covariance: FloatArray = IMU) -> MotionPrior:
+    """A prediction off by its own standard deviation."""
+    off = np.sqrt(np.diag(covariance)) * np.random.default_rng(4).choice([-1.0, 1.0], 6)
+    return MotionPrior(se3_exp(off) @ T, covariance)
+
+
+def scenery(static: int, moving: int) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Points (N, 3), their pixels (N, 2), and the mask (N,) of those on the object."""
+    wall, truck = scene(static, 12, (8.0, 40.0)), scene(moving, 13, (6.0, 8.0))
+    uv = np.concatenate([pixels(T_TRUE, wall, 14), pixels(T_OBJECT, truck, 15)])
+    return np.concatenate([wall, truck]), uv, np.arange(static + moving) >= static
+
+
+def choose(
+    static: int, moving: int, predicted: MotionPrior | None, *, in_event: bool = False
+) -> tuple[TwoMotions, Consensus, BoolArray]:
+    p, uv, truck = scenery(static, moving)
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
+    assert found is not None
+    return choose_motion(make_problem(), p, uv, found, predicted, in_event=in_event), found, truck
+
+
+def test_prediction_chooses_the_smaller_group_that_agrees_with_it() -> None:
+    """One point in five is of the scene, the others are of an object: the consensus is the object's."""
+    chosen, found, truck = choose(60, 240, prediction())
+    assert found.inliers[truck].mean() > 0.95  # control: the test would be trivial otherwise
+    assert chosen.motion.inliers[~truck].mean() > 0.95
+    assert not chosen.motion.inliers[truck].any()
+    assert np.linalg.norm(se3_log(chosen.motion.T_curr_prev @ se3_inverse(T_TRUE))) < 0.02
+    assert (chosen.decision, chosen.object_share) == ("predicted", pytest.approx(0.8, abs=0.02))
+
+
+def test_an_object_over_the_smaller_part_is_reported_and_changes_nothing() -> None:
+    chosen, found, truck = choose(160, 140, prediction())
+    assert not found.inliers[truck].any()
+    assert chosen.motion is found
+    assert (chosen.decision, chosen.object_share) == ("predicted", pytest.approx(140 / 300, abs=0.03))
+
+
+@pytest.mark.parametrize("predicted", [None, prediction(covariance=NOTHING)], ids=["none", "of no use"])
+def test_without_a_useful_prediction_the_larger_group_is_used_and_called_undecided(
+    predicted: MotionPrior | None,
+) -> None:
+    chosen, found, _ = choose(120, 180, predicted)
+    assert chosen.motion is found
+    assert (chosen.decision, chosen.object_share) == ("undecided", pytest.approx(0.4, abs=0.03))
+
+
+def test_a_wrong_prediction_does_not_override_the_consensus() -> None:
+    """A spike of the IMU: no group agrees with the prediction. Mismatches do not make one."""
+    p, uv, _ = scenery(250, 0)
+    uv[:50] += np.random.default_rng(1).uniform(-40, 40, (50, 2))
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
+    assert found is not None
+    wrong = prediction(se3_exp([0.3, 0.0, 0.0, 0.0, 0.1, 0.0]))
+    chosen = choose_motion(make_problem(), p, uv, found, wrong)
+    assert chosen.motion is found
+    assert chosen.object_share == 0.0
+
+
+def test_an_object_that_hides_the_scene_does_not_become_the_scene() -> None:
+    """Six points of the scene are left, too few for a motion: while the object is known, the prediction is used."""
+    before, found, truck = choose(6, 300, prediction())
+    assert before.motion is found  # control
+    chosen, _, _ = choose(6, 300, prediction(), in_event=True)
+    assert not chosen.motion.inliers[truck].any()
+    assert chosen.motion.inliers[~truck].sum() >= 4
+    np.testing.assert_allclose(chosen.motion.T_curr_prev, prediction().T_curr_prev)
+
+
+def test_an_object_is_reported_once_per_event_with_what_decided() -> None:
+    everything = Consensus(np.eye(4), np.arange(10) < 6)
+    nothing, object_ = TwoMotions(everything, 0.0, None), TwoMotions(everything, 0.4, "predicted")
+    report = ObjectReport()
+    for k in range(4):
+        assert report.frame(k, object_) == ()
+    assert report.frame(4, nothing) == ()
+    assert not report.active
+    lines = [line for k in range(5, 40) for line in report.frame(k, object_)]
+    assert [line[:36] for line in lines] == ["frame 9: 40 % of the points move tog"]
+    assert "its points are left out" in lines[0]
+    assert report.active
+    assert [line for k in range(40, 70) for line in report.frame(k, nothing)] == []
+    assert not report.active
+    undecided = TwoMotions(everything, 0.4, "undecided")
+    (line,) = [line for k in range(70, 80) for line in report.frame(k, undecided)]
+    assert "60 % and 40 % of all" in line
+    assert "does not tell which group it is; the larger one is taken for the scene" in line
+
+
+def test_a_prediction_that_is_no_number_is_not_used() -> None:
+    broken = MotionPrior(np.full((4, 4), np.nan), IMU)
+    prior = usable_prior(TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), broken))
+    assert prior is not None
+    assert prior.motion is None
+    good = usable_prior(TrackPrior(np.array([1]), np.array([[1.0, 2.0, 0.0, 2.0]]), np.eye(3), prediction()))
+    assert good is not None
+    assert good.motion is not None

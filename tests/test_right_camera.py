@@ -1,0 +1,168 @@
+"""A right camera that is frozen, dark or displaced: named, and not used until it agrees with the left one again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from frontend.klt import KltFrontend
+from frontend.prediction import prior_depths
+from frontend.right_camera import RightCamera
+from frontend.settings import FrontendSettings, GridSettings
+from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
+from vio.records import FrontendOutput, Image, StereoFrame, TrackPrior
+
+SETTINGS = FrontendSettings(grid=GridSettings(target_features=150))
+FROZEN = range(3, 8)  # frames with the right image of frame 2
+FRAMES = 12
+RNG = np.random.default_rng(0)
+TEXTURE = cv2.GaussianBlur(RNG.integers(0, 256, (150, 400)).astype(np.uint8), (0, 0), 2.0)
+TEXTURE = cv2.normalize(TEXTURE, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
+
+Pair = tuple[Image, Image]
+
+
+def pair(k: int) -> Pair:
+    """Images of frame k of a camera that moves sideways, with sensor noise, and a right camera of another gain."""
+    rng = np.random.default_rng(k)
+    crops = (TEXTURE[:, 100 + 3 * k : 300 + 3 * k], TEXTURE[:, 110 + 3 * k : 310 + 3 * k] * 0.6)
+    left, right = (np.clip(c + rng.normal(0, 1.0, c.shape), 0, 255).astype(np.uint8) for c in crops)
+    return left, right
+
+
+def noisy(image: Image, seed: int) -> Image:
+    """The image as an encoder might repeat it: off by one gray level here and there."""
+    off = np.random.default_rng(seed).integers(-1, 2, image.shape)
+    return np.clip(image.astype(np.int16) + off, 0, 255).astype(np.uint8)
+
+
+def run(frames: list[Pair]) -> tuple[list[bool], list[bool], list[str]]:
+    """Whether the right image could be used, whether the left one was frozen, and the lines, frame by frame."""
+    camera = RightCamera()
+    usable, frozen, lines = [], [], []
+    for k, (left, right) in enumerate(frames):
+        frozen.append(camera.left_is_frozen(k, left, right))
+        if not frozen[-1]:
+            camera.check_matches(k, np.ones(50, dtype=np.bool_), moved=True)
+        usable.append(camera.usable)
+        lines += camera.take_lines()
+    return usable, frozen, lines
+
+
+def test_moving_and_standing_cameras_are_silent() -> None:
+    moving = [pair(k) for k in range(8)]
+    standing = [(noisy(a, k), noisy(b, 100 + k)) for k in range(8) for a, b in [pair(0)]]
+    equal = [pair(0)] * 8  # without any noise: whether it is frozen is for the IMU to say
+    for frames in (moving, standing, equal):
+        usable, frozen, lines = run(frames)
+        assert (all(usable), any(frozen), lines) == (True, False, [])
+
+
+@pytest.mark.parametrize("repeat", [lambda image, k: image, noisy], ids=["equal to the bit", "re-encoded"])
+def test_a_frozen_right_image_is_not_used_and_named_once(repeat: Callable[[Image, int], Image]) -> None:
+    frames = [pair(k) for k in range(14)]
+    for k in FROZEN:
+        frames[k] = frames[k][0], repeat(frames[2][1], k)
+    usable, frozen, lines = run(frames)
+    assert not any(frozen)
+    assert [k for k, good in enumerate(usable) if not good] == [*FROZEN, 8, 9]  # three frames must agree before it is
+    said, again = lines
+    assert said.startswith("frame 5: the right camera is frozen")
+    assert "since frame 2; going on with the left images" in said
+    assert again == "frame 10: the right images agree with the left ones again, and are used"
+
+
+def test_a_single_repeated_right_image_is_not_used_and_not_an_event() -> None:
+    frames = [pair(k) for k in range(10)]
+    frames[4] = frames[4][0], frames[3][1]
+    usable, _, lines = run(frames)
+    assert not usable[4]
+    assert usable[-1]
+    assert lines == []
+
+
+def test_a_frozen_left_image_is_skipped_and_named_once() -> None:
+    frames = [pair(k) for k in range(12)]
+    for k in FROZEN:
+        frames[k] = frames[2][0], frames[k][1]
+    _, frozen, lines = run(frames)
+    assert [k for k, bad in enumerate(frozen) if bad] == [*FROZEN]
+    (line,) = lines
+    assert line.startswith("frame 5: the left camera is frozen: its image does not change since frame 2")
+
+
+def test_a_dark_right_image_is_named() -> None:
+    frames = [pair(k) for k in range(12)]
+    for k in FROZEN:
+        frames[k] = frames[k][0], np.full_like(frames[k][1], 3)
+    usable, _, lines = run(frames)
+    assert not any(usable[k] for k in FROZEN)
+    assert lines[0].startswith("frame 5: the right camera is dark or covered")
+
+
+def test_matches_decide_where_the_images_are_plausible() -> None:
+    """Most points of known depth are not where they should be, for six frames: said once, and when it is over."""
+    camera, lines = RightCamera(), []
+    for k in range(16):
+        camera.left_is_frozen(k, *pair(k))
+        matched = np.arange(40) < (4 if 5 <= k < 11 else 36)
+        assert camera.check_matches(k, matched, moved=True) == (not 5 <= k < 13)
+        lines += camera.take_lines()
+    assert [line.partition(",")[0] for line in lines] == [
+        "frame 8: the right image contradicts the left one",
+        "frame 13: the right images agree with the left ones again",
+    ]
+
+
+def test_few_points_or_an_unknown_motion_contradict_nothing() -> None:
+    camera = RightCamera()
+    camera.left_is_frozen(0, *pair(0))
+    assert camera.check_matches(0, np.zeros(10, dtype=np.bool_), moved=True)
+    assert camera.check_matches(0, np.zeros(80, dtype=np.bool_), moved=False)
+
+
+def test_prior_gives_the_depth_of_the_features_that_it_names() -> None:
+    z = np.array([[100.0, 50.0, 80.0, 50.0], [200.0, 60.0, 200.0, 60.0]])
+    depth, known = prior_depths(CAMERA, np.array([-1, 7, 5, -1, 9]), TrackPrior(np.array([9, 7]), z))
+    assert known.tolist() == [False, False, False, False, True]  # a disparity of zero is no depth
+    assert depth[4] == pytest.approx(CAMERA.fu * CAMERA.baseline_m / 20.0)
+
+
+@pytest.fixture(scope="module")
+def frozen_run() -> tuple[list[StereoFrame], list[FrontendOutput]]:
+    """A flight whose right camera is frozen in some frames; the prior knows the true pixels, as a filter does."""
+    poses = flight(FRAMES)
+    frames = [stereo_frame(k, pose) for k, pose in enumerate(poses)]
+    frames = [replace(frame, right=frames[2].right) if frame.index in FROZEN else frame for frame in frames]
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    outputs: list[FrontendOutput] = []
+    for k, frame in enumerate(frames):
+        prior = None
+        if k:
+            seen = outputs[-1].observations
+            prior = TrackPrior(seen.ids, truth(SLANTED, poses[k - 1], seen.z[:, :2], poses[k]))
+        outputs.append(frontend.process(frame, prior))
+    return frames, outputs
+
+
+def test_front_end_goes_on_with_the_left_images_of_a_frozen_pair(
+    frozen_run: tuple[list[StereoFrame], list[FrontendOutput]],
+) -> None:
+    """No right pixel of a frozen image is output, no track is lost for it, and right pixels are right again later."""
+    poses, (_, outputs) = flight(FRAMES), frozen_run
+    for k in range(1, FRAMES):
+        seen = outputs[k].observations
+        assert seen.has_right.any() == (k not in [*FROZEN, 8, 9])
+        assert outputs[k].tracked > 0.8 * SETTINGS.grid.target_features
+        matched = seen.take(seen.has_right)
+        expected = truth(SLANTED, poses[k], matched.z[:, :2], poses[k])
+        assert np.abs(matched.z[:, 2] - expected[:, 2]).max(initial=0.0) < 1.0
+    assert outputs[-1].observations.has_right.mean() > 0.6
+    assert [line[:36] for output in outputs for line in output.warnings] == [
+        "frame 5: the right camera is frozen:",
+        "frame 10: the right images agree wit",
+    ]

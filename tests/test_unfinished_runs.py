@@ -1,0 +1,336 @@
+"""Nothing computed is lost: runs that are interrupted, killed, out of disk, or diverge, and how they go on."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
+from tests.test_pipeline import FakeDrive
+from vio.checkpoint import load_checkpoint, save_checkpoint
+from vio.cli import main
+from vio.config import Config
+from vio.datasets import open_dataset
+from vio.datasets.observation_log import write_observation_log
+from vio.errors import DataError, EstimationError
+from vio.filters.msckf import Msckf
+from vio.pipeline import RunResult, run
+from vio.protocols import Dataset
+from vio.records import Recording
+from vio.run_recorder import GrowingFolder
+from vio.sim.effects import CLEAN
+from vio.sim.imu import ImuNoise
+from vio.sim.motion import hand_held
+from vio.sim.rigs import small_rig
+from vio.sim.sequence import SimulatedRecording, simulate
+from vio.sim.world import room
+from vio.tables import Table
+from vio.trajectory_io import read_trajectory
+
+FRAMES = 60
+ROW = np.dtype([("a", "<i8"), ("b", "<f8", (2,))])
+
+
+# Tables
+
+
+def _rows(*values: int) -> np.ndarray:
+    rows = np.zeros(len(values), dtype=ROW)
+    rows["a"] = values
+    return rows
+
+
+def test_a_table_in_a_file_can_be_read_by_others_after_each_flush(tmp_path: Path) -> None:
+    table = Table(ROW, tmp_path / "t.npy")
+    for k in range(5):
+        table.append(_rows(k, k))
+        table.flush()
+        np.testing.assert_array_equal(np.load(tmp_path / "t.npy")["a"], np.repeat(np.arange(k + 1), 2))
+    table.replace(3, _rows(77))
+    table.append(_rows(9))
+    assert table.rows()["a"].tolist() == [0, 0, 1, 77, 2, 2, 3, 3, 4, 4, 9]
+    assert len(np.load(tmp_path / "t.npy")) == 10, "not flushed"
+    table.close()
+
+
+def test_a_table_goes_on_where_it_was_cut(tmp_path: Path) -> None:
+    table = Table(ROW, tmp_path / "t.npy")
+    table.append(_rows(*range(10)))
+    table.flush()
+    table.append(_rows(99))  # and the process dies
+    table._file.close()  # type: ignore[union-attr]
+    again = Table(ROW, tmp_path / "t.npy", keep=7)
+    again.append(_rows(50))
+    again.close()
+    assert again.rows()["a"].tolist() == [*range(7), 50]
+    with pytest.raises(DataError, match="fewer than 9"):
+        Table(ROW, tmp_path / "t.npy", keep=9)
+
+
+def test_a_table_in_memory_is_the_same() -> None:
+    table = Table(ROW)
+    for k in range(200):
+        table.append(_rows(k))
+    table.replace(3, _rows(77))
+    assert table.rows(2, 5)["a"].tolist() == [2, 77, 4]
+    assert len(table) == 200
+
+
+# To the bit
+
+
+class Stop:
+    """Asks to stop after a number of events."""
+
+    def __init__(self, after: int) -> None:
+        self.left = after
+
+    def __call__(self) -> str | None:
+        self.left -= 1
+        return "interrupted" if self.left <= 0 else None
+
+
+def _flight_log(path: Path, frames: int = FRAMES) -> Path:
+    """An observation log of a flight with an IMU."""
+    flight, noise = Flight(frames=frames), np.random.default_rng(0)
+    times = np.arange(frames, dtype=np.int64) * STEP_NS
+    recording = Recording("flight", Path("flight"), CAMERA, T_CAM0_IMU, times, False, frozenset({"imu"}), None)
+    samples = flight.imu(noise, Config().msckf, np.zeros(6))
+    seen = [flight.observe(k, 0.3, noise) for k in range(frames)]
+    write_observation_log(path, recording, seen, samples, run_motion="imu")  # type: ignore[arg-type]
+    return path
+
+
+@pytest.fixture(scope="module")
+def flight_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return _flight_log(tmp_path_factory.mktemp("log") / "flight.npz")
+
+
+def _rendered() -> SimulatedRecording:
+    motion = hand_held(duration_s=2.0)
+    return SimulatedRecording(
+        simulate(room(seed=1), small_rig(320, 200), motion, rate_hz=10.0, imu=ImuNoise(), effects=CLEAN, seed=1)
+    )
+
+
+def _assert_same(a: RunResult, b: RunResult) -> None:
+    for name in ("index", "time_ns", "T_world_imu", "covariance", "velocity_world", "gyro_bias"):
+        np.testing.assert_array_equal(a.estimates.column(name), b.estimates.column(name))
+    order = np.argsort(a.landmarks.ids), np.argsort(b.landmarks.ids)
+    for name in ("ids", "p_world", "covariance"):
+        np.testing.assert_array_equal(*(getattr(r.landmarks, name)[k] for r, k in zip((a, b), order, strict=True)))
+    if a.dead_reckoning is not None:
+        assert b.dead_reckoning is not None
+        np.testing.assert_array_equal(a.dead_reckoning.T_world_body, b.dead_reckoning.T_world_body)
+    assert a.warnings == b.warnings
+
+
+@pytest.mark.parametrize(
+    ("make", "config", "events"),
+    [
+        (lambda log: open_dataset(log), Config(), 300),
+        (lambda log: open_dataset(log), replace(Config(), lag_frames=4), 411),
+        (lambda log: FakeDrive(), Config(), 29),
+        (lambda log: _rendered(), Config(), 150),
+    ],
+    ids=["features and imu", "lag", "velocities", "images"],
+)
+def test_a_run_goes_on_to_the_same_bits(
+    flight_log: Path, tmp_path: Path, make: Callable[[Path], Dataset], config: Config, events: int
+) -> None:
+    whole = run(make(flight_log), config, keep_observations=True)
+    folder = GrowingFolder(tmp_path / "run", {})
+    first = run(make(flight_log), config, keep_observations=True, folder=folder, should_stop=Stop(events))
+    assert first.stopped == "interrupted"
+    assert 5 < len(first.frames) < len(whole.frames)
+    second = run(make(flight_log), config, keep_observations=True, folder=folder, resume=True)
+    assert second.stopped is None
+    _assert_same(whole, second)
+    assert whole.observations is not None
+    assert second.observations is not None
+    for a, b in zip(whole.observations, second.observations, strict=True):
+        assert a.frame_index == b.frame_index
+        np.testing.assert_array_equal(a.z, b.z)
+    assert whole.motion_samples is not None
+    assert second.motion_samples is not None
+    assert [s.time_ns for s in whole.motion_samples] == [s.time_ns for s in second.motion_samples]
+
+
+def test_points_put_away_while_running_stay_in_the_map(
+    flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vio.run_recorder._CHECKPOINT_S", 0.05)
+    whole = run(open_dataset(flight_log), Config())
+    grown = run(open_dataset(flight_log), Config(), folder=GrowingFolder(tmp_path / "run", {}))
+    assert len(grown.landmarks.ids) > 50
+    _assert_same(whole, grown)
+
+
+# Processes that end
+
+PATCHED = (
+    "import sys, vio.run_recorder as r, vio.cli; r._FLUSH_S = 0.0; r._CHECKPOINT_S = 0.1; "
+    "sys.exit(vio.cli.main(sys.argv[1:]))"
+)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(flight_log: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    out = tmp_path_factory.mktemp("whole") / "run"
+    assert main(["run", str(flight_log), "--out", str(out)]) == 0
+    return (out / "trajectory.tum").read_text()
+
+
+def _wait_for(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < end, "the run did not get there"
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_process_that_ends_loses_a_second_at_most(
+    flight_log: Path, undisturbed: str, tmp_path: Path, number: signal.Signals
+) -> None:
+    out = tmp_path / "run"
+    command = [sys.executable, "-c", PATCHED, "run", str(flight_log), "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        _wait_for((out / "unfinished" / "checkpoint").is_file)
+        process.send_signal(number)
+        _, error = process.communicate(timeout=120)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["complete"] is False
+    poses = read_trajectory(out / "trajectory.tum")
+    assert 0 < len(poses) < FRAMES
+    assert np.load(out / "unfinished" / "estimates.npy")["time_ns"][0] == 0
+    if number != signal.SIGKILL:
+        assert process.returncode == 128 + number
+        assert f"the results of {len(poses)} of {FRAMES} frames are in {out}" in error
+        assert f"vio run --resume {out}" in error
+        assert (out / "trajectory.png").is_file()
+    assert main(["run", "--resume", str(out)]) == 0
+    assert (out / "trajectory.tum").read_text() == undisturbed
+    assert json.loads((out / "metrics.json").read_text())["complete"] is True
+    assert not (out / "unfinished").exists()
+
+
+def test_two_runs_into_one_folder_are_refused(flight_log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    command = [sys.executable, "-c", PATCHED, "run", str(flight_log), "--out", str(out)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as first:
+        _wait_for((out / "unfinished" / "run.json").is_file)
+        first.send_signal(signal.SIGSTOP)
+        try:
+            for again in (["run", str(flight_log), "--out", str(out)], ["run", "--resume", str(out)]):
+                second = subprocess.run([*command[:3], *again], capture_output=True, text=True, check=False)
+                assert second.returncode == 1
+                assert "another process is writing into this folder" in second.stderr
+        finally:
+            first.send_signal(signal.SIGCONT)
+        assert first.wait(timeout=120) == 0
+    assert len(read_trajectory(out / "trajectory.tum")) == FRAMES
+
+
+def test_an_earlier_run_stays_until_the_new_one_has_a_frame(flight_log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert main(["run", str(flight_log), "--stop", "20", "--out", str(out)]) == 0
+    assert main(["run", str(flight_log), "--start", "900", "--out", str(out)]) == 1
+    assert len(read_trajectory(out / "trajectory.tum")) == 20
+    assert main(["run", str(flight_log), "--stop", "10", "--out", str(out)]) == 0
+    assert len(read_trajectory(out / "trajectory.tum")) == 10
+
+
+def test_a_divergence_keeps_the_results_so_far(
+    flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    update = Msckf.update
+
+    def diverge(self: Msckf, seen: Any) -> Any:
+        if seen.frame_index == 30:
+            raise EstimationError("msckf diverged at frame 30")
+        return update(self, seen)
+
+    monkeypatch.setattr(Msckf, "update", diverge)
+    monkeypatch.setattr(Msckf, "restart", None, raising=False)
+    out = tmp_path / "run"
+    assert main(["run", str(flight_log), "--out", str(out)]) == 1
+    assert f"msckf diverged at frame 30; the results of 30 of {FRAMES} frames are in {out}" in capsys.readouterr().err
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["stopped"] == "msckf diverged at frame 30"
+    assert len(read_trajectory(out / "trajectory.tum")) == 30
+
+
+def test_a_disk_that_fills_keeps_what_is_written(
+    flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vio.run_recorder._FLUSH_S", 0.0)
+    append, room_left = Table.append, iter(range(100))
+
+    def limited(self: Table, rows: Any) -> None:
+        if next(room_left, None) is None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(self, rows)
+
+    monkeypatch.setattr(Table, "append", limited)
+    out = tmp_path / "run"
+    assert main(["run", str(flight_log), "--out", str(out)]) == 1
+    assert "No space left" in capsys.readouterr().err
+    assert len(read_trajectory(out / "trajectory.tum")) > 30
+
+
+# Checkpoints
+
+
+@pytest.fixture
+def state(flight_log: Path, tmp_path: Path) -> tuple[Path, Dataset]:
+    dataset = open_dataset(flight_log)
+    save_checkpoint(tmp_path / "c", {"a": np.arange(3)}, dataset)
+    return tmp_path / "c", dataset
+
+
+def test_a_checkpoint_cannot_call_what_is_not_the_estimators(state: tuple[Path, Dataset]) -> None:
+    path, dataset = state
+
+    class Attack:
+        def __init__(self, function: Any, *arguments: Any) -> None:
+            self.call = function, arguments
+
+        def __reduce__(self) -> Any:
+            return self.call
+
+    from vio.atomic import atomic_write_bytes
+
+    head = path.read_bytes().split(b"\n")[0]
+    target = path.with_name("owned")
+    for attack in (
+        Attack(os.system, f"touch {target}"),
+        Attack(atomic_write_bytes, str(target), b""),
+        Attack(eval, f"open({str(target)!r}, 'w')"),
+    ):
+        path.write_bytes(head + b"\n" + pickle.dumps(attack))
+        with pytest.raises(DataError, match="does not belong into a checkpoint"):
+            load_checkpoint(path, dataset)
+    assert not target.exists()
+
+
+@pytest.mark.parametrize("spoil", [lambda b: b[:-5], lambda b: b"", lambda b: b"{}\n" + b.split(b"\n", 1)[1]])
+def test_a_damaged_or_foreign_checkpoint_is_refused(
+    state: tuple[Path, Dataset], spoil: Callable[[bytes], bytes]
+) -> None:
+    path, dataset = state
+    path.write_bytes(spoil(path.read_bytes()))
+    with pytest.raises(DataError, match="repeat the run from its start"):
+        load_checkpoint(path, dataset)

@@ -1,0 +1,92 @@
+"""Write docs/bad_inputs.md: every bad input that the tests make, and the line that a user gets.
+
+    python -m tools.bad_inputs
+
+The cases are the dictionaries `BAD` of the tests of the readers; `tests/test_bad_inputs.py` compares the page's rows.
+"""
+
+from __future__ import annotations
+
+import importlib
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.rigs import load_rig
+from vio.errors import VioError
+
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "bad_inputs.md"
+MODULES = {
+    "tests.test_rig": "Calibration files (`vio.load_rig`)",
+    "tests.test_datasets_plain": "Plain folders",
+    "tests.test_datasets_bags": "ROS bags",
+    "tests.test_datasets_videos": "Videos",
+}
+_HEAD = """# Bad inputs
+
+An input that cannot be used ends in one line, which says what is wrong, where, and what to do, and in exit status 1.
+Each row is a test; `python -m tools.bad_inputs` writes this page from the same cases. What a run would not stop at but
+makes no sense of (exchanged cameras, readings in g, black images) is found by `vio inspect`, see
+[recordings](recordings.md).
+"""
+
+
+def cases(module: str) -> dict[str, Any]:
+    """Return the cases of one test module."""
+    found: dict[str, Any] = importlib.import_module(module).BAD
+    return found
+
+
+def message_of(module: str, case: Any, folder: Path) -> str:
+    """Return the line that a case gives, with its folder written as '…'."""
+    try:
+        if module == "tests.test_rig":
+            load_rig(case[0](folder))
+        elif module == "tests.test_datasets_videos":
+            case[0](folder)
+            list(open_dataset(folder).events())
+        else:
+            settings = DatasetSettings(topics=case[1]) if len(case) == 3 else DatasetSettings()
+            list(open_dataset(case[0](folder / "r"), settings).events())
+    except VioError as error:
+        text = " ".join(str(error).split())
+        return text.replace(str(folder), "…").replace("|", "\\|")
+    raise AssertionError(f"{module}: a case gives no error")
+
+
+def main() -> int:
+    """Write the page."""
+    parts = [_HEAD]
+    with tempfile.TemporaryDirectory() as name:
+        root = Path(name)
+        videos = _videos(root)
+        for module, title in MODULES.items():
+            parts.append(f"\n## {title}\n\n| input | message |\n|---|---|\n")
+            for k, (label, case) in enumerate(cases(module).items()):
+                folder = root / f"{title[:3]}{k}"
+                if module == "tests.test_datasets_videos":
+                    shutil.copytree(videos, folder)
+                else:
+                    folder.mkdir()
+                    (folder / "r").mkdir() if module == "tests.test_datasets_bags" else None
+                parts.append(f"| {label} | {message_of(module, case, folder)} |\n")
+    PAGE.write_text("".join(parts), encoding="utf-8")
+    return 0
+
+
+def _videos(root: Path) -> Path:
+    """Return the folder of videos that the tests' cases change."""
+    from vio.cli import main as vio
+
+    flight = root / "flight"
+    options = ["--rig", "small", "--width", "160", "--rate", "20", "--duration", "0.8", "--format", "euroc"]
+    assert vio(["render", "--out", str(flight), "--workers", "1", "--json", *options]) == 0
+    folder: Path = importlib.import_module("tests.test_datasets_videos").make_videos(flight, root / "videos")
+    return folder
+
+
+if __name__ == "__main__":
+    sys.exit(main())

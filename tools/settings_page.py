@@ -1,0 +1,50 @@
+"""Write docs/settings.md: the basic settings, and the others in groups.
+
+python tools/settings_page.py > docs/settings.md
+"""
+
+from __future__ import annotations
+
+from vio.config import BASIC, Config, SettingInfo, describe
+
+_INTRODUCTION = """# Settings
+
+Settings come from the defaults, a YAML file that holds deviations only (`--config FILE`), and `--set a.b=value`, in
+that order. `vio config --show` prints the basic ones, `vio config --all` every one with its range; a run's folder holds
+the configuration that was in effect. An unknown key, a wrong type or a number out of range is an error that names the
+file and the nearest valid key. This page is written by `python tools/settings_page.py`. What each setting does to the
+error when it is halved or doubled is in [notes/settings_sweep.md](notes/settings_sweep.md).
+"""
+_HEAD = "| setting | default | unit | meaning |\n|---|---:|---|---|\n"
+_WORDS = {None: "null", True: "true", False: "false"}
+
+
+def page() -> str:
+    """Return the text of the page."""
+    rows = list(describe(Config()))
+    others = [row for row in rows if row.key not in BASIC]
+    parts = [_INTRODUCTION, "## Basic settings\n\n" + _table([row for row in rows if row.key in BASIC])]
+    for section in dict.fromkeys(row.key.rpartition(".")[0] for row in others):
+        chosen = [row for row in others if row.key.rpartition(".")[0] == section]
+        parts.append(f"## Others: `{section}`\n\n{chosen[0].group}.\n\n" + _table(chosen))
+    return "\n".join(parts)
+
+
+def _table(rows: list[SettingInfo]) -> str:
+    cells = ((row.key, _default(row.default), row.unit, _meaning(row)) for row in rows)
+    return _HEAD + "".join(f"| `{key}` | {default} | {unit} | {doc} |\n" for key, default, unit, doc in cells)
+
+
+def _default(value: object) -> str:
+    if value is None or isinstance(value, bool):
+        return _WORDS[value]
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _meaning(row: SettingInfo) -> str:
+    choices = f" (one of {', '.join(row.choices)})" if row.choices else ""
+    return f"{row.doc}{choices}".replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    print(page(), end="")

@@ -1,0 +1,72 @@
+"""`vio inspect`: examine a recording before a run."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from vio.cli.arguments import add_config_arguments, config_from
+
+if TYPE_CHECKING:
+    from vio.inspection.finding import Inspection
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "inspect",
+        help="examine a recording before a run",
+        description="Say what was found in a recording and how it was understood: clocks, calibration, images, stereo "
+        "rows, IMU (units, standstill, gravity, noise against the data sheet, agreement with images), ground truth, "
+        "and what is missing. Exit status 1 where a run makes no sense, with the remedy.",
+    )
+    parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
+    add_config_arguments(parser)
+    parser.add_argument("--pairs", type=int, default=12, metavar="N", help="stereo pairs looked at (default 12)")
+    parser.add_argument("--frames", type=int, default=60, metavar="N", help="frames tracked (default 60; 0: none)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.set_defaults(execute=execute)
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    from frontend import build_frontend
+    from vio.cli.output import print_result
+    from vio.cli.progress import ProgressBar
+    from vio.datasets import open_dataset
+    from vio.errors import ConfigError
+    from vio.inspection.inspect import inspect_recording
+    from vio.threads import one_blas_thread
+
+    if args.pairs < 1 or args.frames < 0:
+        raise ConfigError("--pairs must be at least 1, and --frames at least 0")
+    config = config_from(args)
+    dataset = open_dataset(args.source, config.dataset)
+    recording = dataset.recording
+    with one_blas_thread(), ProgressBar(f"inspect {recording.path.name}") as bar:
+        report = inspect_recording(
+            dataset,
+            lambda d: build_frontend(config.frontend.name, d.recording.camera, config.frontend, d),
+            pairs=args.pairs,
+            tracked=args.frames,
+            progress=bar.update,
+        )
+    facts = {"source": str(recording.path), "kind": recording.kind, **_facts(report)}
+    title = ("recording", f"{recording.path} (kind {recording.kind})")
+    print_result(facts, [title, *_rows(report)], as_json=args.json, name_width=20)
+    return 1 if report.faults else 0
+
+
+def _facts(report: Inspection) -> dict[str, Any]:
+    return {
+        "parts": {part.name: dict(part.facts) for part in report.parts},
+        "faults": list(report.faults),
+        "notes": list(report.notes),
+    }
+
+
+def _rows(report: Inspection) -> list[tuple[str, str]]:
+    rows = [(part.name, part.text) for part in report.parts]
+    rows += [("note", note) for note in report.notes]
+    rows += [("FAULT", fault) for fault in report.faults]
+    return rows if report.faults else [*rows, ("verdict", "nothing speaks against a run")]

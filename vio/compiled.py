@@ -1,0 +1,128 @@
+"""Loops compiled to machine code by numba, kept in a cache on disk.
+
+For loops over small matrices and patches, where NumPy spends its time on calls and temporary arrays. Import this module
+only where arrays are worked on: it loads numba. Inside a compiled function, write out assignments of whole rows and
+sums of arrays as loops: numba's own forms of these take seconds to compile.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray
+
+log = logging.getLogger(__name__)
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled(function: Function) -> Function:
+    """Compile a function at its first call, for the types of that call; later processes load it from the cache.
+
+    Divisions follow IEEE 754 as NumPy's do, and sums keep their order. The cache is beside the source file, else in the
+    user's cache folder (NUMBA_CACHE_DIR overrides both); where neither is writable, every process compiles anew.
+    """
+    return _compiled(function, fastmath=False)
+
+
+def compiled_sums(function: Function) -> Function:
+    """Compile a function like `compiled`, with its sums taken in an order that suits the processor's vectors.
+
+    The order is part of the machine code, so results still repeat to the bit on one kind of processor. Unlike numba's
+    `fastmath=True`, infinities and NaN keep their meaning.
+    """
+    return _compiled(function, fastmath={"reassoc", "contract", "nsz"})
+
+
+def _compiled(function: Function, **options: Any) -> Function:
+    try:
+        return numba.njit(function, cache=True, error_model="numpy", nogil=True, **options)
+    except RuntimeError:  # numba found no folder that it may write to
+        log.debug("no folder for numba's cache is writable: %s is compiled in each process", function.__qualname__)
+        return numba.njit(function, error_model="numpy", nogil=True, **options)
+
+
+@compiled
+def invert_positive(A: FloatArray, out: npt.NDArray[np.floating[Any]]) -> None:
+    """Write the inverse (n, n) of a symmetric positive definite matrix, whose lower triangle is read, by Cholesky."""
+    n = len(A)
+    L = np.empty((n, n))  # first the factor, then its inverse
+    for i in range(n):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+    for j in range(n):
+        L[j, j] = 1.0 / L[j, j]
+        for i in range(j + 1, n):
+            total = 0.0
+            for k in range(j, i):
+                total -= L[i, k] * L[k, j]
+            L[i, j] = total / L[i, i]
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, n):
+                total += L[k, i] * L[k, j]
+            out[i, j] = out[j, i] = total
+
+
+@compiled
+def solve_positive(A: FloatArray, b: FloatArray) -> None:
+    """Solve `A x = b` in place for a symmetric positive definite A (n, n): x (n,) replaces b, and the factor A."""
+    n = len(b)
+    for i in range(n):
+        for j in range(i + 1):
+            total = A[i, j]
+            for k in range(j):
+                total -= A[i, k] * A[j, k]
+            A[i, j] = np.sqrt(total) if i == j else total / A[j, j]
+        total = b[i]
+        for k in range(i):
+            total -= A[i, k] * b[k]
+        b[i] = total / A[i, i]
+    for i in range(n - 1, -1, -1):
+        total = b[i]
+        for k in range(i + 1, n):
+            total -= A[k, i] * b[k]
+        b[i] = total / A[i, i]
+
+
+@compiled
+def move_by_twist(xi: FloatArray, T: FloatArray) -> None:
+    """Replace a transform T (4, 4) by `exp(xi) T`, with a twist (6,) `[rho; phi]`: `se3_exp` of `vio.geometry.lie`."""
+    x, y, z = xi[3], xi[4], xi[5]
+    squared = x * x + y * y + z * z
+    if squared < 1e-4:  # cancellation in the closed forms
+        a = 1.0 - squared / 6.0 * (1.0 - squared / 20.0 * (1.0 - squared / 42.0))
+        b = 0.5 - squared / 24.0 * (1.0 - squared / 30.0 * (1.0 - squared / 56.0))
+        c = 1.0 / 6.0 - squared / 120.0 * (1.0 - squared / 42.0 * (1.0 - squared / 72.0))
+    else:
+        angle = np.sqrt(squared)
+        a, b, c = np.sin(angle) / angle, 2.0 * np.sin(angle / 2.0) ** 2 / squared, (angle - np.sin(angle)) / angle**3
+    # phi^ v and phi^ phi^ v are the cross products of phi with v, and with that.
+    for j in range(4):
+        px, py, pz = T[0, j], T[1, j], T[2, j]
+        cx, cy, cz = y * pz - z * py, z * px - x * pz, x * py - y * px
+        dx, dy, dz = y * cz - z * cy, z * cx - x * cz, x * cy - y * cx
+        T[0, j], T[1, j], T[2, j] = px + a * cx + b * dx, py + a * cy + b * dy, pz + a * cz + b * dz
+    px, py, pz = xi[0], xi[1], xi[2]
+    cx, cy, cz = y * pz - z * py, z * px - x * pz, x * py - y * px
+    dx, dy, dz = y * cz - z * cy, z * cx - x * cz, x * cy - y * cx
+    T[0, 3] += px + b * cx + c * dx
+    T[1, 3] += py + b * cy + c * dy
+    T[2, 3] += pz + b * cz + c * dz
+
+
+@compiled
+def move_poses(xi: FloatArray, T: FloatArray) -> None:
+    """Replace transforms T (N, 4, 4) by `exp(xi) T`, with twists (N, 6)."""
+    for n in range(len(T)):
+        move_by_twist(xi[n], T[n])

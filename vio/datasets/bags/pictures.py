@@ -1,0 +1,90 @@
+"""Decode ROS image messages to 8-bit gray."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.datasets.images import UnreadableImageError, decode_gray
+from vio.errors import DataError
+from vio.records import Image
+
+# OpenCV names a Bayer pattern by its second row and column; ROS by its first pixels.
+_BAYER = {"rggb": "BG", "bggr": "RG", "gbrg": "GR", "grbg": "GB"}
+_YUV = {"yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2"}
+_WHITE_16 = 65535
+_SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
+
+
+def gray_of(fields: Any, where: str, *, compressed: bool, white: int = _WHITE_16) -> Image:
+    """Return a sensor_msgs/Image or CompressedImage as gray (H, W).
+
+    Args:
+        fields: the decoded message.
+        where: topic and frame, for messages.
+        compressed: whether it is a CompressedImage.
+        white: the level of 16-bit pixels that becomes 255.
+
+    Raises:
+        UnreadableImageError: the pixels are truncated or do not decode.
+        DataError: the encoding is not read.
+    """
+    pixels = compressed_pixels(fields, where) if compressed else raw_gray(fields, where)
+    if pixels.dtype == np.uint16:
+        pixels = np.minimum(np.rint(pixels / (white / 255)), 255).astype(np.uint8)
+    return np.ascontiguousarray(pixels, dtype=np.uint8)
+
+
+def compressed_pixels(fields: Any, where: str) -> npt.NDArray[Any]:
+    """Decode a CompressedImage: gray (H, W), 8 bits; of 16-bit files by full scale."""
+    return decode_gray(bytes(fields.data), where)[0]
+
+
+def raw_gray(fields: Any, where: str) -> npt.NDArray[Any]:
+    """Return the pixels of a sensor_msgs/Image as gray (H, W) of its own depth."""
+    import cv2
+
+    encoding, height, width = str(fields.encoding), int(fields.height), int(fields.width)
+    bayer = encoding.startswith("bayer_")
+    yuv = _YUV.get(encoding.lower())
+    depth, channels = _form(encoding, where, bayer=bayer, yuv=yuv)
+    dtype = np.dtype(depth).newbyteorder(">" if fields.is_bigendian else "<")
+    row, needed = int(fields.step), width * channels * dtype.itemsize
+    data = np.frombuffer(bytes(fields.data), dtype=np.uint8)
+    if not (width > 0 and height > 0 and row >= needed and len(data) >= row * height):
+        raise UnreadableImageError(
+            f"{where}: {len(data)} bytes are not {width} x {height} pixels of {encoding} in rows of {row}; the "
+            "message is truncated"
+        )
+    rows = np.ascontiguousarray(data[: row * height].reshape(height, row)[:, :needed])
+    pixels = rows.view(dtype).astype(np.dtype(depth), copy=False).reshape(height, width, channels)
+    if bayer:
+        return np.asarray(cv2.cvtColor(pixels[..., 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding[6:10]]}2GRAY")))
+    if yuv is not None:
+        return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_YUV2GRAY_{yuv}")))
+    if channels == 1:
+        return pixels[..., 0]
+    name = encoding.rstrip("0123456789").upper() if not encoding[:1].isdigit() else {3: "BGR", 4: "BGRA"}[channels]
+    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{name}2GRAY")))
+
+
+def _form(encoding: str, where: str, *, bayer: bool, yuv: str | None) -> tuple[str, int]:
+    """Return the NumPy type and the channels of an encoding of sensor_msgs/image_encodings."""
+    if yuv is not None:
+        return "u1", 2
+    if bayer and encoding[6:10] in _BAYER and encoding[10:] in ("8", "16"):
+        return f"u{int(encoding[10:]) // 8}", 1
+    for name, channels in (("mono", 1), ("bgra", 4), ("rgba", 4), ("bgr", 3), ("rgb", 3)):
+        if encoding in (f"{name}8", f"{name}16"):
+            return f"u{int(encoding[len(name) :]) // 8}", channels
+    for bits in (8, 16):
+        if encoding.startswith(f"{bits}UC") and encoding[len(f"{bits}UC") :] in ("1", "3", "4"):
+            return f"u{bits // 8}", int(encoding[-1])
+    raise DataError(f"{where}: images of encoding {encoding!r} are not read; use mono8, mono16, bgr8, rgb8 or bayer_*8")
+
+
+def white_of(level: float) -> int:
+    """Return the level of white of 16-bit images whose brightest pixels have `level`: that of 10, 12, 14 or 16 bits."""
+    return next((2**bits - 1 for bits in _SENSOR_BITS if level <= 2**bits - 1), _WHITE_16)

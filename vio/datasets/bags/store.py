@@ -1,0 +1,129 @@
+"""The one place that uses the library rosbags: open bags, list topics, stream messages, and name damage in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vio.datasets.bags import bag_files
+from vio.errors import DataError, MissingDependencyError
+
+if TYPE_CHECKING:
+    from rosbags.highlevel import AnyReader
+
+_MISSING = "reading ROS bags needs the package rosbags; install it with: pip install 'stereo-vio[bags]'"
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic of a bag."""
+
+    name: str
+    kind: str  # such as sensor_msgs/msg/Image
+    count: int  # messages
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message as it was recorded."""
+
+    topic: str
+    kind: str
+    logged_ns: int  # when the bag received it
+    data: bytes
+
+
+class Bag:
+    """Opened bags; use it as a context. Messages are streamed, so memory does not grow with the file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._reader: AnyReader | None = None
+
+    def __enter__(self) -> Bag:
+        """Open the files.
+
+        Raises:
+            MissingDependencyError: rosbags is not installed.
+            DataError: a file is missing, truncated or damaged.
+        """
+        try:
+            from rosbags.highlevel import AnyReader
+            from rosbags.typesys import Stores, get_typestore
+        except ImportError as error:
+            raise MissingDependencyError(_MISSING) from error
+        with named_damage(self.path):
+            # ROS 2 bags of before Iron carry no definitions; those of its usual types have not changed since.
+            self._reader = AnyReader(bag_files(self.path), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+            self._reader.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the files."""
+        if self._reader is not None and self._reader.stack is not None:
+            self._reader.close()
+
+    @property
+    def topics(self) -> tuple[Topic, ...]:
+        """All topics, the empty ones too, in the order of their names."""
+        assert self._reader is not None
+        counts: dict[tuple[str, str], int] = {}
+        for connection in self._reader.connections:
+            key = connection.topic, connection.msgtype
+            counts[key] = counts.get(key, 0) + connection.msgcount
+        return tuple(Topic(name, kind, count) for (name, kind), count in sorted(counts.items()))
+
+    def messages(self, topics: Collection[str], start_ns: int | None = None) -> Iterator[Message]:
+        """Yield the messages of some topics in the order in which they were recorded, from a time of the bag's clock.
+
+        Raises:
+            DataError: the bag is damaged; what came before was yielded.
+        """
+        assert self._reader is not None
+        chosen = [c for c in self._reader.connections if c.topic in topics]
+        if not chosen:
+            return
+        with named_damage(self.path):
+            for connection, logged_ns, data in self._reader.messages(chosen, start=start_ns):
+                yield Message(connection.topic, connection.msgtype, logged_ns, bytes(data))
+
+    def decoded(self, message: Message) -> Any:
+        """Return the fields of a message.
+
+        Raises:
+            DataError: the message does not fit its type.
+        """
+        assert self._reader is not None
+        with named_damage(f"{self.path}, {message.topic}"):
+            return self._reader.deserialize(message.data, message.kind)
+
+
+@contextlib.contextmanager
+def named_damage(where: Path | str) -> Iterator[None]:
+    """Turn what the readers of bags raise on damaged files into one line.
+
+    Raises:
+        DataError: instead of any error of rosbags, its storages, or of the file system.
+    """
+    import apsw
+    from rosbags.highlevel import AnyReaderError
+    from rosbags.rosbag1 import ReaderError as ReaderError1
+    from rosbags.rosbag2 import ReaderError as ReaderError2
+    from rosbags.serde import SerdeError
+    from rosbags.typesys import TypesysError
+
+    errors = (AnyReaderError, ReaderError1, ReaderError2, SerdeError, TypesysError, apsw.Error)
+    # Damaged bytes reach the parsers of headers, chunks and compression as the built-in errors.
+    builtin = (OSError, ValueError, KeyError, IndexError, EOFError, AssertionError, RuntimeError, struct.error)
+    try:
+        yield
+    except (*errors, *builtin) as error:
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise DataError(
+            f"{where}: the bag is truncated or damaged ({why[:200]}); copy it again, or repair it with ROS's own tools "
+            "(rosbag reindex, ros2 bag reindex, mcap recover)"
+        ) from error

@@ -1,0 +1,187 @@
+"""Which topics of a bag are cameras, IMU, velocities and ground truth: by type and name, or as named."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vio.datasets.bags.store import Topic
+from vio.errors import DataError
+
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO, IMU, TF = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWISTS = ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/TwistWithCovarianceStamped")
+POSES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "geometry_msgs/msg/TransformStamped",
+)
+_ROLES: dict[str, tuple[str, ...]] = {
+    "left": (IMAGE, COMPRESSED),
+    "right": (IMAGE, COMPRESSED),
+    "imu": (IMU,),
+    "velocity": (ODOMETRY, *TWISTS),
+    "reference": (*POSES, ODOMETRY),
+}
+# What distinguishes the two cameras of a pair in topics' names, left first.
+_SIDES = (
+    ("left", "right"),
+    ("Left", "Right"),
+    ("cam0", "cam1"),
+    ("camera0", "camera1"),
+    ("camera_0", "camera_1"),
+    ("infra1", "infra2"),
+    ("fisheye1", "fisheye2"),
+    ("cam_0", "cam_1"),
+    ("cam1", "cam2"),
+    ("image_0", "image_1"),
+    ("0", "1"),
+)
+_NO_GRAY = re.compile(r"depth|disparity|mask|label|semantic|thermal|theora|confidence|points", re.IGNORECASE)
+_TRUTH = re.compile(r"ground_?truth|\bgt\b|_gt|gt_|vicon|mocap|optitrack|leica|truth|vrpn", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Roles:
+    """The topics that a recording is made of."""
+
+    left: Topic
+    right: Topic
+    imu: Topic | None
+    velocity: Topic | None
+    reference: Topic | None
+
+
+def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Roles, tuple[str, ...]]:
+    """Return the topics of each role, and notes about what was chosen, is empty, or is not used.
+
+    Args:
+        topics: all topics of the bag.
+        named: `left=/a,right=/b,imu=/c`, which takes the place of the choice; a role named `none` is left out.
+        where: the bag, for messages.
+
+    Raises:
+        DataError: a named topic is missing, empty or of another type, or no stereo pair can be chosen.
+    """
+    given = _named(topics, named, where)
+    filled = [t for t in topics if t.count]
+    if "left" in given and "right" in given:
+        left, right = given["left"], given["right"]
+        assert left is not None
+        assert right is not None
+    else:
+        left, right = _pair(filled, given, where)
+    notes: list[str] = []
+    imu = given.get("imu") if "imu" in given else _single(filled, (IMU,), "imu", left, notes)
+    reference = given["reference"] if "reference" in given else _reference(filled, notes)
+    velocity = given.get("velocity")
+    if "velocity" not in given and imu is None:
+        moving = [t for t in filled if t.kind in (ODOMETRY, *TWISTS) and t != reference]
+        velocity = moving[0] if len(moving) == 1 else None
+    roles = Roles(left, right, imu, velocity, reference)
+    return roles, (*notes, *_not_used(topics, roles))
+
+
+def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, Topic | None]:
+    if named is None:
+        return {}
+    by_name = {t.name: t for t in topics}
+    given: dict[str, Topic | None] = {}
+    for part in named.split(","):
+        role, equals, name = (x.strip() for x in part.partition("="))
+        if role not in _ROLES or not equals or not name:
+            raise DataError(f"--topics {named!r}: {part!r} is no ROLE=/TOPIC; roles are {', '.join(_ROLES)}")
+        if name == "none" and role not in ("left", "right"):
+            given[role] = None
+            continue
+        topic = by_name.get(name) or by_name.get(f"/{name}")
+        if topic is None:
+            fit = [t.name for t in topics if t.kind in _ROLES[role] and t.count]
+            raise DataError(f"{where}: holds no topic {name!r} for {role}; those of its type are {_list(fit)}")
+        if topic.kind not in _ROLES[role]:
+            raise DataError(f"{where}: {name} holds {topic.kind}, not {' or '.join(_ROLES[role])} as {role} must")
+        if not topic.count:
+            raise DataError(f"{where}: {name} ({role}) holds no message; name another topic, or another bag")
+        given[role] = topic
+    return given
+
+
+def _pair(filled: Sequence[Topic], given: dict[str, Topic | None], where: str) -> tuple[Topic, Topic]:
+    """Choose the left and right image topic."""
+    images = [t for t in filled if t.kind in (IMAGE, COMPRESSED) and not _NO_GRAY.search(t.name)]
+    if len(images) < 2:
+        have = _list([t.name for t in images])
+        raise DataError(f"{where}: holds {len(images)} image topics with messages ({have}); stereo needs two")
+    by_name = {t.name: t for t in images}
+    pairs = []
+    for a, b in _SIDES:
+        for left in images:
+            right = by_name.get(_replaced_last(left.name, a, b))
+            if a in left.name and right is not None and right != left and right.kind == left.kind:
+                pairs.append((left, right))
+        if pairs:
+            break
+    for role, k in (("left", 0), ("right", 1)):
+        if given.get(role) is not None:
+            pairs = [p for p in pairs if p[k] == given[role]]
+    if len(pairs) > 1:
+        best = min(_rank(left) for left, _ in pairs)
+        pairs = [p for p in pairs if _rank(p[0]) == best]
+    if len(pairs) != 1:
+        what = "several topics could be the pair" if pairs else "no two topics are named as left and right"
+        names = _list([t.name for t in images])
+        raise DataError(f"{where}: {what} ({names}); name them with --topics left=/A,right=/B")
+    return pairs[0]
+
+
+def _replaced_last(name: str, a: str, b: str) -> str:
+    head, found, tail = name.rpartition(a)
+    return f"{head}{b}{tail}" if found else name
+
+
+def _rank(topic: Topic) -> tuple[int, int, int]:
+    """Raw images before rectified ones, uncompressed before compressed, gray before colour."""
+    return int("rect" in topic.name), int(topic.kind == COMPRESSED), int("color" in topic.name or "rgb" in topic.name)
+
+
+def _single(filled: Sequence[Topic], kinds: tuple[str, ...], role: str, left: Topic, notes: list[str]) -> Topic | None:
+    """Choose the topic of a role: the only one, or the one whose name shares most with the left camera's."""
+    found = [t for t in filled if t.kind in kinds]
+    if len(found) < 2:
+        return found[0] if found else None
+    best = max(found, key=lambda t: (_shared(t.name, left.name), t.count))
+    others = _list([t.name for t in found if t != best])
+    notes.append(f"{best.name} is taken as {role}; others are {others} (choose with --topics {role}=/NAME)")
+    return best
+
+
+def _shared(a: str, b: str) -> int:
+    """Count the leading parts that two names share."""
+    parts = list(zip(a.strip("/").split("/"), b.strip("/").split("/"), strict=False))
+    return next((k for k, (x, y) in enumerate(parts) if x != y), len(parts))
+
+
+def _reference(filled: Sequence[Topic], notes: list[str]) -> Topic | None:
+    """Choose ground truth: a pose topic whose name says so; other poses may be another estimate and are only said."""
+    poses = [t for t in filled if t.kind in (*POSES, ODOMETRY)]
+    named = [t for t in poses if _TRUTH.search(t.name)]
+    if named:
+        return named[0]
+    if poses:
+        notes.append(f"{_list([t.name for t in poses])} may be ground truth: say so with --topics reference=/NAME")
+    return None
+
+
+def _not_used(topics: Sequence[Topic], roles: Roles) -> list[str]:
+    used = {roles.left, roles.right, roles.imu, roles.velocity, roles.reference}
+    empty = [t.name for t in topics if not t.count]
+    others = [t.name for t in topics if t.count and t not in used and t.kind not in (CAMERA_INFO, TF)]
+    notes = [f"topics without a message: {_list(empty)}"] if empty else []
+    return [*notes, f"not used: {_list(others)}"] if others else notes
+
+
+def _list(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:12]) or "none"
+    return f"{shown} and {len(names) - 12} more" if len(names) > 12 else shown

@@ -1,0 +1,172 @@
+"""What lies beside the images of a plain recording: calibration, motion samples, ground truth, and the rest."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.common import imu_samples, naming
+from vio.datasets.images import SUFFIXES
+from vio.datasets.kitti import read_extrinsics
+from vio.datasets.overlap import check_overlap, reference_of_body
+from vio.datasets.rigs import find_calibration
+from vio.datasets.tables import read_imu_table, read_velocity_table
+from vio.errors import CalibrationError, DataError
+from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource, Trajectory
+from vio.rig import Rectifier, Rig
+from vio.trajectory_io import read_trajectory
+
+IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
+_REFERENCES = (
+    "reference.tum",
+    "reference.txt",
+    "groundtruth.tum",
+    "groundtruth_tum.txt",
+    "groundtruth.txt",
+    "gt_imu.csv",
+    "mocap0/data.csv",
+    "state_groundtruth_estimate0/data.csv",
+    "poses.txt",
+)
+_CALIBRATION_FOLDERS = ("", "dso", "calibration", "calib")
+_SILENT = ("readme*", "license*", "*.md", "simulation.json", "rectification.json", "conversion.json")  # no data
+_NAMED = 12  # unused files listed by name
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Where the parts of a recording lie."""
+
+    root: Path  # the folder that was given
+    base: Path  # holds the image folders: the root, or its mav0
+    left: Path  # folder of the images, or video
+    right: Path
+
+
+def calibration_beside(layout: Layout) -> Path | None:
+    """Return the calibration file of a recording; None: there is none."""
+    above = [layout.root.parent] if layout.root.name == "mav0" else []
+    for base in dict.fromkeys((layout.root, layout.base, *above)):
+        for inside in _CALIBRATION_FOLDERS:
+            if (base / inside).is_dir() and (found := find_calibration(base / inside)) is not None:
+                return found
+    return None
+
+
+def find_calibration_of(layout: Layout) -> Path:
+    """Return the calibration file of a recording.
+
+    Raises:
+        CalibrationError: there is none; the message names the known forms.
+    """
+    if (found := calibration_beside(layout)) is not None:
+        return found
+    raise CalibrationError(
+        f"{layout.root}: no calibration; add one as calibration.yaml (Kalibr's camchain, OpenCV's M1 D1 M2 D2 R T), "
+        "calib.txt (KITTI's) or another that vio.load_rig reads, or name it with --calibration FILE"
+    )
+
+
+def with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:
+    """Add `T_cam0_imu.txt` where the calibration itself has none."""
+    path = layout.root / "T_cam0_imu.txt"
+    if rig.T_cam0_imu is not None or not path.is_file():
+        return rig, [path] if file.name == "calib.txt" else []
+    return replace(rig, T_cam0_imu=read_extrinsics(path)), [path]
+
+
+def read_motion(
+    layout: Layout, rig: Rig, times_ns: IntArray, timed: bool
+) -> tuple[tuple[MotionSample, ...], list[Path], list[str]]:
+    """Read the IMU and the velocities, on the clock of the images; return the samples, their files and notes."""
+    imu = next((f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()), None)
+    velocity = layout.root / "velocity.csv"
+    files = [f for f in (imu, velocity) if f is not None and f.is_file()]
+    if not files:
+        return (), [], []
+    if not timed:
+        raise DataError(f"{files[0]}: needs the times of the images on the same clock; add times.txt, or remove it")
+    if rig.T_cam0_imu is None:
+        raise CalibrationError(
+            f"{files[0]}: needs the pose of its sensor; add T_cam0_imu.txt (IMU to left camera), or use a calibration "
+            "with T_cam_imu (Kalibr's camchain-imucam), or remove the file to use the images alone"
+        )
+    samples: list[MotionSample] = []
+    notes: list[str] = []
+    if imu is not None:
+        record, found = read_imu_table(imu)
+        shift_ns = round(rig.time_offset_s * NS_PER_S)
+        record = replace(record, times_ns=record.times_ns - shift_ns)
+        notes += found
+        if shift_ns:
+            notes.append(f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states")
+        check_overlap(times_ns, record.times_ns, imu)
+        samples += imu_samples(record)
+    if velocity.is_file():
+        speeds = read_velocity_table(velocity)
+        check_overlap(times_ns, np.array([s.time_ns for s in speeds], dtype=np.int64), velocity)
+        samples += speeds
+    return tuple(sorted(samples, key=lambda s: s.time_ns)), files, notes
+
+
+def sources_of(files: Sequence[Path]) -> frozenset[MotionSource]:
+    """Return the kinds of motion samples that files hold."""
+    return frozenset("velocity" if file.name == "velocity.csv" else "imu" for file in files)
+
+
+def read_reference(
+    layout: Layout, rig: Rig, rectifier: Rectifier, times_ns: IntArray
+) -> tuple[Trajectory | None, Path | None]:
+    """Read the ground truth as that of the body: the IMU, or the rectified left camera where there is none."""
+    bases = (layout.root, layout.base, layout.root / "dso")
+    file = next((f for n in _REFERENCES for base in bases if (f := base / n).is_file()), None)
+    if file is None:
+        return None, None
+    truth = read_trajectory(file)
+    if truth.times_ns is None:
+        if len(truth) > len(times_ns):
+            raise DataError(f"{file} holds {len(truth)} poses for {len(times_ns)} pairs; give one line for each pair")
+        truth = replace(truth, times_ns=times_ns[: len(truth)], frame_indices=np.arange(len(truth)))
+    with naming(file):
+        return reference_of_body(truth, rig, rectifier), file
+
+
+# --- what is not used -----------------------------------------------------------------------------------------------
+
+
+def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
+    """Return one note that names what lies in the folder and was not read."""
+    kept = {layout.left.absolute(), layout.right.absolute(), *(file.absolute() for file in used)}
+    kept |= {parent for path in kept for parent in path.parents}
+    for path in used:  # the other files of a calibration that lies in several
+        if path.suffix.lower() in (".yaml", ".yml", ".txt", ".xml"):
+            kept |= {other.absolute() for other in path.parent.iterdir() if _belongs(other, path)}
+    images = [side for side in (layout.left, layout.right) if side.is_dir()]
+    folders = dict.fromkeys((layout.root, layout.base, *images, *(side.parent for side in images)))
+    found = []
+    for folder in folders:
+        if folder != layout.root and layout.root not in folder.parents:
+            continue
+        for child in sorted(folder.iterdir()):
+            image = folder in images and child.suffix.lower() in SUFFIXES
+            silent = child.name.startswith(".") or any(fnmatch.fnmatch(child.name.lower(), s) for s in _SILENT)
+            if not image and not silent and child.absolute() not in kept:
+                found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
+    if not found:
+        return []
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    return [f"not used: {', '.join(found[:_NAMED])}{more}"]
+
+
+def _belongs(other: Path, calibration: Path) -> bool:
+    """Return whether a file is read together with a calibration file."""
+    partners = {"left": "right", "intrinsic": "extrinsic", "camchain": "imu", "calibration": "imu"}
+    named = any(a in calibration.name and b in other.name for a, b in partners.items())
+    return (named and other.suffix in (".yaml", ".yml")) or (
+        calibration.name.startswith("calib_cam_to_cam")
+        and (other.name in ("calib_velo_to_cam.txt", "calib_imu_to_velo.txt"))
+    )

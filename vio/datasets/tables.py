@@ -1,0 +1,228 @@
+"""Tables of stamped samples as people write them: any separator, a header or none, stamps in s, ms, us or ns."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray
+from vio.records import ImuRecord, IntArray, VelocitySample
+from vio.text_files import INT64_MAX, check_increasing, text_lines
+
+_UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
+_IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
+_VELOCITY_FORM = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
+_GRAVITY = 9.81
+_LEAST_IMU_HZ = 50.0  # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """The fields of a file as text."""
+
+    path: Path
+    header: tuple[str, ...]  # lower case; empty: none
+    rows: tuple[tuple[str, ...], ...]
+    lines: tuple[int, ...]  # line numbers from 1, one per row
+
+    def where(self, row: int) -> str:
+        """Name the place of a row for a message."""
+        return f"{self.path}, line {self.lines[row]}"
+
+
+def read_table(path: Path, columns: int, form: str) -> Table:
+    """Read a table separated by commas, semicolons or white space; its header is the last comment or text line above.
+
+    Args:
+        path: the file.
+        columns: expected number of columns.
+        form: their names, for messages.
+
+    Raises:
+        DataError: the file cannot be read or is empty, or a line has another number of columns.
+    """
+    header: tuple[str, ...] = ()
+    rows: list[tuple[str, ...]] = []
+    lines: list[int] = []
+    for number, line in text_lines(path):
+        text = line.strip()
+        fields = tuple(_split(text.lstrip("#")))
+        if not text or text.startswith("#") or (not rows and not _NUMBER.fullmatch(fields[0])):
+            if not rows and len(fields) == columns:
+                header = tuple(field.lower() for field in fields)
+            continue
+        if len(fields) != columns:
+            raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})")
+        rows.append(fields)
+        lines.append(number)
+    if not rows:
+        raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove it")
+    return Table(path, header, tuple(rows), tuple(lines))
+
+
+def _split(text: str) -> list[str]:
+    for separator in (",", ";"):
+        if separator in text:
+            return [field.strip() for field in text.split(separator)]
+    return text.split()
+
+
+def stamps_ns(table: Table) -> IntArray:
+    """Return the first column as nanoseconds (N,), strictly increasing; the unit as stated, else by its size.
+
+    Raises:
+        DataError: a stamp is no number, or not later than the one before.
+    """
+    stated = re.search(r"(?:\[|_|\()\s*(ns|us|ms|sec|s)\s*(?:\]|\)|$)", table.header[0]) if table.header else None
+    texts = [row[0] for row in table.rows]
+    return parse_stamps(texts, table.where, None if stated is None else stated[1])
+
+
+def parse_stamps(texts: Sequence[str], where: Callable[[int], str], unit: str | None = None) -> IntArray:
+    """Parse stamps as exact decimals.
+
+    Args:
+        texts: one stamp each.
+        where: returns the place of an entry, for messages.
+        unit: "s", "ms", "us" or "ns"; None: by the size of the first (seconds since 1970 or since the start, or
+            milliseconds, microseconds or nanoseconds since 1970).
+
+    Raises:
+        DataError: as `stamps_ns`.
+    """
+    values: list[Decimal] = []
+    for k, text in enumerate(texts):
+        try:
+            value = Decimal(text)
+        except InvalidOperation:
+            value = Decimal("NaN")
+        if not value.is_finite():
+            raise DataError(f"{where(k)}: {text!r} is no time; remove or correct that entry")
+        values.append(value)
+    power = _UNITS[unit] if unit is not None else _power(values[0])
+    limit = Decimal(INT64_MAX)
+    for k, value in enumerate(values):
+        if abs(value.scaleb(power)) > limit:
+            raise DataError(f"{where(k)}: {texts[k]!r} is out of range for a time; state its unit in the header ([ns])")
+    return check_increasing([int(value.scaleb(power).to_integral_value()) for value in values], where)
+
+
+def _power(first: Decimal) -> int:
+    """Return the power of ten to nanoseconds by the size of a stamp: 2001 and later, or seconds from any zero."""
+    for limit, power in ((Decimal("1e17"), 0), (Decimal("1e14"), 3), (Decimal("1e11"), 6)):
+        if abs(first) >= limit:
+            return power
+    return 9
+
+
+def read_imu_table(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
+    """Read raw inertial readings; a header may name the order of its columns, and the units deg/s and g.
+
+    Returns:
+        The record, and notes about what was converted or looks wrong.
+
+    Raises:
+        DataError: a line lacks seven finite numbers, the stamps do not increase, or the order of columns is unclear.
+    """
+    table = read_table(path, 7, _IMU_FORM)
+    times_ns = stamps_ns(table)
+    values = _finite(table)
+    order = _imu_order(table)
+    if order is None:
+        _check_order(values, path)
+        gyro, accel = values[:, :3], values[:, 3:]
+        return ImuRecord(times_ns, gyro, accel), imu_notes(times_ns, str(path))
+    gyro, accel = values[:, order[:3]], values[:, order[3:]]
+    notes: list[str] = []
+    if any("deg" in table.header[1 + k] for k in order[:3]):
+        gyro = np.radians(gyro)
+        notes.append(f"{path}: the header states degrees; the gyro is converted to rad/s")
+    if any(re.search(r"[\[(_]g[\])]?$", table.header[1 + k]) for k in order[3:]):
+        accel = accel * 9.80665
+        notes.append(f"{path}: the header states g; the accelerometer is converted to m/s^2")
+    return ImuRecord(times_ns, gyro, accel), (*notes, *imu_notes(times_ns, str(path)))
+
+
+def _imu_order(table: Table) -> list[int] | None:
+    """Return the columns of gyro x y z and accel x y z by the header's names; None: no header.
+
+    Raises:
+        DataError: the header names other things.
+    """
+    if not table.header:
+        return None
+    found: dict[tuple[str, str], int] = {}
+    for k, cell in enumerate(table.header[1:]):
+        name = re.sub(r"[\[(].*", "", cell)
+        name = re.sub(r"(_?(radps|rad_s|mps2|m_s2|dps|degps|deg_s|ms2|rads|g))$", "", name.strip())
+        letters = re.sub(r"[^a-z]", "", name)
+        kind = "w" if re.match(r"w|g|om|ang|rot|rs?sw", letters) else "a" if letters.startswith(("a", "lin")) else ""
+        axis = next((c for c in reversed(letters) if c in "xyz"), "")
+        found[(kind, axis)] = k
+    wanted = [(kind, axis) for kind in "wa" for axis in "xyz"]
+    if set(found) != set(wanted):
+        raise DataError(
+            f"{table.path}: the header {','.join(table.header)[:80]!r} does not name gyro and accel; write "
+            "'timestamp [ns],wx,wy,wz,ax,ay,az', or no header for that order"
+        )
+    return [found[key] for key in wanted]
+
+
+def _check_order(values: FloatArray, path: Path) -> None:
+    """Raise DataError where, without a header, gravity is in the first three columns."""
+    first, second = (float(np.median(np.linalg.norm(values[:, k : k + 3], axis=1))) for k in (0, 3))
+    if abs(first - _GRAVITY) < 1.5 < abs(second - _GRAVITY):
+        raise DataError(
+            f"{path}: gravity is in the columns 2 to 4 (median {first:.2f}), where {_IMU_FORM} has the gyro; add a "
+            "header such as 'timestamp [ns],ax,ay,az,wx,wy,wz'"
+        )
+
+
+def imu_notes(times_ns: IntArray, where: str) -> tuple[str, ...]:
+    """Return a note where an IMU is too slow to be integrated between images."""
+    if len(times_ns) < 2:
+        return ()
+    rate_hz = 1e9 / float(np.median(np.diff(times_ns)))
+    if rate_hz >= _LEAST_IMU_HZ:
+        return ()
+    return (
+        f"{where}: the IMU has {rate_hz:.3g} Hz, too few to integrate the motion between images; record at least "
+        f"{_LEAST_IMU_HZ:g} Hz, or use --motion none",
+    )
+
+
+def read_velocity_table(path: Path) -> tuple[VelocitySample, ...]:
+    """Read body velocity and angular rate in the IMU frame.
+
+    Raises:
+        DataError: the header or a line is another one, or the clock does not increase.
+    """
+    table = read_table(path, 7, _VELOCITY_FORM)
+    if ",".join(table.header) != _VELOCITY_FORM:
+        raise DataError(f"{path}, line 1: expected the header {_VELOCITY_FORM}")
+    times_ns, values = stamps_ns(table), _finite(table)
+    return tuple(VelocitySample(t, row[:3], row[3:]) for t, row in zip(times_ns.tolist(), values, strict=True))
+
+
+def _finite(table: Table) -> FloatArray:
+    """Return all columns but the first as finite numbers (N, K)."""
+    values = np.array([[_number(x) for x in row[1:]] for row in table.rows])
+    bad = ~np.isfinite(values).all(axis=1)
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise DataError(
+            f"{table.where(k)}: a reading is not a finite number ({','.join(table.rows[k])[:80]}; {int(bad.sum())} "
+            "lines in all); remove such lines"
+        )
+    return values
+
+
+def _number(text: str) -> float:
+    return float(text) if _NUMBER.fullmatch(text) else float("nan")

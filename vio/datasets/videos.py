@@ -1,0 +1,199 @@
+"""Two video files, left and right, with a calibration and, as in a plain folder, what else lies beside them.
+
+Frame k of the one file belongs to frame k of the other. Frames are decoded in order, from the first on, because seeking
+in compressed video is not exact. Times come from `times.txt`, else from the frame rate that the files state.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vio.datasets.common import frame_range, merge_events, naming
+from vio.datasets.companions import (
+    Layout,
+    find_calibration_of,
+    read_motion,
+    read_reference,
+    sources_of,
+    unused_note,
+    with_extrinsics,
+)
+from vio.datasets.image_pairs import ImageSize
+from vio.datasets.images import prefetch
+from vio.datasets.plain import times_of
+from vio.datasets.rigs import load_rig
+from vio.datasets.settings import DatasetSettings
+from vio.errors import DataError
+from vio.records import (
+    NS_PER_S,
+    Event,
+    Image,
+    ImuDensities,
+    IntArray,
+    MotionSample,
+    Observations,
+    Recording,
+    StereoFrame,
+)
+from vio.rig import Rectifier
+
+SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
+_NAMES = (("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("video_0", "video_1"))
+_RATES = (1.0, 1000.0)  # frames per second that a file can plausibly state
+
+
+@dataclass(frozen=True, slots=True)
+class _Facts:
+    """What a video file states of itself."""
+
+    count: int  # frames; containers may state a few too many
+    rate_hz: float
+    width: int  # pixels
+    height: int
+
+
+def video_files(path: Path) -> tuple[Path, Path] | None:
+    """Return the left and right video file of a folder; None: it has none."""
+    found = {child.stem: child for child in sorted(path.iterdir()) if child.suffix.lower() in SUFFIXES}
+    return next(((found[a], found[b]) for a, b in _NAMES if a in found and b in found), None)
+
+
+def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
+    """Read a folder with two video files.
+
+    Raises:
+        DataError: a file is no video, the two differ in rate or size, or times and samples do not fit.
+        CalibrationError: there is no calibration, or it is invalid.
+    """
+    files = video_files(path) if path.is_dir() else None
+    if files is None:
+        raise DataError(f"{path}: holds no pair of videos (left.mp4 and right.mp4, or others); give a folder with both")
+    left, right = (_facts(file) for file in files)
+    if abs(left.rate_hz - right.rate_hz) > 1e-3 * left.rate_hz:
+        raise DataError(
+            f"{files[0]} has {left.rate_hz:g} and {files[1].name} {right.rate_hz:g} frames per second; record both "
+            "with one trigger, or write image folders"
+        )
+    layout = Layout(path, path, *files)
+    calibration = settings.calibration or find_calibration_of(layout)
+    rig, used = with_extrinsics(load_rig(calibration, image_size=(left.width, left.height)), layout, calibration)
+    times_ns, times_file, notes = _times(path, files, min(left.count, right.count), left.rate_hz)
+    if left.count != right.count:
+        notes.append(f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the shorter counts")
+    motion, motion_files, motion_notes = read_motion(layout, rig, times_ns, times_file is not None)
+    with naming(calibration):
+        rectifier = rig.rectifier(settings.interpolation)
+    reference, reference_file = read_reference(layout, rig, rectifier, times_ns)
+    sources = [f for f in (*files, calibration, times_file, *used, *motion_files, reference_file) if f is not None]
+    recording = Recording(
+        kind="video",
+        path=path,
+        camera=rectifier.camera,
+        T_cam0_imu=None if rig.T_cam0_imu is None else rectifier.T_rect0_imu,
+        frame_times_ns=times_ns,
+        has_images=True,
+        motion=sources_of(motion_files),
+        reference=reference,
+        notes=(*rig.notes, *notes, *motion_notes, *unused_note(layout, sources)),
+    )
+    sizes = tuple(ImageSize(camera.width, camera.height, calibration) for camera in (rig.cam0, rig.cam1))
+    return VideoDataset(recording, files, motion, (sizes[0], sizes[1]), settings, rectifier, rig.imu_noise)
+
+
+def _facts(file: Path) -> _Facts:
+    import cv2
+
+    capture = cv2.VideoCapture(str(file))
+    try:
+        count, rate_hz = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
+        found, image = capture.read()
+    finally:
+        capture.release()
+    if not found or count < 1:
+        raise DataError(f"{file}: no frame can be decoded; the file is damaged, or OpenCV has no decoder for it")
+    if not _RATES[0] <= rate_hz <= _RATES[1]:
+        rate_hz = 0.0
+    return _Facts(count, rate_hz, image.shape[1], image.shape[0])
+
+
+def _times(path: Path, files: tuple[Path, Path], count: int, rate_hz: float) -> tuple[IntArray, Path | None, list[str]]:
+    """Return the times (F,) of the frames, the file that states them, and notes."""
+    if (file := path / "times.txt").is_file():
+        names = [(Path(f"{k}"), Path(f"{k}")) for k in range(count)]
+        return times_of(file, tuple(names)), file, []
+    if rate_hz == 0.0:
+        raise DataError(f"{files[0]}: states no frame rate; write one time a frame into times.txt beside it")
+    note = f"no times.txt: frames are {1e3 / rate_hz:.4g} ms apart, as {files[0].name} states; real cameras jitter"
+    return np.rint(np.arange(count) * (NS_PER_S / rate_hz)).astype(np.int64), None, [note]
+
+
+@dataclass(frozen=True, slots=True)
+class VideoDataset:
+    """Implements `vio.protocols.Dataset` over two video files."""
+
+    recording: Recording
+    files: tuple[Path, Path]
+    motion: tuple[MotionSample, ...] = field(repr=False)
+    sizes: tuple[ImageSize, ImageSize]
+    settings: DatasetSettings
+    rectifier: Rectifier
+    imu_noise: ImuDensities | None = None
+
+    def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+        """Yield events of the frames `start <= index < stop` in time order.
+
+        Raises:
+            DataError: the range holds no frame, or a frame cannot be decoded.
+        """
+        chosen = frame_range(self.recording, start, stop)
+        times = self.recording.frame_times_ns
+        if images:
+            frames = self._frames(chosen)
+        else:
+            frames = (StereoFrame(k, int(times[k]), None, None) for k in chosen)
+        return merge_events(self.recording, chosen, self.motion, frames)
+
+    def observations(self, index: int) -> Observations | None:
+        """Return None: the recording holds images only."""
+        return None
+
+    def _frames(self, chosen: range) -> Generator[StereoFrame]:
+        """Decode in order; the prefetch thread is the only one that uses the decoders."""
+        import cv2
+
+        captures = [cv2.VideoCapture(str(file)) for file in self.files]
+
+        def load(index: int) -> StereoFrame:
+            if index == chosen.start:
+                for capture in captures:
+                    for _ in range(index):
+                        capture.grab()
+            images = [self._gray(capture, side, index) for side, capture in enumerate(captures)]
+            left, right = self.rectifier(*images)
+            return StereoFrame(index, int(self.recording.frame_times_ns[index]), left, right)
+
+        try:
+            with contextlib.closing(prefetch(load, chosen, self.settings.prefetch_frames)) as loaded:
+                yield from loaded
+        finally:
+            for capture in captures:
+                capture.release()
+
+    def _gray(self, capture: Any, side: int, index: int) -> Image:
+        import cv2
+
+        found, pixels = capture.read()
+        if not found:
+            raise DataError(
+                f"{self.files[side]}: frame {index} of {len(self.recording.frame_times_ns)} cannot be decoded; "
+                f"the file is truncated, or states too many frames: use --stop {index}"
+            )
+        gray: Image = np.asarray(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
+        self.sizes[side].check(gray, self.files[side])
+        return gray

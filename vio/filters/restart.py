@@ -1,0 +1,59 @@
+"""A new start of the sliding-window filter from its last good state, after it diverged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
+from vio.filters.online_calibration import Calibration, body_twists
+from vio.filters.settings import MsckfSettings
+from vio.geometry.lie import FloatArray, se3_exp, so3_hat
+
+# A divergence begins before it shows, so the last good attitude is taken to be off by a few degrees already.
+_ROTATION_SIGMA_RAD = np.radians(2.0)
+_LEAST_SPEED_MPS = 1.0  # the last velocity may have been wrong by itself, and by this
+_EXTRAPOLATED_S = 0.5  # for which the last velocity and rate are believed; beyond it the pose is held
+_RATE_SIGMA_RADPS = 1.0  # of a body that nothing measures: a turn within a second is not seen
+
+
+@dataclass(frozen=True, slots=True)
+class GoodState:
+    """What is kept of the last frame whose update was plausible."""
+
+    frame_index: int
+    time_ns: int
+    nav: NavState
+    covariance: FloatArray  # (15 + C, 15 + C) of navigation state and calibration, with all that was seen
+    calibration: Calibration
+
+
+def restarted(
+    good: GoodState, time_ns: int, motion: ImuMotion | TwistMotion, settings: MsckfSettings
+) -> tuple[NavState, FloatArray]:
+    """Return the navigation state at a later time and its covariance (15, 15), both from the last good state.
+
+    The pose is carried on with the last velocity and rate for half a second at most. Its covariance grows by what a
+    body of that speed may have done in between; velocity and biases begin anew. Errors are right-invariant: an error
+    `n_r` of the body's attitude alone moves `rho` by `p^ n_r`.
+
+    Args:
+        good: the state to go on from.
+        time_ns: of the frame to go on with.
+        motion: the filter's motion model.
+        settings: initial standard deviations.
+    """
+    elapsed_s = (time_ns - good.time_ns) * 1e-9
+    nav, T = good.nav, good.nav.T_world_imu
+    velocity = motion.velocity_world(nav)
+    twist = body_twists(T[None], velocity[None], nav.rate[None])[0]
+    moved = replace(nav, T_world_imu=T @ se3_exp(min(elapsed_s, _EXTRAPOLATED_S) * twist))
+    speed = float(np.linalg.norm(velocity)) + _LEAST_SPEED_MPS
+    position, rotation = speed * elapsed_s, float(np.hypot(_ROTATION_SIGMA_RAD, _RATE_SIGMA_RADPS * elapsed_s))
+    J = np.eye(6)
+    J[:3, 3:] = so3_hat(moved.T_world_imu[:3, 3])
+    P = np.zeros((DIM, DIM))
+    P[:6, :6] = good.covariance[:6, :6] + J @ np.diag(np.repeat([position, rotation], 3) ** 2) @ J.T
+    P[6:, 6:] = motion.start_covariance(settings)[6:, 6:]
+    return moved, P

@@ -1,0 +1,333 @@
+"""The compiled loops over tracks and their views behind `multiview` and `stereo_calibration`.
+
+Shapes: F tracks, N clones, S coefficients of the stereo field. `lens` is `(fu, fv, cu, cv, baseline)`. Each loop writes
+into the arrays that come last. `tests/numpy_twins.py` holds the same in NumPy.
+"""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+import numpy as np
+
+from vio.compiled import compiled, solve_positive
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.records import BoolArray, IntArray
+
+Lens: TypeAlias = tuple[float, float, float, float, float]
+
+
+def lens_of(camera: StereoCamera) -> Lens:
+    """Return `(fu, fv, cu, cv, baseline)`."""
+    return float(camera.fu), float(camera.fv), float(camera.cu), float(camera.cv), float(camera.baseline_m)
+
+
+@compiled
+def compare_views(
+    lens: Lens,
+    least_depth: float,
+    T: FloatArray,
+    p: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
+    r: FloatArray,
+    J: FloatArray,
+    ahead: BoolArray,
+) -> None:
+    """Write residuals (F, N, 4), Jacobians (F, N, 4, 3) by the points (F, 3), and which points are ahead (F,): (M1)."""
+    fu, fv, cu, cv, baseline = lens
+    for f in range(len(p)):
+        ahead[f] = True
+        for n in range(len(T)):
+            x = T[n, 0, 0] * p[f, 0] + T[n, 0, 1] * p[f, 1] + T[n, 0, 2] * p[f, 2] + T[n, 0, 3]
+            y = T[n, 1, 0] * p[f, 0] + T[n, 1, 1] * p[f, 1] + T[n, 1, 2] * p[f, 2] + T[n, 1, 3]
+            depth = T[n, 2, 0] * p[f, 0] + T[n, 2, 1] * p[f, 1] + T[n, 2, 2] * p[f, 2] + T[n, 2, 3]
+            seen = weight[f, n, 0] > 0.0
+            usable = depth > least_depth
+            if seen and not usable:
+                ahead[f] = False
+            if not (seen and usable):
+                for a in range(4):
+                    r[f, n, a] = 0.0
+                    for j in range(3):
+                        J[f, n, a, j] = 0.0
+                continue
+            u, v, d = fu * x / depth, fv * y / depth, fu * baseline / depth
+            for a in range(4):
+                w = weight[f, n, a]
+                axis, focal, pixel, centre = 0, fu, u, cu
+                if a == 1 or a == 3:
+                    axis, focal, pixel, centre = 1, fv, v, cv
+                elif a == 2:
+                    pixel = u - d
+                r[f, n, a] = (z[f, n, a] - pixel - centre) * w if w > 0.0 else 0.0
+                for j in range(3):
+                    J[f, n, a, j] = w * (focal * T[n, axis, j] - pixel * T[n, 2, j]) / depth
+
+
+@compiled
+def mark_measured(J: FloatArray, out: BoolArray) -> None:
+    """Write which pixel coordinates (F, N, 4) have a Jacobian (F, N, 4, 3) other than zero."""
+    for f in range(J.shape[0]):
+        for n in range(J.shape[1]):
+            for a in range(4):
+                out[f, n, a] = J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
+
+
+@compiled
+def anchor_points(
+    lens: Lens,
+    least_depth: float,
+    T: FloatArray,
+    p: FloatArray,
+    seen: BoolArray,
+    anchor: IntArray,
+    centre: FloatArray,
+    disparity: FloatArray,
+    p_D_q: FloatArray,
+    q_D_p: FloatArray,
+) -> None:
+    """Write the coordinates (M5) of points (F, 3): the columns of `InverseDepth`."""
+    fu, baseline = lens[0], lens[4]
+    for f in range(len(p)):
+        k = 0
+        for n in range(len(T) - 1, -1, -1):
+            if seen[f, n]:
+                k = n
+        anchor[f] = k
+        for i in range(3):
+            centre[f, i] = -(T[k, 0, i] * T[k, 0, 3] + T[k, 1, i] * T[k, 1, 3] + T[k, 2, i] * T[k, 2, 3])
+        x = T[k, 0, 0] * p[f, 0] + T[k, 0, 1] * p[f, 1] + T[k, 0, 2] * p[f, 2] + T[k, 0, 3]
+        y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
+        z = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
+        z = max(z, least_depth)
+        disparity[f] = fu * baseline / z
+        for i in range(3):
+            p_D_q[f, i, 0] = T[k, 0, i] * z / fu
+            p_D_q[f, i, 1] = T[k, 1, i] * z / fu
+            p_D_q[f, i, 2] = (centre[f, i] - p[f, i]) / disparity[f]
+            q_D_p[f, 0, i] = (T[k, 0, i] - x / z * T[k, 2, i]) * fu / z
+            q_D_p[f, 1, i] = (T[k, 1, i] - y / z * T[k, 2, i]) * fu / z
+            q_D_p[f, 2, i] = -T[k, 2, i] * disparity[f] / z
+
+
+@compiled
+def step_points(
+    r: FloatArray, J: FloatArray, p_D_q: FloatArray, scale2: float, tiny: float, prior: float, dq: FloatArray
+) -> None:
+    """Write a Gauss-Newton step (F, 3) of each point in the coordinates (M5), with Cauchy weights of a scale."""
+    C, row = np.empty((3, 3)), np.empty(3)
+    for f in range(len(r)):
+        for i in range(3):
+            dq[f, i] = 0.0
+            for j in range(3):
+                C[i, j] = 0.0
+        C[0, 0], C[1, 1], C[2, 2] = tiny, tiny, prior
+        for n in range(r.shape[1]):
+            squares = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
+            w = 1.0 / (1.0 + squares / (4.0 * scale2))
+            for a in range(4):
+                for i in range(3):
+                    row[i] = (
+                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
+                    )
+                for i in range(3):
+                    dq[f, i] += w * row[i] * r[f, n, a]
+                    for j in range(i + 1):
+                        C[i, j] += w * row[i] * row[j]
+        solve_positive(C, dq[f])
+
+
+@compiled
+def collect_tracks(
+    r: FloatArray,
+    J: FloatArray,
+    weight: FloatArray,
+    p_D_q: FloatArray,
+    B: FloatArray,
+    anchor: IntArray,
+    prior: float,
+    G: FloatArray,
+    C: FloatArray,
+    gradient: FloatArray,
+    point_gradient: FloatArray,
+) -> None:
+    """Write the normal equations of tracks, (M2), (M3), (M5), (M6): the columns of `TrackInformation`."""
+    C_i, g_i, row = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for f in range(len(r)):
+        for i in range(3):
+            point_gradient[f, i] = 0.0
+            for j in range(3):
+                C[f, i, j] = 0.0
+        for n in range(r.shape[1]):
+            for i in range(3):
+                g_i[i] = 0.0
+                for j in range(3):
+                    C_i[i, j] = 0.0
+            for a in range(4):
+                for i in range(3):
+                    row[i] = (
+                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
+                    )
+                for i in range(3):
+                    g_i[i] += weight[f, n] * row[i] * r[f, n, a]
+                    for j in range(3):
+                        C_i[i, j] += weight[f, n] * row[i] * row[j]
+            if n == anchor[f]:
+                C_i[2, 2] += prior
+            for i in range(3):
+                point_gradient[f, i] += g_i[i]
+                for j in range(3):
+                    C[f, i, j] += C_i[i, j]
+            for k in range(6):
+                b0, b1, b2 = B[f, 0, k], B[f, 1, k], B[f, 2, k]
+                gradient[f, 6 * n + k] = b0 * g_i[0] + b1 * g_i[1] + b2 * g_i[2]
+                for j in range(3):
+                    G[f, 6 * n + k, j] = b0 * C_i[0, j] + b1 * C_i[1, j] + b2 * C_i[2, j]
+
+
+@compiled
+def eliminate_tracks(
+    chosen: IntArray,
+    G: FloatArray,
+    C: FloatArray,
+    B: FloatArray,
+    gradient: FloatArray,
+    point_gradient: FloatArray,
+    V: FloatArray,
+    A: FloatArray,
+    b: FloatArray,
+) -> None:
+    """Write `V` (3F, 6N), whose `V' V` is what the points of the chosen tracks take away, equation (M4).
+
+    The blocks of the clones on the diagonal are added to A (6N, 6N), and the vector to b (6N,).
+    """
+    L, y = np.empty((3, 3)), np.empty(3)
+    size = G.shape[1]
+    for c, f in enumerate(chosen):
+        for i in range(3):
+            for j in range(i + 1):
+                total = C[f, i, j]
+                for k in range(j):
+                    total -= L[i, k] * L[j, k]
+                L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+        y[0] = point_gradient[f, 0] / L[0, 0]
+        y[1] = (point_gradient[f, 1] - L[1, 0] * y[0]) / L[1, 1]
+        y[2] = (point_gradient[f, 2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
+        for k in range(size):
+            v0 = G[f, k, 0] / L[0, 0]
+            v1 = (G[f, k, 1] - L[1, 0] * v0) / L[1, 1]
+            v2 = (G[f, k, 2] - L[2, 0] * v0 - L[2, 1] * v1) / L[2, 2]
+            V[3 * c, k], V[3 * c + 1, k], V[3 * c + 2, k] = v0, v1, v2
+            b[k] += gradient[f, k] - v0 * y[0] - v1 * y[1] - v2 * y[2]
+            first = k - k % 6
+            for j in range(6):
+                A[k, first + j] += G[f, k, 0] * B[f, 0, j] + G[f, k, 1] * B[f, 1, j] + G[f, k, 2] * B[f, 2, j]
+
+
+@compiled
+def stereo_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
+    """Write the derivatives (M, 4, 6) of pixels (M, 4) by the coefficients of (R3)."""
+    fu, fv, cu, cv, _ = lens
+    for m in range(len(z)):
+        x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
+        r2, rr2 = x * x + y * y, xr * xr + y * y
+        for a in range(4):
+            for s in range(6):
+                out[m, a, s] = 0.0
+        out[m, 0, 3], out[m, 0, 4], out[m, 0, 5] = fu * x * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
+        out[m, 1, 3], out[m, 1, 4], out[m, 1, 5] = fv * y * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y
+        out[m, 2, 0], out[m, 2, 1], out[m, 2, 2] = fu, fu * xr, fu * rr2
+        out[m, 2, 3], out[m, 2, 4], out[m, 2, 5] = fu * xr * rr2, fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
+
+
+@compiled
+def correct_pixels(
+    lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
+) -> None:
+    """Write pixels (M, 4) without the field (6,) of (R3) and without what follows from the rows (6,) of (R2)."""
+    fu, fv, cu, cv, _ = lens
+    a0, a1, a2, k, q1, q2 = coefficients
+    for m in range(len(z)):
+        x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
+        r2, rr2 = x * x + y * y, xr * xr + y * y
+        left = x * r2 * k + 2.0 * x * y * q1 + (r2 + 2.0 * x * x) * q2
+        row = y * r2 * k + (r2 + 2.0 * y * y) * q1 + 2.0 * x * y * q2
+        right = a0 + a1 * xr + a2 * rr2 + xr * rr2 * k + 2.0 * xr * y * q1 + (rr2 + 2.0 * xr * xr) * q2
+        right += -rows[1] * y + (rows[5] - rows[4]) * xr * y - rows[3] * y * y
+        out[m, 0] = z[m, 0] - fu * left if weight[m, 0] > 0.0 else z[m, 0]
+        out[m, 1] = z[m, 1] - fv * row if weight[m, 1] > 0.0 else z[m, 1]
+        out[m, 2] = z[m, 2] - fu * right if weight[m, 2] > 0.0 else z[m, 2]
+        out[m, 3] = z[m, 3]
+
+
+@compiled
+def collect_columns(
+    J: FloatArray, H: FloatArray, weight: FloatArray, p_D_q: FloatArray, by_point: FloatArray, WH: FloatArray
+) -> None:
+    """Write `J' W H` (F, N, 3, S) and `W H` (F, N, 4, S); H (F, N, 4, S) becomes zero where nothing was measured."""
+    row = np.empty(3)
+    terms = H.shape[3]
+    for f in range(len(J)):
+        for n in range(J.shape[1]):
+            for i in range(3):
+                for s in range(terms):
+                    by_point[f, n, i, s] = 0.0
+            for a in range(4):
+                measured = J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
+                for i in range(3):
+                    row[i] = (
+                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
+                    )
+                for s in range(terms):
+                    if not measured:
+                        H[f, n, a, s] = 0.0
+                    WH[f, n, a, s] = weight[f, n] * H[f, n, a, s]
+                    for i in range(3):
+                        by_point[f, n, i, s] += row[i] * WH[f, n, a, s]
+
+
+@compiled
+def eliminate_columns(
+    chosen: IntArray,
+    by_point: FloatArray,
+    H: FloatArray,
+    WH: FloatArray,
+    r: FloatArray,
+    G: FloatArray,
+    C: FloatArray,
+    B: FloatArray,
+    point_gradient: FloatArray,
+    A: FloatArray,
+    cross: FloatArray,
+    b: FloatArray,
+) -> None:
+    """Add to A (S, S), cross (S, 6N) and b (S,) what is left of the chosen tracks once their points are eliminated."""
+    clones, terms = by_point.shape[1], by_point.shape[3]
+    own, X, factor = np.empty((3, terms)), np.empty((terms, 3)), np.empty((3, 3))
+    for f in chosen:
+        for s in range(terms):
+            for i in range(3):
+                own[i, s] = 0.0
+                for n in range(clones):
+                    own[i, s] += by_point[f, n, i, s]
+                X[s, i] = own[i, s]
+                for j in range(3):
+                    factor[i, j] = C[f, i, j]
+            solve_positive(factor, X[s])
+            b[s] -= X[s, 0] * point_gradient[f, 0] + X[s, 1] * point_gradient[f, 1] + X[s, 2] * point_gradient[f, 2]
+        for s in range(terms):
+            for t in range(terms):
+                A[s, t] -= own[0, s] * X[t, 0] + own[1, s] * X[t, 1] + own[2, s] * X[t, 2]
+        for m in range(H.shape[1]):
+            for s in range(terms):
+                b[s] += WH[f, m, s] * r[f, m]
+                for t in range(terms):
+                    A[s, t] += WH[f, m, s] * H[f, m, t]
+        for n in range(clones):
+            for k in range(6):
+                row = 6 * n + k
+                for s in range(terms):
+                    for i in range(3):
+                        cross[s, row] += B[f, i, k] * by_point[f, n, i, s] - G[f, row, i] * X[s, i]

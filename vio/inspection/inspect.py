@@ -1,0 +1,161 @@
+"""The report on a recording, before anything is run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vio.inspection.finding import Inspection, Part
+from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
+from vio.inspection.pictures import images_part, rows_part
+from vio.inspection.times import frames_part, imu_clock_part
+from vio.protocols import Dataset, Frontend
+from vio.records import ImuRecord, ImuSample, Recording, StereoFrame
+from vio.watch.inertial import InertialCheck
+
+PAIRS = 12  # looked at, spread over the recording
+TRACKED = 60  # frames tracked to compare the IMU with the images' motion
+_VIDEO_FRAMES = 300  # of a video, which can only be decoded in order
+_SHORT_M, _LONG_M = 0.005, 5.0  # baselines outside are another unit
+
+
+def inspect_recording(
+    dataset: Dataset,
+    build_frontend: Callable[[Dataset], Frontend],
+    *,
+    pairs: int = PAIRS,
+    tracked: int = TRACKED,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Inspection:
+    """Examine a recording.
+
+    Args:
+        dataset: the recording.
+        build_frontend: makes the front end that tracks its features.
+        pairs: stereo pairs looked at.
+        tracked: frames tracked from the first on, to compare the IMU with the images; 0: none.
+        progress: called with (done, total).
+
+    Raises:
+        DataError: an image has a wrong size, or too many cannot be read.
+    """
+    recording = dataset.recording
+    parts = [frames_part(recording), camera_part(recording)]
+    if recording.has_images:
+        frames = _spread(dataset, pairs, progress)
+        parts += [images_part(frames), rows_part(frames)]
+    parts += _imu_parts(dataset)
+    if recording.has_images and tracked > 1:
+        parts += _tracking_parts(dataset, build_frontend, min(tracked, len(recording.frame_times_ns)), progress)
+    parts += [_reference_part(recording), _missing_part(recording)]
+    return Inspection(tuple(parts), recording.notes)
+
+
+def camera_part(recording: Recording) -> Part:
+    """Describe the rectified pair."""
+    c = recording.camera
+    facts = {"fu": c.fu, "fv": c.fv, "cu": c.cu, "cv": c.cv, "baseline_m": c.baseline_m}
+    facts |= {"width": c.width or 0, "height": c.height or 0}
+    wide = f", {2 * np.degrees(np.arctan(c.width / 2 / c.fu)):.0f} deg wide" if c.width is not None else ""
+    faults = []
+    if not _SHORT_M <= c.baseline_m <= _LONG_M:
+        faults.append(f"a baseline of {c.baseline_m:g} m is implausible; translations are metres: check the unit")
+    if c.width is not None and c.height is not None and not (0 < c.cu < c.width and 0 < c.cv < c.height):
+        faults.append(f"the principal point {c.cu:.0f}, {c.cv:.0f} lies outside the image; check its size")
+    one_px_m = c.fu * c.baseline_m  # the depth of one pixel of disparity
+    text = f"rectified: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, 1 px at {one_px_m:.0f} m"
+    return Part("camera", text, facts, faults)
+
+
+def _spread(dataset: Dataset, pairs: int, progress: Callable[[int, int], None]) -> list[StereoFrame]:
+    """Read some frames, spread over the recording."""
+    count = len(dataset.recording.frame_times_ns)
+    if dataset.recording.kind == "video":
+        count = min(count, _VIDEO_FRAMES)
+    chosen = np.unique(np.linspace(0, count - 1, pairs).astype(int)).tolist()
+    frames: list[StereoFrame] = []
+    for done, k in enumerate(chosen):
+        frames += [event for event in dataset.events(k, k + 1) if isinstance(event, StereoFrame)]
+        progress(done + 1, len(chosen))
+    return frames
+
+
+def _imu_parts(dataset: Dataset) -> list[Part]:
+    recording = dataset.recording
+    samples = [event for event in dataset.events(images=False) if isinstance(event, ImuSample)]
+    if not samples:
+        return []
+    record = ImuRecord(
+        np.array([s.time_ns for s in samples], dtype=np.int64),
+        np.array([s.gyro for s in samples]),
+        np.array([s.accel for s in samples]),
+    )
+    parts = [imu_clock_part(recording, record.times_ns)]
+    if len(samples) > 1:
+        noise = noise_part(record, getattr(dataset, "imu_noise", None))
+        parts += [rest_part(record, recording.T_cam0_imu), *([noise] if noise is not None else [])]
+    if recording.T_cam0_imu is not None:
+        parts.append(extrinsics_part(recording.T_cam0_imu))
+    return parts
+
+
+def _tracking_parts(
+    dataset: Dataset, build_frontend: Callable[[Dataset], Frontend], frames: int, progress: Callable[[int, int], None]
+) -> list[Part]:
+    """Track the first frames, and compare the IMU with the images' motion as a run does."""
+    recording = dataset.recording
+    frontend = build_frontend(dataset)
+    imu = "imu" in recording.motion and recording.T_cam0_imu is not None
+    check = InertialCheck(recording.camera, recording.T_cam0_imu) if recording.T_cam0_imu is not None else None
+    tracked: list[int] = []
+    matched: list[int] = []
+    findings: list[str] = []
+    for event in dataset.events(0, frames):
+        if isinstance(event, StereoFrame):
+            output = frontend.process(event)
+            tracked.append(output.tracked)
+            matched.append(output.matched)
+            progress(len(tracked), frames)
+            if imu and check is not None:
+                findings += [f.message for f in check.frame(output.observations)]
+        elif isinstance(event, ImuSample) and check is not None:
+            check.imu(event)
+    if imu and check is not None:
+        findings += [f.message for f in check.finish()]
+    kept = float(np.median(tracked[1:])) if len(tracked) > 1 else 0.0
+    facts = {"frames": len(tracked), "tracked_median": kept, "matched_median": float(np.median(matched or [0]))}
+    depth = np.median(matched or [0])
+    text = f"{kept:.0f} features from frame to frame, {depth:.0f} with depth (of {len(tracked)} frames)"
+    faults = []
+    if len(tracked) > 1 and kept < 8:
+        faults.append("hardly any feature is tracked; the frames may not be consecutive, in disorder, dark or blurred")
+    parts = [Part("tracking", text, facts, faults)]
+    if imu:
+        verdict = "agrees with the motion of the images, as far as they move" if not findings else "see below"
+        parts.append(Part("IMU against images", verdict, {"findings": findings}, findings))
+    return parts
+
+
+def _reference_part(recording: Recording) -> Part:
+    truth = recording.reference
+    if truth is None:
+        return Part("ground truth", "none", {"poses": 0})
+    text = f"{len(truth)} poses of the {truth.body}"
+    if truth.times_ns is None:
+        return Part("ground truth", text, {"poses": len(truth)})
+    times = recording.frame_times_ns
+    covered = float(np.mean((times >= truth.times_ns[0]) & (times <= truth.times_ns[-1])))
+    return Part("ground truth", f"{text}, over {100 * covered:.0f} % of the frames", {"poses": len(truth)})
+
+
+def _missing_part(recording: Recording) -> Part:
+    """Say what the recording lacks, and what is lost with it."""
+    missing = []
+    if not recording.motion:
+        missing.append("no IMU, no velocity (images alone: no gravity, nothing carries the pose over blind frames)")
+    elif recording.T_cam0_imu is None:
+        missing.append("no T_cam0_imu")
+    if recording.reference is None:
+        missing.append("no ground truth (no ATE)")
+    return Part("missing", "; ".join(missing) or "nothing", {"missing": missing})

@@ -1,0 +1,138 @@
+"""Brightness, sharpness and stereo rows of some pairs, spread over a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.calibration.findings import NotObservable
+from vio.calibration.stereo import RowResiduals, row_residuals
+from vio.geometry.lie import FloatArray
+from vio.inspection.finding import Part
+from vio.records import Image, StereoFrame
+
+_RATIO = 0.8  # of the best to the second best descriptor distance. Reference: Lowe, Distinctive image features (2004)
+_FEATURES = 1500  # per image
+_RANSAC_PX = 1.5
+_LEAST_MATCHES = 20  # a pair with fewer says nothing about the calibration
+_DARK, _BRIGHT, _FLAT = 12.0, 243.0, 3.0  # mean and standard deviation of gray levels of an image without content
+_ROWS_NOTE_PX, _ROWS_FAULT_PX = 0.3, 2.0  # the aim of docs/rectification.md; where matching along rows fails
+_LEAST_POSITIVE = 0.5  # share of matches with ul > ur; true pairs have nearly all
+
+
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Gray levels of one image."""
+
+    mean: float
+    spread: float
+    clipped: float  # share of pixels at 0 or 255
+    sharpness: float  # gradient of the image over that of the image blurred by 2 px; about 1 for a blurred one
+
+
+def exposure_of(image: Image) -> Exposure:
+    """Measure an image (H, W)."""
+    import cv2
+
+    values = image.astype(np.float32)
+    blurred = cv2.GaussianBlur(values, (0, 0), 2.0)
+    fine, coarse = (float(np.abs(np.diff(v, axis=1)).mean()) for v in (values, blurred))
+    clipped = float(np.mean((image == 0) | (image == 255)))
+    return Exposure(float(values.mean()), float(values.std()), clipped, fine / max(coarse, 1e-6))
+
+
+def images_part(frames: Sequence[StereoFrame]) -> Part:
+    """Describe the images of some frames."""
+    pairs = [(f.left, f.right) for f in frames if f.left is not None and f.right is not None]
+    if not pairs:
+        return Part("images", "none could be read", {}, ["no image could be read; see the warnings above"])
+    found = [[exposure_of(image) for image in side] for side in zip(*pairs, strict=True)]
+    means = [float(np.mean([e.mean for e in side])) for side in found]
+    clipped = max(e.clipped for side in found for e in side)
+    sharpness = float(np.median([e.sharpness for side in found for e in side]))
+    height, width = pairs[0][0].shape
+    facts = {"width": width, "height": height, "mean": means, "clipped": clipped, "sharpness": sharpness}
+    faults = []
+    flat = [e for side in found for e in side if e.spread < _FLAT or not _DARK < e.mean < _BRIGHT]
+    if len(flat) > len(pairs):
+        faults.append(f"{len(flat)} of {2 * len(pairs)} images are black, white or without content; mend the exposure")
+    if all(np.array_equal(left, right) for left, right in pairs):
+        faults.append("left and right are the same images, so there is no depth; give the other camera's images")
+    text = (
+        f"{width} x {height}, mean gray {means[0]:.0f} left and {means[1]:.0f} right, "
+        f"at most {100 * clipped:.1f} % at 0 or 255, sharpness {sharpness:.1f}"
+    )
+    return Part("images", text, facts, faults)
+
+
+def rows_part(frames: Sequence[StereoFrame]) -> Part:
+    """Describe how the rows of left and right images agree, by SIFT matches that assume nothing of the calibration."""
+    matches = [sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None]
+    counts = [len(z) for z in matches]
+    z = np.concatenate([np.zeros((0, 4)), *(m for m in matches if len(m) >= _LEAST_MATCHES)])
+    image = next((f.left for f in frames if f.left is not None), None)
+    size = (1.0, 1.0) if image is None else (float(image.shape[1]), float(image.shape[0]))
+    found = row_residuals(z, *size)
+    if isinstance(found, NotObservable):
+        fault = (
+            f"only {max(counts, default=0)} points match between left and right; check that the folders are of one "
+            "stereo camera, its lenses clean and in focus"
+        )
+        hopeless = max(counts, default=0) < _LEAST_MATCHES
+        return Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])
+    return Part("stereo", _rows_text(found, counts), _rows_facts(found, z), _rows_faults(found))
+
+
+def _rows_text(found: RowResiduals, counts: Sequence[int]) -> str:
+    field = found.grid_px[np.isfinite(found.grid_px)]
+    over = f", {field.min():+.2f} to {field.max():+.2f} over the image" if len(field) else ""
+    hint = "; `vio calibrate` measures the cause" if abs(found.median_px) > _ROWS_NOTE_PX else ""
+    return (
+        f"{np.median(counts):.0f} matches a pair, rows {found.median_px:+.2f} px (median of vl - vr), spread "
+        f"{found.spread_px:.2f}{over}; {100 * found.positive_disparity:.0f} % in front{hint}"
+    )
+
+
+def _rows_facts(found: RowResiduals, z: FloatArray) -> dict[str, object]:
+    disparity = z[:, 0] - z[:, 2]
+    return {
+        "matches": found.matches,
+        "rows_median_px": found.median_px,
+        "rows_spread_px": found.spread_px,
+        "positive_disparity": found.positive_disparity,
+        "disparity_median_px": float(np.median(disparity)),
+    }
+
+
+def _rows_faults(found: RowResiduals) -> list[str]:
+    if found.positive_disparity < _LEAST_POSITIVE:
+        return [
+            f"{100 * (1 - found.positive_disparity):.0f} % of the matches are behind the cameras: left and right "
+            "images are exchanged; exchange the folders or topics"
+        ]
+    if abs(found.median_px) + found.spread_px > _ROWS_FAULT_PX:
+        return [
+            f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: the calibration is not "
+            "that of these images, or they are not rectified; run `vio calibrate`, and give its file with --calibration"
+        ]
+    return []
+
+
+def sift_pairs(left: Image, right: Image) -> FloatArray:
+    """Match SIFT points of two images: `[ul vl ur vr]` (N, 4) that fit one fundamental matrix."""
+    import cv2
+
+    sift = cv2.SIFT_create(_FEATURES)  # type: ignore[attr-defined] # missing in OpenCV's stubs
+    (points0, first), (points1, second) = (sift.detectAndCompute(image, None) for image in (left, right))
+    if first is None or second is None or min(len(points0), len(points1)) < _LEAST_MATCHES:
+        return np.zeros((0, 4))
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    near = [m for m in matcher.knnMatch(first, second, k=2) if len(m) == 2 and m[0].distance < _RATIO * m[1].distance]
+    if len(near) < _LEAST_MATCHES:
+        return np.zeros((0, 4))
+    z = np.array([[*points0[m[0].queryIdx].pt, *points1[m[0].trainIdx].pt] for m in near], dtype=np.float64)
+    cv2.setRNGSeed(0)
+    _, mask = cv2.findFundamentalMat(z[:, :2], z[:, 2:], cv2.FM_RANSAC, _RANSAC_PX, 0.999)
+    return z if mask is None else z[mask.ravel() > 0]

@@ -1,0 +1,215 @@
+"""Write any recording of images as an EuRoC, KITTI or plain folder: streamed, rectified as a run sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
+from vio.datasets.euroc_files import camera_yaml, image_list_csv, image_name, imu_csv, imu_yaml, median_rate_hz
+from vio.datasets.images import write_png
+from vio.datasets.kitti import write_calibration, write_times, write_velocity
+from vio.datasets.rigs.kalibr import NOISE_KEYS, kalibr_text
+from vio.errors import DataError
+from vio.geometry.distortion import rig_from_rectified
+from vio.protocols import Dataset, Progress
+from vio.records import (
+    ImuDensities,
+    ImuRecord,
+    ImuSample,
+    IntArray,
+    Recording,
+    Trajectory,
+    VelocitySample,
+)
+from vio.rig import Rig
+from vio.text_files import exact_text, seconds_text, write_text
+from vio.trajectory_io import in_first_cam0, write_tum
+
+Form: TypeAlias = Literal["euroc", "kitti", "plain"]
+
+
+@dataclass(slots=True)
+class _Written:
+    """What went into the folder."""
+
+    times_ns: list[int] = field(default_factory=list)
+    imu: list[ImuSample] = field(default_factory=list)
+    velocities: list[VelocitySample] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class Converted:
+    """The counts of a conversion, and what the form could not hold."""
+
+    frames: int
+    imu_samples: int
+    velocities: int
+    notes: tuple[str, ...]
+
+
+def convert(
+    dataset: Dataset,
+    out: Path,
+    form: Form,
+    *,
+    start: int = 0,
+    stop: int | None = None,
+    progress: Progress = lambda done, total: None,
+) -> Converted:
+    """Write a recording into an existing, empty folder.
+
+    Args:
+        dataset: a recording with images.
+        out: the folder.
+        form: "euroc" (mav0), "kitti" (image_0 image_1 calib.txt times.txt) or "plain" (left right, Kalibr's file).
+        start: first frame.
+        stop: frame after the last one; None: to the end.
+        progress: called after each frame.
+
+    Raises:
+        DataError: the recording has no images, or too many cannot be read.
+    """
+    recording = dataset.recording
+    if not recording.has_images or recording.camera.width is None:
+        raise DataError(f"{recording.path}: holds no images, so there is nothing to convert")
+    written = _write_images(dataset, out, form, start, stop, progress)
+    if not written.times_ns:
+        raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
+    noise: ImuDensities | None = getattr(dataset, "imu_noise", None)
+    writers: dict[Form, Callable[[Path, Recording, _Written, ImuDensities | None], list[str]]] = {
+        "euroc": _finish_euroc,
+        "kitti": _finish_kitti,
+        "plain": _finish_plain,
+    }
+    notes = writers[form](out, recording, written, noise)
+    return Converted(len(written.times_ns), len(written.imu), len(written.velocities), tuple(notes))
+
+
+def _folders(out: Path, form: Form) -> tuple[Path, Path]:
+    names = {"euroc": ("mav0/cam0/data", "mav0/cam1/data"), "kitti": ("image_0", "image_1"), "plain": ("left", "right")}
+    left, right = (out / name for name in names[form])
+    return left, right
+
+
+def _write_images(
+    dataset: Dataset, out: Path, form: Form, start: int, stop: int | None, progress: Progress
+) -> _Written:
+    """Write the images of a range, and collect its samples."""
+    written = _Written()
+    folders = _folders(out, form)
+    for folder in folders:
+        folder.mkdir(parents=True)
+    count = len(dataset.recording.frame_times_ns)
+    total = (count if stop is None else min(stop, count)) - start
+    last_ns = int(dataset.recording.frame_times_ns[total + start - 1])
+    for event in dataset.events(start, stop):
+        if isinstance(event, ImuSample):
+            written.imu.append(event)
+        elif isinstance(event, VelocitySample):
+            written.velocities.append(event)
+        else:
+            assert event.left is not None
+            assert event.right is not None
+            name = f"{len(written.times_ns):06d}.png" if form == "kitti" else image_name(event.time_ns, last_ns)
+            for folder, image in zip(folders, (event.left, event.right), strict=True):
+                write_png(folder / name, image)
+            written.times_ns.append(event.time_ns)
+            progress(len(written.times_ns), total)
+    return written
+
+
+def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
+    times = np.array(written.times_ns, dtype=np.int64)
+    T_cam0_imu = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    rig, mav = rig_from_rectified(recording.camera, T_cam0_imu), out / "mav0"
+    for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
+        text = camera_yaml(camera, T_imu_cam, comment=f"rectified {name}", rate_hz=median_rate_hz(times))
+        write_text(mav / name / "sensor.yaml", text)
+        write_text(mav / name / "data.csv", image_list_csv(times))
+    notes = []
+    if written.imu:
+        record = _record(written.imu)
+        (mav / "imu0").mkdir()
+        write_text(mav / "imu0" / "data.csv", imu_csv(record))
+        if noise is not None:
+            text = imu_yaml(np.eye(4), noise, comment="imu0", rate_hz=median_rate_hz(record.times_ns))
+            write_text(mav / "imu0" / "sensor.yaml", text)
+    if written.velocities:
+        notes.append("velocities have no place in EuRoC's form and are left out; --to plain keeps them")
+    if recording.reference is not None and recording.reference.times_ns is not None:
+        write_tum(out / EUROC_TUM, recording.reference)
+    return notes
+
+
+def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
+    times = np.array(written.times_ns, dtype=np.int64)
+    first_ns = int(times[0])
+    write_calibration(out, recording.camera, recording.T_cam0_imu)
+    write_times(out, times)
+    if written.velocities:
+        write_velocity(out, written.velocities, first_ns)
+    notes = []
+    if written.imu:
+        record = _record(written.imu)
+        write_text(out / "imu.csv", _imu_text(replace(record, times_ns=record.times_ns - first_ns)))
+        notes.append("KITTI's form has no IMU: imu.csv lies beside it, and makes the folder one of kind plain")
+    truth = recording.reference
+    if truth is None or truth.times_ns is None:
+        return notes
+    at = np.searchsorted(truth.times_ns, times)
+    if (at < len(truth)).all() and np.array_equal(truth.times_ns[at], times):
+        here = replace(truth, T_world_body=truth.T_world_body[at], times_ns=times)
+        T_cam0_imu = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+        rows = in_first_cam0(here, T_cam0_imu).T_world_body[:, :3].reshape(-1, 12)
+        write_text(out / "poses.txt", "".join(f"{exact_text(row)}\n" for row in rows))
+    else:
+        write_tum(out / "reference.tum", _shifted(truth, first_ns))
+        notes.append("the ground truth is not at the frames' times: it is in reference.tum, not in poses.txt")
+    return notes
+
+
+def _finish_plain(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
+    c = recording.camera
+    assert c.width is not None
+    assert c.height is not None
+    rig = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, c.width, c.height, recording.T_cam0_imu)
+    imu = recording.T_cam0_imu is not None
+    write_text(out / ("camchain-imucam.yaml" if imu else "camchain.yaml"), kalibr_text(rig))
+    write_text(out / "times.txt", "".join(f"{seconds_text(t)}\n" for t in written.times_ns))
+    if written.imu:
+        write_text(out / "imu.csv", _imu_text(_record(written.imu)))
+        if noise is not None:
+            values = (noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk)
+            text = "".join(f"{key}: {value!r}\n" for key, value in zip(NOISE_KEYS, values, strict=True))
+            write_text(out / "imu.yaml", text)
+    if written.velocities:
+        write_velocity(out, written.velocities, 0)
+    if recording.reference is not None and recording.reference.times_ns is not None:
+        write_tum(out / "reference.tum", recording.reference)
+    return []
+
+
+def _record(samples: list[ImuSample]) -> ImuRecord:
+    times: IntArray = np.array([s.time_ns for s in samples], dtype=np.int64)
+    return ImuRecord(times, np.array([s.gyro for s in samples]), np.array([s.accel for s in samples]))
+
+
+def _imu_text(record: ImuRecord) -> str:
+    """Return `imu.csv` of a plain folder, with all digits."""
+    rows = _rows(record)
+    return "\n".join(["timestamp [ns],wx,wy,wz,ax,ay,az", *rows]) + "\n"
+
+
+def _rows(record: ImuRecord) -> Iterator[str]:
+    for time_ns, gyro, accel in zip(record.times_ns.tolist(), record.gyro, record.accel, strict=True):
+        yield f"{time_ns},{exact_text([*gyro, *accel], ',')}"
+
+
+def _shifted(truth: Trajectory, first_ns: int) -> Trajectory:
+    assert truth.times_ns is not None
+    return replace(truth, times_ns=truth.times_ns - first_ns)

@@ -1,0 +1,71 @@
+"""YAML of untrusted files: plain data of bounded depth and size, each key once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+MOST_BYTES = 2**22  # of a configuration or calibration
+_MOST_NODES = 20_000  # a long list of views of a calibration; aliases of aliases make a kilobyte a billion
+_MOST_DEPTH = 32  # the deepest known calibration has five levels
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """Refuses what makes a small text large or deep, and duplicate keys, of which YAML itself would use the last."""
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = 0
+        self._nodes = 0  # with each alias counted as what it stands for
+        self._nodes_of: dict[str, int] = {}  # of the nodes with an anchor
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose one node, within the depth and the number of nodes."""
+        event = self.peek_event()  # type: ignore[no-untyped-call] # of the stubs
+        before = self._nodes
+        alias = isinstance(event, yaml.AliasEvent)
+        self._nodes += self._nodes_of.get(event.anchor, 0) if alias else 1
+        if alias and event.anchor in self.anchors and event.anchor not in self._nodes_of:
+            raise self._refused(f"the value of &{event.anchor} contains itself", event)
+        if self._nodes > _MOST_NODES:
+            raise self._refused(f"more than {_MOST_NODES} values", event)
+        if self._depth >= _MOST_DEPTH:
+            raise self._refused(f"nested deeper than {_MOST_DEPTH} levels", event)
+        self._depth += 1
+        try:
+            node = super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+        if not alias and event.anchor is not None:
+            self._nodes_of[event.anchor] = self._nodes - before
+        return node
+
+    @staticmethod
+    def _refused(why: str, event: Any) -> yaml.composer.ComposerError:
+        return yaml.composer.ComposerError(None, None, why, event.start_mark)
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Reject a duplicate key."""
+        if isinstance(node, yaml.MappingNode):
+            seen: set[str] = set()
+            for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is given twice", key.start_mark)
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def read_yaml(text: str) -> Any:
+    """Return the data of a YAML text.
+
+    Raises:
+        ValueError: it is no YAML, or more than plain data; the message is one line and names line and column.
+    """
+    try:
+        return yaml.load(text, Loader=_PlainLoader)
+    except yaml.YAMLError as error:
+        raise ValueError(" ".join(str(error).split())) from error
+    except (ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowError) as error:
+        # PyYAML lets these through for tagged or malformed scalars: a 13th month, !!bool maybe, 5000 digits
+        raise ValueError(f"a value does not fit its type: {' '.join(str(error).split())}") from error
