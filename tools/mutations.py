@@ -511,8 +511,8 @@ MUTATIONS = (
     Mutation(
         "start: the gyro's mean is a bias for sure",
         "vio/filters/imu_start.py",
-        "np.hypot(turn, _NOISE_FACTOR * rate_noise)",
-        "_NOISE_FACTOR * rate_noise",
+        "np.hypot(turn, NOISE_FACTOR * rate_noise)",
+        "NOISE_FACTOR * rate_noise",
         _IMU_START,
     ),
     Mutation(
