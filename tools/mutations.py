@@ -453,6 +453,13 @@ MUTATIONS = (
         _FROZEN,
     ),
     Mutation(
+        "frozen images: what predictions were off by does not count",
+        "vio/watch/frozen.py",
+        "_ERRORS * max(self._errors_px)",
+        "0.0",
+        _FROZEN,
+    ),
+    Mutation(
         "frozen images: a row ends with the prediction's certainty",
         "vio/watch/frozen.py",
         "again = self._repeating is not None",
