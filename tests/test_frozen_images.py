@@ -70,11 +70,13 @@ def _expected(px: float = 2.0, sigma_m: float = 1e-3) -> Prediction:
     return Prediction(TrackPrior(IDS, Z + np.array([px, 0, px, 0])), motion)
 
 
-def _watching(*, shaking: bool = True) -> FrozenImages:
-    """After one frame, with a second of IMU samples."""
+def _watching(*, shaking: bool = True, off_px: float = 0.1) -> FrozenImages:
+    """After six frames whose predictions were off by some pixels, with a second of IMU samples."""
     frozen, rng = FrozenImages(), np.random.default_rng(2)
-    frozen.check(_frame(0, LEFT, RIGHT), None)
-    frozen.observations(observations(0, 0, IDS, Z))
+    for k in range(-5, 1):
+        exact = Prediction(TrackPrior(IDS, Z), MotionPrior(np.eye(4), np.eye(6)))
+        frozen.check(_frame(k, _shifted(LEFT, 5.0 * k), _shifted(RIGHT, 5.0 * k)), exact)
+        frozen.observations(observations(k, k * STEP_NS, IDS, Z + off_px * (k == -3)))
     for k in range(200):
         turn = np.array([0.0, 0.4 * np.sin(0.05 * k) if shaking else 0.0, 0.0])
         gyro, accel = turn + rng.normal(0, 3e-3, 3), np.array([0, 0, 9.81]) + rng.normal(0, 0.15, 3)
@@ -110,6 +112,7 @@ def test_a_rig_at_standstill_is_not_frozen() -> None:
     pair = _frame(1, _noisy(LEFT, 5), _noisy(RIGHT, 6))
     assert _watching().check(pair, _expected(0.1)) is None  # no corner is predicted to move
     assert _watching().check(pair, _expected(2.0, sigma_m=0.05)) is None  # the prediction knows little
+    assert _watching(off_px=1.0).check(pair, _expected(2.0)) is None  # it was off by as much shortly before
     assert _watching(shaking=False).check(pair, _expected(2.0)) is None  # a velocity that is wrong
 
 

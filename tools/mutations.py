@@ -453,6 +453,13 @@ MUTATIONS = (
         _FROZEN,
     ),
     Mutation(
+        "frozen images: what predictions were off by does not count",
+        "vio/watch/frozen.py",
+        "_ERRORS * max(self._errors_px)",
+        "0.0",
+        _FROZEN,
+    ),
+    Mutation(
         "frozen images: a row ends with the prediction's certainty",
         "vio/watch/frozen.py",
         "again = self._repeating is not None",
@@ -488,6 +495,20 @@ MUTATIONS = (
         ("tests/test_stamps.py",),
     ),
     Mutation(
+        "late IMU: the first tilt's corrections turn the world of the first frame",
+        "vio/filters/late_imu.py",
+        "own = super().smoothed(index)",
+        "own = super().smoothed(index) if index == self._window.clones[-1].frame_index else None",
+        ("tests/test_late_imu.py",),
+    ),
+    Mutation(
+        "late IMU: its poses count from the handover",
+        "vio/filters/late_imu.py",
+        "T_world_imu=self._T_first_world @ own.T_world_imu",
+        "T_world_imu=own.T_world_imu",
+        ("tests/test_late_imu.py",),
+    ),
+    Mutation(
         "start: a steady acceleration is no evidence against the tilt",
         "vio/filters/imu_start.py",
         "np.sqrt(max(level, 0.0))",
@@ -497,8 +518,8 @@ MUTATIONS = (
     Mutation(
         "start: the gyro's mean is a bias for sure",
         "vio/filters/imu_start.py",
-        "np.hypot(turn, _NOISE_FACTOR * rate_noise)",
-        "_NOISE_FACTOR * rate_noise",
+        "np.hypot(turn, NOISE_FACTOR * rate_noise)",
+        "NOISE_FACTOR * rate_noise",
         _IMU_START,
     ),
     Mutation(

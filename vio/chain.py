@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from vio.config import BackendName, Config
 from vio.errors import DataError, DivergedError
+from vio.filters.late_imu import LateImuMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
 from vio.geometry.lie import FloatArray
@@ -156,6 +157,8 @@ def build_backend(
     camera: StereoCamera, T_cam0_body: FloatArray, config: Config, motion: MotionSource | None
 ) -> Backend:
     """Build the configured back end; `T_cam0_body` is (4, 4)."""
+    if config.backend == "msckf" and motion == "imu":
+        return LateImuMsckf(camera, T_cam0_body, config.msckf)
     if config.backend == "msckf":
         return Msckf(camera, T_cam0_body, config.msckf, motion=motion)
     return Vislam(camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)

@@ -69,6 +69,7 @@ class PosePredictor:
         gyro_bias = _ZERO if estimate.gyro_bias is None else estimate.gyro_bias
         accel_bias = _ZERO if estimate.accel_bias is None else estimate.accel_bias
         self._bias = gyro_bias, accel_bias
+        self._gravity = self._gravity if estimate.gravity_world is None else estimate.gravity_world
         omega, v = self._motion_of(estimate)
         state = _State(estimate.time_ns, estimate.T_world_imu[:3, :3], estimate.T_world_imu[:3, 3], v, omega, _ZERO)
         before = [sample for sample in self._samples if sample.time_ns <= estimate.time_ns]

@@ -306,6 +306,7 @@ class Estimate:
     velocity_world: FloatArray | None = None  # (3,) m/s
     gyro_bias: FloatArray | None = None  # (3,) rad/s
     accel_bias: FloatArray | None = None  # (3,) m/s^2
+    gravity_world: FloatArray | None = None  # (3,) m/s^2, where the world is not upright (an IMU that began late)
     # The calibration, where the filter estimates it; a frame stamped t was exposed at t + offset of the IMU's clock.
     T_cam0_imu: FloatArray | None = None  # (4, 4)
     T_cam0_imu_covariance: FloatArray | None = None  # (6, 6) of xi in T_cam0_imu = T_hat exp(xi), [rho; phi], m and rad

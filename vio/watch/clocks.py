@@ -93,8 +93,8 @@ def _no_overlap(frames: tuple[int, int], imu: tuple[int, int] | None, step_ns: f
         return InertialFinding(
             "clocks without overlap",
             f"{seen}, no IMU sample among them",
-            "the IMU's stamps may count from another epoch or in another unit (ns, us, ms, s); give both one clock, "
-            "or use --motion none",
+            "the IMU may begin later, or its stamps count from another epoch or in another unit (ns, us, ms, s); give "
+            "both one clock, or use --motion none",
         )
     seen = f"{seen}, IMU samples from {imu[0]} to {imu[1]} ns, without overlap"
     unit = _unit_of_clock(frames, imu, step_ns)

@@ -21,7 +21,9 @@ from vio.statistics import chi_square_quantile
 _RADIUS = 4  # of the patches whose flow is measured, pixels
 _CORNERS = 60  # measured per image
 _LEAST_CORNERS = 15
-_PREDICTED_PX = 0.6  # a corner that is predicted to move less tells nothing
+_PREDICTED_PX = 1.0  # a corner that is predicted to move less tells nothing …
+_ERRORS = 3.0  # … nor one that moves by less than so many times what predictions were off by …
+_RECENT, _LEAST_RECENT = 20, 5  # … at most in so many frames
 _UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
 _SHARE = 0.8  # of the corners that must be unmoved
 _PROBABILITY = 0.9999  # chi-square limit of the predicted motion for no motion to be possible
@@ -46,6 +48,8 @@ class FrozenImages:
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
         self._repeating: Repeated | None = None  # of the frame before
+        self._expected: Prediction | None = None  # of the present frame
+        self._errors_px: deque[float] = deque(maxlen=_RECENT)  # median error of each frame's predicted pixels
 
     def sample(self, sample: ImuSample) -> None:
         """Take a sample of the IMU."""
@@ -55,6 +59,11 @@ class FrozenImages:
 
     def observations(self, seen: Observations) -> None:
         """Take the features of a frame that `check` let pass."""
+        if self._expected is not None:
+            _, a, b = np.intersect1d(seen.ids, self._expected.tracks.ids, assume_unique=True, return_indices=True)
+            if len(a):
+                off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
+                self._errors_px.append(float(np.median(np.linalg.norm(off, axis=1))))
         self._seen = seen
 
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
@@ -64,7 +73,7 @@ class FrozenImages:
             frame: the pair, with or without images; frames come in time order.
             expected: the back end's prediction of this frame, its motion since the last frame with features.
         """
-        self._repeating = self._compare(frame, expected)
+        self._expected, self._repeating = expected, self._compare(frame, expected)
         if self._repeating is None:
             self._shown = frame
         return self._repeating
@@ -86,9 +95,10 @@ class FrozenImages:
             return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
         if not self._contradicts(expected.motion) or self._at_standstill():
             return None
-        return (
-            Repeated(shown.index, False) if _unmoved(shown, frame, _predicted_to_move(self._seen, expected)) else None
-        )
+        if len(self._errors_px) < _LEAST_RECENT:
+            return None
+        moving = _predicted_to_move(self._seen, expected, max(_PREDICTED_PX, _ERRORS * max(self._errors_px)))
+        return Repeated(shown.index, False) if _unmoved(shown, frame, moving) else None
 
     def _moves(self, expected: Prediction | None) -> bool:
         """Whether the rig moves: by the IMU's samples, else by the prediction."""
@@ -114,11 +124,11 @@ class FrozenImages:
         return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > chi_square_quantile(_PROBABILITY, 6))
 
 
-def _predicted_to_move(seen: Observations, expected: Prediction) -> Observations:
+def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float) -> Observations:
     """The features of the last frame that the prediction moves clearly in the left image."""
     _, a, b = np.intersect1d(seen.ids, expected.tracks.ids, assume_unique=True, return_indices=True)
     moved = np.linalg.norm(expected.tracks.z[b, :2] - seen.z[a, :2], axis=1)
-    return seen.take(a[moved > _PREDICTED_PX])
+    return seen.take(a[moved > least_px])
 
 
 def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:

@@ -44,7 +44,7 @@ class ImuSilence:
             if late_s > GAP_S:
                 return (
                     f"frame {index}: the first IMU sample came {late_s:.2f} s after frame {self._first_frame[0]}; "
-                    f"{self._waiting} frames have no pose of their own",
+                    f"until then {self._waiting} frames were carried by images alone, in a world that is not upright",
                 )
         return ()
 
@@ -53,7 +53,7 @@ class ImuSilence:
         if self._last_frame is None:
             return ()
         if self._first_imu_ns is None:
-            return (f"no IMU sample in any of {self._waiting} frames: no frame has a pose; use --motion none",)
+            return (f"no IMU sample in any of {self._waiting} frames: all were carried by images alone",)
         return self._gap(self._last_frame[1], " to the end of the run")
 
     def _gap(self, until_ns: int, where: str) -> tuple[str, ...]:
