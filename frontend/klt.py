@@ -102,8 +102,8 @@ class KltFrontend:
             ConfigError: the mask is not of the images' size.
         """
         watch = Stopwatch()
-        images = self._bands(frame.index, *self._validator.validate(frame))
-        left, right = (self._view(image) for image in images)
+        images = self._validator.validate(frame)
+        left, right = (self._view(image) for image in self._bands(frame.index, *images))
         stereo, allowed = self._set_up(left)
         watch.lap("prepare")
         if self._contrast_lost(left):

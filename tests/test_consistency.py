@@ -111,7 +111,7 @@ def test_flight_and_its_imu_agree() -> None:
     t = np.arange(0.0, 2.0, 0.005)
     rng = np.random.default_rng(0)
     quiet = MsckfSettings(
-        gyro_noise_density=1e-15, accel_noise_density=1e-15, gyro_bias_sigma_radps=0, accel_bias_sigma_mps2=0,
+        gyro_noise_density=1e-9, accel_noise_density=1e-9, gyro_bias_sigma_radps=0, accel_bias_sigma_mps2=0,
         gyro_bias_walk=0, accel_bias_walk=0,
     )  # fmt: skip
     motion = ImuMotion(quiet)

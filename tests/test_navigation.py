@@ -146,7 +146,7 @@ def test_start_turns_the_accelerometers_up_to_the_worlds(up: list[float]) -> Non
 
 def test_an_accelerometer_that_reads_nothing_is_named() -> None:
     motion = ImuMotion(SETTINGS)
-    motion.take(ImuSample(0, np.zeros(3), np.zeros(3)))
+    motion.take(ImuSample(0, np.full(3, 1e-4), np.full(3, 1e-5)))
     with pytest.raises(EstimationError, match=r"accelerometer reads zero; is it in m/s\^2"):
         motion.start(0)
 

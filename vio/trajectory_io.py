@@ -199,7 +199,10 @@ def _floats(table: _Table, first: int, last: int) -> FloatArray:
             table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
     bad = ~(np.abs(out) < _LARGEST).all(axis=1)
     if bad.any():
-        table.fail(int(np.argmax(bad)), f"a pose is not finite (first of {int(bad.sum())}); remove such lines")
+        table.fail(
+            int(np.argmax(bad)),
+            f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(bad.sum())}); remove such lines",
+        )
     return out
 
 
