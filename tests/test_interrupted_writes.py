@@ -33,10 +33,19 @@ sys.exit(vio.cli.main([]))
 """
 
 
+def _take_interrupts() -> None:
+    """Undo what a shell does to its background jobs: they ignore Ctrl-C, and so do their children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def _writing(out: Path) -> subprocess.Popen[str]:
     """Start a process that writes a folder, and wait until it does."""
     process = subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLD, str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=_take_interrupts,
     )
     assert process.stdout is not None
     assert process.stdout.readline() == "writing\n"

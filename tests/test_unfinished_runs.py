@@ -194,6 +194,11 @@ def undisturbed(flight_log: Path, tmp_path_factory: pytest.TempPathFactory) -> s
     return (out / "trajectory.tum").read_text()
 
 
+def _take_interrupts() -> None:
+    """Undo what a shell does to its background jobs: they ignore Ctrl-C, and so do their children."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def _wait_for(condition: Callable[[], bool]) -> None:
     end = time.monotonic() + 120
     while not condition():
@@ -207,7 +212,9 @@ def test_a_process_that_ends_loses_a_second_at_most(
 ) -> None:
     out = tmp_path / "run"
     command = [sys.executable, "-c", PATCHED, "run", str(flight_log), "--out", str(out)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_take_interrupts
+    ) as process:
         _wait_for((out / "unfinished" / "checkpoint").is_file)
         process.send_signal(number)
         _, error = process.communicate(timeout=120)
