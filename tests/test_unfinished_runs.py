@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +29,9 @@ from vio.errors import DataError, EstimationError
 from vio.filters.msckf import Msckf
 from vio.pipeline import RunResult, run
 from vio.protocols import Dataset
-from vio.records import Recording
+from vio.records import Estimate, Recording, StereoFieldEstimate
 from vio.run_recorder import GrowingFolder
+from vio.run_tables import estimate_of, estimate_row
 from vio.sim.effects import CLEAN
 from vio.sim.imu import ImuNoise
 from vio.sim.motion import hand_held
@@ -103,12 +104,12 @@ class Stop:
         return "interrupted" if self.left <= 0 else None
 
 
-def _flight_log(path: Path, frames: int = FRAMES) -> Path:
-    """An observation log of a flight with an IMU."""
+def _flight_log(path: Path, frames: int = FRAMES, imu_from_ns: int = 0) -> Path:
+    """An observation log of a flight with an IMU, which may begin late."""
     flight, noise = Flight(frames=frames), np.random.default_rng(0)
     times = np.arange(frames, dtype=np.int64) * STEP_NS
     recording = Recording("flight", Path("flight"), CAMERA, T_CAM0_IMU, times, False, frozenset({"imu"}), None)
-    samples = flight.imu(noise, Config().msckf, np.zeros(6))
+    samples = [s for s in flight.imu(noise, Config().msckf, np.zeros(6)) if s.time_ns >= imu_from_ns]
     seen = [flight.observe(k, 0.3, noise) for k in range(frames)]
     write_observation_log(path, recording, seen, samples, run_motion="imu")  # type: ignore[arg-type]
     return path
@@ -177,6 +178,45 @@ def test_points_put_away_while_running_stay_in_the_map(
     grown = run(open_dataset(flight_log), Config(), folder=GrowingFolder(tmp_path / "run", {}))
     assert len(grown.landmarks.ids) > 50
     _assert_same(whole, grown)
+
+
+@pytest.mark.parametrize("imu_from_s", [1, 100])
+def test_a_checkpoint_does_not_wait_for_an_imu_that_begins_late(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, imu_from_s: int
+) -> None:
+    """The points put away are those of one world: that of the first frame, which knows no gravity."""
+    monkeypatch.setattr("vio.run_recorder._CHECKPOINT_S", 0.05)
+    log = _flight_log(tmp_path / "late.npz", imu_from_ns=imu_from_s * 10**9)
+    whole = run(open_dataset(log), Config())
+    grown = run(open_dataset(log), Config(), folder=GrowingFolder(tmp_path / "run", {}))
+    assert grown.stopped is None
+    assert len(grown.landmarks.ids) > 50
+    _assert_same(whole, grown)
+
+
+def test_a_run_in_memory_that_is_stopped_keeps_its_map(flight_log: Path) -> None:
+    stopped = run(open_dataset(flight_log), Config(), should_stop=Stop(400))
+    same = run(open_dataset(flight_log), Config(), stop=len(stopped.frames))
+    np.testing.assert_array_equal(stopped.landmarks.ids, same.landmarks.ids)
+
+
+def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
+    rng = np.random.default_rng(0)
+    shapes = {"T_world_imu": (4, 4), "covariance": (6, 6), "T_cam0_imu": (4, 4), "T_cam0_imu_covariance": (6, 6)}
+    values: dict[str, Any] = {f.name: rng.normal(size=shapes.get(f.name, (3,))) for f in fields(Estimate)}
+    field = StereoFieldEstimate(rng.normal(size=6), rng.normal(size=(6, 6)), 0.3)
+    values |= {"time_ns": 2**60 + 1, "time_offset_s": 0.1, "time_offset_sigma_s": 0.2, "stereo_field": field}
+    back = estimate_of(estimate_row(0, Estimate(**values))[0])
+    for name, value in values.items():
+        if name != "stereo_field":
+            np.testing.assert_array_equal(getattr(back, name), value)
+    assert back.stereo_field is not None
+    for part in fields(field):
+        np.testing.assert_array_equal(getattr(back.stereo_field, part.name), getattr(field, part.name))
+    bare = estimate_of(estimate_row(0, Estimate(0, np.eye(4), np.eye(6)))[0])
+    assert [f.name for f in fields(Estimate) if getattr(bare, f.name) is not None] == [
+        *("time_ns", "T_world_imu", "covariance")
+    ]
 
 
 # Processes that end

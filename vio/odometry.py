@@ -32,6 +32,7 @@ from vio.records import (
     Observations,
     StereoFrame,
     VelocitySample,
+    no_landmarks,
     observations,
 )
 from vio.selectors import build_selector
@@ -268,7 +269,7 @@ class Odometry:
         """
         with self._lock:
             if self._chain is None:
-                return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+                return no_landmarks()
             return self._chain.backend.take_landmarks()
 
     def smoothed(self, frame_index: int) -> Estimate | None:

@@ -233,11 +233,10 @@ class _Loop:
             state.note(event)
             if _LEAST_REFUSED <= odometry.frames_refused > len(recorder):
                 break
-            if recorder.wants_checkpoint:
-                recorder.save(state, dataset, odometry.take_landmarks())
             stopped = should_stop()
-            if stopped:
+            if recorder.is_save_due or (stopped and recorder.can_save):
                 recorder.save(state, dataset, odometry.take_landmarks())
+            if stopped:
                 break
         self._record(odometry.finish())
         recorder.revise(odometry.smoothed)

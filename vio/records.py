@@ -287,6 +287,11 @@ class Landmarks:
     covariance: FloatArray  # (M, 3, 3) m^2
 
 
+def no_landmarks() -> Landmarks:
+    """Return a map without points."""
+    return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+
+
 @dataclass(frozen=True, slots=True)
 class StereoFieldEstimate:
     """What the stereo calibration is off by, as coefficients of equation (R3) of docs/math.md, in focal lengths."""

@@ -93,7 +93,7 @@ class RunRecorder:
         self._written = 0  # frames in the text files
         self._csv_stages: list[str] | None = None  # columns of frames.csv
         self._flushed_s = self._saved_s = time.monotonic()
-        self._can_save = True
+        self._savable = True
 
     # What goes in
 
@@ -102,7 +102,8 @@ class RunRecorder:
         if not self._keep:
             return
         if self._tables:
-            self._tables["samples"].append(sample_row(sample))
+            with self._writing():
+                self._tables["samples"].append(sample_row(sample))
         else:
             self._early.append(sample_row(sample))
 
@@ -110,7 +111,8 @@ class RunRecorder:
         """Take the pose (4, 4) of a frame by dead reckoning, after the frame itself."""
         row = np.zeros(1, dtype=_POSE)
         row["T"] = T_world_body
-        self._tables["dead_reckoning"].append(row)
+        with self._writing():
+            self._tables["dead_reckoning"].append(row)
 
     def frame(self, result: FrameResult, read_ms: float, smoothed: Smoothed) -> None:
         """Take the result of a frame.
@@ -208,12 +210,12 @@ class RunRecorder:
             return newest
         with self._writing():
             self._put_away(newest)
-        rows = stored.rows()
-        _, last = np.unique(rows["id"][::-1], return_index=True)
-        joined = Table(POINT, self._unfinished / "landmarks.npy")  # a file, as the map of an hour fills memory
-        for part in np.array_split(len(rows) - 1 - last, 1 + len(last) // _CHUNK):
-            joined.append(rows[part])
-        joined.close()
+            rows = stored.rows()
+            _, last = np.unique(rows["id"][::-1], return_index=True)
+            joined = Table(POINT, self._unfinished / "landmarks.npy")  # a file, as the map of an hour fills memory
+            for part in np.array_split(len(rows) - 1 - last, 1 + len(last) // _CHUNK):
+                joined.append(rows[part])
+            joined.close()
         rows = joined.rows()
         return Landmarks(rows["id"], rows["p_world"], rows["covariance"])
 
@@ -225,25 +227,23 @@ class RunRecorder:
     # Checkpoints
 
     @property
-    def wants_checkpoint(self) -> bool:
-        """Whether it is time for one."""
-        return (
-            self._folder is not None
-            and self._can_save
-            and bool(self._tables)
-            and time.monotonic() - self._saved_s > _CHECKPOINT_S
-        )
+    def can_save(self) -> bool:
+        """Whether there is something to save, a folder to save it in, and nothing that cannot be saved."""
+        return self._folder is not None and self._savable and bool(self._tables)
+
+    @property
+    def is_save_due(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        return self.can_save and time.monotonic() - self._saved_s > _CHECKPOINT_S
 
     def save(self, state: Any, dataset: Dataset, finished: Landmarks) -> None:
-        """Write a checkpoint.
+        """Write a checkpoint, where `can_save` says so.
 
         Args:
             state: of the run, beside the recorder's own.
             dataset: the recording, which is left out of it.
             finished: points of the map that will not change any more, and that the state no longer has.
         """
-        if self._folder is None or not self._tables:
-            return
         with self._writing():
             self._put_away(finished)
         self.flush()
@@ -251,7 +251,7 @@ class RunRecorder:
         try:
             save_checkpoint(self._unfinished / CHECKPOINT, {"recorder": own, "run": state}, dataset)
         except NotSavableError as error:
-            self._can_save = False
+            self._savable = False
             log.warning("this run cannot go on with --resume if it is interrupted: %s", error)
         self._saved_s = time.monotonic()
 

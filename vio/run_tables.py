@@ -27,6 +27,7 @@ ESTIMATE = np.dtype(
         ("velocity_world", "<f8", (3,)),
         ("gyro_bias", "<f8", (3,)),
         ("accel_bias", "<f8", (3,)),
+        ("gravity_world", "<f8", (3,)),
         ("T_cam0_imu", "<f8", (4, 4)),
         ("T_cam0_imu_covariance", "<f8", (6, 6)),
         ("time_offset_s", "<f8"),
@@ -36,7 +37,10 @@ ESTIMATE = np.dtype(
         ("stereo_rows_rms_px", "<f8"),
     ]
 )
-_OPTIONAL_ARRAYS = ("velocity_world", "gyro_bias", "accel_bias", "T_cam0_imu", "T_cam0_imu_covariance")
+_OPTIONAL_ARRAYS = (
+    *("velocity_world", "gyro_bias", "accel_bias", "gravity_world"),
+    *("T_cam0_imu", "T_cam0_imu_covariance"),
+)
 _OPTIONAL_NUMBERS = ("time_offset_s", "time_offset_sigma_s")
 
 _STAGES = 16  # of the front end, at most

@@ -15,7 +15,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
-from vio.records import Estimate, Landmarks, Observations, Prediction, UpdateReport
+from vio.records import Estimate, Landmarks, Observations, Prediction, UpdateReport, no_landmarks
 
 
 class LateImuMsckf(Msckf):
@@ -83,13 +83,37 @@ class LateImuMsckf(Msckf):
         own, early = super().landmarks(), self._early_landmarks
         if early is None:
             return own
-        R = self._T_first_world[:3, :3]
+        own = self._points_in_first_world(own)
         other = ~np.isin(early.ids, own.ids)
         return Landmarks(
             np.concatenate([early.ids[other], own.ids]),
-            np.concatenate([early.p_world[other], transform_points(self._T_first_world, own.p_world)]),
-            np.concatenate([early.covariance[other], R @ own.covariance @ R.T]),
+            np.concatenate([early.p_world[other], own.p_world]),
+            np.concatenate([early.covariance[other], own.covariance]),
         )
+
+    def take_landmarks(self) -> Landmarks:
+        """Return the points that have left the state since the last call, and forget them, see `Msckf`.
+
+        None while images stand in for the IMU, or the transform between the two worlds still changes.
+        """
+        if self._early is not None or (self._handover and super().smoothed(self._handover[0]) is not None):
+            return no_landmarks()
+        own, early = super().take_landmarks(), self._early_landmarks
+        if early is None:
+            return own
+        self._early_landmarks = no_landmarks()
+        own = self._points_in_first_world(own)
+        return Landmarks(
+            np.concatenate([early.ids, own.ids]),
+            np.concatenate([early.p_world, own.p_world]),
+            np.concatenate([early.covariance, own.covariance]),
+        )
+
+    def _points_in_first_world(self, own: Landmarks) -> Landmarks:
+        """Points of the upright world in that of the first frame."""
+        R = self._T_first_world[:3, :3]
+        p_world = transform_points(self._T_first_world, own.p_world)
+        return Landmarks(own.ids, p_world, R @ own.covariance @ R.T)
 
     def _in_first_world(self, own: Estimate) -> Estimate:
         """An estimate in the world of the first frame, with the uncertainty of the images' path to the handover.

@@ -62,6 +62,7 @@ from vio.records import (
     TrackPrior,
     UpdateReport,
     VelocitySample,
+    no_landmarks,
 )
 
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
@@ -337,9 +338,9 @@ class Msckf:
 
         None as long as the first tilt may still turn the map.
         """
-        window = self._started()
-        if not self._map or not window.clones or window.clones[0].time_ns == self._began_ns:
-            return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        window = self._window
+        if window is None or not self._map or not window.clones or window.clones[0].time_ns == self._began_ns:
+            return no_landmarks()
         taken, self._map, self._points_stored = _newest(self._map), [], 0
         return taken
 

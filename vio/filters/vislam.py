@@ -27,6 +27,7 @@ from vio.records import (
     Prediction,
     UpdateReport,
     VelocitySample,
+    no_landmarks,
 )
 from vio.statistics import chi_square_quantile
 
@@ -237,7 +238,7 @@ class Vislam:
 
     def take_landmarks(self) -> Landmarks:
         """Return nothing: all points stay in the state."""
-        return Landmarks(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+        return no_landmarks()
 
     def landmarks(self) -> Landmarks:
         """Return every landmark ever initialised."""
