@@ -1024,7 +1024,7 @@ MUTATIONS = (
     ),
     Mutation(
         "right camera: features are dropped while it cannot be used",
-        "frontend/klt.py",
+        "frontend/new_features.py",
         "return tracks, *nothing",
         "return take(tracks, tracks.has_right), *nothing",
         _RIGHT_CAMERA,
@@ -1136,7 +1136,7 @@ MUTATIONS = (
     ),
     Mutation(
         "tracking: a new anchor in every frame, which drifts",
-        "frontend/klt.py",
+        "frontend/anchor_fit.py",
         "(change > np.log(settings.max_anchor_scale))",
         "(change > -1.0)",
         _TRACK,
