@@ -1284,4 +1284,11 @@ MUTATIONS = (
         "math.prod(shape) * dtype.itemsize < 0",
         _FILES,
     ),
+    Mutation(
+        "png: rows side by side take the corner of the row before",
+        "vio/datasets/png_rows.py",
+        "corner[k] = above[k]",
+        "corner[k] = left[k]",
+        ("tests/test_datasets_png.py",),
+    ),
 )
