@@ -8,7 +8,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image
 
-from .patches import View, inside
+from .patches import View, inside, mean_and_contrast
 from .settings import KltSettings
 
 _LK_EPSILON_PX = 0.02  # of the half-resolution image
@@ -58,23 +58,18 @@ def track_with_retries(
 
 def lost_contrast(image: Image, last: Image) -> bool:
     """Whether an image (H, W) has almost no contrast although the last one had: black, saturated or covered."""
-    return _contrast(image) < _LOST_CONTRAST_SHARE * _contrast(last)
+    return mean_and_contrast(image, _STRIDE)[1] < _LOST_CONTRAST_SHARE * mean_and_contrast(last, _STRIDE)[1]
 
 
 def match_brightness(image: Image, other: Image) -> Image:
     """Adjust an image to another's mean and contrast if they differ clearly: Lucas-Kanade compares gray levels."""
-    a, b = (part[::_STRIDE, ::_STRIDE].astype(np.float64) for part in (image, other))
-    gain = float(b.std() / max(a.std(), _MIN_CONTRAST))
-    if (abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(float(b.mean() - a.mean())) < _MAX_MEAN_CHANGE) or gain <= 0:
+    (mean, contrast), (other_mean, other_contrast) = (mean_and_contrast(part, _STRIDE) for part in (image, other))
+    gain = other_contrast / max(contrast, _MIN_CONTRAST)
+    if (abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(other_mean - mean) < _MAX_MEAN_CHANGE) or gain <= 0:
         return image
     gain = min(max(gain, 1 / _MAX_GAIN), _MAX_GAIN)
-    levels = gain * (np.arange(256) - a.mean()) + b.mean()
+    levels = gain * (np.arange(256) - mean) + other_mean
     return np.asarray(cv2.LUT(image, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8)
-
-
-def _contrast(image: Image) -> float:
-    """Standard deviation of an image's gray levels, from a sparse grid of them."""
-    return float(image[::_STRIDE, ::_STRIDE].astype(np.float64).std())
 
 
 def _track_forward_backward(

@@ -43,7 +43,7 @@ from vio.filters.stereo_calibration import (
     landmark_columns,
 )
 from vio.filters.tracks import latest_pixels
-from vio.filters.window import Clone, Window
+from vio.filters.window import Clone, Fit, Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
@@ -467,13 +467,13 @@ class Msckf:
         predicted, expected = self._predicted_move(window)
         tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _FIRST_STEPS)
         innovation = tracks.newest_innovation()
-        tracks, P = self._fit(window, tracks, pixels, innovation)
-        step = self._step_errors(window, tracks, predicted, expected, P)
+        tracks, fitted = self._fit(window, tracks, pixels, innovation)
+        step = self._step_errors(window, tracks, predicted, expected, fitted)
         if step is not None:
             missing = step.missing_noise()
             if missing.any() and self._tracks.agree(tracks.at):
                 window.inflate_process_noise(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
-                tracks, P = self._fit(window, tracks, pixels, innovation)
+                tracks, fitted = self._fit(window, tracks, pixels, innovation)
             if not self._since_frame.bridged:
                 self._noise.update(step)
         self._since_frame = NO_STEP
@@ -481,7 +481,7 @@ class Msckf:
         tracks = self._tracks.without_wrong_views(tracks)
         good, nis, dof = self._tracks.gate(tracks.at)
         self._tracks.update_pixel_noise(nis, dof)
-        pixels, rejected = self._gate_landmarks(window, pixels, P)
+        pixels, rejected = self._gate_landmarks(window, pixels, fitted)
         created = self._marginalise(window, tracks, good, pixels)
         self._apply_zero_velocity(window)
         return UpdateReport(
@@ -493,8 +493,8 @@ class Msckf:
             nis_per_dof=float(np.median(nis / dof)) if len(nis) else None,
         )
 
-    def _gate_landmarks(self, window: Window, pixels: Views, P: FloatArray) -> tuple[Views, int]:
-        """Test the landmarks' pixels after a fit of covariance P (D, D); drop the landmarks that keep failing.
+    def _gate_landmarks(self, window: Window, pixels: Views, fitted: Fit) -> tuple[Views, int]:
+        """Test the landmarks' pixels after a fit; drop the landmarks that keep failing.
 
         Returns:
             The pixels of the landmarks left, without weight where rejected, and how many observations were rejected.
@@ -502,7 +502,7 @@ class Msckf:
         if not len(pixels.z):
             return pixels, 0
         at = self._landmark_residuals(window, pixels)
-        covariance = window.landmark_covariance(P)
+        covariance = window.landmark_covariance(fitted)
         nis = leave_one_out_nis(at.r, at.J, covariance, at.weight, self._tracks.variance)
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
         used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
@@ -553,24 +553,21 @@ class Msckf:
 
     def _fit(
         self, window: Window, tracks: LinearTracks, pixels: Views, innovation: float | None
-    ) -> tuple[LinearTracks, FloatArray]:
-        """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the covariance (D, D)."""
-        P = window.P
+    ) -> tuple[LinearTracks, Fit]:
+        """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the last fit."""
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
-            P = self._move_to_optimum(window, tracks, A, b, len(A))
+            fitted = self._move_to_optimum(window, tracks, A, b, len(A))
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go.
             if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
                 break
             innovation = residual
-        return tracks, P
+        return tracks, fitted
 
-    def _move_to_optimum(
-        self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int
-    ) -> FloatArray:
+    def _move_to_optimum(self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int) -> Fit:
         """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
 
         Args:
@@ -581,12 +578,12 @@ class Msckf:
             size: how many errors, the first ones, it is about.
 
         Returns:
-            Their covariance (size, size) there.
+            The fit, with their covariance (size, size) there.
         """
-        P, error = window.optimum(A, b, size)
+        fitted, error = window.optimum(A, b, size)
         self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
         window.relinearise(error)
-        return P
+        return fitted
 
     def _step_errors(
         self,
@@ -594,16 +591,16 @@ class Msckf:
         tracks: LinearTracks,
         predicted: FloatArray | None,
         expected: FloatArray,
-        P: FloatArray,
+        fitted: Fit,
     ) -> StepErrors | None:
-        """The predicted and the corrected motion since the last frame, whose fit left the covariance P (D, D).
+        """The predicted and the corrected motion since the last frame, and what its fit leaves of their errors.
 
         None with too few tracks.
         """
         if predicted is None or len(tracks.rows) < MIN_TRACKS_FOR_NOISE:
             return None
         moved = window.move_since(-2)
-        remaining = window.move_covariance(len(window.clones) - 2, P)
+        remaining = window.move_covariance(len(window.clones) - 2, fitted)
         A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
         process = A @ self._since_frame.Q[:6, :6] @ A.T
         correction = se3_log(se3_inverse(predicted) @ moved)
@@ -655,7 +652,7 @@ class Msckf:
         promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
 
         A, b = self._information(window, tracks, good & ~ending, None)
-        P = self._move_to_optimum(window, tracks, A, b, window.first_landmark)  # no landmark is in it
+        P = self._move_to_optimum(window, tracks, A, b, window.first_landmark).covariance()  # no landmark is in it
         own = slice(0, window.first_clone)
         self._output = P[own, own]
         self._smoothed = WindowPosterior.of(window, P)
