@@ -44,14 +44,14 @@ def track_with_retries(
     """
     last = match_brightness(last, view.half)
     few = min(settings.trusted_levels, settings.pyramid_levels) if trusted else settings.pyramid_levels
-    found, good = _track_forward_backward(last, view, points, guess, few, settings)
+    found, good = _track_forward_backward(last, view, points, guess, few, settings, trusted=trusted)
     attempts = [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
     for start, share in attempts:
         retry = np.flatnonzero(~good)
         if len(retry) <= share * len(points):
             break
         found[retry], good[retry] = _track_forward_backward(
-            last, view, points[retry], start[retry], settings.pyramid_levels, settings
+            last, view, points[retry], start[retry], settings.pyramid_levels, settings, trusted=False
         )
     return found, good
 
@@ -73,14 +73,29 @@ def match_brightness(image: Image, other: Image) -> Image:
 
 
 def _track_forward_backward(
-    last: Image, view: View, points: FloatArray, guess: FloatArray, levels: int, settings: KltSettings
+    last: Image,
+    view: View,
+    points: FloatArray,
+    guess: FloatArray,
+    levels: int,
+    settings: KltSettings,
+    *,
+    trusted: bool,
 ) -> tuple[FloatArray, BoolArray]:
-    """Track points (N, 2) forward and backward; return the new pixels and the mask of consistent ones."""
-    forward, seen = _flow(last, view.half, points, guess, levels, settings)
-    backward, seen_back = _flow(view.half, last, forward, points, levels, settings)
-    error = np.linalg.norm(backward - points, axis=1)
-    margin = settings.anchor_radius_px + 2
-    good = seen & seen_back & (error <= settings.max_forward_backward_px) & inside(view.full, forward, margin)
+    """Track points (N, 2) forward and backward; return the new pixels and the mask of consistent ones.
+
+    Points found where a trusted guess expects them, to the same tolerance, are not tracked backward: two independent
+    sources agree on them, and alignment with the anchor is to come.
+    """
+    forward, good = _flow(last, view.half, points, guess, levels, settings)
+    good &= inside(view.full, forward, settings.anchor_radius_px + 2)
+    tolerance = settings.max_forward_backward_px
+    expected = np.linalg.norm(forward - guess, axis=1) <= tolerance
+    doubtful = np.flatnonzero(good & ~expected if trusted else good)
+    if len(doubtful):
+        backward, seen_back = _flow(view.half, last, forward[doubtful], points[doubtful], levels, settings)
+        error = np.linalg.norm(backward - points[doubtful], axis=1)
+        good[doubtful] = seen_back & (error <= tolerance)
     return forward, good
 
 

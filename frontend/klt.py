@@ -32,6 +32,7 @@ from .tracks import AnchorBank, Tracks, no_tracks
 
 _EXCHANGE_POINTS = 80  # points that matches of either sign are counted at
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
+_FEW_MISSING = 0.1  # share of the features; detection takes more time than it is worth for fewer
 _VERY_FEW = 0.25  # share of the target below which new features are output at once
 _LONG_GAP_S = 0.8  # a rig that flies or is carried shows other things after it …
 _LONG_GAP_STEPS = 5.0  # … where frames usually come so many times as often
@@ -67,6 +68,7 @@ class KltFrontend:
         self._previous: PreviousFrame | None = None
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
         self._next_id = 0
+        self._rested = False  # whether the last frame was one in which no corners were detected
         self._skipped = 0  # frames in a row
         self._step_ns: int | None = None  # between the last two frames
 
@@ -97,8 +99,7 @@ class KltFrontend:
         if self._right.left_is_frozen(frame.index, left.half, right.half):
             return make_output(frame, no_tracks(), 0, watch, self._take_lines())
         tracks, motion = self._track(frame, left, right, usable_prior(prior), stereo, watch)
-        missing = self._grid.target_features - len(tracks)
-        wanted = round(missing * (1.0 + self._settings.spare_corners))
+        wanted = self._wanted_corners(len(tracks))
         corners = detect_corners(left.half, tracks.left, wanted, self._grid, self._settings, allowed)
         watch.lap("detect")
         usable, delayed = right if self._right.usable else None, self._delay.frames != 0.0
@@ -114,6 +115,13 @@ class KltFrontend:
         self._store(frame, left, right, tracks, motion)
         watch.lap("check")
         return make_output(frame, seen, tracked, watch, self._take_lines())
+
+    def _wanted_corners(self, active: int) -> int:
+        """Number of corners to detect beside active features; none in every other frame while few are missing."""
+        target = self._grid.target_features
+        missing = target - active
+        self._rested = not self._rested and missing <= _FEW_MISSING * target
+        return 0 if self._rested else round(missing * (1.0 + self._settings.spare_corners))
 
     def _take_lines(self) -> tuple[str, ...]:
         """Return what the frame says of the images, one line an event."""

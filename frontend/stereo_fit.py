@@ -70,6 +70,8 @@ class StereoFit:
 
     def match_near(self, tracks: Tracks, right: View, rows: IntArray, disparity: FloatArray) -> Tracks:
         """Match the given rows (K,) near their disparities (K,)."""
+        if not len(rows):
+            return tracks
         pixels, skew, valid = self._fit(take(tracks, rows), right, disparity)
         return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
 

@@ -1123,8 +1123,8 @@ MUTATIONS = (
     Mutation(
         "tracking: no look back",
         "frontend/flow.py",
-        "seen & seen_back & (error",
-        "seen & (0 * error",
+        "seen_back & (error <= tolerance)",
+        "seen_back",
         _TRACK,
     ),
     Mutation(
@@ -1304,5 +1304,26 @@ MUTATIONS = (
         "largest = max(d0, d1, d2, trace)",
         "largest = d0",
         ("tests/test_lie.py",),
+    ),
+    Mutation(
+        "detection: corners are never searched while few are missing",
+        "frontend/klt.py",
+        "self._rested = not self._rested and missing",
+        "self._rested = missing",
+        ("tests/test_frontend_klt.py",),
+    ),
+    Mutation(
+        "tracking: trusted predictions are tracked backward all the same",
+        "frontend/flow.py",
+        "good & ~expected if trusted else good",
+        "good",
+        ("tests/test_frontend_klt.py",),
+    ),
+    Mutation(
+        "filter: depths known by less than their information says",
+        "vio/filters/multiview.py",
+        "C[:, 2, 2] - a * C[:, 0, 2] - b * C[:, 1, 2]",
+        "C[:, 2, 2]",
+        ("tests/test_multiview.py",),
     ),
 )

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
@@ -145,8 +146,9 @@ def run(
     with contextlib.closing(recorder), contextlib.closing(viewer or NullViewer()) as shown:
         loop = _Loop(state, recorder, shown)
         try:
-            events = dataset.events(state.next_frame, stop, images=_needs_images(dataset, config))
-            stopped = loop.run(events, features, should_stop)
+            with _opencv_threads(dataset, config, frontend):
+                events = dataset.events(state.next_frame, stop, images=_needs_images(dataset, config))
+                stopped = loop.run(events, features, should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
                 raise
@@ -402,6 +404,14 @@ def _build_selector(features: Dataset, config: Config) -> Selector:
         whole_record=whole_record if precomputed else None,
         camera=recording.camera,
     )
+
+
+def _opencv_threads(dataset: Dataset, config: Config, given: Frontend | None) -> AbstractContextManager[None]:
+    """Limit OpenCV to one thread where the front end is `klt`, whose steps are too short for more."""
+    if given is not None or config.frontend.name not in ("auto", "klt") or not _needs_images(dataset, config):
+        return contextlib.nullcontext()
+    one: AbstractContextManager[None] = frontend_module().one_opencv_thread()
+    return one
 
 
 def _needs_images(dataset: Dataset, config: Config) -> bool:

@@ -649,7 +649,8 @@ class Msckf:
         lost, leaving = ~seen[:, newest], seen[:, 0] & full
         ending = lost | leaving
         window.absorb(*self._information(window, tracks, ending & good, pixels))
-        promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
+        depth_sigma = np.sqrt(self._tracks.variance) * tracks.information.relative_depth_sigma()
+        promoted = self._promote(window, tracks, leaving & good & seen[:, newest], depth_sigma)
 
         A, b = self._information(window, tracks, good & ~ending, None)
         P = self._move_to_optimum(window, tracks, A, b, window.first_landmark).covariance()  # no landmark is in it
@@ -657,8 +658,8 @@ class Msckf:
         self._output = P[own, own]
         self._smoothed = WindowPosterior.of(window, P)
 
-        done = ending & good & (self._depth_sigma(tracks) < _MAP_DEPTH_SIGMA)
-        covariance = self._tracks.variance * tracks.information.point_covariance()[done]
+        done = np.flatnonzero(ending & good & (depth_sigma < _MAP_DEPTH_SIGMA))
+        covariance = self._tracks.variance * tracks.information.point_covariance(done)
         self._store_points(table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
         spent = leaving & ~lost
         spent[promoted] = False
@@ -668,32 +669,37 @@ class Msckf:
             table.shift()
         return len(promoted)
 
-    def _promote(self, window: Window, tracks: LinearTracks, candidates: BoolArray) -> IntArray:
-        """Make landmarks of the best known points whose tracks leave the window; return which tracks (indices)."""
+    def _promote(
+        self, window: Window, tracks: LinearTracks, candidates: BoolArray, depth_sigma: FloatArray
+    ) -> IntArray:
+        """Make landmarks of the best known points whose tracks leave the window; return which tracks (indices).
+
+        Args:
+            window: receives the landmarks.
+            tracks: linearised at its means.
+            candidates: mask (F,) of the tracks that may become landmarks.
+            depth_sigma: (F,) standard deviation of each inverse depth, over itself.
+        """
         room = self._settings.max_landmarks - len(window.landmarks)
         by_stereo = np.sqrt(self._tracks.variance) * relative_stereo_sigma(tracks.at, tracks.information.q)
-        has_depth = (self._depth_sigma(tracks) < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
+        has_depth = (depth_sigma < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
         chosen = np.flatnonzero(candidates & has_depth)
         if room <= 0 or not len(chosen):
             return np.zeros(0, dtype=np.int64)
-        covariance = self._tracks.variance * tracks.information.point_covariance()
+        covariance = self._tracks.variance * tracks.information.point_covariance(chosen)
         # The best known points first: smallest largest standard deviation.
-        worst = np.linalg.eigvalsh(covariance[chosen])[:, 2]
+        worst = np.linalg.eigvalsh(covariance)[:, 2]
         table = self._tracks.table
-        chosen = chosen[np.lexsort((table.ids(tracks.rows[chosen]), worst))[:room]]
-        p, point_D_poses = tracks.p_world[chosen], tracks.information.point_D_clones()[chosen]
+        best = np.lexsort((table.ids(tracks.rows[chosen]), worst))[:room]
+        chosen, covariance = chosen[best], covariance[best]
+        p, point_D_poses = tracks.p_world[chosen], tracks.information.point_D_clones(chosen)
         point_D_poses[:, :, -3:] += so3_hat(p)  # the anchor: rotation of the newest exposure
         point_D_stereo = None
         if tracks.stereo is not None:
             point_D_stereo = tracks.stereo.point_D_stereo(tracks.information)[chosen]
         A = window.chain(point_D_poses, point_D_stereo)
-        window.add_landmarks(table.ids(tracks.rows[chosen]), p, A.reshape(-1, len(window.P)), covariance[chosen])
+        window.add_landmarks(table.ids(tracks.rows[chosen]), p, A.reshape(-1, len(window.P)), covariance)
         return chosen
-
-    def _depth_sigma(self, tracks: LinearTracks) -> FloatArray:
-        """Standard deviation (F,) of the inverse depth of the tracks' points, over itself."""
-        out: FloatArray = np.sqrt(self._tracks.variance) * tracks.information.relative_depth_sigma()
-        return out
 
 
 def _half_tangent(R: FloatArray) -> FloatArray:

@@ -291,19 +291,26 @@ class TrackInformation:
         dq = np.linalg.solve(self.C, right[..., None])[..., 0]
         return self.q.moved(dq, np.inf)
 
-    def point_D_clones(self) -> FloatArray:
-        """How the estimated points follow errors of the clones (F, 3, 6N), world: `-C^-1 G'`."""
-        out: FloatArray = -self.q.p_D_q @ np.linalg.solve(self.C, np.swapaxes(self.G, 1, 2))
+    def point_D_clones(self, chosen: IntArray) -> FloatArray:
+        """How the estimated points of tracks (K,) follow errors of the clones (K, 3, 6N), world: `-C^-1 G'`."""
+        G = np.swapaxes(self.G[chosen], 1, 2)
+        out: FloatArray = -self.q.p_D_q[chosen] @ np.linalg.solve(self.C[chosen], G)
         return out
 
-    def point_covariance(self) -> FloatArray:
-        """Covariance (F, 3, 3) of the points given the clones, world, for one pixel of noise."""
-        out: FloatArray = self.q.p_D_q @ np.linalg.inv(self.C) @ np.swapaxes(self.q.p_D_q, 1, 2)
+    def point_covariance(self, chosen: IntArray) -> FloatArray:
+        """Covariance (K, 3, 3) of the points of tracks (K,) given the clones, world, for one pixel of noise."""
+        p_D_q = self.q.p_D_q[chosen]
+        out: FloatArray = p_D_q @ np.linalg.inv(self.C[chosen]) @ np.swapaxes(p_D_q, 1, 2)
         return out
 
     def relative_depth_sigma(self) -> FloatArray:
         """Standard deviation (F,) of the inverse depth given the clones over itself, for one pixel of noise."""
-        out: FloatArray = np.sqrt(np.linalg.inv(self.C)[:, 2, 2]) / self.q.disparity
+        C = self.C
+        minor = C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] ** 2
+        # What is left of the third diagonal entry once the other two coordinates are eliminated.
+        a = (C[:, 0, 2] * C[:, 1, 1] - C[:, 1, 2] * C[:, 0, 1]) / minor
+        b = (C[:, 1, 2] * C[:, 0, 0] - C[:, 0, 2] * C[:, 0, 1]) / minor
+        out: FloatArray = 1.0 / np.sqrt(C[:, 2, 2] - a * C[:, 0, 2] - b * C[:, 1, 2]) / self.q.disparity
         return out
 
 
