@@ -26,7 +26,7 @@ ImuFaultKind: TypeAlias = Literal["gyro spike", "accelerometer spike", "stuck IM
 
 _HISTORY_S = 2.0  # changes between samples that a spike is compared with
 _LEAST_HISTORY = 20  # changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
-_REFRESH = 20  # samples between two evaluations of their scale
+_REFRESH, _REFRESH_SHARE = 20, 4  # samples between two evaluations of their scale, and the least share of all, 1 / 4
 _SPIKE_SIGMAS = 30.0  # robust standard deviations of the changes; real motion reached 23
 _SPIKE_IMPULSE = (5e-3, 5e-3, 5e-3, 0.15, 0.15, 0.15)  # rad and m/s over the sample's period; below, no spike does harm
 _RETURN = 0.25  # of the first change, by which the sample after a spike may lie from the one before it; a shock rings
@@ -219,7 +219,7 @@ class _SpikeCheck:
             self._steps.popleft()
         self._until_refresh -= 1
         if self._until_refresh <= 0 and len(self._steps) >= _LEAST_HISTORY:
-            self._until_refresh = _REFRESH
+            self._until_refresh = max(_REFRESH, len(self._steps) // _REFRESH_SHARE)
             times, changes = zip(*self._steps, strict=True)
             self._period_ns = float(np.median(np.diff(np.array(times, dtype=np.int64))))
             least = np.array(_SPIKE_IMPULSE) / max(self._period_ns * _NS, 1e-6)

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.filters import track_loops as loops
-from vio.geometry.lie import FloatArray, so3_hat, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
+from vio.geometry.lie import FloatArray, so3_hat
+from vio.geometry.stereo import StereoCamera, left_rays
 from vio.records import BoolArray, IntArray
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
@@ -255,13 +255,10 @@ def landmark_residuals(
         views: what was seen, (K, 4) each.
         sigma2: the pixel noise's variance, for the robust weights.
     """
-    p_cam = transform_points(T_cam0_world, p_world)
-    ahead = p_cam[:, 2] > MIN_DEPTH * camera.baseline_m
-    p_cam = np.where(ahead[:, None], p_cam, [0.0, 0.0, 1.0])
-    usable = views.weight * ahead[:, None]
-    r = np.where(usable > 0, views.z - project(camera, p_cam), 0.0)
-    J = (z_D_p_cam(camera, p_cam) @ T_cam0_world[:3, :3]) * usable[..., None]
-    squares, seen = np.sum(r**2, axis=1), usable[:, 1] > 0
+    one = Views(views.z[:, None], views.weight[:, None])
+    at = residuals(camera, T_cam0_world[None], p_world, one)
+    r, J = at.r[:, 0], at.z_D_p[:, 0]
+    squares, seen = np.sum(r**2, axis=1), at.ahead & (views.weight[:, 1] > 0)
     scale2 = max(sigma2, float(np.median(squares[seen])) / _MEDIAN) if seen.any() else sigma2
     return LandmarkResiduals(r, J, seen / (1 + squares / (4 * scale2 * CAUCHY**2)))
 
