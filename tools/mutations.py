@@ -139,8 +139,8 @@ MUTATIONS = (
     Mutation(
         "SO(3): wrong coefficient in a Taylor series",
         "vio/geometry/lie.py",
-        "0.5 - a2 / 24 *",
-        "0.5 - a2 / 12 *",
+        "second = np.where(small, 0.5 - a2 / 24 *",
+        "second = np.where(small, 0.5 - a2 / 12 *",
         _LIE,
     ),
     Mutation(
@@ -285,10 +285,10 @@ MUTATIONS = (
         _WINDOW,
     ),
     Mutation(
-        "landmarks: rotation transposed in the Jacobian",
+        "landmarks: Jacobian of the wrong sign",
         "vio/filters/multiview.py",
-        "@ T_cam0_world[:3, :3]) * usable",
-        "@ T_cam0_world[:3, :3].T) * usable",
+        "r, J = at.r[:, 0], at.z_D_p[:, 0]",
+        "r, J = at.r[:, 0], -at.z_D_p[:, 0]",
         _WINDOW,
     ),
     Mutation(
@@ -721,8 +721,8 @@ MUTATIONS = (
     Mutation(
         "standstill: every motion passes for none",
         "vio/filters/window_posterior.py",
-        "return squared < float(",
-        "return squared < 1e9 * float(",
+        "return squared < limit",
+        "return squared < 1e9 * limit",
         _TRUTH,
     ),
     Mutation(
