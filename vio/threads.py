@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from contextvars import ContextVar
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
-
-_limited: ContextVar[bool] = ContextVar("one_blas_thread", default=False)
 
 
 @contextmanager
@@ -16,11 +13,7 @@ def one_blas_thread() -> Iterator[None]:
     from threadpoolctl import threadpool_limits
 
     with threadpool_limits(limits=1, user_api="blas"):
-        token = _limited.set(True)
-        try:
-            yield
-        finally:
-            _limited.reset(token)
+        yield
 
 
 class BlasLimit:
@@ -32,8 +25,6 @@ class BlasLimit:
         self._controller = ThreadpoolController()
 
     def __call__(self) -> AbstractContextManager[Any]:
-        """Return the context; it does nothing inside `one_blas_thread`, as asking the libraries takes its time."""
-        if _limited.get():
-            return nullcontext()
+        """Return the context."""
         limit: AbstractContextManager[Any] = self._controller.limit(limits=1, user_api="blas")
         return limit
