@@ -30,6 +30,7 @@ from vio.cli import (
     rectify,
     refine,
     render,
+    report,
     reproduce,
     run,
 )
@@ -41,6 +42,7 @@ _COMMANDS = (
     inspect,
     convert,
     evaluate,
+    report,
     check,
     refine,
     export,
