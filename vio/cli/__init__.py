@@ -21,6 +21,7 @@ from vio._version import __version__
 from vio.cli import (
     calibrate,
     check,
+    completion,
     config,
     convert,
     demo,
@@ -52,6 +53,7 @@ _COMMANDS = (
     rectify,
     reproduce,
     config,
+    completion,
 )
 
 
