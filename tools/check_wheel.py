@@ -27,9 +27,10 @@ def main(argv: list[str]) -> int:
         environment = Path(folder) / "env"
         venv.create(environment, with_pip=True)
         programs = environment / ("Scripts" if os.name == "nt" else "bin")
-        pip = [programs / "python", "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+        pip = [str(programs / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
         clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        for command in ([*pip, "-c", constraints, wheels[0]], [programs / "vio", "demo", "--out", "demo"]):
+        demo = [str(programs / "vio"), "demo", "--out", "demo"]
+        for command in ([*pip, "-c", str(constraints), str(wheels[0])], demo):
             subprocess.run(command, cwd=folder, env=clean, check=True)
     print(f"{wheels[0].name} installs and runs alone")
     return 0

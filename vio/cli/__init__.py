@@ -34,6 +34,7 @@ from vio.cli import (
     report,
     reproduce,
     run,
+    view,
 )
 from vio.errors import StoppedError, VioError
 from vio.printable import printable
@@ -44,6 +45,7 @@ _COMMANDS = (
     convert,
     evaluate,
     report,
+    view,
     check,
     refine,
     export,
