@@ -20,9 +20,8 @@ with tempfile.TemporaryDirectory() as folder:
     for clones in (5, 11, 20):
         again = vio.run(features, vio.load_config(overrides=[f"msckf.clones={clones}"]))
         end = again.trajectory.positions[-1]
-        print(
-            f"window of {clones:2d} frames: ends at {end.round(3)}, {again.wall_s / len(again.frames) * 1e3:.1f} ms a frame"
-        )
+        ms = 1e3 * again.wall_s / len(again.frames)
+        print(f"window of {clones:2d} frames: ends at {end.round(3)}, {ms:.1f} ms a frame")
 
 # Features of another program: one call a frame, or a dataset of one's own (docs/recordings.md).
 #   odometry.add_observations(time_ns, ids, z, has_right)     # z = [ul vl ur vr], rectified pixels, (N, 4)
