@@ -16,7 +16,7 @@ endif
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint unit coverage mutations results wheel clean constraints
+.PHONY: demo test lint unit coverage mutations results wheel docs clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -43,6 +43,10 @@ mutations: $(TESTED)
 # only compares, docs/results.md tells what must lie where.
 results: $(VENV)/.base
 	$(BIN)/python -m tools.results --data "$(VIO_DATA)" --work "$(WORK)" $(RESULTS)
+
+# The documentation site, into site/; a broken link or a page without a place in the menu is an error.
+docs: $(TESTED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 # Build the wheel, and run its demo in an environment and a folder of its own.
 wheel: | $(BIN)/python$(EXE)
@@ -71,4 +75,4 @@ constraints: $(VENV)/.learned
 	mv constraints.new constraints.txt
 
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info
+	rm -rf $(VENV) demo build dist site *.egg-info
