@@ -46,6 +46,7 @@ from vio.sim.rigs import (
     small_rig,
 )
 from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
+from vio.sim.textures import TextureKind
 from vio.sim.world import MovingBox, SceneName, World, corridor, room, street
 
 ReadyMotion: TypeAlias = Literal["handheld", "car"]
@@ -316,12 +317,14 @@ def _scene(
 ) -> World:
     """The scene with some boxes moving in it; the furniture of a room stays off the ways of people."""
     hard, seed = scenario.conditions, scenario.seed
+    bare: TextureKind = "plaster" if hard.lighting else "bare"  # in uneven light even a blank wall shows something
     if scenario.scene == "street":
         return street(seed, moving=moving, sunlit=hard.lighting, bare_houses=hard.bare_wall)
     if scenario.scene == "corridor":
-        return corridor(seed, bare_walls=("+y", "-y") if hard.bare_wall else ("+y",), moving=moving)
+        sides = ("+y", "-y") if hard.bare_wall else ("+y",)
+        return corridor(seed, bare_walls=sides, bare_kind=bare, moving=moving)
     walls, windows = ("+x", "+y") if hard.bare_wall else (), _WINDOWS if hard.lighting else 0
-    inside = functools.partial(room, seed, bare_walls=walls, moving=moving, windows=windows)
+    inside = functools.partial(room, seed, bare_walls=walls, bare_kind=bare, moving=moving, windows=windows)
     recorded = isinstance(scenario.trajectory, Path)
     around = room_around(motion, seed=seed) if recorded else room(seed)
     if not furnished:

@@ -21,6 +21,7 @@ from vio.sim.errors import SimulationError
 TextureKind: TypeAlias = Literal[
     "wall",
     "bare",
+    "plaster",
     "floor",
     "ceiling",
     "wood",
@@ -255,6 +256,17 @@ def _bare(width: int, height: int, per_m: float, rng: np.random.Generator) -> _C
     return np.full((height, width), 150.0, dtype=np.float32)
 
 
+def _plaster(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """A painted wall: stains fainter than a sensor's noise, a socket or hook here and there, a skirting board."""
+    canvas = np.ascontiguousarray(150 + 1.5 * _noise(width, height, per_m, rng, 1.5, 0.7), dtype=np.float32)
+    for _ in range(int(width * height / per_m**2 / 2) + 1):
+        side = rng.choice([0.08, 0.02]) * per_m
+        place = rng.uniform((0, 0.3 * height), (width, height - side))
+        _fill(canvas, (*place, max(side, 2), max(side, 2)), 150 + float(rng.choice([-70.0, 40.0])))
+    _fill(canvas, (0, height - 0.08 * per_m, width, 0.08 * per_m), 95.0)
+    return canvas
+
+
 def _picture(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
     canvas = rng.uniform(70, 180) + 35 * _noise(width, height, per_m, rng, 0.4, 0.9)
     canvas = np.ascontiguousarray(canvas, dtype=np.float32)
@@ -464,6 +476,7 @@ def _skin(width: int, height: int, per_m: float, rng: np.random.Generator) -> _C
 _PAINTERS: dict[TextureKind, Callable[[int, int, float, np.random.Generator], _Canvas]] = {
     "wall": _wall,
     "bare": _bare,
+    "plaster": _plaster,
     "floor": _floor,
     "ceiling": _ceiling,
     "wood": _wood,

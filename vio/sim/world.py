@@ -203,6 +203,7 @@ def room(
     bare_walls: tuple[str, ...] = (),
     moving: Sequence[MovingBox] = (),
     windows: int = 0,
+    bare_kind: TextureKind = "bare",
     texel_m: float | None = None,
 ) -> World:
     """Build an indoor room with furniture boxes on the floor and framed pictures on the walls.
@@ -215,6 +216,7 @@ def room(
         keep_clear: positions (N, 3) from which furniture stays 0.6 m away; None keeps the middle of the room free.
         bare_walls: sides without texture, of "+x" "-x" "+y" "-y".
         moving: boxes that move.
+        bare_kind: texture of the bare walls; "plaster" has a few marks.
         windows: bright windows, each on a wall of its own (up to 4), which light the room; 0: even light everywhere.
         texel_m: texture resolution; None chooses 2.5 mm, coarser in halls.
     """
@@ -223,7 +225,7 @@ def room(
     texel = (
         texel_m if texel_m is not None else max(0.0025, 0.0025 * float(np.prod(box[1, :2] - box[0, :2]) / 60) ** 0.5)
     )
-    patches = _shell(box, bare_walls, texel)
+    patches = _shell(box, bare_walls, texel, bare_kind)
     clear = _default_clear(box) if keep_clear is None else np.asarray(keep_clear, dtype=np.float64).reshape(-1, 3)
     solids: list[Solid] = []
     scale = float(np.clip((box[1, 2] - box[0, 2]) / 2.8, 0.7, 2.5))
@@ -273,13 +275,14 @@ def corridor(
     width_m: float = 2.6,
     height_m: float = 2.7,
     bare_walls: tuple[str, ...] = ("+y",),
+    bare_kind: TextureKind = "bare",
     moving: Sequence[MovingBox] = (),
     texel_m: float = 0.003,
 ) -> World:
     """Build a corridor along x whose left wall (`bare_walls`) is bare, with cupboards along the right one."""
     box = np.array([[0.0, -width_m / 2, 0.0], [length_m, width_m / 2, height_m]])
     rng = np.random.default_rng([seed, 2])
-    patches = _shell(box, bare_walls, texel_m)
+    patches = _shell(box, bare_walls, texel_m, bare_kind)
     solids: list[Solid] = []
     x = rng.uniform(2.0, 4.0)
     while x < length_m - 2:
@@ -324,7 +327,7 @@ def street(
     for number, (solid, back) in enumerate(houses):
         solids.append(solid)
         onward = bool(abs(solid.T_world_box[0, 3]) > outer[0] + 10)
-        kind: TextureKind = "bare" if bare_houses and number % _BARE_HOUSES == 0 else "facade"
+        kind: TextureKind = "plaster" if bare_houses and number % _BARE_HOUSES == 0 else "facade"
         patches += _box_patches(solid, kind, (2 if onward else 1) * texel_m, hidden=("-z", "+z", back))
     patches += _road(inner, outer, 0.8 * texel_m)
     for solid in _roadside(half, width_m, parked, rng):
@@ -416,13 +419,13 @@ def _box_patches(solid: Solid, kind: TextureKind, texel_m: float, *, hidden: tup
     return _axis_rectangles(solid.T_world_box, solid.half_size, kinds, texel_m, inwards=False)
 
 
-def _shell(box: FloatArray, bare_walls: tuple[str, ...], texel_m: float) -> list[Patch]:
+def _shell(box: FloatArray, bare_walls: tuple[str, ...], texel_m: float, bare: TextureKind) -> list[Patch]:
     unknown = set(bare_walls) - set(_FACES)
     if unknown:
         raise SimulationError(f"unknown walls {sorted(unknown)}; use some of {', '.join(_FACES)}")
     kinds: dict[str, TextureKind] = dict.fromkeys(("+x", "-x", "+y", "-y"), "wall")
     kinds |= {"-z": "floor", "+z": "ceiling"}
-    kinds |= dict.fromkeys(bare_walls, "bare")
+    kinds |= dict.fromkeys(bare_walls, bare)
     return _axis_rectangles(_pose((box[0] + box[1]) / 2, 0.0), (box[1] - box[0]) / 2, kinds, texel_m, inwards=True)
 
 
