@@ -153,7 +153,7 @@ _RENDERS = {
     "v102_real": f"{_FLIGHT}V1_02 --out WORK/v102_real",
     "mh03_real": f"{_FLIGHT}MH_03 --out WORK/mh03_real",
     "real_v102": f"{_FLIGHT}V1_02 --realism real --imu simulated --duration 20 --out WORK/real_v102",
-    "real_mh03": f"{_FLIGHT}MH_03 --realism real --imu simulated --duration 20 --out WORK/real_mh03",
+    "real_mh03": f"{_FLIGHT}MH_03 --realism real --imu simulated --duration 8 --out WORK/real_mh03",
     "real_street": "vio render --scene street --trajectory car --realism real --duration 20 --out WORK/real_street",
     "still": "vio render --trajectory WORK/still.tum --imu simulated --duration 61 --out WORK/still",
 }
