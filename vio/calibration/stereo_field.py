@@ -15,7 +15,7 @@ import numpy as np
 
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
-from vio.geometry.rectify import rectified_cameras, rectify_pixels
+from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.records import BoolArray, Estimate, StereoFieldEstimate
 from vio.rig import Rig
@@ -89,9 +89,22 @@ class PixelField:
         off[~has_right, 2:] = 0
         return z - off
 
-    def sources(self, z: FloatArray) -> FloatArray:
-        """Return where pixels (N, 4) of corrected images lie in the images as they are, (N, 4)."""
-        return z + self.at(z + self.at(z))
+    def maps(self) -> tuple[tuple[MapArray, MapArray], tuple[MapArray, MapArray]]:
+        """Return where each pixel of the left and right images without the field lies in the images as they are.
+
+        Source u and v (H, W) of both, for cv2.remap.
+        """
+        assert self.camera.width is not None
+        assert self.camera.height is not None
+        out = np.empty((4, self.camera.height, self.camera.width), dtype=np.float32)
+        u = np.arange(self.camera.width, dtype=np.float64)
+        for row in range(self.camera.height):
+            v = np.full_like(u, row)
+            z = np.stack([u, v, u, v], axis=1)
+            seen = z + self.at(z)
+            seen[:, 3] = v  # (R2) and (R3) take the row of the left image
+            out[:, row] = (z + self.at(seen)).T
+        return (out[0], out[1]), (out[2], out[3])
 
 
 @dataclass(frozen=True, slots=True)
