@@ -187,7 +187,7 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     seen = _as_seen(given, grid, x)
     at = _where_the_field_is_read(grid, seen)
     left = seen - grid - field_basis(camera, at) @ measured
-    return CalibratedRig(_moved(given, x), x, covariance, float(np.sqrt(np.mean(left**2))))
+    return CalibratedRig(rig_off_by(given, x), x, covariance, float(np.sqrt(np.mean(left**2))))
 
 
 def _expressible(given: Rig) -> BoolArray:
@@ -216,7 +216,7 @@ def _grid(rig: Rig) -> FloatArray:
     return np.concatenate([uv, uv], axis=1)
 
 
-def _moved(given: Rig, x: FloatArray) -> Rig:
+def rig_off_by(given: Rig, x: FloatArray) -> Rig:
     """Return the rig whose calibration differs from the given one by parameters (12,)."""
     if not np.any(x):
         return given
@@ -256,7 +256,7 @@ def _bent(camera: CameraModel, k: float, p1: float, p2: float) -> CameraModel:
 def _as_seen(given: Rig, z: FloatArray, x: FloatArray) -> FloatArray:
     """Return where the given rectification shows pixels (N, 4) of a perfect pair if it is off by parameters (12,)."""
     camera, R_rect_cam0, R_rect_cam1 = _rectified(given)
-    true = _moved(given, x)
+    true = rig_off_by(given, x)
     turns = R_rect_cam0.T, true.T_cam1_cam0[:3, :3] @ R_rect_cam0.T
     out = np.empty(z.shape)
     sides = ((given.cam0, true.cam0, turns[0], R_rect_cam0), (given.cam1, true.cam1, turns[1], R_rect_cam1))
