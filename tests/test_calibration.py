@@ -86,7 +86,7 @@ def test_stereo_extrinsics_have_consistent_standard_deviations(estimate: StereoE
     swing = np.degrees(np.linalg.norm(np.cross(estimate.direction, _direction(T_CAM0_CAM1))))
     assert turn < max(0.05, 4 * estimate.rotation_sigma_deg)
     assert swing < max(0.1, 4 * estimate.direction_sigma_deg)
-    assert 0.15 < estimate.rotation_sigma_deg < 0.2  # what a lens model may leave is in it: pairs cannot tell it from yaw
+    assert 0.15 < estimate.rotation_sigma_deg < 0.2  # what a lens model may leave, which pairs cannot tell from yaw
     assert 1000 < estimate.matches < 1350, "the gross outliers are left out"
     assert estimate.residual_deg == pytest.approx(np.degrees(SIGMA_RAD) * np.sqrt(2), rel=0.25)
 

@@ -29,6 +29,7 @@ _BOTH = ("k", "q1", "q2")
 # lengths by 2e-3 focal lengths; lens models as the sliding window takes it (msckf.stereo_field_sigma). A Cauchy
 # distribution of this width: a rig that is off by much more (KITTI's by 14 px and 1 degree) is believed.
 _PRIOR = np.array([*[np.radians(0.5)] * 3, *[2e-3] * 4, *[2e-3] * 2, 1e-2, *[2e-3] * 2])
+_MODEL = 1e-4  # focal lengths, 0.05 px: what terms beyond the second order leave in a coefficient of the field
 _BENDS = ("pinhole", "radtan", "unified")  # models that hold tangential distortion, or become one that does
 _GRID = (11, 9)  # points along the image's width and height at which field and rig are compared
 _STEP = 1e-6  # of numeric derivatives by the parameters, which are all of the size of radians
@@ -160,6 +161,15 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
     return replace(out, rig=rig)
 
 
+def field_of(camera: StereoCamera, parameters: FloatArray) -> PixelField:
+    """Return the field of a rectified pair, with image size, that is off by parameters (12,)."""
+    assert camera.width is not None
+    assert camera.height is not None
+    c = camera
+    given = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height)
+    return PixelField(camera, _coefficients(given, _grid(given), parameters))
+
+
 def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     """Fit the parameters to the field's coefficients with their covariance and the prior, by Gauss-Newton.
 
@@ -170,6 +180,7 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     assert field.rows_covariance is not None
     P = np.zeros((12, 12))
     P[:6, :6], P[6:, 6:] = field.covariance, field.rows_covariance
+    P += _MODEL**2 * np.eye(12)
     W = np.linalg.inv(P)
     free = _expressible(given)
     x = np.zeros(len(PARAMETERS))

@@ -37,16 +37,19 @@ NAMES = (
 _PRIOR = np.array(
     [*[0.05, 0.005, 0.02, 0.02, 1e-2, 2e-3, 2e-3], *[np.radians(0.5)] * 3, *[5e-3] * 2, *[2e-3] * 4, *[2e-3] * 2]
 )
+_OF_RIGHT = {"cu": "right_cu", "cv": "right_cv", "fu": "right_fu", "fv": "right_fv"}  # in `stereo_field.PARAMETERS`
 INTRINSICS = ("focal", "aspect", "cu", "cv")
 # What lens models leave, beside the scatter: this and the sliding window differ by so much on the same drives.
 _LENS_DEG, _LENS_DIRECTION_DEG = 0.01, 0.3
 _HELD = 1e-9  # standard deviation of what is not free
-_POSES_FIRST = 3  # steps with the calibration held, as the first poses come from frame to frame
-_STEPS = 12
+_STEPS = 30  # of Levenberg-Marquardt, at most
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-10  # over the diagonal of the information
+_SETTLED = 1e-6  # relative decrease of the cost at which the steps end
+_LARGEST_RESIDUAL_PX = 1.5  # robust standard deviation above which the tracks are not of one rigid scene and rig
 _STEP = 1e-6  # of numeric derivatives: by rays and parameters, which have the size of radians
 _CAUCHY = 2.0  # residuals of so many standard deviations count half
-_GATE = 5.0  # rows with larger residuals, in standard deviations, are left out after half the steps
-_DAMPING = 1e-12  # of a point's information, against rounding; more of it passes for knowledge of depths
+_GATE = 5.0  # rows with larger residuals, in standard deviations, are left out
+_ROUNDING = 1e-12  # of a point's information, against rounding; more of it passes for knowledge of depths
 _CELLS = (8, 4)  # regions of the image, along u and v
 _LEAST_RESIDUAL_PX = 0.02  # of exact tracks, so that weights stay finite
 
@@ -98,10 +101,16 @@ class SelfCalibration:
             float(np.hypot(swing, _LENS_DIRECTION_DEG)),
         )
 
+    def after(self, parameters: FloatArray) -> SelfCalibration:
+        """Return the calibration of pixels as they were before a field of parameters (12,) was taken out of them."""
+        values = self.values.copy()
+        for name, value in zip(PARAMETERS, parameters, strict=True):
+            values[NAMES.index(_OF_RIGHT.get(name, name))] += value
+        return replace(self, values=values)
+
     def rig_parameters(self) -> FloatArray:
         """Return what the right camera and both lenses are off by (12,), as `stereo_field.PARAMETERS` names it."""
-        names = {"cu": "right_cu", "cv": "right_cv", "fu": "right_fu", "fv": "right_fv"}
-        return np.array([self.values[NAMES.index(names.get(name, name))] for name in PARAMETERS])
+        return np.array([self.values[NAMES.index(_OF_RIGHT.get(name, name))] for name in PARAMETERS])
 
 
 def intrinsics_of(camera: StereoCamera, found: SelfCalibration) -> Intrinsics | NotObservable:
@@ -149,35 +158,68 @@ def self_calibrate(camera: StereoCamera, stretches: Sequence[Stretch], *, intrin
     Raises:
         EstimationError: no stretch has a consistent track.
     """
-    x: FloatArray = np.zeros(len(NAMES))
+    x = np.zeros(len(NAMES))
     pieces = [s for s in stretches if len(s.tracks.ids)]
     if not pieces:
         raise EstimationError("not observable because no track is consistent over the keyframes")
     width = np.where(np.isin(NAMES, INTRINSICS) & (not intrinsics), _HELD, _PRIOR)
-    sigma = 1.0
-    A = meat = np.zeros((len(NAMES), len(NAMES)))
-    for step in range(_STEPS):
-        if step == _STEPS // 2:
-            pieces = [_without_outliers(camera, x, piece, sigma) for piece in pieces]
-        sigma = max(robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])), _LEAST_RESIDUAL_PX)
-        solved = [_normal_equations(camera, x, piece, sigma) for piece in pieces]
+    x, pieces = _optimum(camera, x, pieces, width)
+    sigma = _spread(camera, x, pieces)
+    if sigma > _LARGEST_RESIDUAL_PX:
+        raise EstimationError(f"not observable because tracks and motion disagree by {sigma:.1f} px")
+    x, pieces = _optimum(camera, x, [_without_outliers(camera, x, piece, sigma) for piece in pieces], width)
+    return _with_covariance(camera, x, pieces, width)
+
+
+def _optimum(
+    camera: StereoCamera, x: FloatArray, pieces: list[Stretch], width: FloatArray
+) -> tuple[FloatArray, list[Stretch]]:
+    """Return parameters (18,) and stretches at the least robust cost, by Levenberg-Marquardt."""
+    damping = _FIRST_DAMPING
+    for _ in range(_STEPS):
+        sigma = _spread(camera, x, pieces)
         prior = np.diag(1 / (width**2 + x**2))
-        data = np.sum([n.A for n in solved], axis=0)
-        A = data + prior
-        dx = np.zeros(len(NAMES))
-        if step >= _POSES_FIRST:
-            dx = np.linalg.solve(A, np.sum([n.b for n in solved], axis=0) - prior @ x)
-        scatter = np.concatenate([n.scores for n in solved])
-        meat = scatter.T @ scatter * (len(scatter) / max(len(scatter) - 1, 1)) + prior
-        meat = _larger(meat, data + prior)
-        pieces = [n.moved(piece, dx) for n, piece in zip(solved, pieces, strict=True)]
-        x = x + dx
+        solved = [_normal_equations(camera, x, piece, sigma, damping) for piece in pieces]
+        A = np.sum([n.A for n in solved], axis=0) + prior
+        dx = np.linalg.solve(A + damping * np.diag(np.diag(A)), np.sum([n.b for n in solved], axis=0) - prior @ x)
+        moved = [n.moved(piece, dx) for n, piece in zip(solved, pieces, strict=True)]
+        before, after = _cost(camera, x, pieces, sigma, width), _cost(camera, x + dx, moved, sigma, width)
+        if after < before:
+            x, pieces, damping = x + dx, moved, max(damping / 30, _LEAST_DAMPING)
+        else:
+            damping = 10 * max(damping, 1e-8)
+        if abs(before - after) < _SETTLED * before:
+            break
+    return x, pieces
+
+
+def _with_covariance(
+    camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch], width: FloatArray
+) -> SelfCalibration:
+    """Return parameters (18,) at the optimum with their sandwich covariance; the prior has a `width` (18,)."""
+    sigma, prior = _spread(camera, x, pieces), np.diag(1 / (width**2 + x**2))
+    solved = [_normal_equations(camera, x, piece, sigma, 0.0) for piece in pieces]
+    A = np.sum([n.A for n in solved], axis=0) + prior
+    scores = np.concatenate([n.scores for n in solved])
+    meat = _larger(scores.T @ scores * (len(scores) / max(len(scores) - 1, 1)) + prior, A)
     inverse = np.linalg.inv(A)
-    covariance = inverse @ meat @ inverse
+    covariance = np.asarray(inverse @ meat @ inverse, dtype=np.float64)
     allowed = width**2 + x**2
     sigmas = np.sqrt(np.minimum(np.diag(covariance), allowed))
     points = int(sum(len(piece.tracks.ids) for piece in pieces))
     return SelfCalibration(x, sigmas, covariance, 1 - sigmas**2 / allowed, len(pieces), points, sigma)
+
+
+def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch]) -> float:
+    """Return the robust standard deviation of a pixel coordinate."""
+    return max(robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])), _LEAST_RESIDUAL_PX)
+
+
+def _cost(camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch], sigma: float, width: FloatArray) -> float:
+    """Return what the steps decrease: Cauchy losses of rows and parameters (18,)."""
+    squares = [np.sum(_residuals(camera, x, piece)[0] ** 2, axis=1) / sigma**2 for piece in pieces]
+    rows = sum(float(np.sum(2 * _CAUCHY**2 * np.log1p(q / (4 * _CAUCHY**2)))) for q in squares)
+    return rows + 0.5 * float(np.sum(np.log1p(x**2 / width**2)))
 
 
 def _larger(A: FloatArray, B: FloatArray) -> FloatArray:
@@ -229,7 +271,7 @@ class _Normal:
         return Stretch(se3_inverse(T_cam0_world), replace(piece.tracks, p_world=p))
 
 
-def _normal_equations(camera: StereoCamera, x: FloatArray, piece: Stretch, sigma: float) -> _Normal:
+def _normal_equations(camera: StereoCamera, x: FloatArray, piece: Stretch, sigma: float, damping: float) -> _Normal:
     tracks, K, M, X = piece.tracks, len(piece.T_world_cam0), len(piece.tracks.ids), len(NAMES)
     r, _, q = _residuals(camera, x, piece)
     J_q, J_x = _derivatives(camera, x, q)
@@ -258,7 +300,9 @@ def _normal_equations(camera: StereoCamera, x: FloatArray, piece: Stretch, sigma
     own = np.zeros((M, X))
     np.add.at(own, tracks.point, np.einsum("nai,na->ni", J_x, r))
     g_c[:, 6 * K :] = own
-    H_pp += _DAMPING * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    H_pp += _ROUNDING * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    H_pp[:, range(3), range(3)] *= 1 + damping
+    H_cc[range(6 * K), range(6 * K)] *= 1 + damping
     return _eliminated(H_pp, H_pc, g_p, g_c, H_cc, _regions(camera, tracks))
 
 

@@ -24,13 +24,14 @@ from vio.calibration.stereo import (
     row_residuals,
     too_few,
 )
+from vio.calibration.stereo_field import PARAMETERS, field_of
 from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo, judge_velocity_lever_arm
 from vio.colmap.pairs import adjust_rig, relative_pose, sift_matches
 from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import load_gray
 from vio.errors import EstimationError
 from vio.geometry.distortion import StereoRig, unproject_pixel
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, so3_log
 from vio.geometry.rectify import rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.mapping.keyframes import choose_keyframes, tracked_stretches
@@ -44,6 +45,9 @@ log = logging.getLogger(__name__)
 
 _STRETCH, _STRETCHES, _STRETCH_KEYFRAMES = 36, 6, 20  # frames, pieces, keyframes of each, for the rig in motion
 _STRETCH_GATE_PX = 8.0  # wide: wrong extrinsics displace every point
+# What the gate leaves of a camera that is far off is biased: it is measured again with what was found taken out, until
+# less than this is left.
+_ROUNDS, _SETTLED_DEG = 5, 0.05
 _FRAMES_PER_PAIR = 5  # a frame of a feature file contains fewer matches than a pair of images
 _MAX_ROW_OFFSET_PX = 2.0  # with larger row differences, features are matched wrongly or not at all
 _UNUSABLE = ("cameras swapped", "baseline translation inverted")  # features are unusable then
@@ -224,11 +228,18 @@ def _measure_in_motion(
     width, height = source.image_size(tracks.z)
     recording = source.dataset.recording
     camera = replace(recording.camera, width=int(width) + 1, height=int(height) + 1)
-    pieces = _stretches(source, camera, tracks, recording.frame_times_ns)
-    if not pieces:
-        return stereo, NotObservable(_INTRINSICS, "there are no 20 frames in a row whose motion is known"), None
+    off: FloatArray = np.zeros(len(PARAMETERS))
     try:
-        held, free = (self_calibrate(camera, pieces, intrinsics=free) for free in (False, True))
+        for _ in range(_ROUNDS):
+            pieces = _stretches(source, camera, _corrected(camera, tracks, off), recording.frame_times_ns)
+            if not pieces:
+                return stereo, NotObservable(_INTRINSICS, "there are no 20 frames in a row whose motion is known"), None
+            step = self_calibrate(camera, pieces, intrinsics=False)
+            held = step.after(off)
+            if np.degrees(np.linalg.norm(so3_log(step.right_camera()[0]))) < _SETTLED_DEG:
+                break
+            off = held.rig_parameters()
+        free = self_calibrate(camera, pieces, intrinsics=True)
     except (EstimationError, np.linalg.LinAlgError) as error:
         log.warning("the motion was not used: %s", error)
         return stereo, NotObservable(_INTRINSICS, "its bundle adjustment failed"), None
@@ -245,6 +256,11 @@ def _measure_in_motion(
         stretches=held.stretches,
     )
     return found, intrinsics_of(camera, free), held
+
+
+def _corrected(camera: StereoCamera, tracks: FeatureTracks, off: FloatArray) -> FeatureTracks:
+    """Return tracks without the field of a pair that is off by parameters (12,)."""
+    return replace(tracks, z=field_of(camera, off).without(tracks.z, tracks.has_right)) if np.any(off) else tracks
 
 
 def _stretches(
