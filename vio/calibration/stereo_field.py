@@ -34,6 +34,7 @@ _BENDS = ("pinhole", "radtan", "unified")  # models that hold tangential distort
 _GRID = (11, 9)  # points along the image's width and height at which field and rig are compared
 _STEP = 1e-6  # of numeric derivatives by the parameters, which are all of the size of radians
 _STEPS = 15  # of Gauss-Newton; the weights of the prior need most of them
+_LINEARISED = (0, 4)  # of these steps: at the given rig and near the solution
 _NAMED_SIGMAS = 3.0  # a parameter within so many standard deviations of zero is not named
 _TEXT = {
     "wx": ("right camera turned by {} deg about its horizontal axis", 180 / np.pi, ".3f"),
@@ -154,7 +155,7 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
         out = CalibratedRig(given, np.zeros(len(PARAMETERS)), np.diag(_PRIOR**2), 0.0)
     rig = out.rig
     if estimate.T_cam0_imu is not None:
-        R_cam0_rect = _rectified(given)[1].T
+        R_cam0_rect = _Frame.of(given).R_rect_cam0.T
         rig = replace(rig, T_cam0_imu=se3_from_parts(R_cam0_rect, np.zeros(3)) @ estimate.T_cam0_imu)
     if estimate.time_offset_s is not None:
         rig = replace(rig, time_offset_s=given.time_offset_s + estimate.time_offset_s)
@@ -167,7 +168,7 @@ def field_of(camera: StereoCamera, parameters: FloatArray) -> PixelField:
     assert camera.height is not None
     c = camera
     given = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height)
-    return PixelField(camera, _coefficients(given, _grid(given), parameters))
+    return PixelField(camera, _Frame.of(given).coefficients(parameters))
 
 
 def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
@@ -175,8 +176,8 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
 
     The Cauchy prior is a Gaussian one whose weights follow the parameters.
     """
-    camera, grid = _rectified(given)[0], _grid(given)
-    measured = PixelField.of(camera, field).coefficients
+    frame = _Frame.of(given)
+    measured = PixelField.of(frame.camera, field).coefficients
     assert field.rows_covariance is not None
     P = np.zeros((12, 12))
     P[:6, :6], P[6:, 6:] = field.covariance, field.rows_covariance
@@ -184,21 +185,19 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     W = np.linalg.inv(P)
     free = _expressible(given)
     x = np.zeros(len(PARAMETERS))
-    information = np.diag(1 / _PRIOR**2)
-    for _ in range(_STEPS):
+    J, information = np.zeros((12, 12)), np.diag(1 / _PRIOR**2)
+    for round_ in range(_STEPS):
         prior = np.diag(1 / (_PRIOR**2 + x**2))
-        J = np.zeros((12, 12))
-        for k in np.flatnonzero(free):
+        for k in np.flatnonzero(free & (round_ in _LINEARISED)):
             step = _STEP * np.eye(12)[k]
-            J[:, k] = (_coefficients(given, grid, x + step) - _coefficients(given, grid, x - step)) / (2 * _STEP)
+            J[:, k] = (frame.coefficients(x + step) - frame.coefficients(x - step)) / (2 * _STEP)
         information = J.T @ W @ J + prior
-        gradient = J.T @ W @ (measured - _coefficients(given, grid, x)) - prior @ x
+        gradient = J.T @ W @ (measured - frame.coefficients(x)) - prior @ x
         x = x + np.linalg.solve(information, gradient * free)
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    seen = _as_seen(given, grid, x)
-    at = _where_the_field_is_read(grid, seen)
-    left = seen - grid - field_basis(camera, at) @ measured
-    return CalibratedRig(rig_off_by(given, x), x, covariance, float(np.sqrt(np.mean(left**2))))
+    seen = frame.as_seen(x)
+    left = seen - frame.grid - field_basis(frame.camera, frame.where_read(seen)) @ measured
+    return CalibratedRig(frame.moved(x), x, covariance, float(np.sqrt(np.mean(left**2))))
 
 
 def _expressible(given: Rig) -> BoolArray:
@@ -209,44 +208,74 @@ def _expressible(given: Rig) -> BoolArray:
     return np.array([held.get(name, True) for name in PARAMETERS])
 
 
-def _rectified(rig: Rig) -> tuple[StereoCamera, FloatArray, FloatArray]:
-    """Return the rectified camera and the rotations (3, 3) into it from the left and the right one."""
-    if rectified_pair(rig.stereo) is not None:
-        return rig.camera, np.eye(3), np.eye(3)
-    pair = rectified_cameras(rig.stereo)
-    return pair.camera, pair.R_rect_cam0, pair.R_rect_cam1
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A given rig, its rectification, and the pixels at which rigs are compared with fields."""
+
+    given: Rig
+    camera: StereoCamera
+    R_rect_cam0: FloatArray  # (3, 3)
+    R_rect_cam1: FloatArray  # (3, 3)
+    grid: FloatArray  # (N, 4) equal left and right positions over the rectified image
+
+    @classmethod
+    def of(cls, rig: Rig) -> _Frame:
+        """Rectify a rig."""
+        camera, R_rect_cam0, R_rect_cam1 = rig.camera, np.eye(3), np.eye(3)
+        if rectified_pair(rig.stereo) is None:
+            pair = rectified_cameras(rig.stereo)
+            camera, R_rect_cam0, R_rect_cam1 = pair.camera, pair.R_rect_cam0, pair.R_rect_cam1
+        assert camera.width is not None
+        assert camera.height is not None
+        u, v = np.meshgrid(np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1]))
+        return cls(rig, camera, R_rect_cam0, R_rect_cam1, np.stack([u, v, u, v], axis=-1).reshape(-1, 4))
+
+    def moved(self, x: FloatArray) -> Rig:
+        """Return the rig whose calibration differs from the given one by parameters (12,)."""
+        if not np.any(x):
+            return self.given
+        given, named = self.given, dict(zip(PARAMETERS, x.tolist(), strict=True))
+        k, q1, q2 = (named[name] for name in _BOTH)
+        b = given.cam1
+        b = replace(
+            b,
+            cu=b.cu + b.fu * named["cu"],
+            cv=b.cv + b.fv * named["cv"],
+            fu=b.fu * (1 + named["fu"]),
+            fv=b.fv * (1 + named["fv"]),
+        )
+        cam0, cam1 = _bent(given.cam0, k, q1, q2), _bent(b, k, q1 + named["p1"], q2 + named["p2"])
+        R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
+        centre = se3_inverse(given.T_cam1_cam0)[:3, 3]
+        return replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
+
+    def as_seen(self, x: FloatArray) -> FloatArray:
+        """Return where the given rectification shows the grid's pixels (N, 4) if it is off by parameters (12,)."""
+        true, out = self.moved(x), np.empty(self.grid.shape)
+        turn1 = true.T_cam1_cam0[:3, :3] @ self.R_rect_cam0.T
+        sides = (
+            (self.given.cam0, true.cam0, self.R_rect_cam0.T, self.R_rect_cam0),
+            (self.given.cam1, true.cam1, turn1, self.R_rect_cam1),
+        )
+        for column, (believed, real, turn, R_rect_cam) in zip((0, 2), sides, strict=True):
+            raw, _ = project_point(real, left_rays(self.camera, self.grid[:, column : column + 2]) @ turn.T)
+            out[:, column : column + 2], _ = rectify_pixels(believed, R_rect_cam, self.camera, raw)
+        return out
+
+    def where_read(self, seen: FloatArray) -> FloatArray:
+        """Return the pixels (N, 4) at which (R2) and (R3) are evaluated: those seen, in the rows of the left image."""
+        return np.stack([seen[:, 0], seen[:, 1], seen[:, 2], self.grid[:, 3]], axis=1)
+
+    def coefficients(self, x: FloatArray) -> FloatArray:
+        """Return the field's coefficients (12,) that fit best what parameters (12,) do to the grid's pixels."""
+        seen = self.as_seen(x)
+        D = field_basis(self.camera, self.where_read(seen)).reshape(-1, 12)
+        return np.asarray(np.linalg.lstsq(D, (seen - self.grid).ravel(), rcond=None)[0], dtype=np.float64)
 
 
-def _grid(rig: Rig) -> FloatArray:
-    """Stereo pixels (N, 4) of equal left and right positions over the rectified image."""
-    camera = _rectified(rig)[0]
-    assert camera.width is not None
-    assert camera.height is not None
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1]))
-    uv = np.stack([u.ravel(), v.ravel()], axis=1)
-    return np.concatenate([uv, uv], axis=1)
-
-
-def rig_off_by(given: Rig, x: FloatArray) -> Rig:
-    """Return the rig whose calibration differs from the given one by parameters (12,)."""
-    if not np.any(x):
-        return given
-    named = dict(zip(PARAMETERS, x.tolist(), strict=True))
-    _, R_rect_cam0, R_rect_cam1 = _rectified(given)
-    k, q1, q2 = (named[name] for name in _BOTH)
-    cam0 = _bent(given.cam0, k, q1, q2)
-    b = given.cam1
-    b = replace(
-        b,
-        cu=b.cu + b.fu * named["cu"],
-        cv=b.cv + b.fv * named["cv"],
-        fu=b.fu * (1 + named["fu"]),
-        fv=b.fv * (1 + named["fv"]),
-    )
-    cam1 = _bent(b, k, q1 + named["p1"], q2 + named["p2"])
-    R = R_rect_cam1.T @ so3_exp(x[:3]) @ R_rect_cam0
-    centre = se3_inverse(given.T_cam1_cam0)[:3, 3]
-    return replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
+def rig_off_by(given: Rig, parameters: FloatArray) -> Rig:
+    """Return the rig whose calibration differs from a given one by parameters (12,)."""
+    return _Frame.of(given).moved(parameters)
 
 
 def _bent(camera: CameraModel, k: float, p1: float, p2: float) -> CameraModel:
@@ -262,29 +291,3 @@ def _bent(camera: CameraModel, k: float, p1: float, p2: float) -> CameraModel:
     if camera.model == "equidistant":
         return replace(camera, coefficients=(c[0] + k, *c[1:]))
     return camera
-
-
-def _as_seen(given: Rig, z: FloatArray, x: FloatArray) -> FloatArray:
-    """Return where the given rectification shows pixels (N, 4) of a perfect pair if it is off by parameters (12,)."""
-    camera, R_rect_cam0, R_rect_cam1 = _rectified(given)
-    true = rig_off_by(given, x)
-    turns = R_rect_cam0.T, true.T_cam1_cam0[:3, :3] @ R_rect_cam0.T
-    out = np.empty(z.shape)
-    sides = ((given.cam0, true.cam0, turns[0], R_rect_cam0), (given.cam1, true.cam1, turns[1], R_rect_cam1))
-    for column, (believed, real, turn, R_rect_cam) in zip((0, 2), sides, strict=True):
-        raw, _ = project_point(real, left_rays(camera, z[:, column : column + 2]) @ turn.T)
-        out[:, column : column + 2], _ = rectify_pixels(believed, R_rect_cam, camera, raw)
-    return out
-
-
-def _where_the_field_is_read(z: FloatArray, seen: FloatArray) -> FloatArray:
-    """Return the pixels (N, 4) at which (R2) and (R3) are evaluated: those seen, in the rows of the left image."""
-    return np.stack([seen[:, 0], seen[:, 1], seen[:, 2], z[:, 3]], axis=1)
-
-
-def _coefficients(given: Rig, z: FloatArray, x: FloatArray) -> FloatArray:
-    """Return the field's coefficients (12,) that fit best what parameters (12,) do to pixels (N, 4)."""
-    seen = _as_seen(given, z, x)
-    camera = _rectified(given)[0]
-    D = field_basis(camera, _where_the_field_is_read(z, seen)).reshape(-1, 12)
-    return np.asarray(np.linalg.lstsq(D, (seen - z).ravel(), rcond=None)[0], dtype=np.float64)
