@@ -32,7 +32,7 @@ def _off(**values: float) -> FloatArray:
 
 
 def _poses(turning: float) -> FloatArray:
-    """Left cameras `T_world_cam0` (K, 4, 4) that move ahead and aside, and turn by up to some radians about all axes."""
+    """Left cameras `T_world_cam0` (K, 4, 4) that move ahead and aside, and turn about all axes by up to an angle."""
     s = np.linspace(0, 1, KEYFRAMES)
     turns = turning * np.stack([np.sin(5 * s), np.sin(4 * s + 1) - np.sin(1), 0.5 * np.sin(6 * s)], axis=1)
     places = np.stack([0.6 * np.sin(3 * s), 0.2 * s, 1.5 * s], axis=1)
