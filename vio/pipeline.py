@@ -12,10 +12,11 @@ from typing import NoReturn
 import numpy as np
 
 from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
-from vio.chain import BACKENDS, STAGES, FrameLog, FrameResult, build_backend
+from vio.chain import BACKENDS, build_backend
 from vio.config import BackendName, Config
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
+from vio.frame_result import STAGES, FrameLog, FrameResult
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.odometry import Odometry, rig_of_rectified
@@ -24,7 +25,6 @@ from vio.records import (
     BodyFrame,
     Estimate,
     Event,
-    FrontendOutput,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -32,7 +32,6 @@ from vio.records import (
     Recording,
     StereoFrame,
     Trajectory,
-    UpdateReport,
 )
 from vio.rig import Rig
 from vio.run_recorder import GrowingFolder, RunRecorder
@@ -83,7 +82,7 @@ class RunResult:
 class NullViewer:
     """Shows nothing."""
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Ignore the frame."""
 
     def close(self) -> None:
@@ -281,7 +280,7 @@ class _Loop:
             self._recorder.frame(result, self._reading.take_ms(), state.odometry.smoothed)
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
-            self._viewer.frame(result.output, result.estimate, result.report)
+            self._viewer.frame(result)
 
 
 def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:

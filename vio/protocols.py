@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
 
+from vio.frame_result import FrameResult
 from vio.records import (
     Estimate,
     Event,
@@ -124,7 +125,7 @@ class Backend(Protocol):
 class Viewer(Protocol):
     """Watches a run; must not change it."""
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Show one processed frame."""
 
     def close(self) -> None:

@@ -40,6 +40,13 @@ def add_parser(commands: Any) -> None:
         help="write the calibration with what the run found it to be off by, for --calibration of the next run "
         "(Kalibr's format; default camchain-imucam.yaml in the folder of results)",
     )
+    parser.add_argument(
+        "--view",
+        nargs="?",
+        const="spawn",
+        metavar="WHERE",
+        help="show the run in rerun: in a window, in a browser (web), or into a file *.rrd (extra view)",
+    )
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(execute=execute)
@@ -53,6 +60,7 @@ _OF_A_NEW_RUN = (
     "out",
     "save_observations",
     "save_calibration",
+    "view",
     "set",
     "config",
     "motion",
@@ -86,5 +94,6 @@ def execute(args: argparse.Namespace) -> int:
         save_observations=args.save_observations,
         save_calibration=args.save_calibration,
         progress=not args.quiet,
+        view=args.view,
     )
     return print_result(metrics, rows_of(metrics), as_json=args.json)
