@@ -94,10 +94,10 @@ class Odometry:
         """
         self._config = Config() if config is None else config
         self._rectifier: Rectifier | None = None
+        self._rig: Rig | None = None  # as given; None: a rectified pair
         self._offset_ns = 0
         if isinstance(rig, StereoCamera):
             self.camera = rig
-            self._rig = rig_of_rectified(rig, T_cam0_imu)
         else:
             self._rig = rig
             self._rectifier = rig.rectifier()
@@ -252,9 +252,10 @@ class Odometry:
         estimate = self._estimate
         if estimate is None:
             raise DataError("there is no calibration before the first frame")
-        if self._rig is None:
+        rig = self._rig or rig_of_rectified(self.camera, None if self.motion is None else self.T_cam0_body)
+        if rig is None:
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
-        return calibrated_rig(self._rig, estimate)
+        return calibrated_rig(rig, estimate)
 
     @property
     def warnings(self) -> tuple[str, ...]:
