@@ -19,6 +19,7 @@ from types import FrameType
 
 from vio._version import __version__
 from vio.cli import (
+    bench,
     calibrate,
     check,
     config,
@@ -41,6 +42,7 @@ _COMMANDS = (
     inspect,
     convert,
     evaluate,
+    bench,
     check,
     refine,
     export,
