@@ -15,7 +15,7 @@ import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,12 +27,13 @@ from vio.datasets import open_dataset
 from vio.datasets.span import frames_between
 from vio.errors import DataError, VioError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, evaluate
-from vio.pipeline import RunResult, run
 from vio.printable import json_text
 from vio.protocols import Dataset
 from vio.records import Estimate, FrontendOutput, Trajectory, UpdateReport
-from vio.run_folder import growing_folder
 from vio.trajectory_io import read_trajectory, tum_text
+
+if TYPE_CHECKING:
+    from vio.pipeline import RunResult
 
 _WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as in tools/bench.py
 _MOST_WARNINGS = 5
@@ -134,6 +135,9 @@ def _stop(job: dict[str, Any]) -> Any:
 def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -> dict[str, Any]:
     """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
     import cv2
+
+    from vio.pipeline import run  # loads the compiled functions: not for a recording that cannot be opened
+    from vio.run_folder import growing_folder
 
     cv2.setNumThreads(1)  # tasks run side by side; the figures do not depend on it
     with tempfile.TemporaryDirectory(prefix="vio-bench-", dir=job["scratch"]) as folder:
