@@ -45,7 +45,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two drives of features with ground truth, and one whose file is cut off."""
     folder = tmp_path_factory.mktemp("recordings")
     for k in range(2):
-        make_mat(folder / f"drive{k}.mat", utias_arrays(make_drive(14, seed=k, pixel_sigma=0.3)))
+        make_mat(folder / f"drive{k}.mat", utias_arrays(make_drive(14 + 2 * k, seed=k, pixel_sigma=0.3)))
     (folder / "corrupt.mat").write_bytes((folder / "drive0.mat").read_bytes()[:3000])
     return folder
 
@@ -324,13 +324,14 @@ def test_only_what_has_no_result_is_run(data: Path, tmp_path: Path, monkeypatch:
 
     monkeypatch.setattr("vio.bench.bench.run_here", engine)
     place = Place(data=data, out=tmp_path / "out", cache=tmp_path / "cache")
-    suite = _suite(tmp_path, sequences={"a": "drive1.mat", "b": "drive0.mat"})
+    assert (data / "drive1.mat").stat().st_size > (data / "drive0.mat").stat().st_size, "the largest is done first"
+    suite = _suite(tmp_path, sequences={"b": "drive0.mat", "a": "drive1.mat"})
     with pytest.raises(KeyboardInterrupt):
         bench(suite, place)
     assert [Path(name).name for name in done] == ["drive1.mat", "drive0.mat"]
     result = bench(suite, place)
     assert (result.reused, len(done)) == (1, 3)
-    assert [o.failure for o in result.failures] == ["the file is damaged", "no space"]
+    assert [o.failure for o in result.failures] == ["no space", "the file is damaged"]
     result = bench(suite, place)
     assert (result.reused, len(done)) == (1, 4), "a full disk may have been emptied"
     assert [o.failure for o in result.failures] == ["the file is damaged"]

@@ -76,7 +76,7 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
     with locked_folder(place.out):
         records: dict[str, Record] = {}
         missing: dict[str, dict[str, Any]] = {}
-        for task in tasks:
+        for task in sorted(tasks, key=lambda task: -task.size):  # a long one that begins last keeps all others waiting
             if task.failure is None and task.key not in records:
                 record = store.get(task.key)
                 if record is None:

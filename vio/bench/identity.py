@@ -84,6 +84,7 @@ class InputDigests:
         """
         self._file, self._identity = file, identity
         self._known: dict[str, list[str]] = {}
+        self._bytes: dict[Path, int] = {}
         try:
             self._known = json.loads(file.read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -98,7 +99,9 @@ class InputDigests:
         if not path.exists():
             raise DataError(f"{path} does not exist; name the folder of the recordings with --data")
         try:
-            signature = digest_of([_stat(file, path) for file in _files(path)])
+            facts = [_stat(file, path) for file in _files(path)]
+            self._bytes[path] = sum(size for _, size, _ in facts)
+            signature = digest_of(facts)
             if self._identity == "stat":
                 return f"stat:{signature}"
             known = self._known.get(str(path.absolute()))
@@ -108,6 +111,10 @@ class InputDigests:
         except OSError as error:
             raise DataError(f"cannot read {error.filename or path}: {error.strerror or error}") from error
         return known[1]
+
+    def bytes_of(self, path: Path) -> int:
+        """Return the size of an input whose digest was asked for."""
+        return self._bytes[path]
 
     def save(self) -> None:
         """Remember the digests.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -31,6 +32,7 @@ class Task:
     key: str  # digest of all that the figures depend on
     job: dict[str, Any]  # what a worker needs; empty where the task cannot be done
     failure: str | None = None  # why it cannot
+    size: float = 0.0  # of the inputs in bytes, infinite for what must be rendered: the largest tasks are done first
 
 
 def tasks_of(suite: Suite, data: Path, digests: InputDigests, peers: Path | None = None) -> list[Task]:
@@ -87,7 +89,8 @@ def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, di
         return replace(task, failure=" ".join(str(error).split()))
     job |= {"kind": "run", "config": config}
     known = {**_without(config, files), "files": files}
-    return replace(task, job=job, key=digest_of([_FORM, "run", identity, known]))
+    size = math.inf if identity["bytes"] is None else identity["bytes"]
+    return replace(task, job=job, key=digest_of([_FORM, "run", identity, known]), size=size)
 
 
 def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -107,9 +110,11 @@ def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) ->
         kind, path = _source(sequence.source, data)
         job["source"] = f"{kind}{path}"
         identity["source"] = [kind, digests.of(path)]
+        identity["bytes"] = digests.bytes_of(path)
     else:
         job["render"] = render_of(sequence, data, digests, seed if sequence.render_each_seed else 0)
         identity["render"] = job["render"]["key"]
+        identity["bytes"] = None
     if sequence.reference is not None:
         job["reference"] = str((data / sequence.reference).absolute())
         identity["reference"] = digests.of(Path(job["reference"]))
