@@ -1,7 +1,7 @@
 """Simulate how a suite of thousands of recordings runs on a cluster: duration, CPU hours, repetitions, price.
 
     python tools/bench_schedule.py [--sequences 10000] [--minutes 3] [--rate 20] [--cpu-ms 40] [--sigma 0.8]
-        [--machines 10] [--cores 64] [--losses-per-hour 0.05] [--order listed|longest] [--seed 0] [--json]
+        [--machines 10] [--cores 64] [--losses-per-hour 0.05] [--order listed|longest] [--runs 20] [--json]
 
 Lengths are log-normal with the given mean and sigma of the logarithm: with 0.8, one recording in a hundred is over five
 times as long as the median. A task takes its frames times the CPU time of a frame, and a second to start. Machines are
@@ -16,7 +16,7 @@ import heapq
 import json
 import sys
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -139,7 +139,7 @@ def _summary(tasks_s: npt.NDArray[np.float64], state: dict[str, float], cores: i
 
 
 def main() -> int:
-    """Print one schedule."""
+    """Print the mean of some schedules."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sequences", type=int, default=10_000)
     parser.add_argument("--minutes", type=float, default=3.0)
@@ -150,25 +150,31 @@ def main() -> int:
     parser.add_argument("--cores", type=int, default=64)
     parser.add_argument("--losses-per-hour", type=float, default=0.05)
     parser.add_argument("--order", choices=("listed", "longest"), default="longest")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--runs", type=int, default=20, help="simulations, with other lengths and losses each")
     parser.add_argument("--json", action="store_true")
     args = parser.parse_args()
-    tasks_s = durations_s(args.sequences, 60 * args.minutes, args.rate, args.cpu_ms, args.sigma, args.seed)
-    found = simulate(
-        tasks_s,
-        machines=args.machines,
-        cores=args.cores,
-        losses_per_hour=args.losses_per_hour,
-        longest_first=args.order == "longest",
-        seed=args.seed,
-    )
+    runs = [
+        simulate(
+            durations_s(args.sequences, 60 * args.minutes, args.rate, args.cpu_ms, args.sigma, seed),
+            machines=args.machines,
+            cores=args.cores,
+            losses_per_hour=args.losses_per_hour,
+            longest_first=args.order == "longest",
+            seed=seed,
+        )
+        for seed in range(args.runs)
+    ]
+    means = {f.name: float(np.mean([getattr(run, f.name) for run in runs])) for f in fields(Schedule)}
+    worst_hours = max(run.hours for run in runs)
     if args.json:
-        print(json.dumps(asdict(found)))
+        print(json.dumps({**means, "worst_hours": worst_hours}))
         return 0
+    found = Schedule(**{**means, "sequences": args.sequences, "cores": args.machines * args.cores})
     print(
-        f"{found.sequences} sequences on {found.cores} cores: {found.hours:.2f} h, {found.cpu_hours:.0f} CPU hours "
-        f"({found.repeated_cpu_hours:.1f} repeated, {found.repeated_tasks} tasks), busy {100 * found.busy:.0f} %, "
-        f"longest task {found.longest_task_s / 60:.0f} min, {found.price_low:.0f} to {found.price_high:.0f} USD"
+        f"{found.sequences} sequences on {found.cores} cores: {found.hours:.2f} h (at worst {worst_hours:.2f}), "
+        f"{found.cpu_hours:.0f} CPU hours ({found.repeated_cpu_hours:.1f} repeated, {found.repeated_tasks:.0f} tasks), "
+        f"busy {100 * found.busy:.0f} %, longest task {found.longest_task_s / 60:.0f} min, "
+        f"{found.price_low:.0f} to {found.price_high:.0f} USD"
     )
     return 0
 

@@ -100,14 +100,19 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
         record["keep"] = not (_of_the_system(error.__cause__) or isinstance(error, _WrongPlaceError))
     except MemoryError:
         record |= {"failure": "out of memory", "keep": False}
-    record["measured"] = {
+    record["measured"] = {} if job["kind"] == "peer" else _measured(timer, began)
+    return record
+
+
+def _measured(timer: _CpuTimer, began: float) -> dict[str, Any]:
+    """What this process took, of which two repetitions differ."""
+    return {
         "cpu_ms": timer.ms_per_frame,
         "cpu_s": time.process_time(),
         "wall_s": time.perf_counter() - began,
         "memory_mib": _peak_memory_mib(),
         "host": platform.node(),
     }
-    return record
 
 
 def _of_the_system(cause: BaseException | None) -> bool:
