@@ -353,6 +353,7 @@ def test_a_bench_that_is_killed_goes_on_where_it_was(
         _wait_for(lambda: len(_workers(tmp_path)) == 1)
         os.kill(process.pid, signal.SIGKILL)
     _wait_for(lambda: not _workers(tmp_path))
+    assert len(list((tmp_path / "cache").glob("task-*"))) == 1, "which the next call removes"
     before = {path: path.stat().st_mtime_ns for path in results.glob("*/*.json")}
     assert len(before) == 1, "the second task was in its middle"
     assert main([*argv, "--json"]) == 1, "two rows have no result"
@@ -363,6 +364,7 @@ def test_a_bench_that_is_killed_goes_on_where_it_was(
     assert "corrupt.mat" in (outcomes["bad"].failure or "")
     assert "nothing.mat does not exist" in (outcomes["gone"].failure or "")
     assert printed.err.count("failed: ") == 2
+    assert not list((tmp_path / "cache").glob("task-*"))
     _check_files(tmp_path / "out")
     (job,) = [
         t.job for t in tasks_of(read_suite(argv[1]), data, InputDigests(tmp_path / "i.json")) if t.sequence == "a"

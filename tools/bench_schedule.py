@@ -3,7 +3,7 @@
     python tools/bench_schedule.py [--sequences 10000] [--minutes 3] [--rate 20] [--cpu-ms 40] [--sigma 0.8]
         [--machines 10] [--cores 64] [--losses-per-hour 0.05] [--order listed|longest] [--runs 20] [--json]
 
-Lengths are log-normal with the given mean and sigma of the logarithm: with 0.8, one recording in a hundred is over five
+Lengths are log-normal with the given mean and sigma of the logarithm: with 0.8, one recording in a hundred is over six
 times as long as the median. A task takes its frames times the CPU time of a frame, and a second to start. Machines are
 lost at random times with all their tasks, which are then repeated from their beginning elsewhere, and come back after
 five minutes. What `vio bench` does between tasks (keys, results of some 100 kB) is below a thousandth, and left out.

@@ -6,6 +6,7 @@ import contextlib
 import json
 import logging
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from vio.atomic import lock_path
 from vio.bench.identity import ROOT
 from vio.errors import DataError, VioError
 
@@ -44,7 +46,7 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
             job = {**job, "source": f"{_rendered(job['render'], Path(cache))}"}
         lost = 0
         while True:
-            record, number = _in_process({**job, "scratch": cache}, Path(cache))
+            record, number = _in_process(job, Path(cache))
             if record is not None:
                 record["lost_processes"] = lost
                 return record
@@ -78,8 +80,8 @@ def end_processes() -> None:
 
 def _in_process(job: dict[str, Any], cache: Path) -> tuple[dict[str, Any] | None, int]:
     """Run one worker; return its record, or None and the signal that ended it."""
-    with tempfile.TemporaryDirectory(prefix="task-", dir=cache) as name:
-        folder = Path(name)
+    with _task_folder(cache) as folder:
+        job = {**job, "scratch": str(folder)}
         (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
         status, words = _call([sys.executable, "-m", "vio.bench.worker", str(folder)])
         result = folder / "result.json"
@@ -130,6 +132,31 @@ def _call(command: list[str]) -> tuple[int, str]:
         words.seek(0)
         text = words.read()
     return status, text[-_LAST_WORDS:]
+
+
+@contextlib.contextmanager
+def _task_folder(cache: Path) -> Iterator[Path]:
+    """A folder for one task, locked meanwhile; those without a lock, which killed processes left, are removed."""
+    for left in cache.glob("task-*"):
+        _remove_unlocked(left)
+    while True:
+        folder = Path(tempfile.mkdtemp(prefix="task-", dir=cache))
+        lock = lock_path(folder)
+        if folder.is_dir():  # another process may have taken it for a leftover before it was locked
+            break
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _remove_unlocked(folder: Path) -> None:
+    lock = lock_path(folder) if fcntl is not None else None
+    if lock is not None:
+        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
 
 
 @contextlib.contextmanager
