@@ -40,10 +40,10 @@ def write_report(
     figures = [
         (
             "Errors of each sequence",
-            "Position errors of all frames of all seeds: median, quartiles, 5 and 95 %.",
+            "Position errors: median, quartiles, 5 and 95 % over the frames. Of several seeds, the run of median ATE.",
             _boxes,
         ),
-        ("Error over time", "The run of the median error among the seeds.", _curves),
+        ("Error over time", "Of several seeds, the run of the median ATE.", _curves),
     ]
     parts = [_as_html(markdown(suite, rows, outcomes, facts))]
     if any(o.curve for o in outcomes):
@@ -103,6 +103,7 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
 def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     """Draw the error of each sequence over time, one plot each."""
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     columns = min(3, len(sequences))
     lines = -(-len(sequences) // columns)
@@ -122,8 +123,9 @@ def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
         axes.tick_params(labelsize=8)
         if j % columns == 0:
             axes.set_ylabel("error (m)", fontsize=8)
-        if j == 0:
-            axes.legend(fontsize=7)
+    colours = {system: _COLOURS[k % len(_COLOURS)] for k, system in enumerate(systems)}
+    handles = [Line2D([], [], color=colour, label=system) for system, colour in colours.items()]
+    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(systems), 6), fontsize=8)
     figure.supxlabel("time (s)", fontsize=9)
     return figure
 
@@ -139,14 +141,14 @@ def _system_boxes(rows: Sequence[Row]) -> Any:
             values.setdefault(row.system, []).append(row.cells[name].median)
     figure = Figure(figsize=(7.0, 0.9 + 0.4 * max(len(values), 1)), layout="constrained")
     axes = figure.add_subplot()
-    for k, (system, known) in enumerate(values.items()):
+    for k, known in enumerate(values.values()):
         q1, median, q3 = (float(v) for v in np.percentile(known, (25, 50, 75)))
         axes.plot([q1, q3], [k, k], color="#c9d1d9", lw=10, solid_capstyle="butt", zorder=1)
         axes.plot([median, median], [k - 0.2, k + 0.2], color="#111111", lw=1.5)
         axes.plot(known, [k] * len(known), ".", color=_COLOURS[k % len(_COLOURS)], ms=6, alpha=0.7)
-        axes.annotate(system, (0.005, k), xycoords=("axes fraction", "data"), fontsize=8, va="bottom")
     axes.set_xscale("log")
-    axes.set_yticks([])
+    axes.set_yticks(range(len(values)), list(values), parse_math=False)
+    axes.set_ylim(len(values) - 0.5, -0.5)
     axes.set_xlabel("ATE (m)")
     axes.grid(alpha=0.25, axis="x")
     return figure
