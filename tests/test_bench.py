@@ -35,7 +35,7 @@ from vio.errors import ConfigError
 from vio.evaluation import evaluate
 from vio.geometry.lie import se3_exp, se3_inverse
 from vio.records import Trajectory
-from vio.trajectory_io import write_tum
+from vio.trajectory_io import read_trajectory, write_tum
 
 ATE = METRICS[0]
 
@@ -403,7 +403,9 @@ def _check_files(out: Path) -> None:
     page = (out / "report.html").read_text()
     assert page.count("<svg") == 3
     assert not re.search(r'(?:src|href)="(?!https://example|#)[^"]*\.(?:js|css|png)|<script|@import', page)
-    assert (out / "trajectories" / "a.w.0.tum").is_file()
+    poses = read_trajectory(out / "trajectories" / "a.w.0.tum")
+    assert poses.frame_indices is not None
+    assert poses.frame_indices.tolist() == list(range(14))
 
 
 def test_another_systems_trajectory_joins_the_table(data: Path, tmp_path: Path) -> None:

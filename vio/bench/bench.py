@@ -143,7 +143,7 @@ def _write(suite: Suite, place: Place, tasks: Sequence[Task], records: Mapping[s
     for task in tasks:
         poses = records[task.key].get("trajectory") if task.key in records else None
         if poses is not None:
-            atomic_write_text(trajectories / f"{task.sequence}.{task.system}.{task.seed}.tum", poses)
+            atomic_write_text(trajectories / f"{task.sequence}.{task.system}.{task.seed}.tum", "\n".join([*poses, ""]))
     return Result(outcomes, reused, facts)
 
 

@@ -161,7 +161,10 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             figures["nees"] = _nees(result, score) if job["exact_truth"] else None
             record["curve"] = error_curve(score, trajectory.times_ns)
         assert trajectory.times_ns is not None
-        record["trajectory"] = tum_text(trajectory.times_ns, trajectory.T_world_body, body=trajectory.body)
+        text = tum_text(
+            trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices
+        )
+        record["trajectory"] = text.splitlines()  # JSON of ours holds printable text only
     return record
 
 
