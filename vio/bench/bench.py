@@ -82,15 +82,15 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
                 if record is None:
                     missing[task.key] = task.job
                 else:
-                    records[task.key] = record
+                    records[task.key] = _without_poses(record)
         reused = len(records)
         progress(len(tasks) - len(missing), len(tasks))
         for key, record in _results(missing, place):
-            records[key] = record
             if record.pop("keep", True):
                 store.put(key, record)
+            records[key] = _without_poses(record)
             progress(len(tasks) - len(missing) + len(records) - reused, len(tasks))
-        return _write(suite, place, tasks, records, reused)
+        return _write(suite, place, tasks, records, store, reused)
 
 
 def read_bench(folder: Path) -> tuple[tuple[Outcome, ...], dict[str, Any]]:
@@ -117,7 +117,14 @@ def _results(jobs: Mapping[str, dict[str, Any]], place: Place) -> Iterator[tuple
     return run_here(jobs, cache, workers=place.workers)
 
 
-def _write(suite: Suite, place: Place, tasks: Sequence[Task], records: Mapping[str, Record], reused: int) -> Result:
+def _without_poses(record: Record) -> Record:
+    """Return a record for tables alone: ten thousand trajectories would fill the memory."""
+    return {name: value for name, value in record.items() if name != "trajectory"}
+
+
+def _write(
+    suite: Suite, place: Place, tasks: Sequence[Task], records: Mapping[str, Record], store: Store, reused: int
+) -> Result:
     outcomes = tuple(_outcome(task, records) for task in tasks)
     facts = {
         "suite": suite.name,
@@ -141,7 +148,7 @@ def _write(suite: Suite, place: Place, tasks: Sequence[Task], records: Mapping[s
     trajectories = place.out / "trajectories"
     trajectories.mkdir(exist_ok=True)
     for task in tasks:
-        poses = records[task.key].get("trajectory") if task.key in records else None
+        poses = (store.get(task.key) or {}).get("trajectory") if task.key in records else None
         if poses is not None:
             atomic_write_text(trajectories / f"{task.sequence}.{task.system}.{task.seed}.tum", "\n".join([*poses, ""]))
     return Result(outcomes, reused, facts)

@@ -27,6 +27,7 @@ from vio.geometry.lie import FloatArray
 Verdict = Literal["better", "worse", "no change beyond chance", "too few sequences to say", "identical"]
 LEVEL = 0.05  # chance of calling anything better or worse when nothing has changed
 _RESAMPLES = 10_000
+_MANY = 1000  # sequences; beyond, the mean is normal, and its interval needs fewer resamples
 _EXACT_FLIPS = 14  # up to so many sequences all flips of signs are counted, beyond a sample of them
 _COMPARED = ("ate_m", "rpe_m", "drift_percent", "drift_deg_per_100m", "coverage", "cpu_ms", "memory_mib")
 # CPU time and memory depend on the machine: told, but no regression.
@@ -162,7 +163,8 @@ def _change(system: str, metric: Metric, values: Sequence[float], level: float) 
 def bootstrap_interval(values: FloatArray, level: float) -> tuple[float, float]:
     """Return the percentile interval of the mean of values (N,) at confidence 1 - level, always the same numbers."""
     rng = np.random.default_rng(0)
-    means = values[rng.integers(0, len(values), (_RESAMPLES, len(values)))].mean(axis=1)
+    n = len(values)
+    means = np.concatenate([values[rng.integers(0, n, (rows, n))].mean(axis=1) for rows in _blocks(n)])
     low, high = np.quantile(means, [level / 2, 1 - level / 2])
     return float(low), float(high)
 
@@ -175,11 +177,21 @@ def sign_flip_p(values: FloatArray) -> float:
     n = len(values)
     if n <= _EXACT_FLIPS:
         signs = 1.0 - 2.0 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
+        sums = np.abs(signs @ values)
     else:
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], (_RESAMPLES, n))
-        signs[0] = 1.0
-    sums = np.abs(signs @ values)
+        rng = np.random.default_rng(0)
+        parts = [(2.0 * rng.integers(0, 2, (rows, n), dtype=np.int8) - 1.0) @ values for rows in _blocks(n)]
+        sums = np.abs(np.concatenate([[values.sum()], *parts]))
     return float(np.mean(sums >= abs(values.sum()) * (1 - 1e-12)))
+
+
+def _blocks(n: int) -> Iterator[int]:
+    """Yield how many resamples of n values to draw at a time; of thousands of values fewer in all."""
+    left = max(_RESAMPLES if n <= _MANY else _RESAMPLES // 5, 1)
+    rows = max(_MANY**2 // n, 1)
+    while left > 0:
+        yield min(rows, left)
+        left -= rows
 
 
 def _sequence_changes(
@@ -190,8 +202,11 @@ def _sequence_changes(
     for system in systems:
         own = [p for p in pairs if p[0].system == system]
         logs = _log_ratios(own, metric)
-        values = {name: [[v for o in own if (v := o[side].value(metric)) and o[side].sequence == name]
-                         for side in (0, 1)] for name in logs}  # fmt: skip
+        values: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in logs}
+        for pair in own:
+            for side, outcome in enumerate(pair):
+                if (value := outcome.value(metric)) is not None and outcome.sequence in values:
+                    values[outcome.sequence][side].append(value)
         for name, ratios in logs.items():
             mean = float(np.mean(ratios))
             limit, reason = _limit(values[name], len(logs) * len(systems), factor)

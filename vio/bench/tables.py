@@ -178,13 +178,15 @@ def ate_matrix(suite: Suite, rows: Sequence[Row]) -> Iterator[str]:
     published = [p for p in suite.published if "ate_m" in p.figures]
     yield _line(["sequence", *systems, *(f"{p.system} (published)" for p in published)])
     yield "|---|" + "---:|" * (len(systems) + len(published))
-    for sequence in dict.fromkeys(row.sequence for row in rows):
-        cells = {row.system: row for row in rows if row.sequence == sequence}
+    by_sequence: dict[str, dict[str, Row]] = {}
+    for row in rows:
+        by_sequence.setdefault(row.sequence, {})[row.system] = row
+    for sequence, cells in by_sequence.items():
         medians = {s: row.cells["ate_m"].median for s, row in cells.items() if "ate_m" in row.cells and not row.failed}
         texts = []
         for system in systems:
-            row = cells.get(system)
-            text = "" if row is None else "failed" if row.failed else cell_text(row.cells.get("ate_m"), metric)
+            own = cells.get(system)
+            text = "" if own is None else "failed" if own.failed else cell_text(own.cells.get("ate_m"), metric)
             best = len(medians) > 1 and medians.get(system) == min(medians.values())
             texts.append(f"**{text}**" if best else text)
         texts += [_published_text(p.figures["ate_m"].get(sequence)) for p in published]

@@ -65,7 +65,7 @@ def _bench(args: argparse.Namespace) -> int:
     from vio.bench.bench import Place, bench
     from vio.bench.suite import SHIPPED, chosen, read_suite
     from vio.cli.progress import ProgressBar
-    from vio.errors import ConfigError
+    from vio.errors import ConfigError, StoppedError
 
     if args.workers is not None and not 1 <= args.workers <= 1024:
         raise ConfigError(f"--workers takes 1 to 1024 processes, got {args.workers}")
@@ -82,11 +82,12 @@ def _bench(args: argparse.Namespace) -> int:
         identity=args.identity,
         peers=args.peers,
     )
-    if args.quiet:
-        result = bench(suite, place)
-    else:
+    try:
         with ProgressBar(suite.name, unit="tasks") as bar:
-            result = bench(suite, place, bar.update)
+            result = bench(suite, place, (lambda done, total: None) if args.quiet else bar.update)
+    except KeyboardInterrupt as stop:  # or another signal, which has a number
+        text = f"interrupted; finished tasks are kept in {place.cache}, and the same command goes on with the others"
+        raise StoppedError(text, status=128 + getattr(stop, "number", 2)) from stop
     return _report(args, place.out, result)
 
 
