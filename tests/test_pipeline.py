@@ -296,6 +296,7 @@ def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
         "trajectory.tum",
         "trajectory.kitti",
         "estimates.npy",
+        "reference.tum",
         "dead_reckoning.tum",
         "landmarks.ply",
         "frames.csv",

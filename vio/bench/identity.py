@@ -18,7 +18,15 @@ from vio.errors import DataError
 Identity = Literal["content", "stat"]
 ROOT = Path(__file__).resolve().parent.parent.parent
 # Code that changes no figure: the command line, and of the bench all but what a task runs.
-_NO_FIGURE = ("vio/cli/", "vio/bench/", "vio/plotting.py", "vio/inspection/", "vio/colmap/", "vio/offline/")
+_NO_FIGURE = (
+    "vio/cli/",
+    "vio/bench/",
+    "vio/plotting.py",
+    "vio/report/",
+    "vio/inspection/",
+    "vio/colmap/",
+    "vio/offline/",
+)
 _TASK_CODE = ("vio/bench/worker.py", "vio/bench/figures.py")
 # Code on which the files that `vio render` writes depend; a test compares it with what that command loads.
 RENDER_CODE = (

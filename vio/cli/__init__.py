@@ -31,6 +31,7 @@ from vio.cli import (
     rectify,
     refine,
     render,
+    report,
     reproduce,
     run,
 )
@@ -42,6 +43,7 @@ _COMMANDS = (
     inspect,
     convert,
     evaluate,
+    report,
     bench,
     check,
     refine,

@@ -293,13 +293,17 @@ class Msckf:
         T, covariance = window.current_pose(output)
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
         A = se3_adjoint(se3_inverse(T))
+        known = self._motion.uncertainty(window.nav, output[:DIM, :DIM])
         estimate = Estimate(
             self._time_ns,
             T,
             A @ covariance @ A.T,
             velocity_world=self._motion.velocity_world(window.nav),
+            velocity_covariance=known.velocity_covariance,
             gyro_bias=window.nav.gyro_bias,
+            gyro_bias_sigma=known.gyro_bias_sigma,
             accel_bias=window.nav.accel_bias,
+            accel_bias_sigma=known.accel_bias_sigma,
         )
         estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:])
         if estimate.stereo_field is not None:
