@@ -223,10 +223,25 @@ def test_nees_of_poses_with_errors_of_their_covariance_is_six() -> None:
     times_ns = np.arange(len(truth), dtype=np.int64) * 10**8
     reference = Trajectory(T_other_world @ truth @ se3_inverse(T_cam0_imu), times_ns, "cam0")
     score = evaluate(Trajectory(estimate, times_ns, "imu"), reference, T_cam0_imu=T_cam0_imu)
-    value = pose_nees(score, estimate, covariances, T_cam0_imu)
-    assert value == pytest.approx(6.0, rel=0.03)
-    assert pose_nees(score, estimate, 4 * covariances, T_cam0_imu) == pytest.approx(1.5, rel=0.03)
-    assert pose_nees(score, estimate, 0 * covariances, T_cam0_imu) is None
+    scales = {1: pytest.approx(6.0, rel=0.03), 4: pytest.approx(1.5, rel=0.03), 0: None}
+    for scale, expected in scales.items():
+        assert pose_nees(score, estimate, scale * covariances, T_cam0_imu, upright=False) == expected
+
+
+def test_nees_of_an_upright_world_knows_that_the_first_inclination_was_uncertain() -> None:
+    """With an IMU; identified with the first pose, all later poses would seem to have its error."""
+    rng = np.random.default_rng(1)
+    truth = np.array([se3_exp([0.1 * k, 0.02 * k, 0, 0, 0, 0.01 * k]) for k in range(2000)])
+    errors = rng.normal(0, 0.001, (len(truth), 6))
+    errors[0] = [0, 0, 0, 0.003, -0.004, 0]
+    estimate = se3_exp([3, 4, 5, 0, 0, 2.5]) @ truth @ np.array([se3_exp(xi) for xi in errors])
+    covariances = np.tile(1e-6 * np.eye(6), (len(truth), 1, 1))
+    times_ns = np.arange(len(truth), dtype=np.int64) * 10**8
+    score = evaluate(Trajectory(estimate, times_ns, "imu"), Trajectory(truth, times_ns, "imu"))
+    upright, whole = (pose_nees(score, estimate, covariances, np.eye(4), upright=flag) for flag in (True, False))
+    assert upright == pytest.approx(6.0, rel=0.05)
+    assert whole is not None
+    assert whole > 20
 
 
 def test_coverage_counts_frames_with_a_pose() -> None:

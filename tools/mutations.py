@@ -1295,6 +1295,13 @@ MUTATIONS = (
         _BENCH,
     ),
     Mutation(
+        "bench: inclination of the first pose taken as known",
+        "vio/bench/figures.py",
+        "_yaw_and_position(T[0], truth[0]) if upright else T[0]",
+        "T[0]",
+        _BENCH,
+    ),
+    Mutation(
         "bench: a recording is known by names and sizes only",
         "vio/bench/identity.py",
         "digest.update(block)",

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from vio.errors import EvaluationError
 from vio.evaluation import Evaluation, associate_times, nees
-from vio.geometry.lie import FloatArray, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.records import NS_PER_S, IntArray, Trajectory
 
 _CURVE = 240  # points of the error over time that are kept; a report shows no more
@@ -52,21 +52,28 @@ def coverage(frame_times_ns: IntArray, trajectory: Trajectory) -> float:
 
 
 def pose_nees(
-    evaluation: Evaluation, T_world_imu: FloatArray, covariances: FloatArray, T_cam0_imu: FloatArray
+    evaluation: Evaluation,
+    T_world_imu: FloatArray,
+    covariances: FloatArray,
+    T_cam0_imu: FloatArray,
+    *,
+    upright: bool,
 ) -> float | None:
     """Return the mean NEES of the poses, 6 for a consistent filter; None where no covariance can be inverted.
 
-    The world frames are identified at the first matched pose, of which filter and reference know the same.
+    The world frames are identified at the first matched pose: all of it where the filter's world is its first frame,
+    position and yaw where both worlds are upright, as the filter then estimates the inclination of its first pose.
 
     Args:
         evaluation: which poses match which of the reference.
         T_world_imu: (N, 4, 4) all estimated poses.
         covariances: (N, 6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat.
         T_cam0_imu: (4, 4) extrinsics.
+        upright: both worlds have z up.
     """
     truth = evaluation.reference.in_imu(T_cam0_imu).T_world_body
     T, P = T_world_imu[evaluation.rows], covariances[evaluation.rows]
-    T_world_true = T[0] @ se3_inverse(truth[0])
+    T_world_true = _yaw_and_position(T[0], truth[0]) if upright else T[0] @ se3_inverse(truth[0])
     errors = se3_log(se3_inverse(T_world_true @ truth) @ T)
     invertible = np.linalg.cond(P) < _MOST_CONDITION
     if not invertible.any():
@@ -75,6 +82,14 @@ def pose_nees(
         return float(nees(errors[invertible], P[invertible]).mean())
     except EvaluationError:
         return None
+
+
+def _yaw_and_position(T: FloatArray, T_true: FloatArray) -> FloatArray:
+    """Return the motion (4, 4) of an upright world into another that fits two poses (4, 4) of one body best."""
+    C = T[:3, :3] @ T_true[:3, :3].T
+    yaw = np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1])
+    R = so3_exp(np.array([0.0, 0.0, yaw]))
+    return se3_from_parts(R, T[:3, 3] - R @ T_true[:3, 3])
 
 
 def error_curve(evaluation: Evaluation, times_ns: IntArray | None) -> dict[str, list[float]]:

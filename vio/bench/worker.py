@@ -171,7 +171,8 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
 def _nees(result: RunResult, score: Evaluation) -> float | None:
     rows = result.estimates
     T_world_imu, covariances = (np.array(rows.column(name)) for name in ("T_world_imu", "covariance"))
-    return pose_nees(score, T_world_imu, covariances, result.T_cam0_body)
+    upright = result.motion == "imu"
+    return pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
 
 
 def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
