@@ -251,6 +251,7 @@ def metrics_of(
         "warnings": list(result.warnings),
         "stereo_field": stereo_field(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
+        "camera": asdict(result.recording.camera),
     }
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.chain import FrameLog
+from vio.frame_result import FrameLog
 from vio.geometry.lie import FloatArray
 from vio.records import Estimate, ImuSample, MotionSample, Observations, StereoFieldEstimate, VelocitySample
 from vio.tables import Rows

@@ -22,6 +22,7 @@ from vio.cli import (
     bench,
     calibrate,
     check,
+    completion,
     config,
     convert,
     demo,
@@ -34,6 +35,7 @@ from vio.cli import (
     report,
     reproduce,
     run,
+    view,
 )
 from vio.errors import StoppedError, VioError
 from vio.printable import printable
@@ -45,6 +47,7 @@ _COMMANDS = (
     evaluate,
     report,
     bench,
+    view,
     check,
     refine,
     export,
@@ -54,6 +57,7 @@ _COMMANDS = (
     rectify,
     reproduce,
     config,
+    completion,
 )
 
 
@@ -109,12 +113,22 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Parse the command line; an unknown option shows the usage of its subcommand, not that of `vio`."""
+    parser = build_parser()
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        chosen = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[args.command]
+        chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
+    return args
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character must not end the program
             stream.reconfigure(errors="replace")
-    args = build_parser().parse_args(argv)
+    args = _parse(argv)
     logging.basicConfig(
         level=logging.DEBUG if args.debug else logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr
     )

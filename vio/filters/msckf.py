@@ -484,6 +484,7 @@ class Msckf:
 
         tracks = self._tracks.without_wrong_views(tracks)
         good, nis, dof = self._tracks.gate(tracks.at)
+        gated_ids = self._tracks.table.ids(tracks.rows[~good])
         self._tracks.update_pixel_noise(nis, dof)
         pixels, rejected = self._gate_landmarks(window, pixels, P)
         created = self._marginalise(window, tracks, good, pixels)
@@ -495,6 +496,8 @@ class Msckf:
             landmarks=len(window.landmarks),
             innovation_median_px=innovation,
             nis_per_dof=float(np.median(nis / dof)) if len(nis) else None,
+            gated_ids=gated_ids,
+            landmark_ids=window.landmark_ids.copy(),
         )
 
     def _gate_landmarks(self, window: Window, pixels: Views, P: FloatArray) -> tuple[Views, int]:
