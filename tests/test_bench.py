@@ -358,6 +358,7 @@ def test_only_what_has_no_result_is_run(
     assert (bench(suite, place).reused, len(done)) == (2, 4)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="looks for processes in /proc")
 def test_a_bench_that_is_killed_goes_on_where_it_was(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -458,6 +459,7 @@ def test_a_worker_with_other_code_says_so(data: Path, tmp_path: Path) -> None:
     assert record["keep"] is False
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
 def test_a_process_that_is_killed_is_started_again_and_named_at_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -84,6 +84,7 @@ def _wait_for(holds: Callable[[], bool], seconds: float = 90.0) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals")
 def test_lost_workers_and_a_lost_scheduler_cost_no_row(cluster: Cluster, tmp_path: Path) -> None:
     """Two machines' worth of workers, one killed in its task, the scheduler restarted, a corrupt recording among good.
 

@@ -29,10 +29,11 @@ from vio.errors import DataError, VioError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, evaluate
 from vio.printable import json_text
 from vio.protocols import Dataset
-from vio.records import Estimate, FrontendOutput, Trajectory, UpdateReport
+from vio.records import Trajectory
 from vio.trajectory_io import read_trajectory, tum_text
 
 if TYPE_CHECKING:
+    from vio.frame_result import FrameResult
     from vio.pipeline import RunResult
 
 _WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as in tools/bench.py
@@ -48,7 +49,7 @@ class _CpuTimer:
         self._began_s = self._ended_s = time.process_time()
         self._first = 0
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Count a frame."""
         self.frames += 1
         self._ended_s = time.process_time()
