@@ -16,7 +16,7 @@ endif
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint unit coverage mutations bench results wheel clean constraints
+.PHONY: demo test lint unit coverage mutations bench results wheel docs clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -48,6 +48,10 @@ bench: $(VENV)/.base
 results: $(VENV)/.base
 	$(BIN)/python -m tools.results --data "$(VIO_DATA)" --work "$(WORK)" $(RESULTS)
 
+# The documentation site, into site/; a broken link or a page without a place in the menu is an error.
+docs: $(TESTED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
 # Build the wheel, and run its demo in an environment and a folder of its own.
 wheel: | $(BIN)/python$(EXE)
 	rm -rf build dist
@@ -75,4 +79,4 @@ constraints: $(VENV)/.learned
 	mv constraints.new constraints.txt
 
 clean:
-	rm -rf $(VENV) demo build dist *.egg-info
+	rm -rf $(VENV) demo build dist site *.egg-info
