@@ -270,7 +270,9 @@ class KltFrontend:
             T = T if motion is None else motion.T_curr_prev
             matched = self._match_delayed(previous, tracks, right, flow, T, stereo)
         frame_s = (frame.time_ns - previous.time_ns) * 1e-9
-        if not self._right.check_matches(frame.index, matched.has_right[has_point], moved=motion is not None):
+        # Wrong matches, of rows far apart, contradict the right image that the search for the rows will need.
+        tested = motion is not None and not stereo.has_few_matches
+        if not self._right.check_matches(frame.index, matched.has_right[has_point], moved=tested):
             if self._right.contradicts and self._delay.suspect(
                 frame.index, self._count_pairings(previous, left, tracks, right, stereo), frame_s
             ):

@@ -107,6 +107,11 @@ class StereoFit:
         """Count the left pixels (N, 2) that match well on their row between two images at half resolution."""
         return int(self._search(left_half, right_half, points, _GOOD_MATCH)[1].sum())
 
+    @property
+    def has_few_matches(self) -> bool:
+        """Whether hardly any feature of the last frame had a right match, so that those matches may be wrong ones."""
+        return self._unmatched > 0
+
     def restart_rows(self) -> None:
         """Forget the row differences."""
         self._rows.restart(0.0)

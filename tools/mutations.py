@@ -38,6 +38,9 @@ _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
 _STEREO_FIELD = ("tests/test_stereo_calibration.py",)
+_KEPT = ("tests/test_stereo_field.py",)
+_IN_MOTION = ("tests/test_self_calibration.py",)
+_ROWS = ("tests/test_frontend_rows.py",)
 _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
 _SCORE = ("tests/test_evaluation.py",)
@@ -1342,5 +1345,53 @@ MUTATIONS = (
         "elif p > level or low <= 0 <= high:",
         "elif low <= 0 <= high:",
         _BENCH_COMPARE,
+    Mutation(
+        "rig turned the other way than its field",
+        "vio/calibration/stereo_field.py",
+        "R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0",
+        "R = self.R_rect_cam1.T @ so3_exp(-x[:3]) @ self.R_rect_cam0",
+        _KEPT,
+    ),
+    Mutation(
+        "rows keep what both lenses do to near points",
+        "vio/filters/stereo_calibration.py",
+        "return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[3:]))",
+        "return np.asarray(self.coefficients - 0 * np.linalg.solve(self._A + prior, self._common @ stereo[3:]))",
+        _STEREO_FIELD,
+    ),
+    Mutation(
+        "covariance of the rows counts each frame's features anew",
+        "vio/filters/stereo_calibration.py",
+        "shared = max(self._count / max(self._matches, 1), 1.0)",
+        "shared = 1.0",
+        _STEREO_FIELD,
+    ),
+    Mutation(
+        "offline commands take tracks with the field",
+        "vio/saved_run.py",
+        "tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))",
+        "tracks = replace(tracks, z=1.0 * tracks.z)",
+        _KEPT,
+    ),
+    Mutation(
+        "rows of a region count as independent",
+        "vio/mapping/self_calibration.py",
+        "meat = _larger(scores.T @ scores * (len(scores) / max(len(scores) - 1, 1)) + prior, A)",
+        "meat = A",
+        _IN_MOTION,
+    ),
+    Mutation(
+        "damping of points passes for information",
+        "vio/mapping/self_calibration.py",
+        "_ROUNDING = 1e-12",
+        "_ROUNDING = 1e-4",
+        _IN_MOTION,
+    ),
+    Mutation(
+        "wrong matches of a pitched camera accuse its images",
+        "frontend/klt.py",
+        "tested = motion is not None and not stereo.has_few_matches",
+        "tested = motion is not None",
+        _ROWS,
     ),
 )

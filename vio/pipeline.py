@@ -11,15 +11,16 @@ from typing import NoReturn
 
 import numpy as np
 
+from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
 from vio.chain import BACKENDS, build_backend
 from vio.config import BackendName, Config
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
 from vio.frame_result import STAGES, FrameLog, FrameResult
 from vio.frontend_package import frontend_module
-from vio.geometry.lie import FloatArray
-from vio.odometry import Odometry
-from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.odometry import Odometry, rig_of_rectified
+from vio.protocols import Backend, Dataset, Frontend, RectifyingDataset, Selector, Viewer
 from vio.records import (
     BodyFrame,
     Estimate,
@@ -32,6 +33,7 @@ from vio.records import (
     StereoFrame,
     Trajectory,
 )
+from vio.rig import Rig
 from vio.run_recorder import GrowingFolder, RunRecorder
 from vio.selectors import build_selector
 from vio.tables import Records
@@ -62,6 +64,11 @@ class RunResult:
     warnings: tuple[str, ...]  # what went wrong in the run, or with its IMU
     wall_s: float
     stopped: str | None = None  # why the run ended before the recording; None: it did not
+    rig: Rig | None = None  # the calibration as given; None: features without an image size
+
+    def calibrated_rig(self) -> CalibratedRig | None:
+        """Return the calibration with what the run found it to be off by; None: features without an image size."""
+        return None if self.rig is None else calibrated_rig(self.rig, self.estimates[-1])
 
     @property
     def trajectory(self) -> Trajectory:
@@ -169,7 +176,23 @@ def run(
             warnings=odometry.warnings,
             wall_s=time.perf_counter() - began,
             stopped=stopped,
+            rig=given_rig(dataset),
         )
+
+
+def given_rig(dataset: Dataset) -> Rig | None:
+    """Return the calibration of a recording's images; None: it holds features, and no image size.
+
+    For features it is that of the rectified images that they come from.
+    """
+    recording = dataset.recording
+    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
+        return rig_of_rectified(recording.camera, recording.T_cam0_imu)
+    made, T_cam0_imu = dataset.rectifier, recording.T_cam0_imu
+    rig = made.rig
+    if T_cam0_imu is not None:
+        T_cam0_imu = se3_inverse(rig.T_imu_cam0)
+    return Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1), T_cam0_imu, dataset.imu_noise, made.time_offset_s)
 
 
 def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:

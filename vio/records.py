@@ -294,11 +294,16 @@ def no_landmarks() -> Landmarks:
 
 @dataclass(frozen=True, slots=True)
 class StereoFieldEstimate:
-    """What the stereo calibration is off by, as coefficients of equation (R3) of docs/math.md, in focal lengths."""
+    """What the stereo calibration is off by, as coefficients of equations (R2) and (R3) of docs/math.md.
+
+    All are in focal lengths.
+    """
 
     coefficients: FloatArray  # (6,) a0, a1, a2 of the right columns; k, q1, q2 of both lenses
     covariance: FloatArray  # (6, 6)
     rows_rms_px: float = 0.0  # root mean square over the features of what the rows of left and right differ by
+    rows: FloatArray | None = None  # (6,) of 1, x, y, x y, x^2, y^2 in the right rows (R2); None: not learned
+    rows_covariance: FloatArray | None = None  # (6, 6)
 
 
 @dataclass(frozen=True, slots=True)

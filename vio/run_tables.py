@@ -38,6 +38,8 @@ ESTIMATE = np.dtype(
         ("stereo_field", "<f8", (6,)),
         ("stereo_field_covariance", "<f8", (6, 6)),
         ("stereo_rows_rms_px", "<f8"),
+        ("stereo_rows", "<f8", (6,)),
+        ("stereo_rows_covariance", "<f8", (6, 6)),
     ]
 )
 _OPTIONAL_ARRAYS = (
@@ -79,6 +81,9 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     row["stereo_field"] = np.nan if field is None else field.coefficients
     row["stereo_field_covariance"] = np.nan if field is None else field.covariance
     row["stereo_rows_rms_px"] = np.nan if field is None else field.rows_rms_px
+    row["stereo_rows"] = np.nan if field is None or field.rows is None else field.rows
+    P = None if field is None else field.rows_covariance
+    row["stereo_rows_covariance"] = np.nan if P is None else P
     return row
 
 
@@ -86,14 +91,21 @@ def estimate_of(row: np.void) -> Estimate:
     """Return the estimate of a row."""
     optional: dict[str, Any] = {name: _array(row[name]) for name in _OPTIONAL_ARRAYS}
     optional |= {name: _number(row[name]) for name in _OPTIONAL_NUMBERS}
-    field, P = _array(row["stereo_field"]), _array(row["stereo_field_covariance"])
     return Estimate(
         int(row["time_ns"]),
         np.array(row["T_world_imu"]),
         np.array(row["covariance"]),
         **optional,
-        stereo_field=None if field is None or P is None else StereoFieldEstimate(field, P, row["stereo_rows_rms_px"]),
+        stereo_field=_stereo_field(row),
     )
+
+
+def _stereo_field(row: np.void) -> StereoFieldEstimate | None:
+    coefficients, P = _array(row["stereo_field"]), _array(row["stereo_field_covariance"])
+    if coefficients is None or P is None:
+        return None
+    rows, rows_P = _array(row["stereo_rows"]), _array(row["stereo_rows_covariance"])
+    return StereoFieldEstimate(coefficients, P, row["stereo_rows_rms_px"], rows, rows_P)
 
 
 class FrameRows:

@@ -32,6 +32,15 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
     parser.add_argument(
+        "--save-calibration",
+        type=Path,
+        nargs="?",
+        const=Path(),
+        metavar="FILE",
+        help="write the calibration with what the run found it to be off by, for --calibration of the next run "
+        "(Kalibr's format; default camchain-imucam.yaml in the folder of results)",
+    )
+    parser.add_argument(
         "--view",
         nargs="?",
         const="spawn",
@@ -50,6 +59,7 @@ _OF_A_NEW_RUN = (
     "lengths",
     "out",
     "save_observations",
+    "save_calibration",
     "view",
     "set",
     "config",
@@ -82,6 +92,7 @@ def execute(args: argparse.Namespace) -> int:
         stop=args.stop,
         lengths_m=args.lengths,
         save_observations=args.save_observations,
+        save_calibration=args.save_calibration,
         progress=not args.quiet,
         view=args.view,
     )

@@ -10,19 +10,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.atomic import check_replaceable, check_writable, locked_folder
+from vio.atomic import atomic_write_text, check_replaceable, check_writable, locked_folder
 from vio.cli.progress import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
 from vio.datasets.span import Seconds, frames_between
-from vio.errors import StoppedError, VioError
+from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.evaluation import KITTI_LENGTHS_M
 from vio.frame_result import FrameResult
-from vio.pipeline import resolve_motion, run
+from vio.pipeline import given_rig, resolve_motion, run
 from vio.protocols import Dataset, Viewer
 from vio.records import Trajectory
-from vio.run_folder import FILES, MARKER, finish_run_folder, growing_folder, read_request
+from vio.run_folder import (
+    CALIBRATION,
+    FILES,
+    MARKER,
+    calibration_text,
+    finish_run_folder,
+    growing_folder,
+    read_request,
+)
 from vio.run_recorder import CHECKPOINT, UNFINISHED
 from vio.trajectory_io import read_trajectory
 
@@ -30,6 +38,8 @@ if TYPE_CHECKING:
     from vio.view.live import RerunViewer
 
 log = logging.getLogger(__name__)
+
+_LINES = 3  # of what the calibration is off by, in the summary; all are in metrics.json
 
 
 class Viewers:
@@ -86,14 +96,19 @@ def process(
     stop: int | Seconds | None = None,
     lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
+    save_calibration: Path | None = None,
     progress: bool = True,
     view: str | None = None,
 ) -> dict[str, Any]:
-    """Process a source into a run folder, which grows meanwhile, and return its metrics."""
+    """Process a source into a run folder, which grows meanwhile, and return its metrics.
+
+    `save_calibration` names the file for the calibration that the run found; `Path()`, one in the run's folder.
+    """
     dataset = open_dataset(source, config.dataset)
     for note in dataset.recording.notes:
         log.warning("%s", note)
     folder = check_out(out if out is not None else free_folder(dataset.recording.path))
+    calibration = _calibration_file(dataset, folder, save_calibration)
     first, end = frames_between(dataset.recording, start, stop)
     request = {
         "source": f"{dataset.recording.kind}:{dataset.recording.path.absolute()}",
@@ -102,6 +117,7 @@ def process(
         "stop": end,
         "lengths_m": None if lengths_m is None else list(lengths_m),
         "save_observations": save_observations,
+        "save_calibration": None if calibration is None else str(calibration.absolute()),
     }
     return _process(dataset, config, folder, request, progress=progress, resume=False, view=view)
 
@@ -154,6 +170,8 @@ def _process(
                 resume=resume,
                 should_stop=asked.reason,
             )
+            file = request.get("save_calibration")  # unfinished runs of earlier versions have none
+            calibration = None if file is None else calibration_text(result)
             metrics = finish_run_folder(
                 folder,
                 result,
@@ -161,6 +179,9 @@ def _process(
                 lengths_m=request["lengths_m"] or KITTI_LENGTHS_M,
                 save_observations=save_observations,
             )
+            if calibration is not None and file is not None:
+                atomic_write_text(file, calibration)
+                metrics["calibration"] = file
         except KeyboardInterrupt as error:
             if not (folder / UNFINISHED).is_dir():
                 raise
@@ -179,6 +200,28 @@ def _process(
             raise StoppedError(f"error: {text}", status=1)
         raise StoppedError(f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number)
     return metrics
+
+
+def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Path | None:
+    """Return where a run's calibration goes, checked before the processing starts; None: it was not asked for.
+
+    Raises:
+        VioError: the recording has no image size, or the file cannot be written.
+    """
+    if asked is None:
+        return None
+    if given_rig(dataset) is None:
+        raise DataError(
+            f"{dataset.recording.path}: states no image size, which a calibration needs; leave --save-calibration out"
+        )
+    if asked == Path():
+        return folder / CALIBRATION
+    if asked.suffix.lower() not in (".yaml", ".yml"):
+        raise ConfigError(f"--save-calibration {asked}: writes Kalibr's format; give a file name that ends in .yaml")
+    if asked.is_dir() or not asked.absolute().parent.is_dir():
+        raise DataError(f"--save-calibration {asked}: its folder does not exist, or it is one; name a file")
+    check_writable(asked)
+    return asked
 
 
 def _open_view(where: str, dataset: Dataset, config: Config, reference: Trajectory | None) -> RerunViewer:
@@ -235,6 +278,9 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             ("stereo", f"rows off by {field['rows_rms_px']:.2f} px (rms), disparities by {-off:+.2f} ± {sigma:.2f} px")
         )
+        found = [] if field["rig"] is None else field["rig"]["lines"]
+        if found:
+            rows.append(("", "; ".join(found[:_LINES])))
     if metrics["ate_m"] is None:
         rows.append(("ATE", "no reference"))
     else:
@@ -246,6 +292,8 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if metrics["landmark_error"] is not None:
         score = metrics["landmark_error"]
         rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
+    if metrics.get("calibration") is not None:
+        rows.append(("calib.", f"{metrics['calibration']} (next: --calibration FILE)"))
     rows.append(("results", metrics["out"]))
     plot = Path(metrics["out"]) / "trajectory.png"
     rows.append(("plot", str(plot) if plot.is_file() else "could not be drawn"))

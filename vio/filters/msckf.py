@@ -307,7 +307,9 @@ class Msckf:
         )
         estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:])
         if estimate.stereo_field is not None:
-            field = replace(estimate.stereo_field, rows_rms_px=self._rows.rms_px)
+            field = estimate.stereo_field
+            own, P = self._rows.without_common(field.coefficients), self._rows.covariance
+            field = replace(field, rows_rms_px=self._rows.rms_px, rows=own, rows_covariance=P)
             estimate = replace(estimate, stereo_field=field)
         return estimate
 
