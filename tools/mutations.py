@@ -1345,6 +1345,7 @@ MUTATIONS = (
         "elif p > level or low <= 0 <= high:",
         "elif low <= 0 <= high:",
         _BENCH_COMPARE,
+    ),
     Mutation(
         "rig turned the other way than its field",
         "vio/calibration/stereo_field.py",
