@@ -56,6 +56,8 @@ _MOVING_OBJECT = ("tests/test_moving_object.py",)
 _ODOMETRY = ("tests/test_odometry.py",)
 _UNFINISHED = ("tests/test_unfinished_runs.py",)
 _INPUTS = ("tests/test_filter_inputs.py",)
+_BENCH = ("tests/test_bench.py",)
+_BENCH_COMPARE = ("tests/test_bench_compare.py",)
 _FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
@@ -1286,6 +1288,63 @@ MUTATIONS = (
         "math.prod(shape) * dtype.itemsize > info.file_size",
         "math.prod(shape) * dtype.itemsize < 0",
         _FILES,
+    ),
+    # --- vio/bench ---
+    Mutation(
+        "bench: errors of poses expressed in the world",
+        "vio/bench/figures.py",
+        "se3_log(se3_inverse(T_world_true @ truth) @ T)",
+        "se3_log(T @ se3_inverse(T_world_true @ truth))",
+        _BENCH,
+    ),
+    Mutation(
+        "bench: inclination of the first pose taken as known",
+        "vio/bench/figures.py",
+        "_yaw_and_position(T[0], truth[0]) if upright else T[0]",
+        "T[0]",
+        _BENCH,
+    ),
+    Mutation(
+        "bench: a recording is known by names and sizes only",
+        "vio/bench/identity.py",
+        "digest.update(block)",
+        "digest.update(b'')",
+        _BENCH,
+    ),
+    Mutation(
+        "bench: settings that are no part of a task's key",
+        "vio/bench/tasks.py",
+        '[_FORM, "run", identity, known]',
+        '[_FORM, "run", identity]',
+        _BENCH,
+    ),
+    Mutation(
+        "bench: failures of the machine kept",
+        "vio/bench/bench.py",
+        'if record.pop("keep", True):',
+        'if record.pop("keep", True) or True:',
+        _BENCH,
+    ),
+    Mutation(
+        "compare: a smaller coverage is better",
+        "vio/bench/compare.py",
+        "-ratio if metric.larger_is_better else ratio",
+        "ratio if metric.larger_is_better else ratio",
+        _BENCH_COMPARE,
+    ),
+    Mutation(
+        "compare: the spread over seeds ignored",
+        "vio/bench/compare.py",
+        "return quantile * sigma,",
+        "return 0.01 * quantile * sigma,",
+        _BENCH_COMPARE,
+    ),
+    Mutation(
+        "compare: flips of signs do not count",
+        "vio/bench/compare.py",
+        "elif p > level or low <= 0 <= high:",
+        "elif low <= 0 <= high:",
+        _BENCH_COMPARE,
     ),
     Mutation(
         "png: rows side by side take the corner of the row before",

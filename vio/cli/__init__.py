@@ -19,6 +19,7 @@ from types import FrameType
 
 from vio._version import __version__
 from vio.cli import (
+    bench,
     calibrate,
     check,
     completion,
@@ -45,6 +46,7 @@ _COMMANDS = (
     convert,
     evaluate,
     report,
+    bench,
     view,
     check,
     refine,
