@@ -12,6 +12,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.loops import LoopEvent
 from vio.protocols import Backend, Frontend, Selector
 from vio.records import (
     Estimate,
@@ -67,6 +68,7 @@ class FrameResult:
     report: UpdateReport
     estimate: Estimate
     log: FrameLog
+    loops: tuple[LoopEvent, ...] = ()  # places of the map seen again, whose results have come with this frame
 
 
 class Chain:

@@ -7,7 +7,8 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
+from vio.mapped_run import MappedRun, mapped_run
 from vio.odometry import Odometry
 from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
 from vio.records import (
@@ -37,6 +39,9 @@ from vio.run_recorder import GrowingFolder, RunRecorder
 from vio.selectors import build_selector
 from vio.tables import Records
 from vio.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    from vio.mapping.session import MapSession
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +68,7 @@ class RunResult:
     warnings: tuple[str, ...]  # what went wrong in the run, or with its IMU
     wall_s: float
     stopped: str | None = None  # why the run ended before the recording; None: it did not
+    mapped: MappedRun | None = None  # where a map was built or used
 
     @property
     def trajectory(self) -> Trajectory:
@@ -98,6 +104,8 @@ def run(
     folder: GrowingFolder | None = None,
     resume: bool = False,
     should_stop: Callable[[], str | None] = lambda: None,
+    map_file: Path | None = None,
+    localise: bool = False,
 ) -> RunResult:
     """Process a recording from its frame `start` to before frame `stop`, with BLAS pinned to one thread meanwhile.
 
@@ -114,6 +122,8 @@ def run(
         folder: where to write while the run goes on; None: everything stays in memory.
         resume: go on from the checkpoint in `folder`.
         should_stop: asked after each event; a reason ends the run in order, and the result names it.
+        map_file: a map to begin or to continue.
+        localise: find poses in the map, and leave it as it is.
 
     Raises:
         VioError: the configuration, the data or the estimation is at fault; the message says which. With a folder, a
@@ -131,21 +141,29 @@ def run(
         state = recorder.restore(features)
         viewer = _skipped(viewer, len(recorder))
     else:
+        run_config = replace(config, motion=motion or "none")
+        session = None if map_file is None else _map_session(map_file, recording, run_config, localise=localise)
         odometry = Odometry(
             recording.camera,
-            replace(config, motion=motion or "none"),
+            run_config,
             T_cam0_imu=T_cam0_body,
             frontend=frontend or _build_frontend(features, config),
             selector=selector or _build_selector(features, config),
-            backend=backend or build_backend(recording.camera, T_cam0_body, config, motion),
+            backend=backend or (None if session else build_backend(recording.camera, T_cam0_body, config, motion)),
+            map=session,
         )
         dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
         state = _RunState(odometry, dead_reckoning, start)
     stopped = None
-    with contextlib.closing(recorder), contextlib.closing(viewer or NullViewer()) as shown:
+    with (
+        contextlib.closing(recorder),
+        contextlib.closing(viewer or NullViewer()) as shown,
+        contextlib.closing(state.odometry),
+    ):
         loop = _Loop(state, recorder, shown)
         try:
-            events = dataset.events(state.next_frame, stop, images=_needs_images(dataset, config))
+            images = _needs_images(dataset, config) or state.odometry.map_session is not None
+            events = dataset.events(state.next_frame, stop, images=images)
             stopped = loop.run(events, features, should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
@@ -170,7 +188,26 @@ def run(
             warnings=odometry.warnings,
             wall_s=time.perf_counter() - began,
             stopped=stopped,
+            mapped=None if odometry.map_session is None else mapped_run(odometry.map_session, recorder.estimates),
         )
+
+
+def _map_session(path: Path, recording: Recording, config: Config, *, localise: bool) -> MapSession:
+    """Open a map for a recording.
+
+    Raises:
+        ConfigError: the recording has no images, or the back end is not msckf.
+        DataError: the map cannot be used.
+    """
+    from vio.mapping.session import MapSession
+
+    if not recording.has_images:
+        raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
+    if config.backend != "msckf":
+        raise ConfigError(f"a map needs the back end msckf, not {config.backend}; leave --backend out")
+    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    source, imu = str(recording.path.absolute()), config.motion == "imu"
+    return MapSession(path, recording.camera, T_cam0_body, source=source, imu=imu, localise=localise)
 
 
 def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:

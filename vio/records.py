@@ -318,6 +318,7 @@ class Estimate:
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     stereo_field: StereoFieldEstimate | None = None
+    T_map_body: FloatArray | None = None  # (4, 4) pose in the map; None: no map, or no place in it yet
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, transform_points
 from vio.input_files import read_input
+from vio.mapped_run import MappedRun
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.printable import json_text
 from vio.protocols import Dataset
@@ -35,6 +36,7 @@ log = logging.getLogger(__name__)
 
 MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
 REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
+LOOP_COLUMNS = ("frame", "time_ns", "keyframe", "keyframe_time_ns", "inliers", "gap_m", "joined")
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 FILES = (
     MARKER,
@@ -42,6 +44,9 @@ FILES = (
     "config.yaml",
     "trajectory.tum",
     "trajectory.kitti",
+    "map_trajectory.tum",
+    "map_causal.tum",
+    "loops.csv",
     "estimates.npy",
     "dead_reckoning.tum",
     "landmarks.ply",
@@ -172,6 +177,8 @@ def _write_files(
     write_kitti(target / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
     if result.dead_reckoning is not None:
         write_tum(target / "dead_reckoning.tum", result.dead_reckoning)
+    if result.mapped is not None:
+        metrics["map"] = _write_mapped(target, result, result.mapped, reference)
     write_landmarks_ply(target / "landmarks.ply", result.landmarks)
     _write_frames(target / "frames.csv", result.frames)
     if save_observations:
@@ -183,18 +190,46 @@ def _write_files(
     return metrics
 
 
+def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference: Trajectory | None) -> dict[str, Any]:
+    """Write the poses in the map and the loops, and return their metrics."""
+    final = replace(result.trajectory, T_world_body=mapped.T_map_body)
+    write_tum(target / "map_trajectory.tum", final)
+    placed, times = mapped.placed, result.trajectory.times_ns
+    assert times is not None
+    causal = Trajectory(mapped.T_map_body_causal[placed], times[placed], result.body)
+    if placed.any():
+        write_tum(target / "map_causal.tum", causal)
+    lines = [",".join(LOOP_COLUMNS), *(",".join(str(getattr(o, c)) for c in LOOP_COLUMNS) for o in mapped.loops)]
+    (target / "loops.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    evaluation, _ = score(replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body)
+    return {
+        "joined": mapped.joined,
+        "keyframes": mapped.keyframes,
+        "loops": len(mapped.loops),
+        "placed": float(placed.mean()),
+        "ate_m": None if evaluation is None else evaluation.as_dict()["ate_m"],
+    }
+
+
 def score(
-    result: RunResult, reference: Trajectory | None, *, lengths_m: Sequence[float] = KITTI_LENGTHS_M
+    result: RunResult,
+    reference: Trajectory | None,
+    *,
+    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    T_world_body: FloatArray | None = None,
 ) -> tuple[Evaluation | None, Evaluation | None]:
     """Evaluate a run's trajectory and its dead reckoning; None without a reference or dead reckoning.
 
-    A reference that cannot be compared (too short, no common time) gives a warning only.
+    A reference that cannot be compared (too short, no common time) gives a warning only. `T_world_body` (N, 4, 4)
+    takes the place of the run's own poses.
     """
     if reference is None:
         return None, None
     try:
         truth = _with_times(reference, result)
-        own = evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
+        poses = result.trajectory
+        poses = poses if T_world_body is None else replace(poses, T_world_body=T_world_body)
+        own = evaluate(poses, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
         for note in own.notes:
             log.warning("%s", note)
         other = result.dead_reckoning

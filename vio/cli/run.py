@@ -31,6 +31,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map: loops are closed in it")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(execute=execute)
@@ -43,6 +44,7 @@ _OF_A_NEW_RUN = (
     "lengths",
     "out",
     "save_observations",
+    "map",
     "set",
     "config",
     "motion",
@@ -75,5 +77,6 @@ def execute(args: argparse.Namespace) -> int:
         lengths_m=args.lengths,
         save_observations=args.save_observations,
         progress=not args.quiet,
+        map_file=args.map,
     )
     return print_result(metrics, rows_of(metrics), as_json=args.json)
