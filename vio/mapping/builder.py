@@ -8,6 +8,7 @@ same. All follows from the keyframes alone, so that equal keyframes give equal m
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from vio.statistics import chi_square_quantile
 
 _CANDIDATES = 3  # keyframes that are compared by geometry
 _RECENT = 10  # newest keyframes, which the filter's own tracks join
-_REVISIT_DEPTHS = 5.0  # path since a keyframe, in median depths, before it counts as seen again
+_REVISIT_DEPTHS = 1.5  # path since a keyframe, in median depths, before it counts as seen again
 _VIEW_DEPTHS, _VIEW_RAD = 1.5, float(np.radians(70.0))  # how far apart two views of a place are, in median depths
 _SIGMAS = 3.0
 _GATE = float(chi_square_quantile(0.999, 6))
@@ -103,6 +104,11 @@ class MapBuilder:
         self._last: _Loop | None = None  # newest accepted loop
         self._waiting = 0  # loops since the last optimisation
         self._moved = False  # poses since the last commit
+
+    @property
+    def path(self) -> Path:
+        """The map's file."""
+        return self._store.path
 
     @property
     def is_joined(self) -> bool:
@@ -253,9 +259,10 @@ class MapBuilder:
         graph, count = self.graph, len(covariance)
         own = graph.session[:count] == self._own
         passed = graph.path_m[number] - graph.path_m[:count]
-        recent = own & ((np.arange(count) > number - _RECENT) | (passed < _REVISIT_DEPTHS * depth))
-        T = se3_inverse(graph.T_map_cam[number]) @ graph.T_map_cam[:count]
         sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+        near_path = (passed < _REVISIT_DEPTHS * depth) & (sigma < _LOST_M)
+        recent = own & ((np.arange(count) > number - _RECENT) | near_path)
+        T = se3_inverse(graph.T_map_cam[number]) @ graph.T_map_cam[:count]
         near = np.linalg.norm(T[:, :3, 3], axis=1) <= _VIEW_DEPTHS * depth + _SIGMAS * sigma
         ahead = np.arccos(np.clip(T[:, 2, 2], -1.0, 1.0)) <= _VIEW_RAD
         part = graph.part

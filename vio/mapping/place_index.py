@@ -76,16 +76,18 @@ class PlaceIndex:
 
     def candidates(self, descriptors: Bits, allowed: BoolArray, most: int) -> IntArray:
         """Return up to `most` keyframes among those `allowed` (K,), the most similar first, each of another place."""
+        if not len(self) or not len(descriptors):
+            return np.zeros(0, dtype=np.int64)
         score = np.where(allowed, self.scores(descriptors), 0.0)
         kernel = np.ones(2 * _NEIGHBOURS + 1)
         around = np.convolve(score, kernel)[_NEIGHBOURS : _NEIGHBOURS + len(score)]
         out: list[int] = []
         left = np.where(score > 0, around, 0.0)
-        while len(out) < most and left.size and left.max() > 0:
+        while len(out) < most and left.max() > 0:
             middle = int(np.argmax(left))
             near = slice(max(middle - _NEIGHBOURS, 0), middle + _NEIGHBOURS + 1)
             out.append(near.start + int(np.argmax(score[near])))
-            left[near] = 0.0
+            left[max(middle - 2 * _NEIGHBOURS, 0) : middle + 2 * _NEIGHBOURS + 1] = 0.0  # those that share its sum
         return np.array(out, dtype=np.int64)
 
 

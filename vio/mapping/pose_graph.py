@@ -22,7 +22,6 @@ _TRUNCATION = 0.999  # probability at which a loop's residual is cut off
 _MU_GROWTH = 1.6  # of the control parameter, from one step to the next
 _MOST_STEPS, _MOST_GNC_STEPS = 15, 30
 _CONVERGED = 1e-6  # largest change, m and rad
-_FIXED_WEIGHT = 1e12  # information on the error of a fixed pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,11 +172,10 @@ def _step(
         D, r = D / uprights.sigma_rad[:, None, None], r / uprights.sigma_rad[:, None]
         blocks.append((uprights.pose, uprights.pose, np.swapaxes(D, 1, 2) @ D))
         np.add.at(gradient, uprights.pose, -np.einsum("eji,ej->ei", D, r))
-    held = np.flatnonzero(fixed)
-    blocks.append((held, held, np.broadcast_to(_FIXED_WEIGHT * np.eye(6), (len(held), 6, 6))))
-    gradient[held] = 0.0
-    xi: FloatArray = splu(_sparse(blocks, count)).solve(gradient.ravel()).reshape(count, 6)
-    return xi
+    free = np.flatnonzero(np.repeat(~fixed, 6))
+    xi = np.zeros(6 * count)
+    xi[free] = splu(_sparse(blocks, count)[free][:, free].tocsc()).solve(gradient.ravel()[free])
+    return xi.reshape(count, 6)
 
 
 def _sparse(blocks: list[tuple[IntArray, IntArray, FloatArray]], count: int) -> coo_matrix:
@@ -186,4 +184,4 @@ def _sparse(blocks: list[tuple[IntArray, IntArray, FloatArray]], count: int) -> 
     rows = np.concatenate([(6 * i[:, None] + inner_row).ravel() for i, _, _ in blocks])
     columns = np.concatenate([(6 * j[:, None] + inner_column).ravel() for _, j, _ in blocks])
     values = np.concatenate([M.reshape(-1) for _, _, M in blocks])
-    return coo_matrix((values, (rows, columns)), shape=(6 * count, 6 * count)).tocsc()
+    return coo_matrix((values, (rows, columns)), shape=(6 * count, 6 * count)).tocsr()

@@ -43,7 +43,7 @@ from vio.sim.rigs import (
     small_rig,
 )
 from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
-from vio.sim.world import MovingBox, SceneName, World, corridor, room, street
+from vio.sim.world import MovingBox, SceneName, World, corridor, equal_doors, room, street
 
 ReadyMotion: TypeAlias = Literal["handheld", "car"]
 RigName: TypeAlias = Literal["euroc", "euroc-rectified", "kitti", "fisheye", "small"]
@@ -173,6 +173,8 @@ def _check(scenario: Scenario) -> None:
         raise SimulationError(f"the seed must not be negative, got {scenario.seed}")
     if scenario.conditions.bare_wall and scenario.scene == "street":
         raise SimulationError("a street has no bare walls; use that effect in a room or a corridor")
+    if scenario.scene == "doors" and (scenario.conditions.bare_wall or scenario.conditions.moving):
+        raise SimulationError("the corridor of equal doors has no bare walls and nothing that moves; use corridor")
 
 
 def scaled(rig: StereoRig, width: int | None) -> StereoRig:
@@ -232,7 +234,7 @@ def _ready(scenario: Scenario) -> tuple[MotionSpline, IntArray, None]:
 def _motion(scenario: Scenario, duration_s: float) -> MotionSpline:
     if scenario.trajectory == "car":
         return car_loop(duration_s=duration_s, seed=scenario.seed)
-    if scenario.scene == "corridor":
+    if scenario.scene in ("corridor", "doors"):
         return _walk(duration_s, scenario.seed)
     centre = (0.0, -37.8, 1.5) if scenario.scene == "street" else (0.0, 0.0, 1.4)
     return hand_held(centre=centre, duration_s=duration_s, seed=scenario.seed)
@@ -265,6 +267,8 @@ def _world(scenario: Scenario, motion: MotionSpline) -> World:
     hard, seed = scenario.conditions, scenario.seed
     if scenario.scene == "street":
         return street(seed, moving=_traffic(motion, seed) if hard.moving else ())
+    if scenario.scene == "doors":
+        return equal_doors(seed)
     if scenario.scene == "corridor":
         lane = np.array([[3.0, 0.95, 1.1], [27.0, 0.95, 1.1]])
         moving = (_oscillating_box(lane, motion.start_ns, 25.0),) if hard.moving else ()
