@@ -14,8 +14,8 @@ import pytest
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse
 from vio.geometry.relative_pose import RelativePose
 from vio.mapping.builder import Keyframe, MapBuilder
+from vio.mapping.features import KeyframeFeatures, extract
 from vio.mapping.map_store import MapStore
-from vio.records import Image
 from vio.sim.motion import look_rotation, spline_from_waypoints
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate
@@ -36,9 +36,9 @@ class Walk:
         assert trajectory is not None
         self.T = trajectory.T_world_body @ RIG.T_imu_cam0
         self.camera = self._recording.recording.camera
-        self.images: list[tuple[Image, Image]] = [self._recording.images(k) for k in range(len(self._recording))]
+        self.features = [extract(*self._recording.images(k)) for k in range(len(self._recording))]
 
-    def keyframes(self, *, seed: int, rows: slice = slice(None)) -> Iterator[Keyframe]:
+    def keyframes(self, *, seed: int, rows: slice = slice(None)) -> Iterator[tuple[Keyframe, KeyframeFeatures]]:
         """Keyframes with the odometry's errors, in a world of its own where they begin."""
         rng = np.random.default_rng(seed)
         chosen = range(len(self.T))[rows]
@@ -50,7 +50,7 @@ class Walk:
                 motion = RelativePose(step, np.diag(STEP_SIGMA**2))
                 T_odom = T_odom @ step
             before = k
-            yield Keyframe(k, 10**9 * k, *self.images[k], T_odom, motion, None, 0.0)
+            yield Keyframe(k, 10**9 * k, T_odom, motion, None, 0.0), self.features[k]
 
 
 @pytest.fixture(scope="module")
@@ -98,8 +98,8 @@ def doors_map(doors_walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> Map
 def _map(walk: Walk, path: Path, *, seed: int = 0, rows: slice = slice(None), localise: bool = False) -> MapBuilder:
     store = MapStore(path, create=not localise, read_only=localise)
     builder = MapBuilder(store, "walk", walk.camera, upright=False, localise=localise)
-    for keyframe in walk.keyframes(seed=seed, rows=rows):
-        builder.add(keyframe)
+    for keyframe, features in walk.keyframes(seed=seed, rows=rows):
+        builder.add(keyframe, features)
     return builder
 
 
@@ -160,9 +160,9 @@ def test_after_a_gap_without_odometry_the_place_is_found_again(
     builder = _map(room_walk, tmp_path / "a.map", seed=2, rows=slice(0, 15))
     T_last = builder.graph.T_odom_cam[-1]
     jump = RelativePose(np.eye(4), np.diag(np.repeat([30.0**2, 1.0], 3)))
-    for n, keyframe in enumerate(room_walk.keyframes(seed=3, rows=slice(25, 31))):
+    for n, (keyframe, features) in enumerate(room_walk.keyframes(seed=3, rows=slice(25, 31))):
         motion = jump if n == 0 else keyframe.motion
-        builder.add(replace(keyframe, T_odom_cam=T_last @ keyframe.T_odom_cam, motion=motion))
+        builder.add(replace(keyframe, T_odom_cam=T_last @ keyframe.T_odom_cam, motion=motion), features)
     found = room_walk.T[0] @ builder.graph.T_map_cam.rows[-3:]
     assert np.linalg.norm((found - room_walk.T[28:31])[:, :3, 3], axis=1).max() < 0.2
     builder.close()
@@ -174,14 +174,14 @@ def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBui
     builder = _map(room_walk, path, rows=slice(0, 30))
     builder.commit()
     saved = pickle.dumps(builder)
-    for keyframe in keyframes[30:33]:  # what the first process still did before it died
-        builder.add(keyframe)
+    for keyframe, features in keyframes[30:33]:  # what the first process still did before it died
+        builder.add(keyframe, features)
     builder.commit()
     builder.close()
     resumed: MapBuilder = pickle.loads(saved)
     resumed.reopen(MapStore(path))
-    for keyframe in keyframes[30:]:
-        resumed.add(keyframe)
+    for keyframe, features in keyframes[30:]:
+        resumed.add(keyframe, features)
     resumed.finish()
     resumed.close()
     np.testing.assert_array_equal(resumed.graph.T_map_cam.rows, whole_map.graph.T_map_cam.rows)

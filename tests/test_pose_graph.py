@@ -96,7 +96,7 @@ def test_without_loops_the_odometry_is_the_optimum() -> None:
 
 
 def test_false_loops_end_without_weight_and_change_nothing() -> None:
-    T, start, odometry, loops = _problem(2)
+    _, start, odometry, loops = _problem(2)
     _, _, _, mixed = _problem(2, false_loops=4)
     clean = optimise(start, odometry, loops, no_uprights(), _fixed())
     robust = optimise(start, odometry, mixed, no_uprights(), _fixed())
@@ -109,7 +109,7 @@ def test_the_error_at_the_optimum_is_that_of_its_covariance() -> None:
     """Chi-square of the last pose, whose covariance is that of odometry and loops: 6 on average."""
     squared = []
     for seed in range(30):
-        T, start, odometry, loops = _problem(seed)
+        _, start, odometry, loops = _problem(seed)
         best = optimise(start, odometry, loops, no_uprights(), _fixed()).T_map_cam
         r = np.concatenate([residual(best, odometry).ravel(), residual(best, loops).ravel()])
         sigma = np.concatenate([np.tile(SIGMA, len(odometry)), np.tile(LOOP_SIGMA, len(loops))])

@@ -9,8 +9,8 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.loops import LoopEvent
-from vio.records import BoolArray, Estimate, IntArray
-from vio.tables import Records
+from vio.records import Estimate, IntArray
+from vio.tables import Records, Rows
 
 if TYPE_CHECKING:
     from vio.mapping.session import MapSession
@@ -21,20 +21,18 @@ class MappedRun:
     """What a map made of a run."""
 
     T_map_body: FloatArray  # (N, 4, 4) of all frames, optimised at the end
-    T_map_body_causal: FloatArray  # (N, 4, 4) as known at each frame; arbitrary where `placed` is False
-    placed: BoolArray  # (N,) whether the frame's place in the map was known at the time
+    causal: Rows  # (M,) rows of MAPPED: poses as known at the time, of the frames that had one
     joined: bool  # whether `T_map_body` is in the map's frame; else in one of the run's own
     keyframes: int  # of this run
     loops: tuple[LoopEvent, ...]
 
 
-def mapped_run(session: MapSession, estimates: Records[Estimate]) -> MappedRun:
-    """Return the poses of all frames in the map."""
+def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows) -> MappedRun:
+    """Return the poses of all frames in the map; `causal` are those known at the time."""
     T_odom_body, index = (np.array(estimates.column(name)) for name in ("T_world_imu", "index"))
     frames, T_map, T_odom = session.keyframes()
-    causal, placed = _causal(session, index, T_odom_body)
     T = corrected(T_odom_body, index, frames, T_map, T_odom)
-    return MappedRun(T, causal, placed, session.is_joined, len(frames), tuple(session.loops))
+    return MappedRun(T, causal, session.is_joined, len(frames), tuple(session.loops))
 
 
 def corrected(
@@ -59,12 +57,3 @@ def corrected(
     xi = se3_log(se3_inverse(end) @ T_map[after])
     share = (index - frames[before]) / np.maximum(frames[after] - frames[before], 1)
     return out @ se3_exp(np.clip(share, 0.0, 1.0)[:, None] * xi)
-
-
-def _causal(session: MapSession, index: IntArray, T_odom_body: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Poses (N, 4, 4) with the correction known at each frame, and a mask (N,) of those that had one."""
-    begins = np.array([frame for frame, _ in session.changes], dtype=np.int64)
-    T_map_odom = np.array([np.eye(4), *(T for _, T in session.changes)])
-    last = np.searchsorted(begins, index, side="right")
-    placed = (last > 0) | session.began_in_map
-    return T_map_odom[last] @ T_odom_body, placed

@@ -412,7 +412,8 @@ class Odometry:
         loops = self._map.frame(frame, result.output.observations, result.estimate, backend.relative)
         T = self._map.T_map_odom
         if T is not None:
-            estimate = replace(result.estimate, T_map_body=T @ result.estimate.T_world_imu)
+            T_map_body, covariance = T @ result.estimate.T_world_imu, self._map.covariance
+            estimate = replace(result.estimate, T_map_body=T_map_body, T_map_body_covariance=covariance)
             result = replace(result, estimate=estimate)
         return replace(result, loops=loops)
 

@@ -172,7 +172,7 @@ def run(
         odometry = state.odometry
         if not len(recorder):
             _nothing_done(recording, odometry, stopped)
-        reckoned = state.dead_reckoning is not None
+        reckoned, session = state.dead_reckoning is not None, odometry.map_session
         return RunResult(
             recording=recording,
             config=config,
@@ -188,7 +188,7 @@ def run(
             warnings=odometry.warnings,
             wall_s=time.perf_counter() - began,
             stopped=stopped,
-            mapped=None if odometry.map_session is None else mapped_run(odometry.map_session, recorder.estimates),
+            mapped=None if session is None else mapped_run(session, recorder.estimates, recorder.mapped),
         )
 
 

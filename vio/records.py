@@ -318,7 +318,9 @@ class Estimate:
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     stereo_field: StereoFieldEstimate | None = None
-    T_map_body: FloatArray | None = None  # (4, 4) pose in the map; None: no map, or no place in it yet
+    # The pose in a map; None without one, or without a place in it yet.
+    T_map_body: FloatArray | None = None  # (4, 4)
+    T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi), given the map
 
 
 @dataclass(frozen=True, slots=True)

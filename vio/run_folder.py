@@ -46,6 +46,7 @@ FILES = (
     "trajectory.kitti",
     "map_trajectory.tum",
     "map_causal.tum",
+    "map_covariance.npy",
     "loops.csv",
     "estimates.npy",
     "dead_reckoning.tum",
@@ -194,11 +195,11 @@ def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference:
     """Write the poses in the map and the loops, and return their metrics."""
     final = replace(result.trajectory, T_world_body=mapped.T_map_body)
     write_tum(target / "map_trajectory.tum", final)
-    placed, times = mapped.placed, result.trajectory.times_ns
-    assert times is not None
-    causal = Trajectory(mapped.T_map_body_causal[placed], times[placed], result.body)
-    if placed.any():
-        write_tum(target / "map_causal.tum", causal)
+    causal = mapped.causal
+    if len(causal):
+        poses = Trajectory(np.array(causal["T_map_body"]), np.array(causal["time_ns"]), result.body)
+        write_tum(target / "map_causal.tum", poses)
+    np.save(target / "map_covariance.npy", causal["covariance"])
     lines = [",".join(LOOP_COLUMNS), *(",".join(str(getattr(o, c)) for c in LOOP_COLUMNS) for o in mapped.loops)]
     (target / "loops.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     evaluation, _ = score(replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body)
@@ -206,7 +207,7 @@ def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference:
         "joined": mapped.joined,
         "keyframes": mapped.keyframes,
         "loops": len(mapped.loops),
-        "placed": float(placed.mean()),
+        "placed": len(causal) / len(final),
         "ate_m": None if evaluation is None else evaluation.as_dict()["ate_m"],
     }
 

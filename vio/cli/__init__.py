@@ -27,6 +27,8 @@ from vio.cli import (
     evaluate,
     export,
     inspect,
+    localise,
+    map,
     rectify,
     refine,
     render,
@@ -38,6 +40,8 @@ from vio.printable import printable
 
 _COMMANDS = (
     run,
+    localise,
+    map,
     inspect,
     convert,
     evaluate,

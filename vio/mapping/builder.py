@@ -17,12 +17,12 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.loops import LoopEvent
-from vio.mapping.features import KeyframeFeatures, extract
+from vio.mapping.features import KeyframeFeatures
 from vio.mapping.loop_geometry import Verified, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.place_index import PlaceIndex
-from vio.records import BoolArray, Image, IntArray
+from vio.records import BoolArray, IntArray
 from vio.statistics import chi_square_quantile
 
 _CANDIDATES = 3  # keyframes that are compared by geometry
@@ -50,8 +50,6 @@ class Keyframe:
 
     frame: int
     time_ns: int
-    left: Image  # (H, W) rectified
-    right: Image  # (H, W)
     T_odom_cam: FloatArray  # (4, 4) by the filter
     motion: RelativePose | None  # of the camera since the last keyframe; None: the session begins
     up_cam: FloatArray | None  # (3,) unit vector against gravity; None: not known
@@ -115,14 +113,13 @@ class MapBuilder:
         """Whether this session's poses are in the map's frame."""
         return self.graph.sessions[self._own].part == self._home
 
-    def add(self, keyframe: Keyframe) -> MapUpdate:
-        """Take the next keyframe of the session.
+    def add(self, keyframe: Keyframe, features: KeyframeFeatures) -> MapUpdate:
+        """Take the next keyframe of the session, with what `extract` made of its images.
 
         Raises:
             DataError: the file cannot be written or read.
         """
         graph, number, motion = self.graph, len(self.graph), keyframe.motion
-        features = extract(keyframe.left, keyframe.right)
         drift, path = graph.gathered(keyframe.T_odom_cam, motion)
         T = keyframe.T_odom_cam if motion is None else graph.T_map_cam[-1] @ motion.T_i_j
         up, sigma = keyframe.up_cam, keyframe.up_sigma_rad

@@ -143,6 +143,15 @@ class MapStore:
                 self._db.execute("COMMIT")
             self._db.close()
 
+    def copy_to(self, path: Path) -> None:
+        """Write a copy of the whole map.
+
+        Raises:
+            DataError: it cannot be written.
+        """
+        with self._errors(), contextlib.closing(sqlite3.connect(path)) as target:
+            self._db.backup(target)
+
     def add_session(self, row: SessionRow) -> int:
         """Add a session and return its number."""
         c = row.camera

@@ -13,13 +13,14 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, se3_inverse, so3_hat
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_hat
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.loops import LoopEvent
 from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate
+from vio.mapping.features import extract
 from vio.mapping.map_store import MapStore
-from vio.records import Estimate, IntArray, Observations, StereoFrame
+from vio.records import Estimate, Image, IntArray, Observations, StereoFrame
 
 Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
@@ -56,7 +57,7 @@ class MapSession:
         store = MapStore(path, create=not localise, read_only=localise)
         self._builder = MapBuilder(store, source, camera, upright=imu, localise=localise)
         self._executor = ThreadPoolExecutor(1, "map")
-        self._waiting: list[tuple[int, Future[MapUpdate]]] = []  # due frame, result
+        self._waiting: list[tuple[int, int, Future[MapUpdate]]] = []  # when it is due, frame, result
         self._frames = 0
         self._ids: IntArray = np.zeros(0, dtype=np.int64)  # stereo features of the last keyframe
         self._base: RelativePose | None = None  # from the last keyframe to the anchor
@@ -65,9 +66,10 @@ class MapSession:
         self._newest: tuple[int, RelativePose, FloatArray] | None = None
         self._since = 0  # frames since the last keyframe
         self.T_map_odom: FloatArray | None = np.eye(4) if self._builder.first == 0 and not localise else None
-        self.covariance: FloatArray | None = None  # (6, 6) of xi in T_map_cam = T_hat exp(xi) at the newest result
+        # (6, 6) covariance in the map of the newest keyframe with a result
+        self._known: FloatArray | None = None if self.T_map_odom is None else np.zeros((6, 6))
+        self._moves: list[tuple[int, RelativePose]] = []  # later keyframes, each with the motion since the one before
         self.loops: list[LoopEvent] = []
-        self.changes: list[tuple[int, FloatArray]] = []  # from which frame on, T_map_odom
 
     def frame(
         self, frame: StereoFrame, seen: Observations, estimate: Estimate, relative: Relative
@@ -81,7 +83,7 @@ class MapSession:
             relative: the filter's motion between two frames of its window.
         """
         self._frames += 1
-        events = self._take(frame.index, lambda due: due <= self._frames)
+        events = self._take(lambda due: due <= self._frames)
         fresh = seen.take(seen.has_right & ~seen.stale)
         if len(fresh) < _LEAST_FEATURES or frame.left is None or frame.right is None:
             return events
@@ -95,9 +97,9 @@ class MapSession:
 
     def finish(self) -> tuple[LoopEvent, ...]:
         """Wait for everything, and write the map."""
-        events = self._take(None, lambda due: True)
+        events = self._take(lambda due: True)
         if self._frames:
-            self._note(None, self._executor.submit(self._builder.finish).result())
+            self.T_map_odom = self._executor.submit(self._builder.finish).result().T_map_odom
         return events
 
     def close(self) -> None:
@@ -116,9 +118,20 @@ class MapSession:
         return frames, graph.T_map_cam[own] @ self._T_cam_body, graph.T_odom_cam[own] @ self._T_cam_body
 
     @property
-    def began_in_map(self) -> bool:
-        """Whether the session began the map, so that its odometry frame is the map's."""
-        return self._builder.first == 0 and not self._localise
+    def covariance(self) -> FloatArray | None:
+        """Covariance (6, 6) of xi in T_map_body = T_hat exp(xi), [rho; phi], at the newest frame, given the map.
+
+        That of the newest keyframe whose place is known, grown by the odometry since; None without a place.
+        """
+        if self._known is None:
+            return None
+        now = RelativePose(np.eye(4), self._known)
+        for _, motion in self._moves:
+            now = now.then(motion)
+        if self._newest is not None:
+            now = now.then(self._newest[1])
+        A = se3_adjoint(self._T_body_cam)
+        return A @ now.covariance @ A.T
 
     @property
     def is_joined(self) -> bool:
@@ -157,8 +170,8 @@ class MapSession:
         if motion is None:
             return True
         if self._localise and self._since >= _LOST_STEP:
-            lost = self.T_map_odom is None or motion.covariance[:3, :3].trace() > _LOST_M**2
-            if lost or (self.covariance is not None and self.covariance[:3, :3].trace() > _LOST_M**2):
+            covariance = self.covariance
+            if covariance is None or covariance[:3, :3].trace() > _LOST_M**2:
                 return True
         return bool(np.isin(self._ids, ids).mean() < _SHARED)
 
@@ -167,8 +180,11 @@ class MapSession:
         assert frame.right is not None
         T_odom_cam = estimate.T_world_imu @ self._T_body_cam
         up, sigma = self._vertical(estimate)
-        keyframe = Keyframe(frame.index, frame.time_ns, frame.left, frame.right, T_odom_cam, motion, up, sigma)
-        self._waiting.append((self._frames + HANDOVER_FRAMES, self._executor.submit(self._builder.add, keyframe)))
+        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, motion, up, sigma)
+        result = self._executor.submit(_add, self._builder, keyframe, frame.left, frame.right)
+        self._waiting.append((self._frames + HANDOVER_FRAMES, frame.index, result))
+        if motion is not None:
+            self._moves.append((frame.index, motion))
         self._ids, self._base, self._anchor, self._since = ids, None, frame.index, 0
         self._newest = frame.index, RelativePose(np.eye(4), np.zeros((6, 6))), T_odom_cam
 
@@ -186,27 +202,23 @@ class MapSession:
 
     # Results
 
-    def _take(self, frame: int | None, is_due: Callable[[int], bool]) -> tuple[LoopEvent, ...]:
+    def _take(self, is_due: Callable[[int], bool]) -> tuple[LoopEvent, ...]:
         """Take over what is due, waiting for it; errors of the map's thread are raised here."""
         events: list[LoopEvent] = []
         while self._waiting and is_due(self._waiting[0][0]):
-            _, result = self._waiting.pop(0)
+            _, frame, result = self._waiting.pop(0)
             update = result.result()
-            self._note(frame, update)
+            self.T_map_odom, self._known = update.T_map_odom, update.covariance
+            self._moves = [move for move in self._moves if move[0] > frame]
             events += update.loops
         self.loops += events
         return tuple(events)
-
-    def _note(self, frame: int | None, update: MapUpdate) -> None:
-        self.T_map_odom, self.covariance = update.T_map_odom, update.covariance
-        if frame is not None and update.T_map_odom is not None:
-            self.changes.append((frame, update.T_map_odom))
 
     # Checkpoints
 
     def __getstate__(self) -> dict[str, Any]:
         """State for a checkpoint: waits for the thread, and brings the map to the disk."""
-        results = [(due, future.result()) for due, future in self._waiting]
+        results = [(due, frame, future.result()) for due, frame, future in self._waiting]
         self._executor.submit(self._builder.commit).result()
         state = {key: value for key, value in self.__dict__.items() if key not in ("_executor", "_waiting")}
         return {**state, "_results": results}
@@ -217,8 +229,13 @@ class MapSession:
         self.__dict__.update(state)
         self._executor = ThreadPoolExecutor(1, "map")
         self._waiting = []
-        for due, update in results:
+        for due, frame, update in results:
             done: Future[MapUpdate] = Future()
             done.set_result(update)
-            self._waiting.append((due, done))
+            self._waiting.append((due, frame, done))
         self._builder.reopen(MapStore(Path(self._path), read_only=self._localise))
+
+
+def _add(builder: MapBuilder, keyframe: Keyframe, left: Image, right: Image) -> MapUpdate:
+    """What the map's thread does with a keyframe."""
+    return builder.add(keyframe, extract(left, right))
