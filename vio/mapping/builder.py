@@ -66,11 +66,13 @@ class MapUpdate:
 
 
 @dataclass(frozen=True, slots=True)
-class _Loop:
-    first: int
-    second: int
+class FoundPlace:
+    """A loop before its confirmation."""
+
+    first: int  # keyframe
+    second: int  # later keyframe
     seen: Verified
-    needed: int  # confirmations
+    needed: int  # other keyframes that must confirm it
 
 
 class MapBuilder:
@@ -98,8 +100,8 @@ class MapBuilder:
         sessions.append(SessionRow(source, camera, upright, self._own))
         if not localise:
             store.add_session(sessions[-1])
-        self._pending: list[_Loop] = []
-        self._last: _Loop | None = None  # newest accepted loop
+        self._pending: list[FoundPlace] = []
+        self._last: FoundPlace | None = None  # newest accepted loop
         self._waiting = 0  # loops since the last optimisation
         self._moved = False  # poses since the last commit
 
@@ -107,6 +109,11 @@ class MapBuilder:
     def path(self) -> Path:
         """The map's file."""
         return self._store.path
+
+    @property
+    def index_bytes(self) -> int:
+        """Memory of the words of all keyframes."""
+        return self._index.nbytes
 
     @property
     def is_joined(self) -> bool:
@@ -186,7 +193,7 @@ class MapBuilder:
 
     def _close_loops(self, number: int, features: KeyframeFeatures) -> tuple[LoopEvent, ...]:
         """Look for places seen again, and return what was accepted."""
-        loop = self._find(number, features)
+        loop = self.find(number, features)
         if loop is None:
             return ()
         near = [o for o in self._pending if number - o.second <= _CONFIRM_WITHIN]
@@ -197,26 +204,31 @@ class MapBuilder:
         known = {(o.first, o.second) for o in self.graph.loops[-4 * _CONFIRM_WITHIN :]}
         return tuple(self._accept(o) for o in [*agree, loop] if (o.first, o.second) not in known)
 
-    def _find(self, number: int, features: KeyframeFeatures) -> _Loop | None:
-        """Return the best place that fits by geometry and odometry, unless another one fits nearly as well."""
+    def find(self, number: int, features: KeyframeFeatures) -> FoundPlace | None:
+        """Return the best place that fits by geometry and odometry, unless another one fits nearly as well.
+
+        Args:
+            number: of the keyframe, which is in the graph.
+            features: what it shows.
+        """
         depth, known = self._median_depth(features), len(self._index)
         if not known or depth is None:
             return None
         drift = self._drift_since(np.arange(known), number)
         allowed = self._may_be_seen(number, depth, drift[:, :3, :3])
-        found: list[_Loop] = []
+        found: list[FoundPlace] = []
         for i in self._index.candidates(features.descriptors, allowed, _CANDIDATES).tolist():
             camera = self.graph.sessions[int(self.graph.session[i])].camera
             seen = verify(camera, self._store.features(i), self._camera, features)
             if seen is not None and self._fits(i, number, seen, drift[i]):
                 lost = drift[i, :3, :3].trace() > _LOST_M**2 and seen.inliers < _SURE_INLIERS
-                found.append(_Loop(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS))
+                found.append(FoundPlace(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS))
         if not found:
             return None
         best = max(found, key=lambda loop: loop.seen.inliers)
         return None if any(self._is_rival(other, best, depth) for other in found) else best
 
-    def _is_rival(self, other: _Loop, best: _Loop, depth: float) -> bool:
+    def _is_rival(self, other: FoundPlace, best: FoundPlace, depth: float) -> bool:
         """Whether another place of the same part of the map fits nearly as well as the best one."""
         part = self.graph.part
         if part[other.first] != part[best.first] or other.seen.inliers < _OTHER_PLACE * best.seen.inliers:
@@ -224,7 +236,7 @@ class MapBuilder:
         gap = self._position(other) - self._position(best)
         return float(np.linalg.norm(gap)) > _SAME_M + _SAME_DEPTHS * depth
 
-    def _position(self, loop: _Loop) -> FloatArray:
+    def _position(self, loop: FoundPlace) -> FloatArray:
         """Position (3,) of the later keyframe in the map, as a loop says it."""
         return (self.graph.T_map_cam[loop.first] @ loop.seen.pose.T_i_j)[:3, 3]
 
@@ -274,7 +286,7 @@ class MapBuilder:
         r = se3_log(se3_inverse(graph.T_map_cam[k]) @ graph.T_map_cam[i] @ seen.pose.T_i_j)
         return _squared(r, drift + seen.pose.covariance) < _GATE
 
-    def _agree(self, a: _Loop, b: _Loop) -> bool:
+    def _agree(self, a: FoundPlace, b: FoundPlace) -> bool:
         """Whether two loops say the same of where the session is in the map."""
         graph = self.graph
         if graph.part[a.first] != graph.part[b.first]:
@@ -289,7 +301,7 @@ class MapBuilder:
             C = C + graph.drift(np.array([a.first]), np.array([b.first]))[0]
         return _squared(r, C) < _GATE
 
-    def _accept(self, loop: _Loop) -> LoopEvent:
+    def _accept(self, loop: FoundPlace) -> LoopEvent:
         """Add a confirmed loop to the graph, and optimise where it moves the map."""
         graph, i, k, pose = self.graph, loop.first, loop.second, loop.seen.pose
         joined = bool(graph.part[i] != graph.part[k])

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
@@ -20,11 +21,13 @@ from vio.records import BoolArray, IntArray
 LEAST_INLIERS = 20
 _LEAST_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random
 _MOST_BITS = 64
+_WORSE = 1000  # more than the 256 bits in which two descriptors can differ
 _RATIO = 0.85  # to the second-best descriptor
+_MOST_PAIRS = 200  # that enter the fit, which takes 4 ms then
 _RANSAC_PX, _RANSAC_STEPS, _RANSAC_SURE = 4.0, 300, 0.999
 _SAME_M, _SAME_DEG = 0.1, 3.0  # by which both directions may differ; metres, beside a share of the depth
 _SAME_DEPTH = 0.05
-_STEPS = 10
+_STEPS, _CONVERGED = 10, 1e-5  # largest change, m and rad
 _GATE = 3.0  # standard deviations, of a pixel coordinate
 _LEAST_DISPARITY_PX = 1.0
 # Floor of a loop's standard deviations: errors that its points share, such as those of the calibration.
@@ -47,12 +50,20 @@ def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
     """Pair features by descriptor: rows (K, 2) of i and j, each the other's best and clearly better than the next."""
     if len(i) < 2 or len(j) < 2:
         return np.zeros((0, 2), dtype=np.int64)
-    bits, best = cv2.batchDistance(i.descriptors, j.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=2)
-    _, back = cv2.batchDistance(j.descriptors, i.descriptors, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=1)
-    mutual = back[best[:, 0], 0] == np.arange(len(i))
-    good = mutual & (bits[:, 0] <= np.minimum(_MOST_BITS, _RATIO * bits[:, 1]))
-    rows = np.flatnonzero(good)
-    return np.stack([rows, best[rows, 0].astype(np.int64)], axis=1)
+    bits = _differing_bits(i, j)
+    rows, best = np.arange(len(i)), bits.argmin(axis=1)
+    mutual = bits.argmin(axis=0)[best] == rows
+    least = bits[rows, best]
+    bits[rows, best] = _WORSE
+    good = np.flatnonzero(mutual & (least <= np.minimum(_MOST_BITS, _RATIO * bits.min(axis=1))))
+    return np.stack([good, best[good]], axis=1)
+
+
+def _differing_bits(i: KeyframeFeatures, j: KeyframeFeatures) -> npt.NDArray[np.float32]:
+    """Hamming distances (N, M) of descriptors: with bits as -1 and 1, 256 less their product, halved (exact)."""
+    a, b = (2 * np.unpackbits(f.descriptors, axis=1).astype(np.float32) - 1 for f in (i, j))
+    out: npt.NDArray[np.float32] = (np.float32(a.shape[1]) - a @ b.T) / np.float32(2)
+    return out
 
 
 def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, j: KeyframeFeatures) -> Verified | None:
@@ -60,6 +71,8 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
     pairs = match(i, j)
     if len(pairs) < LEAST_INLIERS:
         return None
+    if len(pairs) > _MOST_PAIRS:  # features are in the order of their columns, so these are spread over the image
+        pairs = pairs[np.linspace(0, len(pairs) - 1, _MOST_PAIRS).astype(np.int64)]
     a, b = pairs.T
     T_j_i = _pnp(camera_i, i, a, camera_j, j, b)
     T_i_j = None if T_j_i is None else _pnp(camera_j, j, b, camera_i, i, a)
@@ -133,25 +146,29 @@ def _fit(
     the other way round. Residuals are [ul vl ur] (the right row says nothing new, see docs/math.md).
     """
     forward = _points(camera_i, i, a)[1]
-    xi_terms = (_Terms(camera_i, i, a, camera_j, j, b, forward), _Terms(camera_j, j, b, camera_i, i, a, ~forward))
-    good = np.ones(len(a), dtype=np.bool_)
-    T, normal = T_i_j, np.eye(6)
+    order = np.concatenate([np.flatnonzero(forward), np.flatnonzero(~forward)])
+    parts = (
+        _Terms(camera_i, i, a[forward], camera_j, j, b[forward]),
+        _Terms(camera_j, j, b[~forward], camera_i, i, a[~forward]),
+    )
+    T, normal, fits = T_i_j, np.eye(6), np.zeros(len(a), dtype=np.bool_)
     for step in range(_STEPS):
         width = _GATE * 2.0 ** max(2 - step, 0)
-        r_f, W_f, H_f, on_f = xi_terms[0].at(se3_inverse(T), inverse=True)
-        r_b, W_b, H_b, on_b = xi_terms[1].at(T, inverse=False)
-        r, W, H, on = r_f + r_b, W_f + W_b, H_f + H_b, on_f | on_b
+        both = parts[0].at(se3_inverse(T), inverse=True), parts[1].at(T, inverse=False)
+        r, W, H, on = (np.concatenate(one) for one in zip(*both, strict=True))
         squared = np.einsum("ki,kij,kj->k", r, W, r)
         weight = on / (1 + squared / (3 * width**2)) ** 2
-        good = on & (squared < 3 * _GATE**2)
-        if good.sum() < LEAST_INLIERS:
+        fits = on & (squared < 3 * _GATE**2)
+        if fits.sum() < LEAST_INLIERS:
             return None
-        HW = np.einsum("kij,kil,k->kjl", H, W, weight)
-        normal = np.einsum("kjl,klm->jm", HW, H)
-        xi = np.linalg.solve(normal + 1e-9 * np.eye(6), np.einsum("kjl,kl->j", HW, r))
+        HW = np.swapaxes(H, 1, 2) @ (W * weight[:, None, None])
+        normal = np.sum(HW @ H, axis=0)
+        xi = np.linalg.solve(normal + 1e-9 * np.eye(6), np.sum(HW @ r[..., None], axis=0)[:, 0])
         T = T @ se3_exp(xi)
-        if step > 3 and np.abs(xi).max() < 1e-7:
+        if step > 2 and np.abs(xi).max() < _CONVERGED:
             break
+    good = np.zeros(len(a), dtype=np.bool_)
+    good[order] = fits
     depth = _median_depth(camera_j, j, b[good])
     floor = np.repeat([(_FLOOR_DEPTH * depth) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
     covariance = _INFLATION**2 * np.asarray(np.linalg.inv(normal), dtype=np.float64) + np.diag(floor)
@@ -169,11 +186,10 @@ class _Terms:
         camera_t: StereoCamera,
         t: KeyframeFeatures,
         rows_t: IntArray,
-        used: BoolArray,
     ) -> None:
-        """Prepare pairs (K,), of which `used` (K,) have a point in the source."""
-        p, valid = _points(camera_s, s, rows_s)
-        self._used, self._camera = used & valid, camera_t
+        """Prepare pairs (K,); those without a point in the source count nothing."""
+        p, self._used = _points(camera_s, s, rows_s)
+        self._camera = camera_t
         self._p = np.where(self._used[:, None], p, [0.0, 0.0, 1.0])
         z_s = np.where(self._used[:, None], s.z[rows_s], project(camera_s, [0.0, 0.0, 1.0]))
         J = p_cam_D_z(camera_s, z_s)

@@ -26,9 +26,13 @@ Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
 _SHARED = 0.6  # of the last keyframe's features that are still seen: below it, a new keyframe
 _LEAST_FEATURES = 30  # with a right pixel
-_LOST_STEP = 3  # frames between keyframes while a session that is localised has no place
+_LOCALISE_STEP = 5  # frames between keyframes of a session that is localised, where nothing is stored
+_LOST_STEP = 3  # likewise while it has no place
 _LOST_M = 1.0  # standard deviation of the position, likewise
 HANDOVER_FRAMES = 10  # from a keyframe to the frame at which its result is taken over
+# On the standard deviations of a motion: errors of a track last longer than a frame, which the window does not count.
+# Measured over a keyframe's step: 1.6 to 3.1 times the standard deviation (street), 1.2 to 3.1 (room).
+_MOTION_INFLATION = 2.0
 _LEAST_UP_SIGMA_RAD = float(np.radians(0.1))  # errors of the vertical last longer than from keyframe to keyframe
 _BROKEN = np.repeat([30.0**2, 1.0**2], 3)  # variance of the motion where the filter began anew, m^2 and rad^2
 
@@ -171,7 +175,8 @@ class MapSession:
             return True
         if self._localise and self._since >= _LOST_STEP:
             covariance = self.covariance
-            if covariance is None or covariance[:3, :3].trace() > _LOST_M**2:
+            lost = covariance is None or covariance[:3, :3].trace() > _LOST_M**2
+            if lost or self._since >= _LOCALISE_STEP:
                 return True
         return bool(np.isin(self._ids, ids).mean() < _SHARED)
 
@@ -180,6 +185,8 @@ class MapSession:
         assert frame.right is not None
         T_odom_cam = estimate.T_world_imu @ self._T_body_cam
         up, sigma = self._vertical(estimate)
+        if motion is not None:
+            motion = RelativePose(motion.T_i_j, _MOTION_INFLATION**2 * motion.covariance)
         keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, motion, up, sigma)
         result = self._executor.submit(_add, self._builder, keyframe, frame.left, frame.right)
         self._waiting.append((self._frames + HANDOVER_FRAMES, frame.index, result))
