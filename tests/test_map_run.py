@@ -18,10 +18,13 @@ from vio.config import Config
 from vio.datasets import open_dataset
 from vio.errors import ConfigError
 from vio.filters.msckf import Msckf
-from vio.geometry.lie import FloatArray, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
+from vio.geometry.relative_pose import RelativePose
+from vio.mapped_run import corrected
 from vio.mapping.map_store import MapStore
+from vio.mapping.session import MapSession
 from vio.pipeline import run
-from vio.records import StereoFrame
+from vio.records import Estimate, StereoFrame, observations
 from vio.run_recorder import GrowingFolder
 from vio.trajectory_io import read_trajectory
 
@@ -188,3 +191,58 @@ def test_motions_beyond_the_window_are_not_known() -> None:
         filter_.update(flight.observe(k, 0.5, rng))
     assert filter_.relative(0, 15) is None
     assert filter_.relative(15, 16) is None
+
+
+def test_motions_are_joined_where_the_window_moves_on(tmp_path: Path) -> None:
+    """Eight frames between two keyframes, and a filter that knows the motion over three only."""
+    steps = se3_exp(np.random.default_rng(0).normal(0, 0.1, (9, 6)))
+    poses = [np.eye(4)]
+    for step in steps[:-1]:
+        poses.append(poses[-1] @ step)
+
+    def relative(older: int, newer: int) -> RelativePose | None:
+        if newer - older > 3:
+            return None
+        return RelativePose(se3_inverse(poses[older]) @ poses[newer], max(newer - older, 0) * np.eye(6))
+
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    gray = np.zeros((64, 64), dtype=np.uint8)
+    for k in range(9):
+        ids = np.arange(40) + 1000 * (k == 8)
+        seen = observations(k, k, ids, np.tile([9.0, 9, 5, 9], (40, 1)))
+        session.frame(StereoFrame(k, k, gray, gray), seen, Estimate(k, poses[k], np.eye(6)), relative)
+    session.finish()
+    session.close()
+    ((first, second, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    assert (first, second) == (0, 1)
+    np.testing.assert_allclose(motion.T_i_j, poses[8], atol=1e-12)
+    assert np.linalg.eigvalsh(motion.covariance)[0] > 7.0, "of eight steps of unit variance each"
+
+
+def test_where_the_filter_began_anew_the_motion_is_not_known(tmp_path: Path) -> None:
+    def relative(older: int, newer: int) -> RelativePose | None:
+        return None if older < 5 <= newer else RelativePose(np.eye(4), 1e-6 * np.eye(6))
+
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    gray = np.zeros((64, 64), dtype=np.uint8)
+    for k in range(9):
+        seen = observations(k, k, np.arange(40) + 1000 * (k == 8), np.tile([9.0, 9, 5, 9], (40, 1)))
+        session.frame(StereoFrame(k, k, gray, gray), seen, Estimate(k, np.eye(4), np.eye(6)), relative)
+    session.finish()
+    session.close()
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    assert np.sqrt(motion.covariance[0, 0]) >= 30.0
+
+
+def test_corrections_are_spread_between_keyframes() -> None:
+    T_odom = se3_exp(np.random.default_rng(1).normal(0, 0.5, (11, 6)))
+    frames = np.array([2, 6])
+    T_map = se3_exp([[1.0, 0, 0, 0, 0, 0.1], [1.2, 0.1, 0, 0, 0, 0.2]]) @ T_odom[frames]
+    out = corrected(T_odom, np.arange(11), frames, T_map, T_odom[frames])
+    np.testing.assert_allclose(out[frames], T_map, atol=1e-12)
+    for k, keyframe in ((0, 2), (10, 6)):  # outside, they move with the nearest keyframe
+        np.testing.assert_allclose(
+            se3_inverse(out[keyframe]) @ out[k], se3_inverse(T_odom[keyframe]) @ T_odom[k], atol=1e-12
+        )
+    jumps = [se3_log(se3_inverse(T_odom[k]) @ T_odom[k + 1] @ se3_inverse(out[k + 1]) @ out[k]) for k in range(2, 6)]
+    assert np.linalg.norm(jumps, axis=1).max() < 0.4, "no frame takes the whole correction"
