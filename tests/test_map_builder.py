@@ -63,8 +63,8 @@ def room_walk() -> Walk:
 
 @pytest.fixture(scope="module")
 def doors_walk() -> Walk:
-    """Straight along eight equal doors, once, in steps that do not divide their spacing."""
-    x = np.linspace(2.0, 22.0, 29)
+    """Along six equal doors, and four of them back, looking ahead all the time."""
+    x = np.concatenate([np.linspace(2.0, 20.0, 19), np.linspace(18.0, 7.5, 6)])
     return Walk(equal_doors(seed=1, texel_m=0.008), x, 0 * x, 0 * x)
 
 
@@ -120,14 +120,19 @@ def test_a_second_round_closes_loops_and_takes_the_drift_away(room_walk: Walk, w
     assert np.sqrt(np.mean(optimised**2)) < 0.6 * np.sqrt(np.mean(odometry**2))
 
 
-def test_equal_doors_make_no_loop(doors_map: MapBuilder) -> None:
-    assert doors_map.graph.loops == []
+def test_equal_doors_are_told_apart_by_the_odometry(doors_walk: Walk, doors_map: MapBuilder) -> None:
+    """Three metres away everything looks the same; the loops are those with the place itself."""
+    loops = doors_map.graph.loops
+    assert len(loops) >= 2
+    for o in loops:
+        truth = se3_inverse(doors_walk.T[o.first]) @ doors_walk.T[o.second]
+        assert np.linalg.norm((se3_inverse(truth) @ o.pose.T_i_j)[:3, 3]) < 0.2
 
 
 def test_who_wakes_between_equal_doors_is_told_no_place(doors_walk: Walk, doors_map: MapBuilder) -> None:
     lost = _map(doors_walk, doors_map.path, seed=1, rows=slice(8, 16), localise=True)
     assert not lost.is_joined
-    assert lost.graph.loops == []
+    assert [o for o in lost.graph.loops if o.second >= lost.first] == []
 
 
 def test_a_session_finds_its_place_in_an_earlier_map(room_walk: Walk, first_round: Path) -> None:
