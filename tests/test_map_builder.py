@@ -192,3 +192,4 @@ def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBui
     np.testing.assert_array_equal(resumed.graph.T_map_cam.rows, whole_map.graph.T_map_cam.rows)
     rows = [[r.T_map_cam.tobytes() for r in MapStore(p, read_only=True).keyframes()] for p in (path, whole_map.path)]
     assert rows[0] == rows[1]
+    assert rows[0] == [T.tobytes() for T in resumed.graph.T_map_cam.rows], "the file holds what was optimised"

@@ -33,9 +33,7 @@ MOTION = RelativePose(STEP, 1e-6 * np.eye(6))
 def features(seed: int, *, wrong_bits: float = 0.0) -> KeyframeFeatures:
     """A keyframe with random features; the same seed gives the same place."""
     rng = np.random.default_rng(seed)
-    p = np.stack(
-        [rng.uniform(-3, 3, MOST_FEATURES), rng.uniform(-1, 1, MOST_FEATURES), rng.uniform(3, 9, MOST_FEATURES)]
-    )
+    p = rng.uniform((-3, -1, 3), (3, 1, 9), (MOST_FEATURES, 3))
     bits = rng.integers(0, 256, (MOST_FEATURES, 32), dtype=np.uint8)
     flipped = np.random.default_rng([seed, 1]).random((MOST_FEATURES, 256)) < wrong_bits
     z = project(CAMERA, p) + rng.normal(0, 0.5, (MOST_FEATURES, 4))
