@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.chain import BACKENDS, Chain, FrameResult, build_backend
+from vio.chain import BACKENDS, Chain, build_backend
 from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.event_order import EventOrder
 from vio.filters.msckf import Msckf
+from vio.frame_result import FrameResult
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera

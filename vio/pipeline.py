@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
-from vio.chain import BACKENDS, STAGES, FrameLog, FrameResult, build_backend
+from vio.chain import BACKENDS, build_backend
 from vio.config import BackendName, Config
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
+from vio.frame_result import STAGES, FrameLog, FrameResult
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
 from vio.mapped_run import MappedRun, mapped_run
@@ -25,7 +26,6 @@ from vio.records import (
     BodyFrame,
     Estimate,
     Event,
-    FrontendOutput,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -33,7 +33,6 @@ from vio.records import (
     Recording,
     StereoFrame,
     Trajectory,
-    UpdateReport,
 )
 from vio.run_recorder import GrowingFolder, RunRecorder
 from vio.selectors import build_selector
@@ -82,7 +81,7 @@ class RunResult:
 class NullViewer:
     """Shows nothing."""
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Ignore the frame."""
 
     def close(self) -> None:
@@ -295,7 +294,7 @@ class _Loop:
             self._recorder.frame(result, self._reading.take_ms(), state.odometry.smoothed)
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
-            self._viewer.frame(result.output, result.estimate, result.report)
+            self._viewer.frame(result)
 
 
 def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Protocol, TypeAlias
 
+from vio.frame_result import FrameResult
 from vio.records import (
     Estimate,
     Event,
@@ -107,7 +108,7 @@ class Backend(Protocol):
 class Viewer(Protocol):
     """Watches a run; must not change it."""
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Show one processed frame."""
 
     def close(self) -> None:

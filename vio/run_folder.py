@@ -49,11 +49,13 @@ FILES = (
     "map_covariance.npy",
     "loops.csv",
     "estimates.npy",
+    "reference.tum",
     "dead_reckoning.tum",
     "landmarks.ply",
     "frames.csv",
     "observations.npz",
     "trajectory.png",
+    "report.html",  # of vio report
 )
 
 
@@ -176,6 +178,11 @@ def _write_files(
     (target / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
     write_tum(target / "trajectory.tum", result.trajectory)
     write_kitti(target / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
+    if evaluation is not None:
+        times_ns = result.trajectory.times_ns
+        assert times_ns is not None
+        # The poses that were compared, each at the time of its estimate: the folder alone then tells the errors.
+        write_tum(target / "reference.tum", replace(evaluation.reference, times_ns=times_ns[evaluation.rows]))
     if result.dead_reckoning is not None:
         write_tum(target / "dead_reckoning.tum", result.dead_reckoning)
     if result.mapped is not None:
@@ -280,6 +287,7 @@ def metrics_of(
         "warnings": list(result.warnings),
         "stereo_field": stereo_field(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
+        "camera": asdict(result.recording.camera),
     }
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.chain import FrameLog
+from vio.frame_result import FrameLog
 from vio.geometry.lie import FloatArray
 from vio.records import Estimate, ImuSample, MotionSample, Observations, StereoFieldEstimate, VelocitySample
 from vio.tables import Rows
@@ -25,8 +25,11 @@ ESTIMATE = np.dtype(
         ("T_world_imu", "<f8", (4, 4)),
         ("covariance", "<f8", (6, 6)),
         ("velocity_world", "<f8", (3,)),
+        ("velocity_covariance", "<f8", (3, 3)),
         ("gyro_bias", "<f8", (3,)),
+        ("gyro_bias_sigma", "<f8", (3,)),
         ("accel_bias", "<f8", (3,)),
+        ("accel_bias_sigma", "<f8", (3,)),
         ("gravity_world", "<f8", (3,)),
         ("T_cam0_imu", "<f8", (4, 4)),
         ("T_cam0_imu_covariance", "<f8", (6, 6)),
@@ -38,7 +41,8 @@ ESTIMATE = np.dtype(
     ]
 )
 _OPTIONAL_ARRAYS = (
-    *("velocity_world", "gyro_bias", "accel_bias", "gravity_world"),
+    *("velocity_world", "velocity_covariance"),
+    *("gyro_bias", "gyro_bias_sigma", "accel_bias", "accel_bias_sigma", "gravity_world"),
     *("T_cam0_imu", "T_cam0_imu_covariance"),
 )
 _OPTIONAL_NUMBERS = ("time_offset_s", "time_offset_sigma_s")

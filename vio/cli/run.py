@@ -32,6 +32,13 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
     parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map: loops are closed in it")
+    parser.add_argument(
+        "--view",
+        nargs="?",
+        const="spawn",
+        metavar="WHERE",
+        help="show the run in rerun: in a window, in a browser (web), or into a file *.rrd (extra view)",
+    )
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(execute=execute)
@@ -45,6 +52,7 @@ _OF_A_NEW_RUN = (
     "out",
     "save_observations",
     "map",
+    "view",
     "set",
     "config",
     "motion",
@@ -78,5 +86,6 @@ def execute(args: argparse.Namespace) -> int:
         save_observations=args.save_observations,
         progress=not args.quiet,
         map_file=args.map,
+        view=args.view,
     )
     return print_result(metrics, rows_of(metrics), as_json=args.json)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from vio.atomic import check_replaceable, check_writable, locked_folder
 from vio.cli.progress import ProgressBar
@@ -15,14 +18,43 @@ from vio.datasets import open_dataset
 from vio.datasets.span import Seconds, frames_between
 from vio.errors import StoppedError, VioError
 from vio.evaluation import KITTI_LENGTHS_M
-from vio.pipeline import run
-from vio.protocols import Dataset
-from vio.records import Estimate, FrontendOutput, UpdateReport
+from vio.frame_result import FrameResult
+from vio.pipeline import resolve_motion, run
+from vio.protocols import Dataset, Viewer
+from vio.records import Trajectory
 from vio.run_folder import FILES, MARKER, finish_run_folder, growing_folder, read_request
 from vio.run_recorder import CHECKPOINT, UNFINISHED
 from vio.trajectory_io import read_trajectory
 
+if TYPE_CHECKING:
+    from vio.view.live import RerunViewer
+
 log = logging.getLogger(__name__)
+
+
+class Viewers:
+    """Several viewers as one."""
+
+    def __init__(self, viewers: Sequence[Viewer]) -> None:
+        self._viewers = viewers
+
+    def frame(self, result: FrameResult) -> None:
+        """Show one frame."""
+        for viewer in self._viewers:
+            viewer.frame(result)
+
+    def skip(self, frames: int) -> None:
+        """Count frames that an earlier process has done."""
+        for viewer in self._viewers:
+            skip = getattr(viewer, "skip", None)
+            if skip is not None:
+                skip(frames)
+
+    def close(self) -> None:
+        """Close all, whatever happens to one of them."""
+        with contextlib.ExitStack() as stack:
+            for viewer in self._viewers:
+                stack.callback(viewer.close)
 
 
 class ProgressViewer:
@@ -31,7 +63,7 @@ class ProgressViewer:
     def __init__(self, frames: int, label: str) -> None:
         self._bar = ProgressBar(label, frames, unit="frames")
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Advance by one frame."""
         self._bar.advance()
 
@@ -57,6 +89,7 @@ def process(
     progress: bool = True,
     map_file: Path | None = None,
     localise: bool = False,
+    view: str | None = None,
 ) -> dict[str, Any]:
     """Process a source into a run folder, which grows meanwhile, and return its metrics."""
     dataset = open_dataset(source, config.dataset)
@@ -74,7 +107,7 @@ def process(
         "map": None if map_file is None else str(map_file.absolute()),
         "localise": localise,
     }
-    return _process(dataset, config, folder, request, progress=progress, resume=False)
+    return _process(dataset, config, folder, request, progress=progress, resume=False, view=view)
 
 
 def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
@@ -93,7 +126,14 @@ def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
 
 
 def _process(
-    dataset: Dataset, config: Config, folder: Path, request: dict[str, Any], *, progress: bool, resume: bool
+    dataset: Dataset,
+    config: Config,
+    folder: Path,
+    request: dict[str, Any],
+    *,
+    progress: bool,
+    resume: bool,
+    view: str | None = None,
 ) -> dict[str, Any]:
     """Run, write the results and return the metrics; a run that was interrupted says so and how to go on."""
     recording, reference = dataset.recording, request["reference"]
@@ -101,6 +141,10 @@ def _process(
     start, stop, save_observations = request["start"], request["stop"], request["save_observations"]
     total = len(recording.frame_times_ns)
     frames = max(min(total, total if stop is None else stop) - start, 0)
+    viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
+    shown = None if view is None else _open_view(view, dataset, config, truth)
+    if shown is not None:
+        viewers.append(shown)
     with locked_folder(folder), StopRequest() as asked:
         try:
             result = run(
@@ -109,7 +153,7 @@ def _process(
                 start=start,
                 stop=stop,
                 keep_observations=save_observations,
-                viewer=ProgressViewer(frames, recording.path.name) if progress else None,
+                viewer=Viewers(viewers),
                 folder=growing_folder(folder, dataset, config, request),
                 resume=resume,
                 should_stop=asked.reason,
@@ -128,12 +172,37 @@ def _process(
                 raise
             text = f"interrupted; what was flushed is in {folder}; go on with: vio run --resume {folder}"
             raise StoppedError(text, status=130) from error
+    if shown is not None:
+        shown.landmarks(result.landmarks)
+        shown.close()
+        if shown.address is not None and result.stopped is None:
+            from vio.view.stream import wait_for_interrupt
+
+            wait_for_interrupt(shown.address)
     if result.stopped is not None:
         text = f"{result.stopped}; the results of {len(result.frames)} of {frames} frames are in {folder}"
         if asked.number is None:
             raise StoppedError(f"error: {text}", status=1)
         raise StoppedError(f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number)
     return metrics
+
+
+def _open_view(where: str, dataset: Dataset, config: Config, reference: Trajectory | None) -> RerunViewer:
+    """Open rerun's viewer, a file or a web server for a run.
+
+    Raises:
+        VioError: rerun is not installed, or `where` cannot be opened.
+    """
+    from vio.view.live import RerunViewer, ViewedRig
+    from vio.view.stream import open_stream
+
+    recording = dataset.recording
+    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    rig = ViewedRig(recording.camera, T_cam0_body, resolve_motion(recording, config), reference)
+    stream, address = open_stream(where, recording.path.name)
+    if address is not None:
+        log.warning("the run is shown at %s", address)
+    return RerunViewer(stream, rig, address=address)
 
 
 def check_out(folder: Path) -> Path:

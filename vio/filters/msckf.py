@@ -294,13 +294,17 @@ class Msckf:
         T, covariance = window.current_pose(output)
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
         A = se3_adjoint(se3_inverse(T))
+        known = self._motion.uncertainty(window.nav, output[:DIM, :DIM])
         estimate = Estimate(
             self._time_ns,
             T,
             A @ covariance @ A.T,
             velocity_world=self._motion.velocity_world(window.nav),
+            velocity_covariance=known.velocity_covariance,
             gyro_bias=window.nav.gyro_bias,
+            gyro_bias_sigma=known.gyro_bias_sigma,
             accel_bias=window.nav.accel_bias,
+            accel_bias_sigma=known.accel_bias_sigma,
         )
         estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:])
         if estimate.stereo_field is not None:
@@ -488,6 +492,7 @@ class Msckf:
 
         tracks = self._tracks.without_wrong_views(tracks)
         good, nis, dof = self._tracks.gate(tracks.at)
+        gated_ids = self._tracks.table.ids(tracks.rows[~good])
         self._tracks.update_pixel_noise(nis, dof)
         pixels, rejected = self._gate_landmarks(window, pixels, P)
         created = self._marginalise(window, tracks, good, pixels)
@@ -499,6 +504,8 @@ class Msckf:
             landmarks=len(window.landmarks),
             innovation_median_px=innovation,
             nis_per_dof=float(np.median(nis / dof)) if len(nis) else None,
+            gated_ids=gated_ids,
+            landmark_ids=window.landmark_ids.copy(),
         )
 
     def _gate_landmarks(self, window: Window, pixels: Views, P: FloatArray) -> tuple[Views, int]:
