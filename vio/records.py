@@ -326,6 +326,9 @@ class Estimate:
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     stereo_field: StereoFieldEstimate | None = None
+    # The pose in a map; None without one, or without a place in it yet.
+    T_map_body: FloatArray | None = None  # (4, 4)
+    T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi), given the map
 
 
 def _no_ids() -> IntArray:

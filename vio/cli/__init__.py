@@ -29,6 +29,8 @@ from vio.cli import (
     evaluate,
     export,
     inspect,
+    localise,
+    map,
     rectify,
     refine,
     render,
@@ -42,6 +44,8 @@ from vio.printable import printable
 
 _COMMANDS = (
     run,
+    localise,
+    map,
     inspect,
     convert,
     evaluate,
