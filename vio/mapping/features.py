@@ -1,7 +1,7 @@
 """What a keyframe keeps of its images: ORB key points with their pixels in both images.
 
 ORB (Rublee et al. 2011) from OpenCV: its bits are compared in a microsecond and its words need no training
-(`place_index`). The figures against SIFT are in docs/maps.md.
+(`place_index`).
 """
 
 from __future__ import annotations
