@@ -345,7 +345,7 @@ class UpdateReport:
     landmarks: int  # landmarks in the map
     innovation_median_px: float | None  # median absolute innovation before the update, all gated-in rows
     nis_per_dof: float | None  # normalised innovation squared over its degrees of freedom; about 1 when consistent
-    gated_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of the observations rejected, where the back end says it
+    gated_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of those rejected, where the back end says it
     landmark_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of the landmarks in the map, likewise
 
 

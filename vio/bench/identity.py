@@ -39,6 +39,7 @@ RENDER_CODE = (
     "vio/datasets/image_pairs.py",
     "vio/datasets/images.py",
     "vio/datasets/kitti.py",
+    "vio/datasets/png.py",
     "vio/datasets/settings.py",
     "vio/datasets/yaml_files.py",
     "vio/records.py",
