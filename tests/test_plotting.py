@@ -13,27 +13,19 @@ import pytest
 from tests.dataset_makers import ece276a_arrays, make_drive, make_npz
 from vio.cli import main
 from vio.config import Config, load_config, to_yaml
-from vio.plotting import _plane
+from vio.plotting import _view
 from vio.printable import json_text, printable
 
-RNG = np.random.default_rng(0)
-STREET = RNG.uniform([-12, -4, 0], [12, 2, 60], size=(400, 3))  # x right, y down, z forward, metres
 
-
-@pytest.mark.parametrize(
-    ("across_m", "up_m", "points", "expected"),
-    [
-        (0.1, 1.0, STREET, (0, 2)),  # a straight road uphill: the street is wider than high
-        (0.1, 1.0, STREET[:0], (1, 2)),  # nothing else is known
-        (1.0, 15.0, STREET, (1, 2)),  # a climb
-        (9.0, 1.0, STREET, (0, 2)),  # a bend
-    ],
-)
-def test_map_shows_the_plane_of_the_motion(
-    across_m: float, up_m: float, points: np.ndarray, expected: tuple[int, int]
-) -> None:
-    s = np.linspace(0, 1, 50)
-    assert _plane(np.stack([across_m * s, up_m * s, 40 * s], axis=1), points) == expected
+def test_the_map_of_a_drive_holds_the_path_and_that_of_a_standing_rig_its_landmarks() -> None:
+    points = np.random.default_rng(0).uniform([-12, 0], [12, 60], size=(400, 2))
+    drive = np.stack([np.zeros(50), np.linspace(0, 200, 50)], axis=1)
+    low, high = _view(drive, points)
+    assert (low, high) == (pytest.approx([-30, -30]), pytest.approx([30, 230]))
+    low, high = _view(0.01 * drive[:10], points)
+    assert np.mean(np.all((points > low) & (points < high), axis=1)) > 0.75
+    assert np.all(high - low < 80)
+    assert np.array_equal(_view(drive[:1], points[:0]), ([-1, -1], [1, 1]))
 
 
 NAME = os.fsdecode(b"a$1_$2 \\frac{ b\xff\x1b[31m.npz")

@@ -17,11 +17,11 @@ from vio.filters.navigation import ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
 from vio.finished_run import read_finished_run, with_distinct_names
 from vio.geometry.lie import se3_from_parts, so3_exp
-from vio.report.curves import attitude_deg, curves_of
+from vio.report.curves import curves_of
 from vio.report.page import page
 from vio.report.words import figures_of, summary
 from vio.trajectory_io import read_trajectory
-from vio.upright import up_of, upright_axes
+from vio.upright import attitude_deg, up_of, upright_axes
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 

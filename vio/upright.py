@@ -38,3 +38,15 @@ def up_of(motion: str | None, gravity_world: FloatArray | None) -> FloatArray | 
     if gravity_world is not None and np.isfinite(gravity_world).all():
         return -np.asarray(gravity_world, dtype=np.float64)
     return np.array([0.0, 0.0, 1.0]) if motion == "imu" else None
+
+
+def attitude_deg(R_view_cam0: FloatArray) -> FloatArray:
+    """Return heading, pitch and roll (N, 3) of cameras (N, 3, 3) in the upright frame, degrees; heading is unwrapped.
+
+    Heading is that of the optical axis, to the right of ahead; pitch its elevation; roll turns the right side down.
+    """
+    ahead, right, up = R_view_cam0[:, :, 2], R_view_cam0[:, :, 0], -R_view_cam0[:, :, 1]
+    heading = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 1]))
+    pitch = np.arcsin(np.clip(ahead[:, 2], -1, 1))
+    roll = np.arctan2(-right[:, 2], up[:, 2])
+    return np.degrees(np.stack([heading, pitch, roll], axis=1))

@@ -9,7 +9,7 @@ import numpy as np
 
 from vio.finished_run import FinishedRun
 from vio.geometry.lie import FloatArray, se3_from_parts, transform_points
-from vio.upright import up_of, upright_axes
+from vio.upright import attitude_deg, up_of, upright_axes
 
 _MOST = 3000  # samples of a curve; more are not seen on a screen
 _MOST_POINTS = 6000
@@ -123,18 +123,6 @@ def _truth(run: FinishedRun, view_ref: FloatArray) -> Truth:
         error_m=evaluation.errors_m[rows],
         error_deg=evaluation.errors_deg[rows],
     )
-
-
-def attitude_deg(R_view_cam0: FloatArray) -> FloatArray:
-    """Return heading, pitch and roll (N, 3) of cameras (N, 3, 3) in the upright frame, degrees; heading is unwrapped.
-
-    Heading is that of the optical axis, to the right of ahead; pitch its elevation; roll turns the right side down.
-    """
-    ahead, right, up = R_view_cam0[:, :, 2], R_view_cam0[:, :, 0], -R_view_cam0[:, :, 1]
-    heading = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 1]))
-    pitch = np.arcsin(np.clip(ahead[:, 2], -1, 1))
-    roll = np.arctan2(-right[:, 2], up[:, 2])
-    return np.degrees(np.stack([heading, pitch, roll], axis=1))
 
 
 def _attitude_sigma(R_view_cam0: FloatArray, P: FloatArray) -> FloatArray:

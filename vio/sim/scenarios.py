@@ -208,9 +208,7 @@ def _check(scenario: Scenario) -> None:
         raise SimulationError(f"{scenario.conditions.people} people cannot be placed; choose 0 to 100")
     hard = scenario.conditions
     if scenario.scene == "doors" and (hard.bare_wall or hard.moving or hard.people or hard.lighting):
-        raise SimulationError(
-            "the corridor of equal doors has no effects of a scene; use corridor"
-        )
+        raise SimulationError("the corridor of equal doors has no effects of a scene; use corridor")
 
 
 def scaled(rig: StereoRig, width: int | None) -> StereoRig:
