@@ -15,7 +15,15 @@ import numpy as np
 
 from vio.chain import FrameLog
 from vio.geometry.lie import FloatArray
-from vio.records import Estimate, ImuSample, MotionSample, Observations, StereoFieldEstimate, VelocitySample
+from vio.records import (
+    Estimate,
+    ImuSample,
+    MotionSample,
+    Observations,
+    StereoFieldEstimate,
+    StereoScaleEstimate,
+    VelocitySample,
+)
 from vio.tables import Rows
 
 ESTIMATE = np.dtype(
@@ -35,6 +43,8 @@ ESTIMATE = np.dtype(
         ("stereo_field", "<f8", (6,)),
         ("stereo_field_covariance", "<f8", (6, 6)),
         ("stereo_rows_rms_px", "<f8"),
+        ("stereo_scale", "<f8", (2,)),
+        ("stereo_scale_covariance", "<f8", (2, 2)),
     ]
 )
 _OPTIONAL_ARRAYS = (
@@ -75,6 +85,9 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     row["stereo_field"] = np.nan if field is None else field.coefficients
     row["stereo_field_covariance"] = np.nan if field is None else field.covariance
     row["stereo_rows_rms_px"] = np.nan if field is None else field.rows_rms_px
+    scale = estimate.stereo_scale
+    row["stereo_scale"] = np.nan if scale is None else scale.logs
+    row["stereo_scale_covariance"] = np.nan if scale is None else scale.covariance
     return row
 
 
@@ -83,12 +96,14 @@ def estimate_of(row: np.void) -> Estimate:
     optional: dict[str, Any] = {name: _array(row[name]) for name in _OPTIONAL_ARRAYS}
     optional |= {name: _number(row[name]) for name in _OPTIONAL_NUMBERS}
     field, P = _array(row["stereo_field"]), _array(row["stereo_field_covariance"])
+    scale, S = _array(row["stereo_scale"]), _array(row["stereo_scale_covariance"])
     return Estimate(
         int(row["time_ns"]),
         np.array(row["T_world_imu"]),
         np.array(row["covariance"]),
         **optional,
         stereo_field=None if field is None or P is None else StereoFieldEstimate(field, P, row["stereo_rows_rms_px"]),
+        stereo_scale=None if scale is None or S is None else StereoScaleEstimate(scale, S),
     )
 
 
