@@ -6,11 +6,17 @@ LEARNED ?=
 VIO_DATA ?=
 WORK ?= results
 RESULTS ?=
+ifeq ($(OS),Windows_NT)
+BIN := $(VENV)/Scripts
+EXE := .exe
+else
 BIN := $(VENV)/bin
+EXE :=
+endif
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint unit coverage mutations results clean constraints
+.PHONY: demo test lint unit coverage mutations results wheel docs clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -38,18 +44,28 @@ mutations: $(TESTED)
 results: $(VENV)/.base
 	$(BIN)/python -m tools.results --data "$(VIO_DATA)" --work "$(WORK)" $(RESULTS)
 
-$(VENV)/bin/python:
+# The documentation site, into site/; a broken link or a page without a place in the menu is an error.
+docs: $(TESTED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+# Build the wheel, and run its demo in an environment and a folder of its own.
+wheel: | $(BIN)/python$(EXE)
+	rm -rf build dist
+	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+	$(BIN)/python tools/check_wheel.py dist constraints.txt
+
+$(BIN)/python$(EXE):
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.base: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/.base: pyproject.toml constraints.txt | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e .
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev]'
 	@touch $@ $(VENV)/.base
 
-$(VENV)/.learned: pyproject.toml constraints.txt | $(VENV)/bin/python
+$(VENV)/.learned: pyproject.toml constraints.txt | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev,learned]'
 	@touch $@ $(VENV)/.dev $(VENV)/.base
 
@@ -59,4 +75,4 @@ constraints: $(VENV)/.learned
 	mv constraints.new constraints.txt
 
 clean:
-	rm -rf $(VENV) demo build *.egg-info
+	rm -rf $(VENV) demo build dist site *.egg-info

@@ -13,7 +13,9 @@ Record = TypeVar("Record")
 
 
 def take(record: Record, index: BoolArray | IntArray) -> Record:
-    """Select rows of a record by a mask (N,) or indices (K,)."""
+    """Select rows of a record by a mask (N,) or indices (K,); the record itself where the mask selects all."""
+    if index.dtype == np.bool_ and index.all():
+        return record
     return type(record)(*(take(c, index) if is_dataclass(c) else c[index] for c in _columns(record)))
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.compiled import compiled
 from vio.errors import ConfigError
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
@@ -77,17 +78,44 @@ def local_maxima(response: Response, occupied: FloatArray, distance: int, border
     Distances are in the maximum norm. The outermost `border` pixels and responses below `least` are excluded.
     """
     height, width = response.shape
-    blocked = np.zeros((height, width), dtype=np.uint8)
-    if len(occupied):
-        taken = np.clip(np.rint(occupied).astype(np.int64), 0, [width - 1, height - 1])
-        blocked[taken[:, 1], taken[:, 0]] = 1
-        blocked = np.asarray(cv2.dilate(blocked, np.ones((2 * distance + 1, 2 * distance + 1), np.uint8)), np.uint8)
-    free = np.where(blocked == 0, response, np.float32(0.0))
-    peak = cv2.dilate(free, np.ones((2 * distance + 1, 2 * distance + 1), np.uint8))
-    found = (free == peak) & (free >= max(least, 1e-12))
-    found[:border], found[height - border :], found[:, :border], found[:, width - border :] = False, False, False, False
-    v, u = np.nonzero(found)
-    return np.stack([u, v], axis=1)
+    taken = np.clip(np.rint(occupied).astype(np.int64), 0, [width - 1, height - 1])
+    free, found = response.copy(), np.empty((response.size, 2), dtype=np.int64)
+    count = _find_maxima(free, taken, distance, border, np.float32(max(least, 1e-12)), found)
+    return found[:count].copy()
+
+
+@compiled
+def _find_maxima(
+    free: Response, taken: IntArray, distance: int, border: int, least: np.float32, found: IntArray
+) -> int:
+    """Clear responses near taken pixels (N, 2), and write the pixels of the maxima of the rest; return their number."""
+    height, width = free.shape
+    for n in range(len(taken)):
+        for v in range(max(taken[n, 1] - distance, 0), min(taken[n, 1] + distance + 1, height)):
+            for u in range(max(taken[n, 0] - distance, 0), min(taken[n, 0] + distance + 1, width)):
+                free[v, u] = 0.0
+    count = 0
+    for v in range(border, height - border):
+        for u in range(border, width - border):
+            here = free[v, u]
+            # Nearly all pixels fail one of the first comparisons.
+            if here < least or here < free[v, u - 1] or here < free[v, u + 1] or here < free[v - 1, u]:
+                continue
+            if _is_largest(free, u, v, distance):
+                found[count, 0], found[count, 1] = u, v
+                count += 1
+    return count
+
+
+@compiled
+def _is_largest(free: Response, u: int, v: int, distance: int) -> bool:
+    """Whether no response within a distance of a pixel is larger."""
+    height, width = free.shape
+    for y in range(max(v - distance, 0), min(v + distance + 1, height)):
+        for x in range(max(u - distance, 0), min(u + distance + 1, width)):
+            if free[y, x] > free[v, u]:
+                return False
+    return True
 
 
 def detect_corners(

@@ -13,6 +13,8 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.records import Image
 
+from .patches import mean_and_contrast
+
 # Change of the difference of row means in a frame, gray levels (root mean square over the rows). Measured: up to 7 on
 # recordings without a fault, up to 19 where the right camera is late, 70 and more by bands of 25 %.
 _CHANGE = 25.0
@@ -40,7 +42,7 @@ class BandRemoval:
     def __call__(self, index: int, left: Image, right: Image) -> tuple[Image, Image]:
         """Return both images (H, W) of a frame, without bands where there are such."""
         rows_left, rows_right = _row_means(left), _row_means(right)
-        contrast = sorted(float(image[::_STRIDE, ::_STRIDE].std()) for image in (left, right))
+        contrast = sorted(mean_and_contrast(image, _STRIDE)[1] for image in (left, right))
         if not self._active and contrast[0] > _LEAST_CONTRAST * contrast[1]:
             self._detect(index, rows_left - rows_right)
         if not self._active:

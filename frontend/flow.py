@@ -8,7 +8,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image
 
-from .patches import View, inside
+from .patches import View, inside, mean_and_contrast
 from .settings import KltSettings
 
 _LK_EPSILON_PX = 0.02  # of the half-resolution image
@@ -44,48 +44,58 @@ def track_with_retries(
     """
     last = match_brightness(last, view.half)
     few = min(settings.trusted_levels, settings.pyramid_levels) if trusted else settings.pyramid_levels
-    found, good = _track_forward_backward(last, view, points, guess, few, settings)
+    found, good = _track_forward_backward(last, view, points, guess, few, settings, trusted=trusted)
     attempts = [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
     for start, share in attempts:
         retry = np.flatnonzero(~good)
         if len(retry) <= share * len(points):
             break
         found[retry], good[retry] = _track_forward_backward(
-            last, view, points[retry], start[retry], settings.pyramid_levels, settings
+            last, view, points[retry], start[retry], settings.pyramid_levels, settings, trusted=False
         )
     return found, good
 
 
 def lost_contrast(image: Image, last: Image) -> bool:
     """Whether an image (H, W) has almost no contrast although the last one had: black, saturated or covered."""
-    return _contrast(image) < _LOST_CONTRAST_SHARE * _contrast(last)
+    return mean_and_contrast(image, _STRIDE)[1] < _LOST_CONTRAST_SHARE * mean_and_contrast(last, _STRIDE)[1]
 
 
 def match_brightness(image: Image, other: Image) -> Image:
     """Adjust an image to another's mean and contrast if they differ clearly: Lucas-Kanade compares gray levels."""
-    a, b = (part[::_STRIDE, ::_STRIDE].astype(np.float64) for part in (image, other))
-    gain = float(b.std() / max(a.std(), _MIN_CONTRAST))
-    if (abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(float(b.mean() - a.mean())) < _MAX_MEAN_CHANGE) or gain <= 0:
+    (mean, contrast), (other_mean, other_contrast) = (mean_and_contrast(part, _STRIDE) for part in (image, other))
+    gain = other_contrast / max(contrast, _MIN_CONTRAST)
+    if (abs(gain - 1) < _MAX_CONTRAST_CHANGE and abs(other_mean - mean) < _MAX_MEAN_CHANGE) or gain <= 0:
         return image
     gain = min(max(gain, 1 / _MAX_GAIN), _MAX_GAIN)
-    levels = gain * (np.arange(256) - a.mean()) + b.mean()
+    levels = gain * (np.arange(256) - mean) + other_mean
     return np.asarray(cv2.LUT(image, np.clip(np.rint(levels), 0, 255).astype(np.uint8)), dtype=np.uint8)
 
 
-def _contrast(image: Image) -> float:
-    """Standard deviation of an image's gray levels, from a sparse grid of them."""
-    return float(image[::_STRIDE, ::_STRIDE].astype(np.float64).std())
-
-
 def _track_forward_backward(
-    last: Image, view: View, points: FloatArray, guess: FloatArray, levels: int, settings: KltSettings
+    last: Image,
+    view: View,
+    points: FloatArray,
+    guess: FloatArray,
+    levels: int,
+    settings: KltSettings,
+    *,
+    trusted: bool,
 ) -> tuple[FloatArray, BoolArray]:
-    """Track points (N, 2) forward and backward; return the new pixels and the mask of consistent ones."""
-    forward, seen = _flow(last, view.half, points, guess, levels, settings)
-    backward, seen_back = _flow(view.half, last, forward, points, levels, settings)
-    error = np.linalg.norm(backward - points, axis=1)
-    margin = settings.anchor_radius_px + 2
-    good = seen & seen_back & (error <= settings.max_forward_backward_px) & inside(view.full, forward, margin)
+    """Track points (N, 2) forward and backward; return the new pixels and the mask of consistent ones.
+
+    Points found where a trusted guess expects them, to the same tolerance, are not tracked backward: two independent
+    sources agree on them, and alignment with the anchor is to come.
+    """
+    forward, good = _flow(last, view.half, points, guess, levels, settings)
+    good &= inside(view.full, forward, settings.anchor_radius_px + 2)
+    tolerance = settings.max_forward_backward_px
+    expected = np.linalg.norm(forward - guess, axis=1) <= tolerance
+    doubtful = np.flatnonzero(good & ~expected if trusted else good)
+    if len(doubtful):
+        backward, seen_back = _flow(view.half, last, forward[doubtful], points[doubtful], levels, settings)
+        error = np.linalg.norm(backward - points[doubtful], axis=1)
+        good[doubtful] = seen_back & (error <= tolerance)
     return forward, good
 
 

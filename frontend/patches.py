@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.compiled import compiled
 from vio.records import BoolArray, Image
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]  # (H, W) gray levels
@@ -33,3 +34,23 @@ def inside(image: Image | FloatImage, points: npt.NDArray[np.float64], margin: f
     height, width = image.shape
     u, v = points[:, 0], points[:, 1]
     return (u >= margin) & (u <= width - 1 - margin) & (v >= margin) & (v <= height - 1 - margin)
+
+
+def mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:
+    """Mean and standard deviation of an image's gray levels, from every `stride`-th pixel of every `stride`-th row."""
+    mean, contrast = _mean_and_contrast(image, stride)
+    return float(mean), float(contrast)
+
+
+@compiled
+def _mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:
+    height, width = image.shape
+    total, squares, count = np.int64(0), np.int64(0), 0
+    for y in range(0, height, stride):
+        for x in range(0, width, stride):
+            gray = np.int64(image[y, x])
+            total += gray
+            squares += gray * gray
+            count += 1
+    mean = total / count
+    return mean, np.sqrt(max(squares / count - mean * mean, 0.0))

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, transform_points
-from vio.geometry.stereo import StereoCamera, project
+from vio.geometry.lie import FloatArray, se3_from_parts, transform_points
+from vio.geometry.stereo import StereoCamera, left_rays, project
 from vio.records import BoolArray, IntArray, TrackPrior
+
+from .patches import FloatImage, inside
+from .tracks import Tracks
 
 _ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
 _MIN_DEPTH_M = 0.1
+_NEIGHBOURS = 3  # matched features whose median depth replaces an unknown one
+_FAR_M = 1e6  # depth assumed where too few features have one
 
 
 def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
@@ -56,3 +61,46 @@ def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArr
     ahead = moved[:, 2] > _MIN_DEPTH_M
     pixels = project(camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
     return np.where(ahead[:, None], pixels, left)
+
+
+def guessed_pixels(
+    camera: StereoCamera, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage
+) -> FloatArray:
+    """Predict the left pixels (N, 2) of features in the current frame: from the prior, else by the last motion.
+
+    Args:
+        camera: the rectified pair.
+        old: features of the previous frame.
+        prior: usable prior, or None.
+        expected: motion (4, 4) `T_curr_prev` by the last one.
+        image: the current left image.
+    """
+    if prior is not None and prior.R_cam_prev is not None:
+        expected = se3_from_parts(prior.R_cam_prev, expected[:3, 3])
+    guess = moved_pixels(camera, expected, _points_with_borrowed_depth(camera, old), old.left)
+    if prior is not None:
+        rows, predicted = prior_rows(old, np.arange(len(old)), prior)
+        guess[rows] = predicted
+    # A prediction outside the image cannot be tracked; the search then starts at the old pixel.
+    outside = ~inside(image, guess, 0.0)
+    guess[outside] = old.left[outside]
+    return guess
+
+
+def _points_with_borrowed_depth(camera: StereoCamera, old: Tracks) -> FloatArray:
+    """Points (N, 3) of the features; unknown depths are the median depth of the nearest neighbours in the image."""
+    known, unknown = np.flatnonzero(old.has_point), np.flatnonzero(~old.has_point)
+    if len(unknown) == 0 or len(known) < _NEIGHBOURS:
+        return np.where(old.has_point[:, None], old.point, left_rays(camera, old.left) * _FAR_M)
+    gap = np.abs(old.left[unknown, None] - old.left[known]).sum(axis=2)
+    nearest = known[np.argpartition(gap, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]]
+    point = old.point.copy()
+    point[unknown] = left_rays(camera, old.left[unknown]) * np.median(old.point[nearest, 2], axis=1)[:, None]
+    return point
+
+
+def prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
+    """Return those of the rows that were output and are in a prior, and the left pixels (K, 2) that it predicts."""
+    shown = rows[tracks.shown[rows]]
+    named, predicted = prior_pixels(tracks.ids[shown], prior)
+    return shown[named], predicted

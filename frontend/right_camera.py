@@ -13,7 +13,10 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.compiled import compiled_sums
 from vio.records import BoolArray, Image
+
+from .patches import mean_and_contrast
 
 Cause: TypeAlias = Literal["frozen", "dark", "contradicts"]
 
@@ -98,7 +101,7 @@ class RightCamera:
             self._count_left(last.index, index)
             return True
         self._left_frozen = 0
-        if now.right.std() < _DARK_SHARE * now.left.std():
+        if mean_and_contrast(now.right, 1)[1] < _DARK_SHARE * mean_and_contrast(now.left, 1)[1]:
             self._distrust("dark", last.index, index)
             return False
         change_left, change_right = image_change(now.left, last.left), image_change(now.right, last.right)
@@ -175,8 +178,19 @@ def image_change(image: Image, other: Image) -> float:
     """Mean absolute difference of two images, in gray levels at a common mean and contrast; 0: equal to the bit."""
     if np.array_equal(image, other):
         return 0.0
-    a, b = ((x - x.mean()) / max(float(x.std()), 1.0) for x in (image.astype(np.float32), other.astype(np.float32)))
-    return _CONTRAST * float(np.abs(a - b).mean())
+    (mean, contrast), (other_mean, other_contrast) = mean_and_contrast(image, 1), mean_and_contrast(other, 1)
+    return _CONTRAST * _difference(image, other, mean, other_mean, max(contrast, 1.0), max(other_contrast, 1.0))
+
+
+@compiled_sums
+def _difference(image: Image, other: Image, mean: float, other_mean: float, scale: float, other_scale: float) -> float:
+    """Mean absolute difference of two images, each less its mean and over its scale."""
+    total = 0.0
+    height, width = image.shape
+    for y in range(height):
+        for x in range(width):
+            total += abs((image[y, x] - mean) / scale - (other[y, x] - other_mean) / other_scale)
+    return total / (height * width)
 
 
 def _is_frozen(change: float, other_change: float) -> bool:

@@ -70,6 +70,8 @@ class StereoFit:
 
     def match_near(self, tracks: Tracks, right: View, rows: IntArray, disparity: FloatArray) -> Tracks:
         """Match the given rows (K,) near their disparities (K,)."""
+        if not len(rows):
+            return tracks
         pixels, skew, valid = self._fit(take(tracks, rows), right, disparity)
         return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
 
@@ -106,6 +108,11 @@ class StereoFit:
     def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that match well on their row between two images at half resolution."""
         return int(self._search(left_half, right_half, points, _GOOD_MATCH)[1].sum())
+
+    @property
+    def has_few_matches(self) -> bool:
+        """Whether hardly any feature of the last frame had a right match, so that those matches may be wrong ones."""
+        return self._unmatched > 0
 
     def restart_rows(self) -> None:
         """Forget the row differences."""

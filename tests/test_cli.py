@@ -342,6 +342,24 @@ def test_eval_reads_the_extrinsics_from_a_file(
     )
 
 
+def test_an_unknown_option_shows_the_usage_of_its_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["eval", "a", "b", "--alignment", "se3"])
+    assert ended.value.code == 2
+    message = capsys.readouterr().err
+    assert message.startswith("usage: vio eval")
+    assert "unrecognized arguments: --alignment" in message
+
+
+def test_a_run_is_compared_with_the_truth_of_its_recording(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(flight), "--quiet", "--json", "--out", str(tmp_path / "run")]) == 0
+    ate_m = json.loads(capsys.readouterr().out)["ate_m"]
+    assert main(["eval", str(tmp_path / "run"), str(flight), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ate_m"] == pytest.approx(ate_m, rel=1e-6)
+
+
 def test_wrong_usage_exits_with_status_2() -> None:
     for argv in (
         [],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,8 @@ import pytest
 from vio.config import Config, SettingInfo, as_dict, describe, load_config, to_yaml
 from vio.errors import ConfigError
 from vio.filters.settings import MsckfSettings
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 def _write(tmp_path: Path, text: str) -> Path:
@@ -134,3 +137,15 @@ def test_rejects_infinite_numbers_and_checks_ranges_in_code() -> None:
         MsckfSettings(clones=2)
     with pytest.raises(ConfigError, match=r"pixel_sigma_min_px, 3, must not be above"):
         MsckfSettings(pixel_sigma_min_px=3.0)
+
+
+def test_preset_is_found_by_its_name_and_is_packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    fast, default = load_config(Path("fast")), Config()
+    assert fast.frontend.grid.target_features < default.frontend.grid.target_features
+    assert fast.msckf.clones < default.msckf.clones
+    with pytest.raises(ConfigError, match="nor a preset of this name; presets are: fast"):
+        load_config(Path("quick"))
+    Path("fast").write_text("lag_frames: 2\n")  # a file of the user's goes first
+    assert load_config(Path("fast")) == replace(default, lag_frames=2)
+    assert 'vio = ["py.typed", "presets/*.yaml"]' in (ROOT / "pyproject.toml").read_text()

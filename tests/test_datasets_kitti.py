@@ -14,12 +14,15 @@ import numpy as np
 import pytest
 
 from tests.dataset_makers import T_CAM0_IMU, calib_text, make_drive, make_images, make_kitti
+from vio.datasets import open_dataset
 from vio.datasets.kitti import read_calibration, read_kitti
+from vio.datasets.rigs.kalibr import kalibr_text
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import se3_from_parts, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import StereoFrame, VelocitySample
+from vio.rig import Rig
 
 DEFAULT = DatasetSettings()
 OFFICIAL_00 = """P0: 7.188560000000e+02 0.000000000000e+00 6.071928000000e+02 0.000000000000e+00 0.000000000000e+00 \
@@ -424,3 +427,18 @@ def test_real_images_match_along_rows(data_dir: Path) -> None:
             disparities.append(130 - 7 - int(score.argmax()))
     assert len(disparities) > 20
     assert np.mean(np.array(disparities) > 0) > 0.95
+
+
+def test_a_calibration_kept_in_the_folder_goes_before_calib_txt(tmp_path: Path) -> None:
+    """The file that `vio run --save-calibration` writes."""
+    folder = make_kitti(tmp_path)
+    plain = open_dataset(folder).recording
+    assert plain.kind == "kitti"
+    c = plain.camera
+    assert c.width is not None
+    assert c.height is not None
+    rig = Rig.rectified(c.fu, c.fv, c.cu, c.cv, 1.01 * c.baseline_m, c.width, c.height)
+    (folder / "camchain-imucam.yaml").write_text(kalibr_text(rig))
+    kept = open_dataset(folder).recording
+    assert kept.camera.baseline_m == pytest.approx(1.01 * c.baseline_m)
+    assert kept.motion == plain.motion

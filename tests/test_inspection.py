@@ -12,8 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from vio.cli import main
+from vio.geometry.lie import so3_exp
 from vio.inspection.inertial import allan_deviation, noise_part, rest_part
 from vio.inspection.times import clock_facts
 from vio.records import ImuDensities, ImuRecord
@@ -39,6 +41,42 @@ def test_a_sound_recording(flight: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert parts["rest"]["force_norm_mps2"] == pytest.approx(9.8, abs=0.5)
     assert parts["tracking"]["tracked_median"] > 50
     assert parts["missing"]["missing"] == []
+
+
+def _turn_right_camera(folder: Path, w_deg: list[float]) -> None:
+    """Turn the right camera of an EuRoC folder, not its calibration."""
+    sheet = yaml.safe_load((folder / "mav0" / "cam1" / "sensor.yaml").read_text().removeprefix("%YAML:1.0"))
+    fu, fv, cu, cv = sheet["intrinsics"]
+    K = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, 1]])
+    H = K @ so3_exp(np.radians(w_deg)) @ np.linalg.inv(K)
+    for file in (folder / "mav0" / "cam1" / "data").glob("*.png"):
+        image = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        size = image.shape[1], image.shape[0]
+        cv2.imwrite(str(file), cv2.warpPerspective(image, H, size, borderMode=cv2.BORDER_REPLICATE))
+
+
+@pytest.mark.parametrize(
+    ("w_deg", "where"), [([2.0, 0.0, 0.0], "a camera has been turned"), ([0.0, 2.0, 0.0], "calibration is off")]
+)
+def test_a_turned_right_camera_is_named_before_and_in_the_run(
+    w_deg: list[float],
+    where: str,
+    flight: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    folder = tmp_path / "turned"
+    shutil.copytree(flight, folder)
+    _turn_right_camera(folder, w_deg)
+    main(["inspect", str(folder), "--pairs", "3", "--frames", "0"])
+    assert where in capsys.readouterr().out
+    assert (
+        main(["run", str(folder), "--motion", "none", "--stop", "12", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    )
+    named = [line for line in caplog.messages if "the stereo calibration is off" in line]
+    assert len(named) == 1
 
 
 def test_one_screen_for_people(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:

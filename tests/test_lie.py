@@ -271,3 +271,21 @@ def test_batches_of_rotations_equal_single_calls(name: str) -> None:
     R = lie.so3_exp(np.random.default_rng(5).normal(size=(2, 4, 3)) * 2)
     for index in np.ndindex(2, 4):
         close(f(R)[index], f(R[index]), atol=1e-14)
+
+
+@properties
+@given(twists)
+def test_single_arguments_and_batches_give_the_same(xi: FloatArray) -> None:
+    batch, T = np.stack([xi, xi]), lie.se3_exp(xi)
+    for function in (lie.so3_exp, lie.so3_left_jacobian, lie.so3_left_jacobian_inverse):
+        close(function(xi[3:]), function(batch[:, 3:])[0], atol=4e-15)
+    close(T, lie.se3_exp(batch)[0], rtol=1e-14)
+    close(lie.se3_inverse(T), lie.se3_inverse(np.stack([T, T]))[1], rtol=1e-14)
+    close(np.abs(lie.so3_log(T[:3, :3])), np.abs(lie.so3_log(np.stack([T, T])[:, :3, :3])[0]), rtol=1e-13)
+
+
+def test_what_is_not_finite_stays_so_without_an_error() -> None:
+    with np.errstate(invalid="ignore"):
+        for value in (np.nan, np.inf):
+            assert not np.isfinite(lie.so3_exp([value, 0.0, 0.0])).all()
+            assert not np.isfinite(lie.so3_log(np.full((3, 3), value))).all()

@@ -89,7 +89,7 @@ def test_points_follow_the_clones_as_their_triangulation_does() -> None:
         return refine_points(CAMERA, moved, p, views, 10, 1e6)[0]
 
     numeric = numeric_jacobian(triangulated, np.zeros(24), eps=1e-5)
-    np.testing.assert_allclose(info.point_D_clones()[0], numeric, atol=1e-4 * np.abs(numeric).max())
+    np.testing.assert_allclose(info.point_D_clones(np.arange(1))[0], numeric, atol=1e-4 * np.abs(numeric).max())
 
 
 @pytest.mark.parametrize("disparity", [0.0, -0.4])
@@ -224,3 +224,14 @@ def test_weak_prior_is_outweighed_by_one_stereo_view() -> None:
     left = track_information(CAMERA, T, *_sideways(1e-6, 5.0, True)[2:], p, np.ones((8, 5)))
     np.testing.assert_allclose(left.C[:, 2, 2], 1e-6, rtol=1e-3)
     assert np.all(stereo.C[:, 2, 2] > 1e5 * left.C[:, 2, 2])
+
+
+def test_depth_sigma_and_covariance_are_those_of_the_inverted_information() -> None:
+    p = _points(5)
+    at = residuals(CAMERA, T_CAM0_WORLD, p, _views(p))
+    info = track_information(CAMERA, T_CAM0_WORLD, at, p, np.ones((5, 4)))
+    inverse = np.linalg.inv(info.C)
+    np.testing.assert_allclose(info.relative_depth_sigma(), np.sqrt(inverse[:, 2, 2]) / info.q.disparity, rtol=1e-9)
+    p_D_q, chosen = info.q.p_D_q, np.array([3, 1])
+    expected = (p_D_q @ inverse @ np.swapaxes(p_D_q, 1, 2))[chosen]
+    np.testing.assert_allclose(info.point_covariance(chosen), expected, rtol=1e-9)

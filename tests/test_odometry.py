@@ -15,9 +15,9 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import vio
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
-from vio.chain import FrameResult
 from vio.config import Config
 from vio.errors import CalibrationError, ConfigError, DataError, VioError
+from vio.frame_result import FrameResult
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_log
 from vio.odometry import Odometry
 from vio.records import Estimate, FrontendOutput, ImuSample, StereoFrame

@@ -17,11 +17,11 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from vio.config import Config, load_config
 from vio.errors import ConfigError, DataError, VioError
 from vio.filters.msckf import Msckf
+from vio.frame_result import FrameResult
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.pipeline import resolve_motion, run
 from vio.records import (
-    Estimate,
     Event,
     FrontendOutput,
     Landmarks,
@@ -167,7 +167,7 @@ def test_the_viewer_sees_each_frame_and_is_closed_even_after_an_error() -> None:
         frames = 0
         closed = False
 
-        def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+        def frame(self, result: FrameResult) -> None:
             self.frames += 1
             if self.frames == 7:
                 raise DataError("enough")
@@ -194,7 +194,7 @@ def test_memory_does_not_grow_with_frames_beyond_the_map() -> None:
     class Watch:
         sizes: ClassVar[list[int]] = []
 
-        def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+        def frame(self, result: FrameResult) -> None:
             self.sizes.append(tracemalloc.get_traced_memory()[0])
 
         def close(self) -> None:
@@ -296,6 +296,7 @@ def test_run_folder_holds_what_it_promises(tmp_path: Path) -> None:
         "trajectory.tum",
         "trajectory.kitti",
         "estimates.npy",
+        "reference.tum",
         "dead_reckoning.tum",
         "landmarks.ply",
         "frames.csv",

@@ -332,7 +332,7 @@ def command_line(*arguments: str) -> Callable[[Path], list[str]]:
         (command_line("--format", "kitti", "--imu", "simulated"), "cannot contain an IMU"),
         (command_line("--format", "kitti", "--rig", "fisheye"), "needs a rectified rig"),
         (command_line("--effects", "noise,fog"), "no effect 'fog'"),
-        (command_line("--scene", "street", "--effects", "bare-wall"), "no bare walls"),
+        (command_line("--set", "people=101"), "101 people cannot be placed"),
         (command_line("--set", "effects.read_nois=2"), "did you mean 'effects.read_noise'"),
         (command_line("--set", "effects.vignetting=2"), "between 0 and 1"),
         (command_line("--set", "faults.dropped=1"), "shares of the frames"),

@@ -104,7 +104,7 @@ def test_exact_blur_is_the_mean_of_sub_exposures() -> None:
     def render_at(time_ns: int) -> Radiance:
         return np.full((2, 2), time_ns * 1e-6, dtype=np.float32)
 
-    blurred = average_exposures(render_at, 50_000_000, SensorEffects(blur_exposure_ms=10.0, blur_samples=5))
+    blurred = average_exposures(render_at, 50_000_000, 10.0, 5)
     np.testing.assert_allclose(blurred, 50.0, atol=1e-4)  # symmetric about the frame's time
 
 

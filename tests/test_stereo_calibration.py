@@ -178,6 +178,27 @@ def test_rows_are_learned_among_mismatches() -> None:
     assert np.abs(field(grid)).max() > 1.0
 
 
+def test_rows_without_what_both_lenses_do_to_near_points() -> None:
+    """5e-3 of tangential distortion of both lenses bends the rows of near points; a turned right camera is left."""
+    z, q2 = _grid(), 5e-3
+    moved = _turned_right(z, CAMERA, np.array([0.0, 0.0, 1e-3]))
+    left, right = (_distorted(_rays(CAMERA, moved[:, c]), 0.0, (0.0, q2)) for c in (slice(0, 2), slice(2, 4)))
+    near = _learned(np.concatenate([left, right], axis=1))
+    own = near.without_common(np.array([0, 0, 0, 0, 0, q2]))
+    bare = _learned(moved).coefficients
+    assert np.abs(near.coefficients - bare).max() > 2e-4
+    assert np.abs(own - bare).max() < 5e-5
+
+
+def test_the_covariance_of_rows_covers_features_that_keep_their_error() -> None:
+    """50 frames of the same 105 features, each with an error of its own of 0.3 px in all of them, 40 times."""
+    z, rng, errors = _grid(), np.random.default_rng(7), []
+    for _ in range(40):
+        rows = _learned(z + rng.normal(0, 0.3, (len(z), 1)) * [0, 0, 0, 1])
+        errors.append(rows.coefficients @ np.linalg.solve(rows.covariance, rows.coefficients))
+    assert 3.5 < np.mean(errors) < 9.0  # chi-square with 6 degrees of freedom; 3.5 times the variance would give 1.7
+
+
 def test_rows_are_not_learned_from_few_matches_or_left_views() -> None:
     z = _grid()
     z[:, 3] += 2.0

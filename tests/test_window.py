@@ -9,7 +9,7 @@ import numpy as np
 
 from vio.filters.navigation import DIM, Measurement, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
-from vio.filters.window import Window, posterior
+from vio.filters.window import Window, factor, fit, posterior
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 
 STEP_NS = 50_000_000
@@ -82,11 +82,12 @@ def test_covariance_of_the_last_move_counts_what_both_poses_share() -> None:
     window = _window()
     J = np.zeros((6, len(window.P)))
     J[:, window.clone_rows(3)], J[:, window.clone_rows(2)] = np.eye(6), -np.eye(6)
-    np.testing.assert_allclose(window.move_covariance(2, window.P), J @ window.P @ J.T, atol=1e-12)
+    prior = fit(factor(window.P), np.zeros_like(window.P))
+    np.testing.assert_allclose(window.move_covariance(2, prior), J @ window.P @ J.T, atol=1e-12)
     for index in (2, -2):
         move = window.camera_move_since(index)
         np.testing.assert_allclose(window.clones[2].T_world_imu @ move, window.clones[3].T_world_imu, atol=1e-12)
-    assert not window.move_covariance(3, window.P).any()
+    assert not window.move_covariance(3, prior).any()
     np.testing.assert_allclose(window.camera_move_since(3), np.eye(4), atol=1e-12)
 
 
@@ -142,3 +143,31 @@ def test_posterior_of_a_prior_with_a_negative_eigenvalue_by_rounding_is_still_on
     P, shift = posterior(known, np.diag([1.0, 0.0, 1e6]), np.array([1.0, 1.0, 1e6]))
     np.testing.assert_allclose(P, np.diag([0.5, 4.0, 0.0]), atol=1e-12)
     np.testing.assert_allclose(shift, [0.5, 4.0, 0.0], atol=1e-12)
+
+
+def test_fit_by_factors_equals_the_dense_covariance() -> None:
+    rng = np.random.default_rng(2)
+    root, J, b = rng.normal(size=(9, 9)), rng.normal(size=(2, 3, 9)), rng.normal(size=9)
+    H = rng.normal(size=(5, 9))
+    for prior in (root @ root.T, root[:, :6] @ root[:, :6].T - 1e-9 * np.eye(9)):  # the second one is no covariance
+        fitted = fit(factor(prior), H.T @ H)
+        P_new, shift = posterior(prior, H.T @ H, b)
+        np.testing.assert_allclose(fitted.covariance(), P_new, atol=1e-12)
+        np.testing.assert_allclose(fitted.move(b), shift, atol=1e-9)
+        S = fitted.spread(J)
+        np.testing.assert_allclose(S @ np.swapaxes(S, 1, 2), J @ P_new @ np.swapaxes(J, 1, 2), atol=1e-9)
+        first = factor(prior).leading(4).L
+        np.testing.assert_allclose(first @ first.T, prior[:4, :4], atol=1e-7)
+
+
+def test_changes_in_place_are_seen_by_the_next_fit() -> None:
+    window = _window()
+    for change in (
+        lambda: window.propagate(window.motion.advance(window.nav, 3 * STEP_NS, 4 * STEP_NS)),
+        lambda: window.add_clone(4, 4 * STEP_NS),
+        window.drop_oldest_clone,
+    ):
+        change()
+        nothing = np.zeros_like(window.P)
+        fitted, _ = window.optimum(nothing, np.zeros(len(nothing)), len(nothing))
+        np.testing.assert_allclose(fitted.covariance(), window.P, atol=1e-11)

@@ -38,6 +38,9 @@ _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
 _STEREO_FIELD = ("tests/test_stereo_calibration.py",)
+_KEPT = ("tests/test_stereo_field.py",)
+_IN_MOTION = ("tests/test_self_calibration.py",)
+_ROWS = ("tests/test_frontend_rows.py",)
 _PAPER = ("tests/test_vislam.py",)
 _SELECT = ("tests/test_information.py", "tests/test_selectors.py")
 _SCORE = ("tests/test_evaluation.py",)
@@ -139,8 +142,8 @@ MUTATIONS = (
     Mutation(
         "SO(3): wrong coefficient in a Taylor series",
         "vio/geometry/lie.py",
-        "0.5 - a2 / 24 *",
-        "0.5 - a2 / 12 *",
+        "second = np.where(small, 0.5 - a2 / 24 *",
+        "second = np.where(small, 0.5 - a2 / 12 *",
         _LIE,
     ),
     Mutation(
@@ -285,10 +288,10 @@ MUTATIONS = (
         _WINDOW,
     ),
     Mutation(
-        "landmarks: rotation transposed in the Jacobian",
+        "landmarks: Jacobian of the wrong sign",
         "vio/filters/multiview.py",
-        "@ T_cam0_world[:3, :3]) * usable",
-        "@ T_cam0_world[:3, :3].T) * usable",
+        "r, J = at.r[:, 0], at.z_D_p[:, 0]",
+        "r, J = at.r[:, 0], -at.z_D_p[:, 0]",
         _WINDOW,
     ),
     Mutation(
@@ -616,8 +619,8 @@ MUTATIONS = (
     Mutation(
         "window: covariance of a motion without correlations",
         "vio/filters/window.py",
-        "P[a, a] + P[b, b] - P[a, b] - P[b, a]",
-        "P[a, a] + P[b, b]",
+        "J[:, self.clone_rows(index)] -= np.eye(6)",
+        "J[:, self.clone_rows(index)] -= 0.5 * np.eye(6)",
         _WINDOW,
     ),
     Mutation(
@@ -721,8 +724,8 @@ MUTATIONS = (
     Mutation(
         "standstill: every motion passes for none",
         "vio/filters/window_posterior.py",
-        "return squared < float(",
-        "return squared < 1e9 * float(",
+        "return squared < limit",
+        "return squared < 1e9 * limit",
         _TRUTH,
     ),
     Mutation(
@@ -1059,7 +1062,7 @@ MUTATIONS = (
     ),
     Mutation(
         "right camera: features are dropped while it cannot be used",
-        "frontend/klt.py",
+        "frontend/new_features.py",
         "return tracks, *nothing",
         "return take(tracks, tracks.has_right), *nothing",
         _RIGHT_CAMERA,
@@ -1158,8 +1161,8 @@ MUTATIONS = (
     Mutation(
         "tracking: no look back",
         "frontend/flow.py",
-        "seen & seen_back & (error",
-        "seen & (0 * error",
+        "seen_back & (error <= tolerance)",
+        "seen_back",
         _TRACK,
     ),
     Mutation(
@@ -1171,7 +1174,7 @@ MUTATIONS = (
     ),
     Mutation(
         "tracking: a new anchor in every frame, which drifts",
-        "frontend/klt.py",
+        "frontend/anchor_fit.py",
         "(change > np.log(settings.max_anchor_scale))",
         "(change > -1.0)",
         _TRACK,
@@ -1318,5 +1321,96 @@ MUTATIONS = (
         "math.prod(shape) * dtype.itemsize > info.file_size",
         "math.prod(shape) * dtype.itemsize < 0",
         _FILES,
+    ),
+    Mutation(
+        "png: rows side by side take the corner of the row before",
+        "vio/datasets/png_rows.py",
+        "corner[k] = above[k]",
+        "corner[k] = left[k]",
+        ("tests/test_datasets_png.py",),
+    ),
+    Mutation(
+        "fits start from an old factor",
+        "vio/filters/window.py",
+        "self._P, self._L = P, None",
+        "self._P = P",
+        ("tests/test_window.py",),
+    ),
+    Mutation(
+        "single rotations: the wrong component of the quaternion is the largest",
+        "vio/geometry/lie.py",
+        "largest = max(d0, d1, d2, trace)",
+        "largest = d0",
+        ("tests/test_lie.py",),
+    ),
+    Mutation(
+        "detection: corners are never searched while few are missing",
+        "frontend/klt.py",
+        "self._rested = not self._rested and missing",
+        "self._rested = missing",
+        ("tests/test_frontend_klt.py",),
+    ),
+    Mutation(
+        "tracking: trusted predictions are tracked backward all the same",
+        "frontend/flow.py",
+        "good & ~expected if trusted else good",
+        "good",
+        ("tests/test_frontend_klt.py",),
+    ),
+    Mutation(
+        "filter: depths known by less than their information says",
+        "vio/filters/multiview.py",
+        "C[:, 2, 2] - a * C[:, 0, 2] - b * C[:, 1, 2]",
+        "C[:, 2, 2]",
+        ("tests/test_multiview.py",),
+    ),
+    Mutation(
+        "rig turned the other way than its field",
+        "vio/calibration/stereo_field.py",
+        "R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0",
+        "R = self.R_rect_cam1.T @ so3_exp(-x[:3]) @ self.R_rect_cam0",
+        _KEPT,
+    ),
+    Mutation(
+        "rows keep what both lenses do to near points",
+        "vio/filters/stereo_calibration.py",
+        "return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[3:]))",
+        "return np.asarray(self.coefficients - 0 * np.linalg.solve(self._A + prior, self._common @ stereo[3:]))",
+        _STEREO_FIELD,
+    ),
+    Mutation(
+        "covariance of the rows counts each frame's features anew",
+        "vio/filters/stereo_calibration.py",
+        "shared = max(self._count / max(self._matches, 1), 1.0)",
+        "shared = 1.0",
+        _STEREO_FIELD,
+    ),
+    Mutation(
+        "offline commands take tracks with the field",
+        "vio/saved_run.py",
+        "tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))",
+        "tracks = replace(tracks, z=1.0 * tracks.z)",
+        _KEPT,
+    ),
+    Mutation(
+        "rows of a region count as independent",
+        "vio/mapping/self_calibration.py",
+        "meat = _larger(scores.T @ scores * (len(scores) / max(len(scores) - 1, 1)) + prior, A)",
+        "meat = A",
+        _IN_MOTION,
+    ),
+    Mutation(
+        "damping of points passes for information",
+        "vio/mapping/self_calibration.py",
+        "_ROUNDING = 1e-12",
+        "_ROUNDING = 1e-4",
+        _IN_MOTION,
+    ),
+    Mutation(
+        "wrong matches of a pitched camera accuse its images",
+        "frontend/right_match.py",
+        "tested = motion is not None and not stereo.has_few_matches",
+        "tested = motion is not None",
+        _ROWS,
     ),
 )

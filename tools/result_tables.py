@@ -24,6 +24,11 @@ DRIVE_METHODS = ("paper/none", "paper/velocity", "window/none", "window/velocity
 KITTI = {"kitti_0039": "KITTI raw 2011_09_26 0039", "kitti_06_head": "KITTI odometry 06, frames 0-29"}
 UTIAS = ("2011_09_26 0001", "2011_09_26 0005", "2011_09_26 0036", "2011_09_26 0051", "2011_09_30 0020")
 FLIGHTS = {"v102_sim": "V1_02, simulated IMU", "v102_real": "V1_02, real IMU", "mh03_real": "MH_03, real IMU"}
+REAL = {  # rendered with --realism real: what the table says, and the sensor beside the images
+    "real_v102": ("flight V1_02", "imu"),
+    "real_mh03": ("flight MH_03", "imu"),
+    "real_street": ("street", "velocity"),
+}
 PAPER_ROWS = {  # name of `vio reproduce`: what the table says
     "dead reckoning": "dead reckoning",
     "mapping only": "mapping only (pose from dead reckoning)",
@@ -157,6 +162,16 @@ def _gaps(f: Figures) -> Iterator[str]:
 def _still(f: Figures) -> Iterator[str]:
     yield from _head("a minute at rest", "images alone", "with IMU")
     yield _row(["ATE", *(f"{f.tell(f'still/{motion}', 'ate_mm')} mm" for motion in ("none", "imu"))])
+
+
+def _real(f: Figures) -> Iterator[str]:
+    yield from _head("rendered with `--realism real`", "images alone", "with IMU", "with velocities")
+    for name, (label, sensor) in REAL.items():
+        alone = f"real/{name}/none"
+        facts = f"{f.tell(alone, 'length_m')} m, {f.tell(alone, 'frames')} frames"
+        both = f"{f.tell(f'real/{name}/{sensor}', 'ate_m')} m"
+        cells = (both, "–") if sensor == "imu" else ("–", both)
+        yield _row([f"{label} ({facts})", f"{f.tell(alone, 'ate_m')} m", *cells])
 
 
 def _alone(f: Figures) -> Iterator[str]:
@@ -331,6 +346,7 @@ TABLES: Mapping[str, Callable[[Figures], Iterator[str]]] = {
     "flights": _flights,
     "gaps": _gaps,
     "still": _still,
+    "real": _real,
     "alone": _alone,
     "drives": _drives,
     "noise": _noise,

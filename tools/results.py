@@ -40,6 +40,7 @@ from tools.result_tables import (
     KITTI,
     NOISE_SEEDS,
     PAPER_ROWS,
+    REAL,
     ROOT,
     SPEED,
     STARRY,
@@ -151,6 +152,9 @@ _RENDERS = {
     "v102_sim": f"{_FLIGHT}V1_02 --imu simulated --out WORK/v102_sim",
     "v102_real": f"{_FLIGHT}V1_02 --out WORK/v102_real",
     "mh03_real": f"{_FLIGHT}MH_03 --out WORK/mh03_real",
+    "real_v102": f"{_FLIGHT}V1_02 --realism real --imu simulated --duration 20 --out WORK/real_v102",
+    "real_mh03": f"{_FLIGHT}MH_03 --realism real --imu simulated --duration 8 --out WORK/real_mh03",
+    "real_street": "vio render --scene street --trajectory car --realism real --duration 20 --out WORK/real_street",
     "still": "vio render --trajectory WORK/still.tum --imu simulated --duration 61 --out WORK/still",
 }
 
@@ -298,6 +302,13 @@ def _section_still() -> Iterator[Run]:
         )
 
 
+def _section_real() -> Iterator[Run]:
+    for name, (_, sensor) in REAL.items():
+        for motion in ("none", sensor):
+            command = f"vio run WORK/{name} --motion {motion} --lengths 5,10"
+            yield Run(f"real/{name}/{motion}", command, partial(_run, digits=4), partial(_render, name=name))
+
+
 def _section_speed() -> Iterator[Run]:
     for run in SPEED:
         source, motion = ("kitti_0039", "none") if run == "kitti_0039" else (f"WORK/{run}", "imu")
@@ -314,6 +325,7 @@ SECTIONS: Mapping[str, Callable[[], Iterator[Run]]] = {  # in this order: gaps a
     "flights": _section_flights,
     "gaps": _section_gaps,
     "still": _section_still,
+    "real": _section_real,
     "speed": _section_speed,
 }
 

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
 
 from vio.config import BackendName, Config
 from vio.errors import DataError, DivergedError
 from vio.filters.late_imu import LateImuMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
+from vio.frame_result import FrameLog, FrameResult
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Backend, Frontend, Selector
 from vio.records import (
-    Estimate,
     FrontendOutput,
     MotionSample,
     MotionSource,
@@ -27,46 +26,6 @@ from vio.records import (
 from vio.watch.run import RunWatch
 
 BACKENDS: dict[BackendName, type[Vislam] | type[Msckf]] = {"vislam": Vislam, "msckf": Msckf}
-STAGES = ("read", "frontend", "watch", "select", "filter")  # of a frame's wall time
-
-
-@dataclass(frozen=True, slots=True)
-class FrameLog:
-    """What happened in one frame: one row of frames.csv."""
-
-    index: int
-    time_ns: int
-    read_ms: float
-    frontend_ms: float
-    watch_ms: float
-    select_ms: float
-    filter_ms: float
-    detected: int
-    tracked: int
-    matched: int
-    selected: int
-    stale: int
-    used: int
-    gated: int
-    landmarks: int
-    innovation_median_px: float | None
-    nis_per_dof: float | None
-    stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
-
-    @property
-    def total_ms(self) -> float:
-        """Wall time of the whole frame."""
-        return sum(getattr(self, f"{stage}_ms") for stage in STAGES)
-
-
-@dataclass(frozen=True, slots=True)
-class FrameResult:
-    """All that the chain made of one frame."""
-
-    output: FrontendOutput
-    report: UpdateReport
-    estimate: Estimate
-    log: FrameLog
 
 
 class Chain:
@@ -139,7 +98,9 @@ class Chain:
         self.watch.update(frame.index, report, estimate)
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
         self._propagate_ms = 0.0
-        return FrameResult(output, report, estimate, _frame_log(frame, timer.ms, output, selection, report))
+        return FrameResult(
+            frame, output, selection, report, estimate, _frame_log(frame, timer.ms, output, selection, report)
+        )
 
     def _update(self, seen: Observations) -> UpdateReport:
         """Update with a frame; a back end that can start again does so where it diverges."""

@@ -59,6 +59,7 @@ BASIC = (
     "msckf.calibrate",
     "msckf.calibrate_stereo",
 )
+_PRESETS = Path(__file__).parent / "presets"  # packaged configurations, by name
 _MOST_NAMED = 8  # settings in the message on an unknown one
 _MOST_SHOWN = 200  # characters of a wrong value in a message
 
@@ -93,15 +94,32 @@ class Config(Section):
 def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
     """Build the configuration from the defaults, a YAML file and `a.b=value` overrides, in that order.
 
+    A bare name of which there is no file, such as `fast`, is that of a preset in `vio/presets`.
+
     Raises:
         ConfigError: the file cannot be read, or a key or value is wrong.
     """
     config = Config()
     if path is not None:
-        config = merge(config, _read_yaml(path), where=str(path))
+        config = merge(config, _read_yaml(_preset_or(path)), where=str(path))
     for override in overrides:
         config = merge_override(config, override, example="selector.budget=40")
     return config
+
+
+def _preset_or(path: Path) -> Path:
+    """Return the file of a preset where a path is its name, else the path.
+
+    Raises:
+        ConfigError: a bare name is neither a file's nor a preset's.
+    """
+    if path.suffix or path.name != str(path) or path.exists():
+        return path
+    preset = _PRESETS / f"{path}.yaml"
+    if not preset.is_file():
+        known = ", ".join(sorted(file.stem for file in _PRESETS.glob("*.yaml")))
+        raise ConfigError(f"--config {path}: there is no such file, nor a preset of this name; presets are: {known}")
+    return preset
 
 
 def merge_override(section: _Section, override: str, *, example: str) -> _Section:

@@ -19,17 +19,16 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray
 from vio.records import ImuSample
-from vio.robust import robust_sigma
+from vio.robust import robust_sigmas
 
 ImuFaultKind: TypeAlias = Literal["gyro spike", "accelerometer spike", "stuck IMU", "stuck gyro", "stuck accelerometer"]
 
 _HISTORY_S = 2.0  # changes between samples that a spike is compared with
 _LEAST_HISTORY = 20  # changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
-_REFRESH = 20  # samples between two evaluations of their scale
+_REFRESH, _REFRESH_SHARE = 20, 4  # samples between two evaluations of their scale, and the least share of all, 1 / 4
 _SPIKE_SIGMAS = 30.0  # robust standard deviations of the changes; real motion reached 23
-_SPIKE_IMPULSE = np.repeat([5e-3, 0.15], 3)  # rad and m/s over the sample's period; below, no spike does harm
+_SPIKE_IMPULSE = (5e-3, 5e-3, 5e-3, 0.15, 0.15, 0.15)  # rad and m/s over the sample's period; below, no spike does harm
 _RETURN = 0.25  # of the first change, by which the sample after a spike may lie from the one before it; a shock rings
 _LONG_PERIODS = 3.0  # after a longer interval a change is no spike
 _PARTS: tuple[tuple[ImuFaultKind, slice], ...] = (
@@ -43,6 +42,7 @@ _RARE = 0.02  # share of repetitions below which one is held back
 _LEAST_CHANCE = 1e-8  # probability of so many repetitions in a row where they are independent
 _COUNTED = 400  # samples over which the share of repetitions is counted
 _NS = 1e-9
+_Reading: TypeAlias = list[float]  # (6,) gyro and accelerometer; plain numbers, as arrays of six cost ten times as much
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,25 +65,27 @@ class ImuSampleCheck:
         self._spikes = _SpikeCheck()
         self._repeats = [_Repetition(kind, part) for kind, part in _PARTS]
         self._previous: ImuSample | None = None  # as received
+        self._last_reading: _Reading = []  # its numbers
         self._held: list[ImuSample] = []  # repetitions of the last sample that passed
         self._faults: list[ImuFault] = []
 
     def take(self, sample: ImuSample) -> tuple[ImuSample, ...]:
         """Take a sample; return those that may be used now, in time order."""
-        reading = np.concatenate([sample.gyro, sample.accel])
+        reading = _reading(sample)
         if self._previous is not None:
-            equal = (np.concatenate([self._previous.gyro, self._previous.accel]) == reading).tolist()
+            equal = [a == b for a, b in zip(self._last_reading, reading, strict=True)]
             ended = [f for r in self._repeats for f in r.take(self._previous, sample, equal)]
             self._faults += ended[:1]  # that of the whole IMU is that of both sensors
-        self._previous = sample
-        if any(r.stuck for r in self._repeats) or not reading[3:].any():  # gravity is never zero in all axes
+        self._previous, self._last_reading = sample, reading
+        if any(r.stuck for r in self._repeats) or not any(reading[3:]):  # gravity is never zero in all axes
             self._held = []
             return ()
         if any(r.unusual for r in self._repeats):
             self._held.append(sample)
             return ()
         held, self._held = self._held, []
-        usable = [x for candidate in (*held, sample) for x in self._spikes.take(candidate)]
+        usable = [x for candidate in held for x in self._spikes.take(candidate, _reading(candidate))]
+        usable += self._spikes.take(sample, reading)
         self._faults += self._spikes.new_faults()
         return tuple(usable)
 
@@ -158,16 +160,15 @@ class _SpikeCheck:
     """Leaves out single samples that lie far from both neighbours."""
 
     def __init__(self) -> None:
-        self._last: tuple[int, FloatArray] | None = None  # time and reading of the last sample that passed
+        self._last: tuple[int, _Reading] | None = None  # time and reading of the last sample that passed
         self._suspect: ImuSample | None = None
-        self._steps: deque[tuple[int, FloatArray]] = deque()  # times and changes
-        self._limit: FloatArray | None = None  # (6,) a larger change is suspect; None: unknown
+        self._steps: deque[tuple[int, _Reading]] = deque()  # times and changes
+        self._limit: _Reading | None = None  # (6,) a larger change is suspect; None: unknown
         self._period_ns = 0.0
         self._until_refresh = 0
         self._faults: list[ImuFault] = []
 
-    def take(self, sample: ImuSample) -> tuple[ImuSample, ...]:
-        reading = np.concatenate([sample.gyro, sample.accel])
+    def take(self, sample: ImuSample, reading: _Reading) -> tuple[ImuSample, ...]:
         if self._last is None:
             self._last = sample.time_ns, reading
             return (sample,)
@@ -176,7 +177,7 @@ class _SpikeCheck:
             if self._has_returned(suspect, reading):
                 self._accept(sample, reading)
                 return (sample,)
-            self._accept(suspect, np.concatenate([suspect.gyro, suspect.accel]))
+            self._accept(suspect, _reading(suspect))
         elif self._is_suspect(sample.time_ns, reading):
             self._suspect = sample
             return ()
@@ -187,19 +188,21 @@ class _SpikeCheck:
         faults, self._faults = self._faults, []
         return faults
 
-    def _is_suspect(self, time_ns: int, reading: FloatArray) -> bool:
+    def _is_suspect(self, time_ns: int, reading: _Reading) -> bool:
         assert self._last is not None
         if self._limit is None or time_ns - self._last[0] > _LONG_PERIODS * self._period_ns:
             return False
-        return bool((np.abs(reading - self._last[1]) > self._limit).any())
+        pairs = zip(reading, self._last[1], self._limit, strict=True)
+        return any(abs(now - last) > limit for now, last, limit in pairs)
 
-    def _has_returned(self, suspect: ImuSample, reading: FloatArray) -> bool:
+    def _has_returned(self, suspect: ImuSample, reading: _Reading) -> bool:
         """Whether the sample after a suspect lies near the one before it; then note the fault."""
         assert self._last is not None
         assert self._limit is not None
-        jump = np.concatenate([suspect.gyro, suspect.accel]) - self._last[1]
+        last = np.array(self._last[1])
+        jump = np.concatenate([suspect.gyro, suspect.accel]) - last
         axes = np.abs(jump) > self._limit
-        back = np.abs(reading - self._last[1])
+        back = np.abs(reading - last)
         if (back > self._limit).any() or (back > _RETURN * np.abs(jump))[axes].any():
             return False
         for kind, part in (("gyro spike", slice(0, 3)), ("accelerometer spike", slice(3, 6))):
@@ -208,16 +211,20 @@ class _SpikeCheck:
                 self._faults.append(ImuFault(kind, suspect.time_ns, suspect.time_ns, size))  # type: ignore[arg-type]
         return True
 
-    def _accept(self, sample: ImuSample, reading: FloatArray) -> None:
+    def _accept(self, sample: ImuSample, reading: _Reading) -> None:
         assert self._last is not None
-        self._steps.append((sample.time_ns, reading - self._last[1]))
+        self._steps.append((sample.time_ns, [now - last for now, last in zip(reading, self._last[1], strict=True)]))
         self._last = sample.time_ns, reading
         while sample.time_ns - self._steps[0][0] > _HISTORY_S / _NS:
             self._steps.popleft()
         self._until_refresh -= 1
         if self._until_refresh <= 0 and len(self._steps) >= _LEAST_HISTORY:
-            self._until_refresh = _REFRESH
+            self._until_refresh = max(_REFRESH, len(self._steps) // _REFRESH_SHARE)
             times, changes = zip(*self._steps, strict=True)
             self._period_ns = float(np.median(np.diff(np.array(times, dtype=np.int64))))
-            sigma = np.array([robust_sigma(axis) for axis in np.array(changes).T])
-            self._limit = np.maximum(_SPIKE_SIGMAS * sigma, _SPIKE_IMPULSE / max(self._period_ns * _NS, 1e-6))
+            least = np.array(_SPIKE_IMPULSE) / max(self._period_ns * _NS, 1e-6)
+            self._limit = np.maximum(_SPIKE_SIGMAS * robust_sigmas(np.array(changes)), least).tolist()
+
+
+def _reading(sample: ImuSample) -> _Reading:
+    return [*sample.gyro.tolist(), *sample.accel.tolist()]

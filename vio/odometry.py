@@ -12,10 +12,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.chain import BACKENDS, Chain, FrameResult, build_backend
+from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
+from vio.chain import BACKENDS, Chain, build_backend
 from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.event_order import EventOrder
+from vio.frame_result import FrameResult
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -35,13 +37,22 @@ from vio.records import (
     no_landmarks,
     observations,
 )
+from vio.rig import Rig
 from vio.selectors import build_selector
 from vio.threads import BlasLimit
 
 if TYPE_CHECKING:
-    from vio.rig import Rectifier, Rig
+    from vio.rig import Rectifier
 
 log = logging.getLogger(__name__)
+
+
+def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig | None:
+    """Return a rectified pair with the pose (4, 4) of its IMU as a rig; None: its image size is not known."""
+    if camera.width is None or camera.height is None:
+        return None
+    c = camera
+    return Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height, T_cam0_imu)
 
 
 class Odometry:
@@ -83,10 +94,12 @@ class Odometry:
         """
         self._config = Config() if config is None else config
         self._rectifier: Rectifier | None = None
+        self._rig: Rig | None = None  # as given; None: a rectified pair
         self._offset_ns = 0
         if isinstance(rig, StereoCamera):
             self.camera = rig
         else:
+            self._rig = rig
             self._rectifier = rig.rectifier()
             self.camera = self._rectifier.camera
             T_cam0_imu = rig.T_rect0_imu
@@ -229,6 +242,20 @@ class Odometry:
     def estimate(self) -> Estimate | None:
         """The newest estimate; None before the first."""
         return self._estimate
+
+    def calibrated_rig(self) -> CalibratedRig:
+        """Return the rig with what the estimate says that its calibration is off by; `rig` of it begins the next run.
+
+        Raises:
+            DataError: there is no estimate yet, or the size of the rectified images is not known.
+        """
+        estimate = self._estimate
+        if estimate is None:
+            raise DataError("there is no calibration before the first frame")
+        rig = self._rig or rig_of_rectified(self.camera, None if self.motion is None else self.T_cam0_body)
+        if rig is None:
+            raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
+        return calibrated_rig(rig, estimate)
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -6,24 +6,26 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from typing import NoReturn
 
 import numpy as np
 
-from vio.chain import BACKENDS, STAGES, FrameLog, FrameResult, build_backend
+from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
+from vio.chain import BACKENDS, build_backend
 from vio.config import BackendName, Config
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
+from vio.frame_result import STAGES, FrameLog, FrameResult
 from vio.frontend_package import frontend_module
-from vio.geometry.lie import FloatArray
-from vio.odometry import Odometry
-from vio.protocols import Backend, Dataset, Frontend, Selector, Viewer
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.odometry import Odometry, rig_of_rectified
+from vio.protocols import Backend, Dataset, Frontend, RectifyingDataset, Selector, Viewer
 from vio.records import (
     BodyFrame,
     Estimate,
     Event,
-    FrontendOutput,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -31,8 +33,8 @@ from vio.records import (
     Recording,
     StereoFrame,
     Trajectory,
-    UpdateReport,
 )
+from vio.rig import Rig
 from vio.run_recorder import GrowingFolder, RunRecorder
 from vio.selectors import build_selector
 from vio.tables import Records
@@ -63,6 +65,11 @@ class RunResult:
     warnings: tuple[str, ...]  # what went wrong in the run, or with its IMU
     wall_s: float
     stopped: str | None = None  # why the run ended before the recording; None: it did not
+    rig: Rig | None = None  # the calibration as given; None: features without an image size
+
+    def calibrated_rig(self) -> CalibratedRig | None:
+        """Return the calibration with what the run found it to be off by; None: features without an image size."""
+        return None if self.rig is None else calibrated_rig(self.rig, self.estimates[-1])
 
     @property
     def trajectory(self) -> Trajectory:
@@ -76,7 +83,7 @@ class RunResult:
 class NullViewer:
     """Shows nothing."""
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Ignore the frame."""
 
     def close(self) -> None:
@@ -145,8 +152,9 @@ def run(
     with contextlib.closing(recorder), contextlib.closing(viewer or NullViewer()) as shown:
         loop = _Loop(state, recorder, shown)
         try:
-            events = dataset.events(state.next_frame, stop, images=_needs_images(dataset, config))
-            stopped = loop.run(events, features, should_stop)
+            with _opencv_threads(dataset, config, frontend):
+                events = dataset.events(state.next_frame, stop, images=_needs_images(dataset, config))
+                stopped = loop.run(events, features, should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
                 raise
@@ -170,7 +178,23 @@ def run(
             warnings=odometry.warnings,
             wall_s=time.perf_counter() - began,
             stopped=stopped,
+            rig=given_rig(dataset),
         )
+
+
+def given_rig(dataset: Dataset) -> Rig | None:
+    """Return the calibration of a recording's images; None: it holds features, and no image size.
+
+    For features it is that of the rectified images that they come from.
+    """
+    recording = dataset.recording
+    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
+        return rig_of_rectified(recording.camera, recording.T_cam0_imu)
+    made, T_cam0_imu = dataset.rectifier, recording.T_cam0_imu
+    rig = made.rig
+    if T_cam0_imu is not None:
+        T_cam0_imu = se3_inverse(rig.T_imu_cam0)
+    return Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1), T_cam0_imu, dataset.imu_noise, made.time_offset_s)
 
 
 def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:
@@ -258,7 +282,7 @@ class _Loop:
             self._recorder.frame(result, self._reading.take_ms(), state.odometry.smoothed)
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
-            self._viewer.frame(result.output, result.estimate, result.report)
+            self._viewer.frame(result)
 
 
 def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:
@@ -402,6 +426,14 @@ def _build_selector(features: Dataset, config: Config) -> Selector:
         whole_record=whole_record if precomputed else None,
         camera=recording.camera,
     )
+
+
+def _opencv_threads(dataset: Dataset, config: Config, given: Frontend | None) -> AbstractContextManager[None]:
+    """Limit OpenCV to one thread where the front end is `klt`, whose steps are too short for more."""
+    if given is not None or config.frontend.name not in ("auto", "klt") or not _needs_images(dataset, config):
+        return contextlib.nullcontext()
+    one: AbstractContextManager[None] = frontend_module().one_opencv_thread()
+    return one
 
 
 def _needs_images(dataset: Dataset, config: Config) -> bool:

@@ -20,6 +20,7 @@ from vio.printable import printable
 log = logging.getLogger(__name__)
 
 _ESTIMATE, _REFERENCE, _DEAD_RECKONING, _LANDMARKS = "#1f5fbf", "#111111", "#d9822b", "#9aa5b1"
+_MOVED_SIGMAS = 3.0  # a stereo calibration that ends within so many standard deviations of zero is not drawn
 _STRAIGHT = 0.1  # extent across a path over that along it, below which it gives no plane
 
 
@@ -56,14 +57,49 @@ def _figure(result: RunResult, evaluation: Evaluation | None, dead_reckoning: Ev
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 7.2), dpi=110, layout="constrained")
-    grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
+    calibrated = has_calibration_panel(result)
+    grid = figure.add_gridspec(4 if calibrated else 3, 2, width_ratios=(1.25, 1))
     _draw_map(figure.add_subplot(grid[:, 0]), result, evaluation, dead_reckoning)
     seconds = np.array(result.frames.column("time_ns") - result.frames[0].time_ns) * 1e-9
     _draw_error(figure.add_subplot(grid[0, 1]), seconds, result, evaluation, dead_reckoning)
     _draw_counts(figure.add_subplot(grid[1, 1]), seconds, result)
     _draw_time(figure.add_subplot(grid[2, 1]), seconds, result)
+    if calibrated:
+        _draw_calibration(figure.add_subplot(grid[3, 1]), seconds, result)
     figure.suptitle(_title(result, evaluation), fontsize=12, parse_math=False)  # a $ in a file name is no formula
     return figure
+
+
+def has_calibration_panel(result: RunResult) -> bool:
+    """Return whether the stereo calibration was estimated, and ended off by more than its standard deviations."""
+    field = result.estimates[-1].stereo_field
+    if field is None:
+        return False
+    sigma = np.sqrt(np.diag(field.covariance))
+    return bool(np.any(np.abs(field.coefficients) > _MOVED_SIGMAS * sigma))
+
+
+def _draw_calibration(axes: Any, seconds: FloatArray, result: RunResult) -> None:
+    """Draw the right columns' coefficients of (R3) with a standard deviation, and how far the rows are off."""
+    f = result.recording.camera.fu
+    fields = [estimate.stereo_field for estimate in result.estimates]
+    has = np.array([field is not None for field in fields])
+    known = [field for field in fields if field is not None]
+    values = f * np.array([field.coefficients[:3] for field in known])
+    sigmas = f * np.array([np.sqrt(np.diag(field.covariance)[:3]) for field in known])
+    colours = (_ESTIMATE, _DEAD_RECKONING, "#3a9d5d")
+    for k, (name, colour) in enumerate(zip(("all columns", "along u", "with radius²"), colours, strict=True)):
+        axes.plot(seconds[has], values[:, k], color=colour, lw=1.2, label=name)
+        axes.fill_between(
+            seconds[has], values[:, k] - sigmas[:, k], values[:, k] + sigmas[:, k], color=colour, alpha=0.2, lw=0
+        )
+    axes.plot(seconds[has], [field.rows_rms_px for field in known], color=_LANDMARKS, lw=1.2, label="rows, rms")
+    axes.set_title("stereo calibration is off by", fontsize=9, loc="left")
+    axes.set_ylabel("px")
+    axes.set_xlabel("time in the recording (s)")
+    axes.set_xlim(0, max(float(seconds[-1]), 1e-3))
+    axes.legend(loc="best", fontsize=8, ncols=4)
+    axes.grid(alpha=0.25)
 
 
 def _title(result: RunResult, evaluation: Evaluation | None) -> str:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
 
+from vio.frame_result import FrameResult
 from vio.records import (
     Estimate,
     Event,
     FrontendOutput,
+    ImuDensities,
     Landmarks,
     MotionPrior,
     MotionSample,
@@ -20,6 +22,9 @@ from vio.records import (
     TrackPrior,
     UpdateReport,
 )
+
+if TYPE_CHECKING:
+    from vio.rig import Rectifier
 
 Progress: TypeAlias = Callable[[int, int], None]  # called after each frame: frames done, frames in all
 
@@ -45,6 +50,19 @@ class Dataset(Protocol):
 
     def observations(self, index: int) -> Observations | None:
         """Return the precomputed features of one frame; None where the recording holds images only."""
+
+
+@runtime_checkable
+class RectifyingDataset(Protocol):
+    """A recording of raw images, which it rectifies as it reads them."""
+
+    @property
+    def rectifier(self) -> Rectifier:
+        """The rectification, with the raw cameras as calibrated."""
+
+    @property
+    def imu_noise(self) -> ImuDensities | None:
+        """Noise densities of the IMU, where the calibration states them."""
 
 
 class Frontend(Protocol):
@@ -107,7 +125,7 @@ class Backend(Protocol):
 class Viewer(Protocol):
     """Watches a run; must not change it."""
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Show one processed frame."""
 
     def close(self) -> None:

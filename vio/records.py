@@ -294,11 +294,16 @@ def no_landmarks() -> Landmarks:
 
 @dataclass(frozen=True, slots=True)
 class StereoFieldEstimate:
-    """What the stereo calibration is off by, as coefficients of equation (R3) of docs/math.md, in focal lengths."""
+    """What the stereo calibration is off by, as coefficients of equations (R2) and (R3) of docs/math.md.
+
+    All are in focal lengths.
+    """
 
     coefficients: FloatArray  # (6,) a0, a1, a2 of the right columns; k, q1, q2 of both lenses
     covariance: FloatArray  # (6, 6)
     rows_rms_px: float = 0.0  # root mean square over the features of what the rows of left and right differ by
+    rows: FloatArray | None = None  # (6,) of 1, x, y, x y, x^2, y^2 in the right rows (R2); None: not learned
+    rows_covariance: FloatArray | None = None  # (6, 6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,8 +331,11 @@ class Estimate:
     T_world_imu: FloatArray  # (4, 4)
     covariance: FloatArray  # (6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat, [rho; phi], m and rad
     velocity_world: FloatArray | None = None  # (3,) m/s
+    velocity_covariance: FloatArray | None = None  # (3, 3) of velocity_world, (m/s)^2
     gyro_bias: FloatArray | None = None  # (3,) rad/s
+    gyro_bias_sigma: FloatArray | None = None  # (3,) standard deviations, rad/s
     accel_bias: FloatArray | None = None  # (3,) m/s^2
+    accel_bias_sigma: FloatArray | None = None  # (3,) standard deviations, m/s^2; zero where it is not estimated
     gravity_world: FloatArray | None = None  # (3,) m/s^2, where the world is not upright (an IMU that began late)
     # The calibration, where the filter estimates it; a frame stamped t was exposed at t + offset of the IMU's clock.
     T_cam0_imu: FloatArray | None = None  # (4, 4)
@@ -336,6 +344,10 @@ class Estimate:
     time_offset_sigma_s: float | None = None
     stereo_field: StereoFieldEstimate | None = None
     stereo_scale: StereoScaleEstimate | None = None
+
+
+def _no_ids() -> IntArray:
+    return np.zeros(0, dtype=np.int64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,6 +360,8 @@ class UpdateReport:
     landmarks: int  # landmarks in the map
     innovation_median_px: float | None  # median absolute innovation before the update, all gated-in rows
     nis_per_dof: float | None  # normalised innovation squared over its degrees of freedom; about 1 when consistent
+    gated_ids: IntArray = field(default_factory=_no_ids)  # of the observations rejected, where the back end says it
+    landmark_ids: IntArray = field(default_factory=_no_ids)  # of the landmarks in the map, likewise
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ class Rectifier:
     T_rect0_imu: FloatArray  # (4, 4)
     maps: tuple[tuple[MapArray, MapArray], tuple[MapArray, MapArray]] | None  # left, right; None: nothing to do
     interpolation: Interpolation
+    time_offset_s: float = 0.0  # of the calibration; readers take it out of the IMU's stamps
 
     def __call__(self, left: Image, right: Image) -> tuple[Image, Image]:
         """Rectify one raw pair, each image (H, W) of its camera's size."""
@@ -194,9 +195,9 @@ class Rig:
         """
         made = rectifier_of(self.stereo, interpolation)
         if made.maps is not None:
-            return made
+            return replace(made, time_offset_s=self.time_offset_s)
         T = made.T_rect0_imu if self.T_cam0_imu is None else self.T_cam0_imu
-        return replace(made, camera=self._exact(made.camera), T_rect0_imu=T)
+        return replace(made, camera=self._exact(made.camera), T_rect0_imu=T, time_offset_s=self.time_offset_s)
 
     def _exact(self, pair: StereoCamera) -> StereoCamera:
         """Return a rectified pair with the baseline as stated, which the way through the body would round."""

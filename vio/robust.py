@@ -15,6 +15,12 @@ def robust_sigma(values: npt.ArrayLike) -> float:
     return _MEDIAN_TO_SIGMA * float(np.median(np.abs(values)))
 
 
+def robust_sigmas(values: FloatArray) -> FloatArray:
+    """Estimate the standard deviations (K,) of the columns of zero-mean values (N, K) as `robust_sigma` does."""
+    out: FloatArray = _MEDIAN_TO_SIGMA * np.median(np.abs(values), axis=0)
+    return out
+
+
 def jackknife(values: npt.ArrayLike) -> FloatArray:
     """Compute standard errors (...) of an estimate from its leave-one-block-out values (n, ...).
 

@@ -16,14 +16,16 @@ import numpy as np
 
 from vio._version import __version__
 from vio.atomic import atomic_folder
+from vio.calibration.stereo_field import PARAMETERS
 from vio.config import Config, to_yaml
 from vio.datasets.common import checked_transform
+from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.input_files import read_input
 from vio.pipeline import STAGES, FrameLog, RunResult
-from vio.printable import json_text
+from vio.printable import json_text, printable
 from vio.protocols import Dataset
 from vio.records import Landmarks, Trajectory
 from vio.run_recorder import UNFINISHED, GrowingFolder
@@ -34,6 +36,7 @@ from vio.trajectory_io import in_first_cam0, read_trajectory, write_kitti, write
 log = logging.getLogger(__name__)
 
 MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
+CALIBRATION = "camchain-imucam.yaml"  # the corrected calibration, where no other file is named for it
 REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 FILES = (
@@ -43,11 +46,14 @@ FILES = (
     "trajectory.tum",
     "trajectory.kitti",
     "estimates.npy",
+    "reference.tum",
     "dead_reckoning.tum",
     "landmarks.ply",
     "frames.csv",
     "observations.npz",
     "trajectory.png",
+    CALIBRATION,
+    "report.html",  # of vio report
 )
 
 
@@ -170,6 +176,11 @@ def _write_files(
     (target / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
     write_tum(target / "trajectory.tum", result.trajectory)
     write_kitti(target / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
+    if evaluation is not None:
+        times_ns = result.trajectory.times_ns
+        assert times_ns is not None
+        # The poses that were compared, each at the time of its estimate: the folder alone then tells the errors.
+        write_tum(target / "reference.tum", replace(evaluation.reference, times_ns=times_ns[evaluation.rows]))
     if result.dead_reckoning is not None:
         write_tum(target / "dead_reckoning.tum", result.dead_reckoning)
     write_landmarks_ply(target / "landmarks.ply", result.landmarks)
@@ -246,22 +257,36 @@ def metrics_of(
         "stereo_scale": stereo_scale(result),
         "camera_imu": camera_imu(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
+        "camera": asdict(result.recording.camera),
     }
 
 
 def stereo_field(result: RunResult) -> dict[str, Any] | None:
     """Return what the stereo calibration was found to be off by at the end of the run; None: it was not estimated.
 
-    Coefficients of equation (R3) of docs/math.md and their standard deviations, times the focal length.
+    Coefficients of equations (R3) and (R2) of docs/math.md and their standard deviations, times the focal length; and
+    what the rig is off by, as `vio.calibration.stereo_field` names it.
     """
     field = result.estimates[-1].stereo_field
     if field is None:
         return None
     f = result.recording.camera.fu
+    found = result.calibrated_rig()
+    rig = None
+    if found is not None:
+        sigmas = found.sigmas.tolist()
+        rig = {
+            "off": dict(zip(PARAMETERS, found.parameters.tolist(), strict=True)),
+            "sigma": dict(zip(PARAMETERS, sigmas, strict=True)),
+            "not_expressed_px": found.left_px,
+            "lines": list(found.lines()),
+        }
     return {
         "rows_rms_px": field.rows_rms_px,
         "coefficients_px": (f * field.coefficients).tolist(),
         "sigma_px": (f * np.sqrt(np.diag(field.covariance))).tolist(),
+        "rows_px": None if field.rows is None else (f * field.rows).tolist(),
+        "rig": rig,
     }
 
 
@@ -311,6 +336,24 @@ def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str
         "surveyed": len(truth.ids),
         **{f"{name}_m": value for name, value in asdict(error_statistics(errors_m)).items()},
     }
+
+
+def calibration_text(result: RunResult) -> str:
+    """Return the calibration with what a run found it to be off by, as Kalibr's camchain, which `vio.load_rig` reads.
+
+    Raises:
+        DataError: the recording holds features without an image size.
+    """
+    found = result.calibrated_rig()
+    if found is None:
+        raise DataError(f"{result.recording.path}: states no image size, which a calibration needs; nothing was saved")
+    lines = [f"by vio run {__version__}, of {result.recording.path.name}"]
+    lines += found.lines() or ["nothing was found to be off: the calibration as given"]
+    if found.left_px:
+        lines.append(f"what this calibration cannot express of it: {found.left_px:.2f} px (rms over the images)")
+    if not result.recording.has_images:
+        lines.append("of the rectified images that the features come from")
+    return "".join(f"# {printable(line)}\n" for line in lines) + kalibr_text(found.rig)
 
 
 def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:

@@ -19,9 +19,9 @@ from typing import Any, overload
 import numpy as np
 
 from vio.atomic import atomic_write_text
-from vio.chain import FrameLog, FrameResult
 from vio.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.errors import DataError
+from vio.frame_result import FrameLog, FrameResult
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
 from vio.records import BodyFrame, Estimate, Landmarks, MotionSample, Observations

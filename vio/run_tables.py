@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.chain import FrameLog
+from vio.frame_result import FrameLog
 from vio.geometry.lie import FloatArray
 from vio.records import (
     Estimate,
@@ -33,8 +33,11 @@ ESTIMATE = np.dtype(
         ("T_world_imu", "<f8", (4, 4)),
         ("covariance", "<f8", (6, 6)),
         ("velocity_world", "<f8", (3,)),
+        ("velocity_covariance", "<f8", (3, 3)),
         ("gyro_bias", "<f8", (3,)),
+        ("gyro_bias_sigma", "<f8", (3,)),
         ("accel_bias", "<f8", (3,)),
+        ("accel_bias_sigma", "<f8", (3,)),
         ("gravity_world", "<f8", (3,)),
         ("T_cam0_imu", "<f8", (4, 4)),
         ("T_cam0_imu_covariance", "<f8", (6, 6)),
@@ -43,12 +46,15 @@ ESTIMATE = np.dtype(
         ("stereo_field", "<f8", (6,)),
         ("stereo_field_covariance", "<f8", (6, 6)),
         ("stereo_rows_rms_px", "<f8"),
+        ("stereo_rows", "<f8", (6,)),
+        ("stereo_rows_covariance", "<f8", (6, 6)),
         ("stereo_scale", "<f8", (2,)),
         ("stereo_scale_covariance", "<f8", (2, 2)),
     ]
 )
 _OPTIONAL_ARRAYS = (
-    *("velocity_world", "gyro_bias", "accel_bias", "gravity_world"),
+    *("velocity_world", "velocity_covariance"),
+    *("gyro_bias", "gyro_bias_sigma", "accel_bias", "accel_bias_sigma", "gravity_world"),
     *("T_cam0_imu", "T_cam0_imu_covariance"),
 )
 _OPTIONAL_NUMBERS = ("time_offset_s", "time_offset_sigma_s")
@@ -85,6 +91,9 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     row["stereo_field"] = np.nan if field is None else field.coefficients
     row["stereo_field_covariance"] = np.nan if field is None else field.covariance
     row["stereo_rows_rms_px"] = np.nan if field is None else field.rows_rms_px
+    row["stereo_rows"] = np.nan if field is None or field.rows is None else field.rows
+    P = None if field is None else field.rows_covariance
+    row["stereo_rows_covariance"] = np.nan if P is None else P
     scale = estimate.stereo_scale
     row["stereo_scale"] = np.nan if scale is None else scale.logs
     row["stereo_scale_covariance"] = np.nan if scale is None else scale.covariance
@@ -95,16 +104,23 @@ def estimate_of(row: np.void) -> Estimate:
     """Return the estimate of a row."""
     optional: dict[str, Any] = {name: _array(row[name]) for name in _OPTIONAL_ARRAYS}
     optional |= {name: _number(row[name]) for name in _OPTIONAL_NUMBERS}
-    field, P = _array(row["stereo_field"]), _array(row["stereo_field_covariance"])
     scale, S = _array(row["stereo_scale"]), _array(row["stereo_scale_covariance"])
     return Estimate(
         int(row["time_ns"]),
         np.array(row["T_world_imu"]),
         np.array(row["covariance"]),
         **optional,
-        stereo_field=None if field is None or P is None else StereoFieldEstimate(field, P, row["stereo_rows_rms_px"]),
+        stereo_field=_stereo_field(row),
         stereo_scale=None if scale is None or S is None else StereoScaleEstimate(scale, S),
     )
+
+
+def _stereo_field(row: np.void) -> StereoFieldEstimate | None:
+    coefficients, P = _array(row["stereo_field"]), _array(row["stereo_field_covariance"])
+    if coefficients is None or P is None:
+        return None
+    rows, rows_P = _array(row["stereo_rows"]), _array(row["stereo_rows_covariance"])
+    return StereoFieldEstimate(coefficients, P, row["stereo_rows_rms_px"], rows, rows_P)
 
 
 class FrameRows:

@@ -9,15 +9,19 @@ from typing import Any
 
 import numpy as np
 
+from vio.calibration.stereo_field import PixelField
 from vio.datasets import open_dataset
 from vio.datasets.common import read_npz
 from vio.datasets.features import FeatureDataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
+from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
 from vio.mapping.comparison import GroundTruth
 from vio.mapping.keyframes import TrackedPath
 from vio.records import IntArray, StereoFrame
+from vio.rig import Rectifier
 from vio.run_folder import read_metrics
 from vio.trajectory_io import read_trajectory
 
@@ -33,6 +37,7 @@ class SavedRun:
     dataset: FeatureDataset  # observations of every frame, as a recording
     T_cam0_imu: FloatArray  # (4, 4)
     metrics: dict[str, Any]
+    field: PixelField | None = None  # what the run found its stereo calibration to be off by; None: nothing
 
     @property
     def truth(self) -> GroundTruth | None:
@@ -43,6 +48,9 @@ class SavedRun:
 
 def read_saved_run(folder: Path) -> SavedRun:
     """Read the folder of `vio run --save-observations`.
+
+    Where the run estimated what its stereo calibration is off by, the tracks are those of a rectified pair without it;
+    `dataset` holds the pixels as the front end saw them.
 
     Raises:
         DataError: no such folder, or the observations were not saved.
@@ -56,8 +64,30 @@ def read_saved_run(folder: Path) -> SavedRun:
     frames = trajectory.frame_indices
     if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
         raise DataError(f"{folder}: trajectory.tum and {OBSERVATIONS} are not of the same complete run; repeat the run")
-    tracked = TrackedPath(folder, dataset.recording.camera, trajectory.in_cam0(T_cam0_imu), dataset.tracks)
-    return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics)
+    camera, tracks = dataset.recording.camera, dataset.tracks
+    field = _pixel_field(folder, camera, metrics)
+    if field is not None:
+        tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
+    tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks)
+    return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics, field)
+
+
+def _pixel_field(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> PixelField | None:
+    """Return the field of pixels that a run's metrics state; None: the run estimated none.
+
+    Raises:
+        DataError: the metrics are damaged.
+    """
+    stated = metrics.get("stereo_field")
+    if stated is None or stated.get("rows_px") is None:
+        return None
+    try:
+        coefficients = np.array([*stated["coefficients_px"], *stated["rows_px"]], dtype=np.float64) / camera.fu
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
+    if coefficients.shape != (12,) or not np.isfinite(coefficients).all():
+        raise DataError(f"{folder}: stereo_field of its metrics holds no 12 finite numbers; repeat the run")
+    return PixelField(camera, coefficients)
 
 
 def _original_source(log: Path) -> str:
@@ -87,7 +117,7 @@ def with_poses(run: SavedRun, folder: Path) -> SavedRun:
 
 
 def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator[StereoFrame]:
-    """Yield the rectified image pairs of rows (K,) of the trajectory, in order.
+    """Yield the rectified image pairs of rows (K,) of the trajectory, in order, as the run corrected their calibration.
 
     Args:
         run: the run.
@@ -115,9 +145,20 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
         rtol=1e-9,
     ):
         raise DataError(f"{recording.path} has another calibration than the run {run.tracked.where}; repeat the run")
+    correct = None if run.field is None else _image_correction(run.field)
     for row in rows.tolist():
         index = int(run.tracked.frames[row])
         found = [e for e in dataset.events(index, index + 1) if isinstance(e, StereoFrame)]
         if not found or found[0].left is None or found[0].right is None:
             raise DataError(f"{recording.path}: frame {index} cannot be read; see the warnings above")
-        yield found[0]
+        if correct is None:
+            yield found[0]
+        else:
+            left, right = correct(found[0].left, found[0].right)
+            yield replace(found[0], left=left, right=right)
+
+
+def _image_correction(field: PixelField) -> Rectifier:
+    """Return the map of rectified image pairs to those without a field."""
+    rig = rig_from_rectified(field.camera, np.eye(4))
+    return Rectifier(rig, field.camera, np.eye(4), field.maps(), "linear")

@@ -10,6 +10,8 @@ Fault: TypeAlias = Literal[
     "baseline translation inverted",
     "left-right rotation wrong",
     "baseline direction wrong",
+    "focal length wrong",
+    "principal point wrong",
     "IMU-camera rotation wrong",
     "IMU-camera rotation inverted",
     "IMU-camera translation inverted",

@@ -21,6 +21,7 @@ from vio._version import __version__
 from vio.cli import (
     calibrate,
     check,
+    completion,
     config,
     convert,
     demo,
@@ -30,8 +31,10 @@ from vio.cli import (
     rectify,
     refine,
     render,
+    report,
     reproduce,
     run,
+    view,
 )
 from vio.errors import StoppedError, VioError
 from vio.printable import printable
@@ -41,6 +44,8 @@ _COMMANDS = (
     inspect,
     convert,
     evaluate,
+    report,
+    view,
     check,
     refine,
     export,
@@ -50,6 +55,7 @@ _COMMANDS = (
     rectify,
     reproduce,
     config,
+    completion,
 )
 
 
@@ -105,12 +111,22 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    """Parse the command line; an unknown option shows the usage of its subcommand, not that of `vio`."""
+    parser = build_parser()
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        chosen = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[args.command]
+        chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
+    return args
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that cannot show a character must not end the program
             stream.reconfigure(errors="replace")
-    args = build_parser().parse_args(argv)
+    args = _parse(argv)
     logging.basicConfig(
         level=logging.DEBUG if args.debug else logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr
     )

@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments that change the configuration."""
     parser.add_argument(
-        "--config", type=Path, metavar="F", help="YAML file with settings that differ from the defaults"
+        "--config",
+        type=Path,
+        metavar="F",
+        help="YAML file with settings that differ from the defaults; or fast, a preset",
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="a.b=c", help="change one setting; may be repeated"

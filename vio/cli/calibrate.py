@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vio.calibration.findings import NotObservable
+    from vio.calibration.intrinsics import Intrinsics
     from vio.calibration.stereo import RowResiduals, StereoEstimate
+    from vio.mapping.self_calibration import SelfCalibration
     from vio.offline.calibrate import CalibrationReport, ImuReport
     from vio.protocols import Dataset, Frontend
 
@@ -24,8 +26,9 @@ def add_parser(commands: Any) -> None:
         help="measure and check a calibration",
         description="Measure from a recording itself: left-right rotation and baseline direction (the length is taken "
         "as given), IMU-camera rotation, time offset and lever arm where the motion makes them observable; compare "
-        "with the given calibration and report its faults. Writes a Kalibr-style and EuRoC-style YAML. "
-        "Intrinsics are taken as given.",
+        "with the given calibration and report its faults; focal length and principal point, too, where the cameras "
+        "turn. Writes a Kalibr-style and EuRoC-style YAML, which --calibration of `vio run` takes. The length of the "
+        "baseline is taken as given.",
     )
     parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
     parser.add_argument(
@@ -85,6 +88,8 @@ def _facts(report: CalibrationReport) -> dict[str, Any]:
         "source": str(report.source.path),
         "stereo": _plain(report.stereo),
         "rows": _plain(report.rows),
+        "intrinsics": _plain(report.intrinsics),
+        "in_motion": None if report.in_motion is None else _parameters(report.in_motion),
         "imu": _plain(report.imu.alignment),
         "lever_arm": _plain(report.imu.lever_arm),
         "findings": [{"fault": f.fault, "detail": f.detail} for f in report.findings],
@@ -105,6 +110,19 @@ def _plain(record: Any) -> dict[str, Any]:
     return {key: _finite(v.tolist()) if isinstance(v, np.ndarray) else v for key, v in asdict(record).items()}
 
 
+def _parameters(found: SelfCalibration) -> dict[str, Any]:
+    """Return what a bundle adjustment says of the calibration, by name."""
+    from vio.mapping.self_calibration import NAMES
+
+    rows = zip(NAMES, found.values.tolist(), found.sigmas.tolist(), strict=True)
+    return {
+        "off": {name: {"value": value, "sigma": sigma} for name, value, sigma in rows},
+        "stretches": found.stretches,
+        "points": found.points,
+        "residual_px": found.residual_px,
+    }
+
+
 def _finite(values: Any) -> Any:
     """Return nested lists of numbers with None for non-finite values: JSON has no NaN."""
     import math
@@ -115,10 +133,45 @@ def _finite(values: Any) -> Any:
 
 
 def _rows(report: CalibrationReport) -> list[tuple[str, str]]:
-    rows = [*_stereo_rows(report.stereo), *_alignment_rows(report.rows), *_imu_rows(report.imu)]
+    rows = [*_stereo_rows(report.stereo), *_alignment_rows(report.rows), *_intrinsics_rows(report.intrinsics)]
+    rows += _imu_rows(report.imu)
     rows += [("note", note) for note in report.notes]
+    rows.append(("not checked", "; ".join(_unchecked(report))))
     rows += [("FOUND", str(finding)) for finding in report.findings]
     return rows if report.findings else [*rows, ("verdict", "no fault found in what could be observed")]
+
+
+def _intrinsics_rows(found: Intrinsics | NotObservable) -> list[tuple[str, str]]:
+    from vio.calibration.findings import NotObservable
+
+    if isinstance(found, NotObservable):
+        return [("intrinsics", str(found))]
+    (u, v), (su, sv) = found.centre_off_px, found.centre_sigma_px
+    return [
+        (
+            "focal length",
+            f"off by {100 * found.focal_off:+.1f} %, sigma {100 * found.focal_sigma:.1f} "
+            f"(given {found.focal_px:.1f} px)",
+        ),
+        ("principal point", f"off by {u:+.1f} {v:+.1f} px, sigma {su:.1f} {sv:.1f}"),
+    ]
+
+
+def _unchecked(report: CalibrationReport) -> list[str]:
+    """Return what the report says nothing about."""
+    from vio.calibration.findings import NotObservable
+
+    out = ["the length of the baseline"]
+    parts = {
+        "left and right": report.stereo,
+        "focal length and principal point": report.intrinsics,
+        "IMU-camera rotation and clocks": report.imu.alignment,
+        "lever arm": report.imu.lever_arm,
+    }
+    out += [name for name, part in parts.items() if isinstance(part, NotObservable)]
+    if report.in_motion is None:
+        out.append("lens distortion")
+    return [*out, "cameras exposed at different times"]
 
 
 def _stereo_rows(stereo: StereoEstimate | NotObservable) -> list[tuple[str, str]]:

@@ -27,7 +27,10 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("estimate", type=Path, metavar="EST", help="a trajectory file or a run's folder")
     parser.add_argument(
-        "reference", type=Path, metavar="REF", help="a trajectory file, a run's folder or a COLMAP model"
+        "reference",
+        type=Path,
+        metavar="REF",
+        help="a trajectory file, a run's folder, a COLMAP model, or the recording",
     )
     parser.add_argument(
         "--align",
@@ -76,7 +79,7 @@ def execute(args: argparse.Namespace) -> int:
     scores = result.as_dict()
     figures = ((key, value) for key, value in scores.items() if not isinstance(value, (list, dict)))
     rows = ((k, "–" if v is None else v if isinstance(v, str) else f"{v:.6g}") for k, v in figures)
-    return print_result(scores, rows, as_json=args.json, name_width=22)
+    return print_result(scores, rows, as_json=args.json, name_width=24)
 
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
@@ -90,4 +93,24 @@ def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
         quiet()
         if model_folder(path) is not None:
             return read_colmap_trajectory(path), None
+        return _truth_of(path)
     return read_run(path)
+
+
+def _truth_of(path: Path) -> tuple[Trajectory, FloatArray | None]:
+    """Return the ground truth of a recording, with its extrinsics.
+
+    Raises:
+        DataError: it is no recording either, or has no ground truth.
+    """
+    from vio.datasets import open_dataset
+    from vio.errors import DataError
+
+    try:
+        recording = open_dataset(path).recording
+    except DataError as error:
+        text = f"{path}: no run folder, no COLMAP model, and no recording ({error})"
+        raise DataError(text) from error
+    if recording.reference is None:
+        raise DataError(f"{path}: this recording has no ground truth; give a trajectory file")
+    return recording.reference, recording.T_cam0_imu

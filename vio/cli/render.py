@@ -54,13 +54,22 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--width", type=int, metavar="PX", help="image width, with the same field of view")
     parser.add_argument("--rate", type=float, metavar="HZ", help="frames per second (default 20; 10 for car)")
     parser.add_argument("--duration", type=float, metavar="S", help="length (default 30 s, or the whole flight)")
-    parser.add_argument("--effects", metavar="NAME,…", default="", help=f"of {_EFFECTS}")
+    parser.add_argument(
+        "--realism",
+        choices=("plain", "real"),
+        default="plain",
+        help="real: what real cameras do, all at once: exposure control with lag and jumps, motion blur of its shutter "
+        "time, noise of its gain, unequal cameras, vignetting, glare, uneven light, blank walls, walking people, and a "
+        "calibration that is slightly off; --set switches single ones off (default plain)",
+    )
+    parser.add_argument("--effects", metavar="NAME,…", default="", help=f"in addition, of {_EFFECTS}")
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="a.b=c",
-        help="one value of effects, faults or imu_noise, such as effects.blur_exposure_ms=20; may be repeated",
+        help="one value of effects, faults, imu_noise or calibration, or of the scene (bare_wall, moving, people, "
+        "lighting), such as effects.blur_exposure_ms=20 or people=0; may be repeated",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers")
     parser.add_argument("--format", choices=("euroc", "kitti"), help="of the folder (default kitti for that rig)")
@@ -117,6 +126,7 @@ def execute(args: argparse.Namespace) -> int:
         "duration_s": span_ns * 1e-9,
         "width": camera.width,
         "height": camera.height,
+        "realism": args.realism,
         "imu": "recorded" if isinstance(scenario.imu, Path) else scenario.imu,
         "seed": scenario.seed,
         "workers": workers,
@@ -191,9 +201,10 @@ def scenario_from(args: argparse.Namespace) -> tuple[Scenario, str]:
 def _conditions(args: argparse.Namespace) -> Conditions:
     """Return the named effects with single values replaced."""
     from vio.config import merge_override
-    from vio.sim.scenarios import conditions_of
+    from vio.sim.scenarios import Conditions, conditions_of, real_conditions
 
-    conditions = conditions_of([name.strip() for name in args.effects.split(",") if name.strip()])
+    level = real_conditions(args.scene) if args.realism == "real" else Conditions()
+    conditions = conditions_of([name.strip() for name in args.effects.split(",") if name.strip()], level)
     for override in args.set:
         conditions = merge_override(conditions, override, example="effects.gamma=2.2")
     return conditions

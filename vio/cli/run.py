@@ -31,6 +31,22 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
+    parser.add_argument(
+        "--save-calibration",
+        type=Path,
+        nargs="?",
+        const=Path(),
+        metavar="FILE",
+        help="write the calibration with what the run found it to be off by, for --calibration of the next run "
+        "(Kalibr's format; default camchain-imucam.yaml in the folder of results)",
+    )
+    parser.add_argument(
+        "--view",
+        nargs="?",
+        const="spawn",
+        metavar="WHERE",
+        help="show the run in rerun: in a window, in a browser (web), or into a file *.rrd (extra view)",
+    )
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(execute=execute)
@@ -43,6 +59,8 @@ _OF_A_NEW_RUN = (
     "lengths",
     "out",
     "save_observations",
+    "save_calibration",
+    "view",
     "set",
     "config",
     "motion",
@@ -74,6 +92,8 @@ def execute(args: argparse.Namespace) -> int:
         stop=args.stop,
         lengths_m=args.lengths,
         save_observations=args.save_observations,
+        save_calibration=args.save_calibration,
         progress=not args.quiet,
+        view=args.view,
     )
     return print_result(metrics, rows_of(metrics), as_json=args.json)

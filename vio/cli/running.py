@@ -2,28 +2,70 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from vio.atomic import check_replaceable, check_writable, locked_folder
+import numpy as np
+
+from vio.atomic import atomic_write_text, check_replaceable, check_writable, locked_folder
 from vio.cli.progress import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
 from vio.datasets.span import Seconds, frames_between
-from vio.errors import StoppedError, VioError
+from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.evaluation import KITTI_LENGTHS_M
-from vio.pipeline import run
-from vio.protocols import Dataset
-from vio.records import Estimate, FrontendOutput, UpdateReport
-from vio.run_folder import FILES, MARKER, finish_run_folder, growing_folder, read_request
+from vio.frame_result import FrameResult
+from vio.pipeline import given_rig, resolve_motion, run
+from vio.protocols import Dataset, Viewer
+from vio.records import Trajectory
+from vio.run_folder import (
+    CALIBRATION,
+    FILES,
+    MARKER,
+    calibration_text,
+    finish_run_folder,
+    growing_folder,
+    read_request,
+)
 from vio.run_recorder import CHECKPOINT, UNFINISHED
 from vio.trajectory_io import read_trajectory
 
+if TYPE_CHECKING:
+    from vio.view.live import RerunViewer
+
 log = logging.getLogger(__name__)
+
+_LINES = 3  # of what the calibration is off by, in the summary; all are in metrics.json
+
+
+class Viewers:
+    """Several viewers as one."""
+
+    def __init__(self, viewers: Sequence[Viewer]) -> None:
+        self._viewers = viewers
+
+    def frame(self, result: FrameResult) -> None:
+        """Show one frame."""
+        for viewer in self._viewers:
+            viewer.frame(result)
+
+    def skip(self, frames: int) -> None:
+        """Count frames that an earlier process has done."""
+        for viewer in self._viewers:
+            skip = getattr(viewer, "skip", None)
+            if skip is not None:
+                skip(frames)
+
+    def close(self) -> None:
+        """Close all, whatever happens to one of them."""
+        with contextlib.ExitStack() as stack:
+            for viewer in self._viewers:
+                stack.callback(viewer.close)
 
 
 class ProgressViewer:
@@ -32,7 +74,7 @@ class ProgressViewer:
     def __init__(self, frames: int, label: str) -> None:
         self._bar = ProgressBar(label, frames, unit="frames")
 
-    def frame(self, output: FrontendOutput, estimate: Estimate, report: UpdateReport) -> None:
+    def frame(self, result: FrameResult) -> None:
         """Advance by one frame."""
         self._bar.advance()
 
@@ -55,13 +97,19 @@ def process(
     stop: int | Seconds | None = None,
     lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
+    save_calibration: Path | None = None,
     progress: bool = True,
+    view: str | None = None,
 ) -> dict[str, Any]:
-    """Process a source into a run folder, which grows meanwhile, and return its metrics."""
+    """Process a source into a run folder, which grows meanwhile, and return its metrics.
+
+    `save_calibration` names the file for the calibration that the run found; `Path()`, one in the run's folder.
+    """
     dataset = open_dataset(source, config.dataset)
     for note in dataset.recording.notes:
         log.warning("%s", note)
     folder = check_out(out if out is not None else free_folder(dataset.recording.path))
+    calibration = _calibration_file(dataset, folder, save_calibration)
     first, end = frames_between(dataset.recording, start, stop)
     request = {
         "source": f"{dataset.recording.kind}:{dataset.recording.path.absolute()}",
@@ -70,8 +118,9 @@ def process(
         "stop": end,
         "lengths_m": None if lengths_m is None else list(lengths_m),
         "save_observations": save_observations,
+        "save_calibration": None if calibration is None else str(calibration.absolute()),
     }
-    return _process(dataset, config, folder, request, progress=progress, resume=False)
+    return _process(dataset, config, folder, request, progress=progress, resume=False, view=view)
 
 
 def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
@@ -90,7 +139,14 @@ def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
 
 
 def _process(
-    dataset: Dataset, config: Config, folder: Path, request: dict[str, Any], *, progress: bool, resume: bool
+    dataset: Dataset,
+    config: Config,
+    folder: Path,
+    request: dict[str, Any],
+    *,
+    progress: bool,
+    resume: bool,
+    view: str | None = None,
 ) -> dict[str, Any]:
     """Run, write the results and return the metrics; a run that was interrupted says so and how to go on."""
     recording, reference = dataset.recording, request["reference"]
@@ -98,6 +154,10 @@ def _process(
     start, stop, save_observations = request["start"], request["stop"], request["save_observations"]
     total = len(recording.frame_times_ns)
     frames = max(min(total, total if stop is None else stop) - start, 0)
+    viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
+    shown = None if view is None else _open_view(view, dataset, config, truth)
+    if shown is not None:
+        viewers.append(shown)
     with locked_folder(folder), StopRequest() as asked:
         try:
             result = run(
@@ -106,11 +166,13 @@ def _process(
                 start=start,
                 stop=stop,
                 keep_observations=save_observations,
-                viewer=ProgressViewer(frames, recording.path.name) if progress else None,
+                viewer=Viewers(viewers),
                 folder=growing_folder(folder, dataset, config, request),
                 resume=resume,
                 should_stop=asked.reason,
             )
+            file = request.get("save_calibration")  # unfinished runs of earlier versions have none
+            calibration = None if file is None else calibration_text(result)
             metrics = finish_run_folder(
                 folder,
                 result,
@@ -118,17 +180,67 @@ def _process(
                 lengths_m=request["lengths_m"] or KITTI_LENGTHS_M,
                 save_observations=save_observations,
             )
+            if calibration is not None and file is not None:
+                atomic_write_text(file, calibration)
+                metrics["calibration"] = file
         except KeyboardInterrupt as error:
             if not (folder / UNFINISHED).is_dir():
                 raise
             text = f"interrupted; what was flushed is in {folder}; go on with: vio run --resume {folder}"
             raise StoppedError(text, status=130) from error
+    if shown is not None:
+        shown.landmarks(result.landmarks)
+        shown.close()
+        if shown.address is not None and result.stopped is None:
+            from vio.view.stream import wait_for_interrupt
+
+            wait_for_interrupt(shown.address)
     if result.stopped is not None:
         text = f"{result.stopped}; the results of {len(result.frames)} of {frames} frames are in {folder}"
         if asked.number is None:
             raise StoppedError(f"error: {text}", status=1)
         raise StoppedError(f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number)
     return metrics
+
+
+def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Path | None:
+    """Return where a run's calibration goes, checked before the processing starts; None: it was not asked for.
+
+    Raises:
+        VioError: the recording has no image size, or the file cannot be written.
+    """
+    if asked is None:
+        return None
+    if given_rig(dataset) is None:
+        raise DataError(
+            f"{dataset.recording.path}: states no image size, which a calibration needs; leave --save-calibration out"
+        )
+    if asked == Path():
+        return folder / CALIBRATION
+    if asked.suffix.lower() not in (".yaml", ".yml"):
+        raise ConfigError(f"--save-calibration {asked}: writes Kalibr's format; give a file name that ends in .yaml")
+    if asked.is_dir() or not asked.absolute().parent.is_dir():
+        raise DataError(f"--save-calibration {asked}: its folder does not exist, or it is one; name a file")
+    check_writable(asked)
+    return asked
+
+
+def _open_view(where: str, dataset: Dataset, config: Config, reference: Trajectory | None) -> RerunViewer:
+    """Open rerun's viewer, a file or a web server for a run.
+
+    Raises:
+        VioError: rerun is not installed, or `where` cannot be opened.
+    """
+    from vio.view.live import RerunViewer, ViewedRig
+    from vio.view.stream import open_stream
+
+    recording = dataset.recording
+    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    rig = ViewedRig(recording.camera, T_cam0_body, resolve_motion(recording, config), reference)
+    stream, address = open_stream(where, recording.path.name)
+    if address is not None:
+        log.warning("the run is shown at %s", address)
+    return RerunViewer(stream, rig, address=address)
 
 
 def check_out(folder: Path) -> Path:
@@ -167,6 +279,9 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             ("stereo", f"rows off by {field['rows_rms_px']:.2f} px (rms), disparities by {-off:+.2f} ± {sigma:.2f} px")
         )
+        found = [] if field["rig"] is None else field["rig"]["lines"]
+        if found:
+            rows.append(("", "; ".join(found[:_LINES])))
     rows += _calibration_rows(metrics)
     if metrics["ate_m"] is None:
         rows.append(("ATE", "no reference"))
@@ -179,6 +294,8 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if metrics["landmark_error"] is not None:
         score = metrics["landmark_error"]
         rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
+    if metrics.get("calibration") is not None:
+        rows.append(("calib.", f"{metrics['calibration']} (next: --calibration FILE)"))
     rows.append(("results", metrics["out"]))
     plot = Path(metrics["out"]) / "trajectory.png"
     rows.append(("plot", str(plot) if plot.is_file() else "could not be drawn"))

@@ -1,4 +1,4 @@
-"""Bundle adjustment of keyframes and points with fixed stereo extrinsics, or of the extrinsics from video."""
+"""Bundle adjustment of keyframes and points with fixed stereo extrinsics."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from vio.colmap.model import LEFT, RIGHT, build_model, frame_id, image_id, matrix, numbered, rig_geometry
+from vio.colmap.model import LEFT, RIGHT, build_model, frame_id, image_id, matrix, numbered
 from vio.colmap.solver import adjustment_config, solve, solver_options
 from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
@@ -119,40 +119,6 @@ def _solve(
     T_cam0_world = np.array([matrix(model.frame(frame_id(k)).rig_from_world) for k in range(count)])
     points = np.array([model.point3D(m + 1).xyz for m in range(len(tracks.ids))])
     return se3_inverse(T_cam0_world), points
-
-
-def adjust_rig_in_motion(
-    camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks, *, gate_sigma: float = 5.0
-) -> tuple[FloatArray, FloatArray]:
-    """Bundle-adjust the pose of cam1 in cam0 together with keyframes and points of a video.
-
-    Motion makes observable what a single pair cannot separate from the lens model: a yaw of one camera shifts all
-    disparities, which contradicts the motion between frames.
-
-    Returns `R_cam1_cam0` (3, 3) and the unit direction (3,) from cam0 to cam1 in cam0, of the rectified pair.
-
-    Raises:
-        EstimationError: the solver failed, or no track is consistent.
-    """
-    good = np.ones(len(tracks.point), dtype=np.bool_)
-    R, direction = np.eye(3), np.array([1.0, 0.0, 0.0])
-    for loss_px in (1.0, 0.5):
-        kept = keep_rows(tracks, good)
-        if not len(kept.ids):
-            raise EstimationError("not observable because no track is consistent over the keyframes")
-        count = len(T_world_cam0)
-        model = build_model(camera, T_world_cam0, kept, numbered(count))
-        config = adjustment_config(model)
-        config.set_constant_rig_from_world_pose(frame_id(0))
-        options = solver_options(loss_px, 1)
-        options.refine_sensor_from_rig = True
-        solve(pycolmap.create_default_bundle_adjuster(options, config, model))
-        R, direction = rig_geometry(model)
-        model.update_point_3d_errors()
-        errors = np.array([model.point3D(m + 1).error for m in range(len(kept.ids))])
-        limit = gate_sigma * float(np.median(errors))
-        good = np.isin(tracks.ids[tracks.point], kept.ids[errors < limit])
-    return R, direction
 
 
 def _pose_priors(model: pycolmap.Reconstruction, priors: PositionPriors, sigma_px: float) -> list[pycolmap.PosePrior]:

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
+from vio.datasets.png import decode_gray8
 from vio.errors import DataError
 from vio.input_files import check_regular, read_input
 from vio.records import Image
@@ -104,10 +105,12 @@ def _load(path: Path) -> npt.NDArray[Any]:
 
 def _decoded(data: bytes, path: Path | str) -> npt.NDArray[Any]:
     """Decode a file in memory as gray (H, W) of its own depth."""
-    import cv2
-
     if problem := _damage(data):
         raise UnreadableImageError(f"{path}: {problem}; copy the image again")
+    if data.startswith(_PNG_START) and (gray := decode_gray8(data)) is not None:
+        return gray
+    import cv2
+
     try:
         pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except (cv2.error, MemoryError) as error:

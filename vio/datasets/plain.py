@@ -60,12 +60,12 @@ def is_plain_folder(path: Path) -> bool:
 
 
 def holds_more_than_kitti(path: Path) -> bool:
-    """Return whether a folder with KITTI's names has an IMU, or another calibration in the place of `calib.txt`."""
+    """Return whether a folder with KITTI's names has an IMU, or another calibration that goes before `calib.txt`."""
     if not is_plain_folder(path):
         return False
     if any((path / name).is_file() for name in IMU_FILES) or not any((path / f"image_{k}").is_dir() for k in (0, 2)):
         return True
-    return not (path / "calib.txt").is_file() and find_calibration(path) is not None
+    return find_calibration(path) not in (None, path / "calib.txt")
 
 
 def lacks_sensor_yaml(path: Path) -> bool:

@@ -21,6 +21,7 @@ _MEMORY_S = 2.0  # samples that the structure function is learned from
 _LONGEST_LAG_S = 1.0  # half of it; beyond, the signal is taken to have changed as much as it ever does
 _LEAST_SAMPLES = 10  # with fewer the signal is not characterised
 _UNKNOWN = np.array([3.0, 1.0]) ** 2  # D then: accelerometer (m/s^2)^2, gyro (rad/s)^2, of a vehicle that manoeuvres
+_MEASURED_SHARE = 8  # of the samples in memory, 1 / 8: so many new ones change their median little
 _LONG_PERIODS = 1.5  # an interval longer than so many median periods lacks a sample; jitter of the clock stays below
 _SHORTEST_CUT_NS, _MOST_CUTS = 1e6, 1000  # of a gap, for the integration
 
@@ -39,10 +40,12 @@ class ImuHistory:
 
     def __init__(self) -> None:
         self._samples: deque[ImuSample] = deque()
+        self._period, self._unmeasured = 0.0, 0  # median distance, and samples since it was computed
 
     def take(self, sample: ImuSample) -> None:
         """Take a sample and drop what is too old."""
         self._samples.append(sample)
+        self._unmeasured += 1
         while sample.time_ns - self._samples[0].time_ns > _MEMORY_S / _NS:
             self._samples.popleft()
 
@@ -72,9 +75,12 @@ class ImuHistory:
         return Hidden(cuts, variance, bool(gap.any()))
 
     def _period_ns(self) -> float:
-        """Median distance of the samples; 0 where there are not two."""
-        times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
-        return float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+        """Median distance of the samples, up to a few of them ago; 0 where there are not two."""
+        if self._unmeasured >= len(self._samples) // _MEASURED_SHARE:
+            times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
+            self._period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+            self._unmeasured = 0
+        return self._period
 
     def _hidden_variance(self, cuts: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
         """Variance (2, K - 1) that each step adds to the integrals, equations (N11) and (N12), by Simpson's rule."""

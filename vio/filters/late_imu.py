@@ -13,7 +13,7 @@ import numpy as np
 
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, transform_points
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, Landmarks, Observations, Prediction, UpdateReport, no_landmarks
 
@@ -112,7 +112,9 @@ class LateImuMsckf(Msckf):
     def _points_in_first_world(self, own: Landmarks) -> Landmarks:
         """Points of the upright world in that of the first frame."""
         R = self._T_first_world[:3, :3]
-        p_world = transform_points(self._T_first_world, own.p_world)
+        # Point by point: the rounding of a matrix product depends on how many points were taken at once.
+        T = self._T_first_world
+        p_world = np.einsum("ij,nj->ni", T[:3, :3], own.p_world) + T[:3, 3]
         return Landmarks(own.ids, p_world, R @ own.covariance @ R.T)
 
     def _in_first_world(self, own: Estimate) -> Estimate:
@@ -131,5 +133,6 @@ class LateImuMsckf(Msckf):
             T_world_imu=self._T_first_world @ own.T_world_imu,
             covariance=own.covariance + A @ by_images.covariance @ A.T,
             velocity_world=None if own.velocity_world is None else R @ own.velocity_world,
+            velocity_covariance=None if own.velocity_covariance is None else R @ own.velocity_covariance @ R.T,
             gravity_world=R @ np.array([0.0, 0.0, -self._settings.gravity_mps2]),
         )

@@ -42,7 +42,7 @@ from vio.filters.stereo_calibration import (
     landmark_columns,
 )
 from vio.filters.tracks import latest_pixels
-from vio.filters.window import NO_TWIST, Clone, Window
+from vio.filters.window import NO_TWIST, Clone, Fit, Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
@@ -351,17 +351,23 @@ class Msckf:
         T, covariance = self._current_pose(window, output)
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
         A = se3_adjoint(se3_inverse(T))
+        known = self._motion.uncertainty(window.nav, output[:DIM, :DIM])
         estimate = Estimate(
             self._time_ns,
             T,
             A @ covariance @ A.T,
             velocity_world=self._motion.velocity_world(window.nav),
+            velocity_covariance=known.velocity_covariance,
             gyro_bias=window.nav.gyro_bias,
+            gyro_bias_sigma=known.gyro_bias_sigma,
             accel_bias=window.nav.accel_bias,
+            accel_bias_sigma=known.accel_bias_sigma,
         )
         estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:], window.nav.T_world_imu)
         if estimate.stereo_field is not None:
-            field = replace(estimate.stereo_field, rows_rms_px=self._rows.rms_px)
+            field = estimate.stereo_field
+            own, P = self._rows.without_common(field.coefficients), self._rows.covariance
+            field = replace(field, rows_rms_px=self._rows.rms_px, rows=own, rows_covariance=P)
             estimate = replace(estimate, stereo_field=field)
         return estimate
 
@@ -530,21 +536,22 @@ class Msckf:
         predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
         tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _FIRST_STEPS)
         innovation = tracks.newest_innovation()
-        tracks, P = self._fit(window, tracks, pixels, innovation)
-        step = self._step_errors(window, tracks, predicted, P)
+        tracks, fitted = self._fit(window, tracks, pixels, innovation)
+        step = self._step_errors(window, tracks, predicted, fitted)
         if step is not None:
             missing = step.missing_noise()
             if missing.any() and self._tracks.agree(tracks.at):
                 window.inflate_process_noise(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
-                tracks, P = self._fit(window, tracks, pixels, innovation)
+                tracks, fitted = self._fit(window, tracks, pixels, innovation)
             if not self._since_frame.bridged:
                 self._noise.update(step)
         self._since_frame = NO_STEP
 
         tracks = self._tracks.without_wrong_views(tracks)
         good, nis, dof = self._tracks.gate(tracks.at)
+        gated_ids = self._tracks.table.ids(tracks.rows[~good])
         self._tracks.update_pixel_noise(nis, dof)
-        pixels, rejected = self._gate_landmarks(window, pixels, P)
+        pixels, rejected = self._gate_landmarks(window, pixels, fitted)
         created = self._marginalise(window, tracks, good, pixels)
         self._apply_zero_velocity(window)
         return UpdateReport(
@@ -554,10 +561,12 @@ class Msckf:
             landmarks=len(window.landmarks),
             innovation_median_px=innovation,
             nis_per_dof=float(np.median(nis / dof)) if len(nis) else None,
+            gated_ids=gated_ids,
+            landmark_ids=window.landmark_ids.copy(),
         )
 
-    def _gate_landmarks(self, window: Window, pixels: Views, P: FloatArray) -> tuple[Views, int]:
-        """Test the landmarks' pixels after a fit of covariance P (D, D); drop the landmarks that keep failing.
+    def _gate_landmarks(self, window: Window, pixels: Views, fitted: Fit) -> tuple[Views, int]:
+        """Test the landmarks' pixels after a fit; drop the landmarks that keep failing.
 
         Returns:
             The pixels of the landmarks left, without weight where rejected, and how many observations were rejected.
@@ -569,7 +578,7 @@ class Msckf:
         if field is not None:
             H = field.jacobian(pixels.z - at.r) * np.any(at.J, axis=2)[..., None]
             J = np.concatenate([J, H], axis=2)
-        nis = leave_one_out_nis(at.r, J, window.landmark_covariance(P), at.weight, self._tracks.variance)
+        nis = leave_one_out_nis(at.r, J, window.landmark_covariance(fitted), at.weight, self._tracks.variance)
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
         used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
         self._keep_landmarks(window, ~dropped)
@@ -617,24 +626,21 @@ class Msckf:
 
     def _fit(
         self, window: Window, tracks: LinearTracks, pixels: Views, innovation: float | None
-    ) -> tuple[LinearTracks, FloatArray]:
-        """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the covariance (D, D)."""
-        P = window.P
+    ) -> tuple[LinearTracks, Fit]:
+        """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the last fit."""
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
             A, b = self._information(window, tracks, everything, pixels)
-            P = self._move_to_optimum(window, tracks, A, b, len(A))
+            fitted = self._move_to_optimum(window, tracks, A, b, len(A))
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
             # Another step pays only where this one had far to go.
             if innovation is None or residual is None or innovation < max(_FAR, 3 * residual):
                 break
             innovation = residual
-        return tracks, P
+        return tracks, fitted
 
-    def _move_to_optimum(
-        self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int
-    ) -> FloatArray:
+    def _move_to_optimum(self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int) -> Fit:
         """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
 
         Args:
@@ -645,21 +651,21 @@ class Msckf:
             size: how many errors, the first ones, it is about.
 
         Returns:
-            Their covariance (size, size) there.
+            The fit, with their covariance (size, size) there.
         """
-        P, error = window.optimum(A, b, size)
+        fitted, error = window.optimum(A, b, size)
         self._tracks.move_points(tracks, window.exposure_errors(error), error[window.stereo_rows])
         window.relinearise(error)
-        return P
+        return fitted
 
     def _step_errors(
         self,
         window: Window,
         tracks: LinearTracks,
         predicted: FloatArray | None,
-        P: FloatArray,
+        fitted: Fit,
     ) -> StepErrors | None:
-        """The predicted and the corrected motion since the last frame, whose fit left the covariance P (D, D).
+        """The predicted and the corrected motion since the last frame, and what its fit leaves of their errors.
 
         It is the camera's motion, seen from the body, so that a new estimate of the extrinsics is no motion. None with
         too few tracks.
@@ -667,7 +673,7 @@ class Msckf:
         if predicted is None or len(tracks.rows) < MIN_TRACKS_FOR_NOISE:
             return None
         moved = window.camera_move_since(-2)
-        remaining = window.move_covariance(len(window.clones) - 2, P)
+        remaining = window.move_covariance(len(window.clones) - 2, fitted)
         A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
         process = A @ self._since_frame.Q[:6, :6] @ A.T
         B = se3_adjoint(se3_inverse(window.calibration.T_cam0_imu))
@@ -719,18 +725,19 @@ class Msckf:
         lost, leaving = ~seen[:, newest], seen[:, 0] & full
         ending = lost | leaving
         window.absorb(*self._information(window, tracks, ending & good, pixels))
-        promoted = self._promote(window, tracks, leaving & good & seen[:, newest])
+        depth_sigma = np.sqrt(self._tracks.variance) * tracks.information.relative_depth_sigma()
+        promoted = self._promote(window, tracks, leaving & good & seen[:, newest], depth_sigma)
 
         A, b = self._information(window, tracks, good & ~ending, None)
-        P = self._move_to_optimum(window, tracks, A, b, window.first_landmark)  # no landmark is in it
+        P = self._move_to_optimum(window, tracks, A, b, window.first_landmark).covariance()  # no landmark is in it
         own = slice(0, window.first_clone)
         self._output = P[own, own]
         rows = np.concatenate([np.arange(window.first_clone), np.r_[window.clone_rows(newest)]])
         self._newest, self._frame_pose = P[np.ix_(rows, rows)], window.nav.T_world_imu
         self._smoothed = WindowPosterior.of(window, P)
 
-        done = ending & good & (self._depth_sigma(tracks) < _MAP_DEPTH_SIGMA)
-        covariance = self._tracks.variance * tracks.information.point_covariance()[done]
+        done = np.flatnonzero(ending & good & (depth_sigma < _MAP_DEPTH_SIGMA))
+        covariance = self._tracks.variance * tracks.information.point_covariance(done)
         self._store_points(table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
         spent = leaving & ~lost
         spent[promoted] = False
@@ -740,34 +747,39 @@ class Msckf:
             table.shift()
         return len(promoted)
 
-    def _promote(self, window: Window, tracks: LinearTracks, candidates: BoolArray) -> IntArray:
-        """Make landmarks of the best known points whose tracks leave the window; return which tracks (indices)."""
+    def _promote(
+        self, window: Window, tracks: LinearTracks, candidates: BoolArray, depth_sigma: FloatArray
+    ) -> IntArray:
+        """Make landmarks of the best known points whose tracks leave the window; return which tracks (indices).
+
+        Args:
+            window: receives the landmarks.
+            tracks: linearised at its means.
+            candidates: mask (F,) of the tracks that may become landmarks.
+            depth_sigma: (F,) standard deviation of each inverse depth, over itself.
+        """
         if window.calibration.stereo_field or window.scale_sigma() > _SCALE_SIGMA:
             return np.zeros(0, dtype=np.int64)
         room = self._settings.max_landmarks - len(window.landmarks)
         by_stereo = np.sqrt(self._tracks.variance) * relative_stereo_sigma(tracks.at, tracks.information.q)
-        has_depth = (self._depth_sigma(tracks) < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
+        has_depth = (depth_sigma < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
         chosen = np.flatnonzero(candidates & has_depth)
         if room <= 0 or not len(chosen):
             return np.zeros(0, dtype=np.int64)
-        covariance = self._tracks.variance * tracks.information.point_covariance()
+        covariance = self._tracks.variance * tracks.information.point_covariance(chosen)
         # The best known points first: smallest largest standard deviation.
-        worst = np.linalg.eigvalsh(covariance[chosen])[:, 2]
+        worst = np.linalg.eigvalsh(covariance)[:, 2]
         table = self._tracks.table
-        chosen = chosen[np.lexsort((table.ids(tracks.rows[chosen]), worst))[:room]]
-        p, point_D_poses = tracks.p_world[chosen], tracks.information.point_D_clones()[chosen]
+        best = np.lexsort((table.ids(tracks.rows[chosen]), worst))[:room]
+        chosen, covariance = chosen[best], covariance[best]
+        p, point_D_poses = tracks.p_world[chosen], tracks.information.point_D_clones(chosen)
         point_D_poses[:, :, -3:] += so3_hat(p)  # the anchor: rotation of the newest exposure
         point_D_stereo = None
         if tracks.stereo is not None:
             point_D_stereo = tracks.stereo.point_D_stereo(tracks.information)[chosen]
         A = window.chain(point_D_poses, point_D_stereo)
-        window.add_landmarks(table.ids(tracks.rows[chosen]), p, A.reshape(-1, len(window.P)), covariance[chosen])
+        window.add_landmarks(table.ids(tracks.rows[chosen]), p, A.reshape(-1, len(window.P)), covariance)
         return chosen
-
-    def _depth_sigma(self, tracks: LinearTracks) -> FloatArray:
-        """Standard deviation (F,) of the inverse depth of the tracks' points, over itself."""
-        out: FloatArray = np.sqrt(self._tracks.variance) * tracks.information.relative_depth_sigma()
-        return out
 
 
 def _half_tangent(R: FloatArray) -> FloatArray:

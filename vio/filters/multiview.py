@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.filters import track_loops as loops
-from vio.geometry.lie import FloatArray, so3_hat, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, project, z_D_p_cam
+from vio.geometry.lie import FloatArray, so3_hat
+from vio.geometry.stereo import StereoCamera, left_rays
 from vio.records import BoolArray, IntArray
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
@@ -255,13 +255,10 @@ def landmark_residuals(
         views: what was seen, (K, 4) each.
         sigma2: the pixel noise's variance, for the robust weights.
     """
-    p_cam = transform_points(T_cam0_world, p_world)
-    ahead = p_cam[:, 2] > MIN_DEPTH * camera.baseline_m
-    p_cam = np.where(ahead[:, None], p_cam, [0.0, 0.0, 1.0])
-    usable = views.weight * ahead[:, None]
-    r = np.where(usable > 0, views.z - project(camera, p_cam), 0.0)
-    J = (z_D_p_cam(camera, p_cam) @ T_cam0_world[:3, :3]) * usable[..., None]
-    squares, seen = np.sum(r**2, axis=1), usable[:, 1] > 0
+    one = Views(views.z[:, None], views.weight[:, None])
+    at = residuals(camera, T_cam0_world[None], p_world, one)
+    r, J = at.r[:, 0], at.z_D_p[:, 0]
+    squares, seen = np.sum(r**2, axis=1), at.ahead & (views.weight[:, 1] > 0)
     scale2 = max(sigma2, float(np.median(squares[seen])) / _MEDIAN) if seen.any() else sigma2
     return LandmarkResiduals(r, J, seen / (1 + squares / (4 * scale2 * CAUCHY**2)))
 
@@ -291,19 +288,26 @@ class TrackInformation:
         dq = np.linalg.solve(self.C, right[..., None])[..., 0]
         return self.q.moved(dq, np.inf)
 
-    def point_D_clones(self) -> FloatArray:
-        """How the estimated points follow errors of the clones (F, 3, 6N), world: `-C^-1 G'`."""
-        out: FloatArray = -self.q.p_D_q @ np.linalg.solve(self.C, np.swapaxes(self.G, 1, 2))
+    def point_D_clones(self, chosen: IntArray) -> FloatArray:
+        """How the estimated points of tracks (K,) follow errors of the clones (K, 3, 6N), world: `-C^-1 G'`."""
+        G = np.swapaxes(self.G[chosen], 1, 2)
+        out: FloatArray = -self.q.p_D_q[chosen] @ np.linalg.solve(self.C[chosen], G)
         return out
 
-    def point_covariance(self) -> FloatArray:
-        """Covariance (F, 3, 3) of the points given the clones, world, for one pixel of noise."""
-        out: FloatArray = self.q.p_D_q @ np.linalg.inv(self.C) @ np.swapaxes(self.q.p_D_q, 1, 2)
+    def point_covariance(self, chosen: IntArray) -> FloatArray:
+        """Covariance (K, 3, 3) of the points of tracks (K,) given the clones, world, for one pixel of noise."""
+        p_D_q = self.q.p_D_q[chosen]
+        out: FloatArray = p_D_q @ np.linalg.inv(self.C[chosen]) @ np.swapaxes(p_D_q, 1, 2)
         return out
 
     def relative_depth_sigma(self) -> FloatArray:
         """Standard deviation (F,) of the inverse depth given the clones over itself, for one pixel of noise."""
-        out: FloatArray = np.sqrt(np.linalg.inv(self.C)[:, 2, 2]) / self.q.disparity
+        C = self.C
+        minor = C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] ** 2
+        # What is left of the third diagonal entry once the other two coordinates are eliminated.
+        a = (C[:, 0, 2] * C[:, 1, 1] - C[:, 1, 2] * C[:, 0, 1]) / minor
+        b = (C[:, 1, 2] * C[:, 0, 0] - C[:, 0, 2] * C[:, 0, 1]) / minor
+        out: FloatArray = 1.0 / np.sqrt(C[:, 2, 2] - a * C[:, 0, 2] - b * C[:, 1, 2]) / self.q.disparity
         return out
 
 

@@ -49,6 +49,15 @@ class NavState:
 
 
 @dataclass(frozen=True, slots=True)
+class MotionUncertainty:
+    """How well velocity and biases are known."""
+
+    velocity_covariance: FloatArray  # (3, 3) world, (m/s)^2
+    gyro_bias_sigma: FloatArray  # (3,) rad/s
+    accel_bias_sigma: FloatArray  # (3,) m/s^2; zero where it is not estimated
+
+
+@dataclass(frozen=True, slots=True)
 class Transition:
     """One step of a motion model."""
 
@@ -210,6 +219,12 @@ class ImuMotion:
     def velocity_world(self, nav: NavState) -> FloatArray:
         """Velocity (3,) in the world frame."""
         return nav.velocity
+
+    def uncertainty(self, nav: NavState, P: FloatArray) -> MotionUncertainty:
+        """Return the uncertainty of velocity and biases, from the covariance (15, 15) of the error."""
+        velocity_D_error = np.concatenate([-so3_hat(nav.velocity), np.eye(3)], axis=1)  # v = exp(phi) v_hat + xi_v
+        sigmas = np.sqrt(np.diag(P)[9:15])
+        return MotionUncertainty(velocity_D_error @ P[3:9, 3:9] @ velocity_D_error.T, sigmas[:3], sigmas[3:])
 
     def corrected(self, nav: NavState, error: FloatArray) -> NavState:
         """Return the state moved by an error (15,)."""
@@ -395,6 +410,13 @@ class TwistMotion:
         """Velocity (3,) in the world frame."""
         out: FloatArray = nav.T_world_imu[:3, :3] @ nav.velocity
         return out
+
+    def uncertainty(self, nav: NavState, P: FloatArray) -> MotionUncertainty:
+        """Return the uncertainty of velocity and biases, from the covariance (15, 15) of the error."""
+        R = nav.T_world_imu[:3, :3]  # v_world = exp(phi) R (v_hat + delta)
+        velocity_D_error = np.concatenate([-so3_hat(R @ nav.velocity), R], axis=1)
+        velocity_P: FloatArray = velocity_D_error @ P[3:9, 3:9] @ velocity_D_error.T
+        return MotionUncertainty(velocity_P, np.sqrt(np.diag(P)[12:15]), np.zeros(3))
 
     def corrected(self, nav: NavState, error: FloatArray) -> NavState:
         """Return the state moved by an error (15,)."""

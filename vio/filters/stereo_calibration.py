@@ -52,6 +52,7 @@ class RowField:
         self._camera = camera
         self._A: FloatArray = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         self._b: FloatArray = np.zeros(_ROW_TERMS)
+        self._common: FloatArray = np.zeros((_ROW_TERMS, 3))  # right sides if the rows were those of k, q1, q2 alone
         self._squares = self._count = 0.0  # of the rows' residuals, in the same memory
         self._matches = 0  # of the last frame
         self.rms_px = 0.0  # of the field over the matches
@@ -72,6 +73,8 @@ class RowField:
         weight: FloatArray = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
         self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
         self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
+        common = _common_rows((z[:, 0] - camera.cu) / camera.fu, x, y)
+        self._common = _ROW_MEMORY * self._common + (basis * weight[:, None]).T @ common
         prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
         self.coefficients = solution / camera.fv
@@ -80,13 +83,37 @@ class RowField:
         self._count = _ROW_MEMORY * self._count + float(weight.sum())
         self.rms_px = float(np.sqrt(np.mean(field**2)))
 
+    def without_common(self, stereo: FloatArray) -> FloatArray:
+        """Return the coefficients (6,) without what the distortion of both lenses, in (6,) of (R3), does to rows.
+
+        Both lenses bend a near point differently, as it lies at different places in the two images.
+        """
+        prior = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
+        return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[3:]))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (6, 6) of the coefficients, in squared focal lengths."""
+        # Rows of one feature share their error from frame to frame, so only the features of one frame count as many.
+        shared = max(self._count / max(self._matches, 1), 1.0)
+        noise = self._squares / max(self._count, 1.0) if self._count else 1.0
+        prior = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
+        P = noise * shared * np.linalg.inv(self._A + prior)
+        return np.asarray(P / self._camera.fv**2, dtype=np.float64)
+
     @property
     def is_significant(self) -> bool:
         """Whether the rows show that the calibration is off: a field beyond its own uncertainty, and beyond harm."""
-        # Rows of one feature share their error from frame to frame, so only the features of one frame count as many.
+        # The features of one frame count, as in the covariance.
         uncertainty = _ROW_TERMS * self._squares / max(self._count, 1.0) / max(self._matches, 1)
         noise = self._squares / max(self._count, 1.0)
         return self.rms_px**2 > max(_LEAST_ROWS_PX**2 + _ROW_SIGNIFICANCE * uncertainty, _ROW_DOMINANCE * noise)
+
+
+def _common_rows(x: FloatArray, xr: FloatArray, y: FloatArray) -> FloatArray:
+    """Derivatives (N, 3) of right minus left rows, in focal lengths, by k, q1 and q2 of (R3)."""
+    squares = xr * xr - x * x
+    return np.stack([y * squares, squares, 2 * y * (xr - x)], axis=1)
 
 
 def _centred(values: FloatArray) -> FloatArray:

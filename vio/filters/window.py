@@ -56,6 +56,7 @@ class Window:
         calibration: Calibration = _NO_CALIBRATION,
     ) -> None:
         self.motion = motion
+        self._L: Factor | None = None  # factor of P; None: not computed since P changed
         self.nav = nav
         self.calibration = calibration
         self.clones: list[Clone] = []
@@ -63,6 +64,15 @@ class Window:
         self.landmarks: FloatArray = np.zeros((0, 3))
         self.P = P
         self.prior_delta: FloatArray = np.zeros(len(P))
+
+    @property
+    def P(self) -> FloatArray:
+        """Covariance (D, D) of the prior."""
+        return self._P
+
+    @P.setter
+    def P(self, P: FloatArray) -> None:
+        self._P, self._L = P, None
 
     @property
     def first_clone(self) -> int:
@@ -170,28 +180,26 @@ class Window:
         out: FloatArray = T @ move @ se3_inverse(T)
         return out
 
-    def move_covariance(self, index: int, P: FloatArray) -> FloatArray:
-        """Covariance (6, 6) of `xi_newest - xi_clone` where all errors have the covariance P (D, D)."""
-        a, b = self.clone_rows(index), self.clone_rows(len(self.clones) - 1)
-        out: FloatArray = P[a, a] + P[b, b] - P[a, b] - P[b, a]
-        return out
+    def move_covariance(self, index: int, fitted: Fit) -> FloatArray:
+        """Covariance (6, 6) of `xi_newest - xi_clone` after a fit of all errors."""
+        J = np.zeros((6, len(self.P)))
+        J[:, self.clone_rows(len(self.clones) - 1)] = np.eye(6)
+        J[:, self.clone_rows(index)] -= np.eye(6)
+        S = fitted.spread(J)
+        return S @ S.T
 
-    def landmark_covariance(self, P: FloatArray) -> FloatArray:
-        """Covariance (M, 3 + S, 3 + S) of what a landmark's pixels depend on, for errors of covariance P (D, D).
+    def landmark_covariance(self, fitted: Fit) -> FloatArray:
+        """Covariance (M, 3 + S, 3 + S) of what a landmark's pixels depend on, after a fit of all errors.
 
         That is `xi_f - xi_rho`, the landmark relative to the newest exposure, and the coefficients of the stereo
         calibration.
         """
-        M, S, stereo = len(self.landmarks), self.calibration.stereo_dim, self.stereo_rows
+        M, D, S = len(self.landmarks), len(self.P), self.calibration.stereo_dim
         exposure = self.chain(np.eye(6 * len(self.clones))[-6:-3])  # (3, D)
-        with_exposure = P @ exposure.T
-        own = self.first_landmark + np.arange(3 * M).reshape(-1, 3)
-        cross = with_exposure[own]  # (M, 3, 3)
-        out = np.empty((M, 3 + S, 3 + S))
-        out[:, :3, :3] = P[own[:, :, None], own[:, None]] - cross - np.swapaxes(cross, 1, 2) + exposure @ with_exposure
-        out[:, :3, 3:] = P[own, stereo] - with_exposure[stereo].T
-        out[:, 3:, :3] = np.swapaxes(out[:, :3, 3:], 1, 2)
-        out[:, 3:, 3:] = P[stereo, stereo]
+        J = np.eye(3 * M, D, self.first_landmark).reshape(-1, 3, D) - exposure
+        stereo = np.broadcast_to(fitted.spread(np.eye(S, D, DIM)), (M, S, D)) if S else np.zeros((M, 0, D))
+        root = np.concatenate([fitted.spread(J), stereo], axis=1)
+        out: FloatArray = root @ np.swapaxes(root, 1, 2)
         return out
 
     def propagate(self, step: Transition, walk: FloatArray | None = None) -> None:
@@ -207,7 +215,7 @@ class Window:
             rows = self.calibration.extrinsic_rows + DIM
             Phi[np.ix_(rows, rows)] = se3_adjoint(step.nav.T_world_imu @ se3_inverse(self.nav.T_world_imu))
         self.nav = step.nav
-        P, own = self.P, slice(0, len(Phi))
+        P, self._L, own = self.P, None, slice(0, len(Phi))
         P[own] = Phi @ P[own]
         P[:, own] = P[:, own] @ Phi.T
         P[:DIM, :DIM] += step.Q
@@ -255,7 +263,7 @@ class Window:
             to_nav[:6, self.first_clone - 1] = -camera_D_own[:, -1]
             self.P = to_nav @ self.P @ to_nav.T
             self.prior_delta = to_nav @ self.prior_delta
-        added = np.concatenate([camera_D_own @ self.P[own, :at], camera_D_own @ self.P[own, at:]], axis=1)
+        added, beside = camera_D_own @ self.P[own], self.P[:, own] @ camera_D_own.T  # exact copies without calibration
         block = added[:, own] @ camera_D_own.T
         if self.clones:
             block = block + noise
@@ -265,7 +273,7 @@ class Window:
         old = np.concatenate([np.arange(at), np.arange(at + 6, D + 6)])
         new = slice(at, at + 6)
         P[np.ix_(old, old)] = self.P
-        P[new, old], P[old, new], P[new, new] = added, added.T, block
+        P[new, old], P[old, new], P[new, new] = added, beside, block
         delta = self.prior_delta
         self.prior_delta = np.concatenate([delta[:at], camera_D_own @ delta[own], delta[at:]])
         self.P = P
@@ -305,7 +313,7 @@ class Window:
         first, newest = self.first_landmark, self.clone_rows(len(self.clones) - 1).start + 3
         turn, before = slice(newest, newest + 3), slice(previous_rotation, previous_rotation + 3)
         p_cross = so3_hat(self.landmarks).reshape(-1, 3)
-        P, delta = self.P, self.prior_delta
+        P, delta, self._L = self.P, self.prior_delta, None
         P[first:] += p_cross @ (P[turn] - P[before])
         P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
@@ -342,7 +350,7 @@ class Window:
         self.landmark_ids = np.concatenate([self.landmark_ids, ids])
         self.landmarks = np.concatenate([self.landmarks, p_world])
 
-    def optimum(self, information: FloatArray, vector: FloatArray, size: int) -> tuple[FloatArray, FloatArray]:
+    def optimum(self, information: FloatArray, vector: FloatArray, size: int) -> tuple[Fit, FloatArray]:
         """Where the prior and given information agree best.
 
         Args:
@@ -351,14 +359,22 @@ class Window:
             size: `k`.
 
         Returns:
-            The covariance (k, k) of the first errors there, and the error vector (D,) that moves the means there.
+            The fit, with the covariance (k, k) of the first errors there, and the error vector (D,) that moves the
+            means there.
         """
         own = slice(0, size)
         A, b = information[own, own], vector[own] + information[own, own] @ self.prior_delta[own]
-        P, shift = posterior(self.P[own, own], A, b)
+        fitted = fit(self._factor().leading(size), A)
+        shift = fitted.move(b)
         if size < len(self.P):  # P (b - A shift) is the shift; the others follow by their correlation
             shift = np.concatenate([shift, self.P[size:, own] @ (b - A @ shift)])
-        return P, shift - self.prior_delta
+        return fitted, shift - self.prior_delta
+
+    def _factor(self) -> Factor:
+        """The factor of the present covariance, computed once for all fits to it."""
+        if self._L is None:
+            self._L = factor(self.P)
+        return self._L
 
     def absorb(self, information: FloatArray, vector: FloatArray) -> None:
         """Absorb measurements into the prior.
@@ -367,8 +383,9 @@ class Window:
             information: `H' R^-1 H` (D, D) of the residuals at the present means.
             vector: `H' R^-1 r` (D,).
         """
-        self.P, shift = posterior(self.P, information, vector + information @ self.prior_delta)
-        self.prior_delta = self.prior_delta - shift
+        P = fit(self._factor(), information).covariance()
+        self.prior_delta = self.prior_delta - P @ (vector + information @ self.prior_delta)
+        self.P = P
 
     def measure(self, measurement: Measurement) -> None:
         """Absorb a measurement of the navigation state and move the means to the new prior."""
@@ -440,24 +457,81 @@ class Window:
         return list(motion.corrected_earlier(earlier, 0.5 * (R + R[-1]), ages, error))
 
 
-def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (D, D) and the shift of the mean (D,) after a measurement in information form.
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """A covariance `P = L L'`."""
 
-    `(P^-1 + A)^-1` without an inverse of P, which is singular where states are copies or known: with `P = L L'`, it is
-    `L (I + L' A L)^-1 L'`, symmetric and positive by construction. Of `I + L' A L = K K'`, only the triangle of K' is
-    computed, in LAPACK's order of columns, in which the transpose of an array is free.
-    """
+    L: FloatArray  # (D, D)
+    triangular: bool  # by Cholesky; False: by the eigenvectors of a P that is singular beyond rounding
+
+    def leading(self, size: int) -> Factor:
+        """The factor of the covariance of the first errors alone."""
+        if size == len(self.L):
+            return self
+        if self.triangular:
+            return Factor(np.ascontiguousarray(self.L[:size, :size]), True)
+        return factor(self.L[:size] @ self.L[:size].T)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The covariance after a measurement in information form, as factors: `P_new = L (K K')^-1 L'`."""
+
+    L: FloatArray  # (D, D) of the prior
+    K_transposed: FloatArray  # (D, D) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
+
+    def move(self, vector: FloatArray) -> FloatArray:
+        """Return `P_new v` (D,), for the information vector v (D,) the shift of the mean."""
+        inner = lapack.dpotrs(self.K_transposed, self.L.T @ vector, lower=0)[0]
+        out: FloatArray = self.L @ inner
+        return out
+
+    def spread(self, J: FloatArray) -> FloatArray:
+        """Return S (..., k, D) with `S S'` the covariance of `J error`, for a Jacobian J (..., k, D)."""
+        rows = np.ascontiguousarray((J @ self.L).reshape(-1, J.shape[-1]))
+        S: FloatArray = blas.dtrsm(1.0, self.K_transposed, rows.T, lower=0, trans_a=1).T
+        return S.reshape(J.shape)
+
+    def covariance(self) -> FloatArray:
+        """Return the covariance (D, D): symmetric and positive by construction."""
+        W = blas.dtrsm(1.0, self.K_transposed, self.L.T, lower=0, trans_a=1)
+        P_new: FloatArray = W.T @ W
+        return P_new
+
+
+def factor(P: FloatArray) -> Factor:
+    """Factor a covariance (D, D)."""
     try:
-        L = np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24))
-        inner, _ = lapack.dsygst(information.T, L.T, itype=2, lower=0)
+        L = np.asarray(np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24)), dtype=np.float64)
+        return Factor(L, True)
     except np.linalg.LinAlgError:
         values, vectors = np.linalg.eigh(P)
-        L = vectors * np.sqrt(np.maximum(values, 0.0))
+        root: FloatArray = np.array(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C")
+        return Factor(root, False)
+
+
+def fit(prior: Factor, information: FloatArray) -> Fit:
+    """Fit a prior to a measurement in information form (D, D).
+
+    `(P^-1 + A)^-1` without an inverse of P, which is singular where states are copies or known. Of `I + L' A L = K K'`,
+    only the triangle of K' is computed, in LAPACK's order of columns, in which the transpose of an array is free.
+
+    Raises:
+        numpy.linalg.LinAlgError: the information is not positive.
+    """
+    L = prior.L
+    if prior.triangular:
+        inner, _ = lapack.dsygst(information.T, L.T, itype=2, lower=0)
+    else:
         inner = np.asfortranarray(L.T @ information @ L)
     np.einsum("ii->i", inner)[:] += 1.0
     K_transposed, failed = lapack.dpotrf(inner, lower=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("the information is not positive")
-    W: FloatArray = blas.dtrsm(1.0, K_transposed, L.T, lower=0, trans_a=1)
-    P_new: FloatArray = W.T @ W
+    return Fit(L, K_transposed)
+
+
+def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance (D, D) and the shift of the mean (D,) after a measurement in information form."""
+    P_new = fit(factor(P), information).covariance()
     return P_new, P_new @ vector

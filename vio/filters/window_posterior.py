@@ -73,12 +73,15 @@ class WindowPosterior:
         a, b = slice(0, 6), slice(len(self.P) - 6, None)
         A = se3_adjoint(se3_inverse(old.T_world_imu))
         C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
+        xi = se3_log(se3_inverse(old.T_world_imu) @ new.T_world_imu)
+        limit = float(chi_square_quantile(_STATIONARY_PROBABILITY, 6))
+        if float(xi @ xi) > limit * (float(np.trace(C)) + 6e-18):  # no eigenvalue of C is larger than its trace
+            return False
         largest = np.sqrt([np.linalg.eigvalsh(C[p, p])[-1] for p in (slice(0, 3), slice(3, 6))]) / seconds
         if largest[0] > velocity_sigma_mps or largest[1] > rate_sigma_radps:
             return False
-        xi = se3_log(se3_inverse(old.T_world_imu) @ new.T_world_imu)
         squared = float(xi @ np.linalg.solve(C + 1e-18 * np.eye(6), xi))
-        return squared < float(chi_square_quantile(_STATIONARY_PROBABILITY, 6))
+        return squared < limit
 
 
 def _with_velocities(clones: tuple[Clone, ...]) -> tuple[Clone, ...]:

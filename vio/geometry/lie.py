@@ -1,10 +1,13 @@
 """SO(3) and SE(3): exponential, logarithm, adjoint and the operators of the paper's filter.
 
 Convention: a twist is `xi = [rho; phi]`, translation first; every function takes leading batch dimensions.
+Single rotations and transforms, of which a filter takes many, go through plain numbers: NumPy's calls cost far more.
 Reference: Barfoot, State Estimation for Robotics (2017), chapter 7.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -37,9 +40,43 @@ def _sinc_terms(angle: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return first, second, third
 
 
+def _sinc_terms_of_one(angle: float) -> tuple[float, float, float]:
+    """As `_sinc_terms`, for one finite angle."""
+    a2 = angle * angle
+    if angle < _SMALL_ANGLE_RAD:
+        first = 1 - a2 / 6 * (1 - a2 / 20 * (1 - a2 / 42))
+        second = 0.5 - a2 / 24 * (1 - a2 / 30 * (1 - a2 / 56))
+        return first, second, 1 / 6 - a2 / 120 * (1 - a2 / 42 * (1 - a2 / 72))
+    half, sine = math.sin(angle / 2) / (angle / 2), math.sin(angle)
+    return sine / angle, 0.5 * half * half, (angle - sine) / (angle * a2)
+
+
+def _one(phi: FloatArray) -> tuple[float, float, float, float] | None:
+    """Entries and length of a single finite vector (3,); None: it is another array."""
+    if phi.ndim != 1:
+        return None
+    x, y, z = phi.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    return (x, y, z, angle) if math.isfinite(angle) else None
+
+
+def _series(x: float, y: float, z: float, b: float, c: float) -> FloatArray:
+    """`I + b W + c W W` (3, 3) with W the skew-symmetric matrix of a vector."""
+    xx, yy, zz, xy, xz, yz = c * x * x, c * y * y, c * z * z, c * x * y, c * x * z, c * y * z
+    return np.array(
+        [
+            [1.0 - (yy + zz), xy - b * z, xz + b * y],
+            [xy + b * z, 1.0 - (xx + zz), yz - b * x],
+            [xz - b * y, yz + b * x, 1.0 - (xx + yy)],
+        ]
+    )
+
+
 def so3_exp(phi: npt.ArrayLike) -> FloatArray:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in radians (Rodrigues' formula)."""
     phi = np.asarray(phi, dtype=np.float64)
+    if (one := _one(phi)) is not None:
+        return _series(*one[:3], *_sinc_terms_of_one(one[3])[:2])
     a, b, _ = _sinc_terms(np.linalg.norm(phi, axis=-1))
     W = so3_hat(phi)
     return np.eye(3) + a[..., None, None] * W + b[..., None, None] * (W @ W)
@@ -81,8 +118,31 @@ def rotation_from_quat_xyzw(q: npt.ArrayLike) -> FloatArray:
     return np.eye(3) + 2 * w * V + 2 * (V @ V)
 
 
+def _quat_xyzw_of_one(R: FloatArray) -> tuple[float, float, float, float]:
+    """As `quat_xyzw_from_rotation`, for one finite matrix (3, 3)."""
+    (d0, m01, m02), (m10, d1, m12), (m20, m21, d2) = R.tolist()
+    trace = d0 + d1 + d2
+    largest = max(d0, d1, d2, trace)
+    if largest == d0:
+        x, y, z, w = 1 + d0 - d1 - d2, m01 + m10, m02 + m20, m21 - m12
+    elif largest == d1:
+        x, y, z, w = m01 + m10, 1 - d0 + d1 - d2, m12 + m21, m02 - m20
+    elif largest == d2:
+        x, y, z, w = m02 + m20, m12 + m21, 1 - d0 - d1 + d2, m10 - m01
+    else:
+        x, y, z, w = m21 - m12, m02 - m20, m10 - m01, 1 + trace
+    size = math.copysign(math.sqrt(x * x + y * y + z * z + w * w), -1.0 if w < 0 else 1.0)
+    return x / size, y / size, z / size, w / size
+
+
 def so3_log(R: npt.ArrayLike) -> FloatArray:
     """Rotation vectors (..., 3), angle in [0, pi], of rotation matrices (..., 3, 3)."""
+    R = np.asarray(R, dtype=np.float64)
+    if R.ndim == 2 and math.isfinite(float(R.sum())):
+        x, y, z, w1 = _quat_xyzw_of_one(R)
+        length = math.sqrt(x * x + y * y + z * z)
+        ratio = 2.0 if length < 1e-7 else 2 * math.atan2(length, w1) / length
+        return np.array([ratio * x, ratio * y, ratio * z])
     q = quat_xyzw_from_rotation(R)
     vector, w = q[..., :3], q[..., 3]
     s = np.linalg.norm(vector, axis=-1)
@@ -95,6 +155,8 @@ def so3_log(R: npt.ArrayLike) -> FloatArray:
 def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
     """Left Jacobian of SO(3), (..., 3, 3): exp(phi + d) = exp(J d) exp(phi) to first order in d."""
     phi = np.asarray(phi, dtype=np.float64)
+    if (one := _one(phi)) is not None:
+        return _series(*one[:3], *_sinc_terms_of_one(one[3])[1:])
     _, b, c = _sinc_terms(np.linalg.norm(phi, axis=-1))
     W = so3_hat(phi)
     return np.eye(3) + b[..., None, None] * W + c[..., None, None] * (W @ W)
@@ -103,6 +165,12 @@ def so3_left_jacobian(phi: npt.ArrayLike) -> FloatArray:
 def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
     """Inverse of the left Jacobian of SO(3), (..., 3, 3), for angles below 2 pi."""
     phi = np.asarray(phi, dtype=np.float64)
+    if (one := _one(phi)) is not None:
+        x, y, z, angle1 = one
+        a1, b1, _ = _sinc_terms_of_one(angle1)
+        squared = angle1 * angle1
+        c = 1 / 12 + squared / 720 * (1 + squared / 42) if angle1 < _SMALL_ANGLE_RAD else (1 - a1 / (2 * b1)) / squared
+        return _series(x, y, z, -0.5, c)
     angle = np.linalg.norm(phi, axis=-1)
     a, b, _ = _sinc_terms(angle)
     small = angle < _SMALL_ANGLE_RAD
@@ -116,6 +184,10 @@ def so3_left_jacobian_inverse(phi: npt.ArrayLike) -> FloatArray:
 def se3_from_parts(R: npt.ArrayLike, t: npt.ArrayLike) -> FloatArray:
     """Homogeneous transforms (..., 4, 4) of rotations (..., 3, 3) and translations (..., 3)."""
     R, t = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
+    if R.ndim == 2 and t.ndim == 1:
+        one = np.zeros((4, 4))
+        one[:3, :3], one[:3, 3], one[3, 3] = R, t, 1.0
+        return one
     out = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
     out[..., :3, :3], out[..., :3, 3], out[..., 3, 3] = R, t, 1.0
     return out
@@ -139,6 +211,8 @@ def se3_log(T: npt.ArrayLike) -> FloatArray:
 def se3_inverse(T: npt.ArrayLike) -> FloatArray:
     """Inverse transforms (..., 4, 4), by transposing the rotation."""
     T = np.asarray(T, dtype=np.float64)
+    if T.ndim == 2:
+        return se3_from_parts(T[:3, :3].T, -(T[:3, 3] @ T[:3, :3]))
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return se3_from_parts(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 

@@ -88,7 +88,8 @@ def rows_part(frames: Sequence[StereoFrame]) -> Part:
 def _rows_text(found: RowResiduals, counts: Sequence[int]) -> str:
     field = found.grid_px[np.isfinite(found.grid_px)]
     over = f", {field.min():+.2f} to {field.max():+.2f} over the image" if len(field) else ""
-    hint = "; `vio calibrate` measures the cause" if abs(found.median_px) > _ROWS_NOTE_PX else ""
+    worst = max(float(np.abs(field).max(initial=0.0)), abs(found.median_px))
+    hint = "; the stereo calibration is off: `vio calibrate` measures by what" if worst > _ROWS_NOTE_PX else ""
     return (
         f"{np.median(counts):.0f} matches a pair, rows {found.median_px:+.2f} px (median of vl - vr), spread "
         f"{found.spread_px:.2f}{over}; {100 * found.positive_disparity:.0f} % in front{hint}"
@@ -114,8 +115,9 @@ def _rows_faults(found: RowResiduals) -> list[str]:
         ]
     if abs(found.median_px) + found.spread_px > _ROWS_FAULT_PX:
         return [
-            f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: the calibration is not "
-            "that of these images, or they are not rectified; run `vio calibrate`, and give its file with --calibration"
+            f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: a camera has been turned "
+            "since the calibration, the calibration is not that of these images, or they are not rectified; run `vio "
+            "calibrate`, and give its file with --calibration"
         ]
     return []
 

@@ -8,47 +8,53 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.calibration.egomotion import CameraMotion, camera_motion
+from vio.calibration.egomotion import CameraMotion, camera_motion, stereo_twists
 from vio.calibration.findings import Finding, NotObservable
 from vio.calibration.gyro import align_gyro
 from vio.calibration.inertial import ImuAlignment, rates_of
+from vio.calibration.intrinsics import Intrinsics, judge_intrinsics
 from vio.calibration.lever_arm import LeverArm, estimate_lever_arm
 from vio.calibration.stereo import (
     RayMatches,
     RowResiduals,
     StereoEstimate,
-    combine_stereo,
     epipolar_angles,
     join_matches,
     refine_stereo,
     row_residuals,
     too_few,
 )
+from vio.calibration.stereo_field import PARAMETERS, field_of
 from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo, judge_velocity_lever_arm
-from vio.colmap.adjustment import adjust_rig_in_motion
 from vio.colmap.pairs import adjust_rig, relative_pose, sift_matches
 from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import load_gray
 from vio.errors import EstimationError
 from vio.geometry.distortion import StereoRig, unproject_pixel
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, so3_log
 from vio.geometry.rectify import rectify_pixels
-from vio.geometry.stereo import left_rays
+from vio.geometry.stereo import StereoCamera, left_rays
 from vio.mapping.keyframes import choose_keyframes, tracked_stretches
 from vio.mapping.points import build_tracks
+from vio.mapping.self_calibration import SelfCalibration, Stretch, intrinsics_of, self_calibrate
 from vio.offline.source import CalibrationSource, track
 from vio.protocols import Dataset, Frontend
-from vio.records import BoolArray, FeatureTracks, MotionSample, Recording
+from vio.records import BoolArray, FeatureTracks, IntArray, MotionSample, Recording
 
 log = logging.getLogger(__name__)
 
 _STRETCH, _STRETCHES, _STRETCH_KEYFRAMES = 36, 6, 20  # frames, pieces, keyframes of each, for the rig in motion
 _STRETCH_GATE_PX = 8.0  # wide: wrong extrinsics displace every point
+# What the gate leaves of a camera that is far off is biased: it is measured again with what was found taken out, until
+# less than this is left.
+_ROUNDS, _SETTLED_DEG = 5, 0.05
 _FRAMES_PER_PAIR = 5  # a frame of a feature file contains fewer matches than a pair of images
 _MAX_ROW_OFFSET_PX = 2.0  # with larger row differences, features are matched wrongly or not at all
 _UNUSABLE = ("cameras swapped", "baseline translation inverted")  # features are unusable then
 
 _ROWS, _IMU, _LEVER_ARM = "row alignment", "IMU-camera rotation and time offset", "lever arm"
+_INTRINSICS = "focal length and principal point"
+_NOT_TRACKED = NotObservable(_INTRINSICS, "no features were tracked")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +76,8 @@ class CalibrationReport:
     imu: ImuReport
     stereo_findings: tuple[Finding, ...]
     notes: tuple[str, ...]
+    intrinsics: Intrinsics | NotObservable = _NOT_TRACKED
+    in_motion: SelfCalibration | None = None  # by bundle adjustment; None: from single pairs alone
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -128,12 +136,14 @@ def measure(
         return CalibrationReport(source, stereo, described, _no_imu(why), findings, notes)
     recording = source.dataset.recording
     tracks, samples = tracked or track(source.dataset, build_frontend, frames, progress)
+    in_motion: SelfCalibration | None = None
+    intrinsics: Intrinsics | NotObservable = NotObservable(_INTRINSICS, "left and right could not be measured")
+    if isinstance(stereo, StereoEstimate):
+        stereo, intrinsics, in_motion = _measure_in_motion(source, stereo, tracks)
+        findings = (*judge_stereo(stereo, given, agreeing), *judge_intrinsics(intrinsics))
     motion = camera_motion(recording.camera, tracks, recording.frame_times_ns)
-    if isinstance(motion, CameraMotion) and isinstance(stereo, StereoEstimate):
-        stereo = _stereo_in_motion(source, stereo, tracks, motion)
-        findings = judge_stereo(stereo, given, agreeing)
     imu = _measure_imu(recording, tracks, samples, motion)
-    return CalibrationReport(source, stereo, described, imu, findings, notes)
+    return CalibrationReport(source, stereo, described, imu, findings, notes, intrinsics, in_motion)
 
 
 def _unusable(rows: RowResiduals | NotObservable, findings: tuple[Finding, ...]) -> bool:
@@ -210,29 +220,63 @@ def _measure_stereo(matches: RayMatches) -> tuple[StereoEstimate | NotObservable
     return replace(refined, R_cam1_cam0=R, direction=direction), inliers
 
 
-def _stereo_in_motion(
-    source: CalibrationSource, stereo: StereoEstimate, tracks: FeatureTracks, motion: CameraMotion
-) -> StereoEstimate:
-    """Estimate left-right extrinsics by bundle adjustment over stretches of video; unchanged where that fails."""
+def _measure_in_motion(
+    source: CalibrationSource, stereo: StereoEstimate, tracks: FeatureTracks
+) -> tuple[StereoEstimate, Intrinsics | NotObservable, SelfCalibration | None]:
+    """Estimate the calibration by bundle adjustment over stretches of video; unchanged where there are none."""
     assert source.dataset is not None
     width, height = source.image_size(tracks.z)
-    camera = replace(source.dataset.recording.camera, width=int(width) + 1, height=int(height) + 1)
-    rotations = source.rectifying()
-    found = []
+    recording = source.dataset.recording
+    camera = replace(recording.camera, width=int(width) + 1, height=int(height) + 1)
+    off: FloatArray = np.zeros(len(PARAMETERS))
+    try:
+        for _ in range(_ROUNDS):
+            pieces = _stretches(source, camera, _corrected(camera, tracks, off), recording.frame_times_ns)
+            if not pieces:
+                return stereo, NotObservable(_INTRINSICS, "there are no 20 frames in a row whose motion is known"), None
+            step = self_calibrate(camera, pieces, intrinsics=False)
+            held = step.after(off)
+            if np.degrees(np.linalg.norm(so3_log(step.right_camera()[0]))) < _SETTLED_DEG:
+                break
+            off = held.rig_parameters()
+        free = self_calibrate(camera, pieces, intrinsics=True)
+    except (EstimationError, np.linalg.LinAlgError) as error:
+        log.warning("the motion was not used: %s", error)
+        return stereo, NotObservable(_INTRINSICS, "its bundle adjustment failed"), None
+    R, direction, rotation_deg, direction_deg = held.right_camera()
+    if (rotations := source.rectifying()) is not None:
+        R_rect_cam0, R_rect_cam1 = rotations
+        R, direction = R_rect_cam1.T @ R @ R_rect_cam0, R_rect_cam0.T @ direction
+    found = replace(
+        stereo,
+        R_cam1_cam0=R,
+        direction=direction,
+        rotation_sigma_deg=rotation_deg,
+        direction_sigma_deg=direction_deg,
+        stretches=held.stretches,
+    )
+    return found, intrinsics_of(camera, free), held
+
+
+def _corrected(camera: StereoCamera, tracks: FeatureTracks, off: FloatArray) -> FeatureTracks:
+    """Return tracks without the field of a pair that is off by parameters (12,)."""
+    return replace(tracks, z=field_of(camera, off).without(tracks.z, tracks.has_right)) if np.any(off) else tracks
+
+
+def _stretches(
+    source: CalibrationSource, camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray
+) -> list[Stretch]:
+    """Return keyframes, points and rows of pieces of the recording with tracked features."""
+    motion = stereo_twists(camera, tracks, times_ns, np.zeros((len(times_ns) - 1, 6)))
+    out = []
     for piece in tracked_stretches(source.path, camera, tracks, motion, longest=_STRETCH, most=_STRETCHES):
         try:
             keyframes = choose_keyframes(piece, most=_STRETCH_KEYFRAMES)
             T_world_cam0 = piece.trajectory.T_world_body[keyframes]
-            points = build_tracks(piece, keyframes, T_world_cam0, gate_px=_STRETCH_GATE_PX)
-            R, direction = adjust_rig_in_motion(camera, T_world_cam0, points)
+            out.append(Stretch(T_world_cam0, build_tracks(piece, keyframes, T_world_cam0, gate_px=_STRETCH_GATE_PX)))
         except EstimationError as error:
             log.warning("a stretch of video was left out: %s", error)
-            continue
-        if rotations is not None:
-            R_rect_cam0, R_rect_cam1 = rotations
-            R, direction = R_rect_cam1.T @ R @ R_rect_cam0, R_rect_cam0.T @ direction
-        found.append((R, direction))
-    return combine_stereo(stereo, found) or stereo
+    return out
 
 
 # --- motion sensor --------------------------------------------------------------------------------------------------

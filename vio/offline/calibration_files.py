@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from vio.calibration.inertial import ImuAlignment
 from vio.calibration.lever_arm import LeverArm
 from vio.calibration.stereo import StereoEstimate
+from vio.calibration.stereo_field import rig_off_by
 from vio.datasets.euroc_files import SENSOR_YAML_MODELS, camera_yaml, median_rate_hz
 from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs.kalibr import kalibr_text
@@ -28,11 +30,11 @@ def write_calibration(folder: Path, report: CalibrationReport) -> None:
     rig = report.source.rig
     if rig is None:
         return
-    T_cam0_cam1 = _measured_stereo(report, rig)
+    stereo = _measured_stereo(report, rig)
     T_cam0_imu, offset_s = _measured_imu(report, rig)
     T_imu_cam0 = se3_inverse(T_cam0_imu)
-    poses = {"cam0": T_imu_cam0, "cam1": T_imu_cam0 @ T_cam0_cam1}
-    cameras = {"cam0": rig.cam0, "cam1": rig.cam1}
+    poses = {"cam0": T_imu_cam0, "cam1": T_imu_cam0 @ se3_inverse(stereo.T_cam1_cam0)}
+    cameras = {"cam0": stereo.cam0, "cam1": stereo.cam1}
     dataset = report.source.dataset
     times = np.zeros(0, dtype=np.int64) if dataset is None else dataset.recording.frame_times_ns
     rate_hz = median_rate_hz(times) or _USUAL_RATE_HZ
@@ -43,16 +45,21 @@ def write_calibration(folder: Path, report: CalibrationReport) -> None:
         (folder / name / "sensor.yaml").write_text(
             camera_yaml(camera, poses[name], comment=f"{name}, by vio calibrate", rate_hz=rate_hz), encoding="utf-8"
         )
-    measured = Rig(rig.cam0, rig.cam1, se3_inverse(T_cam0_cam1), T_cam0_imu, time_offset_s=offset_s)
+    measured = replace(stereo, T_cam0_imu=T_cam0_imu, time_offset_s=offset_s)
     (folder / "camchain-imucam.yaml").write_text(kalibr_text(measured), encoding="utf-8")
 
 
-def _measured_stereo(report: CalibrationReport, rig: StereoRig) -> FloatArray:
-    """Return `T_cam0_cam1` (4, 4) as measured, with the given length of the baseline."""
+def _measured_stereo(report: CalibrationReport, given: StereoRig) -> Rig:
+    """Return the cameras as measured, with the given length of the baseline, focal length and principal point."""
+    rig = Rig(given.cam0, given.cam1, se3_inverse(given.T_cam0_cam1))
     if not isinstance(report.stereo, StereoEstimate):
-        return rig.T_cam0_cam1
-    length = float(np.linalg.norm(rig.T_cam0_cam1[:3, 3]))
-    return se3_from_parts(report.stereo.R_cam1_cam0.T, length * report.stereo.direction)
+        return rig
+    length = float(np.linalg.norm(given.T_cam0_cam1[:3, 3]))
+    R = report.stereo.R_cam1_cam0
+    if report.in_motion is not None:  # what lenses and principal point share with the rotation, is apart there
+        rig = rig_off_by(rig, report.in_motion.rig_parameters())
+        R = rig.T_cam1_cam0[:3, :3]
+    return replace(rig, T_cam1_cam0=se3_from_parts(R, -length * R @ report.stereo.direction))
 
 
 def _measured_imu(report: CalibrationReport, rig: StereoRig) -> tuple[FloatArray, float]:

@@ -16,6 +16,7 @@ from vio.sim.errors import SimulationError
 from vio.sim.render import Radiance
 
 _FULL_SCALE = 255.0
+_NO_MAP = np.empty((0, 0), dtype=np.float32)  # cv2.remap's second map, where the first one holds both coordinates
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +34,13 @@ class SensorEffects:
     blur_exposure_ms: float = setting(0.0, "shutter time over which motion blurs the image", unit="ms")
     blur_samples: int = setting(7, "sub-exposures, or taps of the approximate blur")
     blur_exact: bool = setting(False, "render every sub-exposure; else blur one image along its exact optical flow")
+    auto_exposure: bool = setting(False, "each camera's own exposure control sets shutter time and gain of each frame")
+    shutter_ms: float = setting(8.0, "shutter time that leaves the scene's gray levels, with auto_exposure", unit="ms")
+    shutter_max_ms: float = setting(12.0, "longest shutter time; where it does not do, gain is added", unit="ms")
+    gain_max: float = setting(8.0, "largest gain of the exposure control")
+    exposure_target: float = setting(95.0, "mean gray level that the exposure control aims at")
+    camera_difference: float = setting(0.0, "how much the cameras differ: vignetting, mean gray level", unit="0..1")
+    glare: float = setting(0.0, "light of windows and sun scattered in the lens: halo and ghosts; 1 is a usual lens")
 
     def __post_init__(self) -> None:
         if self.exposure < 0 or self.right_gain < 0 or self.gamma <= 0 or self.blur_samples < 1:
@@ -41,13 +49,47 @@ class SensorEffects:
             raise SimulationError("vignetting and exposure_swing must be between 0 and 1")
         if self.read_noise < 0 or self.full_well < 0 or self.blur_exposure_ms < 0:
             raise SimulationError("read_noise, full_well and blur_exposure_ms must not be negative")
+        if min(self.shutter_ms, self.shutter_max_ms, self.exposure_target) <= 0 or self.gain_max < 1:
+            raise SimulationError("shutter times and exposure_target must be positive, gain_max at least 1")
+        if not (0 <= self.camera_difference <= 1 and self.glare >= 0):
+            raise SimulationError("camera_difference must be between 0 and 1, and glare not negative")
+
+    @property
+    def longest_shutter_ms(self) -> float:
+        """The longest shutter time that any frame may have, ms."""
+        return self.shutter_max_ms if self.auto_exposure else self.blur_exposure_ms
 
 
 CLEAN = SensorEffects(read_noise=0.0)
 
 
+@dataclass(frozen=True, slots=True)
+class Exposure:
+    """Exposure of one image by a camera with exposure control."""
+
+    shutter_ms: float
+    gain: float = 1.0  # of the amplifier, which raises signal and noise alike
+
+
+def sensitivity(effects: SensorEffects, camera: int) -> float:
+    """Return a camera's gray levels over those of the scene, at the nominal exposure."""
+    return effects.exposure * (effects.right_gain if camera else 1.0)
+
+
+def camera_factor(effects: SensorEffects, camera: int, seed: int) -> float:
+    """Return a factor about 1 by which a camera's vignetting and mean gray level deviate."""
+    return 1 + effects.camera_difference * float(np.random.default_rng([seed, camera, 32]).uniform(-1, 1))
+
+
 def apply_effects(
-    radiance: Radiance, effects: SensorEffects, *, time_ns: int, frame_index: int, camera: int, seed: int
+    radiance: Radiance,
+    effects: SensorEffects,
+    *,
+    time_ns: int,
+    frame_index: int,
+    camera: int,
+    seed: int,
+    exposure: Exposure | None = None,
 ) -> Image:
     """Convert a linear image (H, W) in gray levels to the sensor's output, uint8.
 
@@ -57,20 +99,27 @@ def apply_effects(
         time_ns: time of exposure, for the slow change of exposure.
         frame_index: number of the frame, for the noise.
         camera: 0 left, 1 right.
-        seed: of the noise.
+        seed: of the noise and of the cameras' difference.
+        exposure: what the camera's exposure control has set; None: it has none.
     """
-    gain = effects.exposure * (effects.right_gain if camera else 1.0)
+    gain = sensitivity(effects, camera)
+    amplifier = 1.0
+    if exposure is not None:
+        amplifier = exposure.gain
+        gain *= exposure.shutter_ms / effects.shutter_ms * amplifier
     gain *= 1 + effects.exposure_swing * float(np.sin(2 * np.pi * time_ns * 1e-9 / effects.exposure_period_s))
     signal = radiance * np.float32(gain)
     if effects.vignetting > 0:
-        signal *= _vignette(radiance.shape, effects.vignetting)
+        signal *= _vignette(radiance.shape, effects, camera, seed)
     rng = np.random.default_rng([seed, frame_index, camera, 31])
+    read = effects.read_noise * amplifier
     if effects.full_well > 0:
-        electrons = np.maximum(signal, 0) * np.float32(effects.full_well / _FULL_SCALE)
-        shot = np.sqrt(electrons) * rng.standard_normal(signal.shape, dtype=np.float32)
-        signal = signal + shot * np.float32(_FULL_SCALE / effects.full_well)
-    if effects.read_noise > 0:
-        signal = signal + np.float32(effects.read_noise) * rng.standard_normal(signal.shape, dtype=np.float32)
+        # One draw for both: electrons e have variance e, and a gray level is 255 gain / full_well electrons.
+        variance = np.maximum(signal, 0) * np.float32(_FULL_SCALE * amplifier / effects.full_well)
+        sigma = np.sqrt(variance + np.float32(read**2))
+        signal = signal + sigma * rng.standard_normal(signal.shape, dtype=np.float32)
+    elif read > 0:
+        signal = signal + np.float32(read) * rng.standard_normal(signal.shape, dtype=np.float32)
     if effects.gamma != 1.0:
         signal = _FULL_SCALE * (np.clip(signal, 0, _FULL_SCALE) / np.float32(_FULL_SCALE)) ** np.float32(
             1 / effects.gamma
@@ -79,20 +128,25 @@ def apply_effects(
     return out
 
 
-def _vignette(shape: tuple[int, ...], loss: float) -> npt.NDArray[np.float32]:
-    """Factor (H, W): 1 in the middle, falling with the square of the radius to 1 - loss in the corners."""
+def _vignette(shape: tuple[int, ...], effects: SensorEffects, camera: int, seed: int) -> npt.NDArray[np.float32]:
+    """Factor (H, W): 1 in the middle, falling with the square of the radius to 1 - loss in the corners.
+
+    With different cameras the middle is off the image's and the loss another one in each of them.
+    """
     height, width = shape
-    y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
-    x = np.linspace(-1, 1, width, dtype=np.float32)[None]
-    return 1 - np.float32(loss / 2) * (x * x + y * y)
+    loss = min(1.0, effects.vignetting * camera_factor(effects, camera, seed))
+    off = effects.camera_difference * np.random.default_rng([seed, camera, 33]).uniform(-1, 1, 2)
+    y = np.linspace(-1 - off[1], 1 - off[1], height, dtype=np.float32)[:, None]
+    x = np.linspace(-1 - off[0], 1 - off[0], width, dtype=np.float32)[None]
+    return np.maximum(1 - np.float32(loss / 2) * (x * x + y * y), np.float32(0))
 
 
-def average_exposures(render_at: Callable[[int], Radiance], time_ns: int, effects: SensorEffects) -> Radiance:
+def average_exposures(render_at: Callable[[int], Radiance], time_ns: int, shutter_ms: float, samples: int) -> Radiance:
     """Average sub-exposures spread evenly over the shutter time, centred at `time_ns`.
 
     `render_at(time_ns)` renders the sharp image at one time.
     """
-    offsets = _shutter(effects)
+    offsets = np.round(((np.arange(samples) + 0.5) / samples - 0.5) * shutter_ms * 1e6).astype(np.int64)
     total = render_at(time_ns + int(offsets[0])).astype(np.float32)
     for offset in offsets[1:]:
         total = total + render_at(time_ns + int(offset))
@@ -100,15 +154,7 @@ def average_exposures(render_at: Callable[[int], Radiance], time_ns: int, effect
     return out
 
 
-def _shutter(effects: SensorEffects) -> npt.NDArray[np.int64]:
-    """Times (N,) of the sub-exposures relative to the middle of the shutter, ns; symmetric about zero."""
-    n = effects.blur_samples
-    return np.round(((np.arange(n) + 0.5) / n - 0.5) * effects.blur_exposure_ms * 1e6).astype(np.int64)
-
-
-def blur_along_flow(
-    sharp: Radiance, flow_before: FloatArray, flow_after: FloatArray, effects: SensorEffects
-) -> Radiance:
+def blur_along_flow(sharp: Radiance, flow_before: FloatArray, flow_after: FloatArray, taps: int) -> Radiance:
     """Blur one sharp image (H, W) along its optical flow: the approximate motion blur.
 
     Each pixel is the mean of taps along the path on which its point crosses the image, so disocclusions are
@@ -118,16 +164,15 @@ def blur_along_flow(
         sharp: image at the middle of the shutter time.
         flow_before: (H, W, 2) pixels from here to where the point is when the shutter opens.
         flow_after: (H, W, 2) pixels from here to where the point is when it closes.
-        effects: sets the number of taps.
+        taps: number of samples along the path.
     """
-    n = effects.blur_samples
     height, width = sharp.shape
-    u, v = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    here = np.stack(np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32)), axis=-1)
+    before, after = (np.asarray(flow, dtype=np.float32) for flow in (flow_before, flow_after))
     total = np.zeros_like(sharp)
-    for position in (np.arange(n) + 0.5) / n * 2 - 1:
+    for position in (np.arange(taps) + 0.5) / taps * 2 - 1:
         # The pixel's content at another time is found upstream along the flow.
-        flow = flow_after if position > 0 else flow_before
-        step = -abs(float(position)) * flow.astype(np.float32)
-        total += cv2.remap(sharp, u + step[..., 0], v + step[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    out: Radiance = total / np.float32(n)
-    return out
+        at = cv2.scaleAdd(after if position > 0 else before, -abs(float(position)), here)
+        cv2.accumulate(cv2.remap(sharp, at, _NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), total)
+    total *= np.float32(1 / taps)
+    return total

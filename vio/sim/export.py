@@ -24,7 +24,7 @@ from vio.datasets.euroc_files import (
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.errors import CalibrationError
-from vio.geometry.distortion import rectified_camera
+from vio.geometry.distortion import StereoRig, rectified_camera
 from vio.geometry.lie import se3_inverse
 from vio.protocols import Progress
 from vio.records import ImuDensities
@@ -68,7 +68,7 @@ def export_euroc(
     record = simulation.imu
     if record is None:
         raise SimulationError("an EuRoC folder needs an IMU; simulate with imu=ImuNoise() or with a recorded one")
-    rig, stamps = simulation.rig, simulation.stamps_ns
+    rig, stamps = simulation.calibration, simulation.stamps_ns
     origin = "recorded" if record.gyro_bias is None else "simulated"
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
         mav = folder / "mav0"
@@ -102,11 +102,11 @@ def export_kitti(
     """
     simulation = recording.simulation
     try:
-        camera = rectified_camera(simulation.rig)
+        camera = rectified_camera(simulation.calibration)
     except CalibrationError as error:
         raise SimulationError("a KITTI folder needs a rectified rig; export this one as an EuRoC folder") from error
     stamps = simulation.stamps_ns
-    T_cam0_imu = se3_inverse(simulation.rig.T_imu_cam0)
+    T_cam0_imu = se3_inverse(simulation.calibration.T_imu_cam0)
     poses = in_first_cam0(recording.reference, T_cam0_imu).T_world_body
     within = [sample for sample in simulation.velocity if stamps[0] <= sample.time_ns <= stamps[-1]]
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
@@ -161,5 +161,16 @@ def _description(recording: SimulatedRecording) -> str:
         if simulation.imu is None
         else ("simulated" if simulation.imu.gyro_bias is not None else "recorded"),
         "effects": asdict(simulation.effects),
+        "true_rig": _rig_facts(simulation.rig),
     }
     return json.dumps(facts, indent=2) + "\n"
+
+
+def _rig_facts(rig: StereoRig) -> dict[str, object]:
+    """The true cameras, which the calibration that is written may miss, as JSON."""
+    return {
+        "cam0": asdict(rig.cam0),
+        "cam1": asdict(rig.cam1),
+        "T_imu_cam0": rig.T_imu_cam0.tolist(),
+        "T_imu_cam1": rig.T_imu_cam1.tolist(),
+    }

@@ -58,7 +58,7 @@ class OracleFrontend:
             SimulationError: the rig is not rectified.
         """
         try:
-            self._camera = rectified_camera(simulation.rig)
+            self._camera = rectified_camera(simulation.calibration)
         except CalibrationError as error:
             raise SimulationError("the oracle outputs rectified pixels and needs a rectified rig") from error
         self._simulation = simulation

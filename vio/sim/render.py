@@ -461,7 +461,7 @@ def _shade(scene: _Scene, k: int, rays: CameraRays, rows: slice, columns: slice)
         texture.page, x.reshape(n * h, w), y.reshape(n * h, w), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     total = np.add.reduce(values.reshape(n, h * w), axis=0, dtype=np.float32)
-    total *= np.float32(1 / n)
+    total *= np.float32(texture.gain / n)
     return total.reshape(h, w)
 
 
@@ -515,4 +515,4 @@ def _sample_points(
     padded[0, : len(x)], padded[1, : len(x)] = x, y
     maps = padded.reshape(2, -1, width)
     values = cv2.remap(texture.page, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return values.reshape(-1)[: len(x)].astype(np.float32)
+    return values.reshape(-1)[: len(x)].astype(np.float32) * np.float32(texture.gain)

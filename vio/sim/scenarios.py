@@ -22,9 +22,11 @@ from vio.errors import DataError
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts
 from vio.records import NS_PER_S, Image, ImuRecord, IntArray
+from vio.setting import setting
 from vio.sim.effects import CLEAN, SensorEffects
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ImuNoise, VelocityNoise
+from vio.sim.miscalibration import CalibrationErrors
 from vio.sim.motion import (
     MotionSpline,
     car_loop,
@@ -34,6 +36,7 @@ from vio.sim.motion import (
     rotate_body_axes,
     spline_from_waypoints,
 )
+from vio.sim.people import Walk, along_walks, plan_walks, walking_people
 from vio.sim.rigs import (
     R_FLU_EUROC_IMU,
     euroc_like_rig,
@@ -43,6 +46,7 @@ from vio.sim.rigs import (
     small_rig,
 )
 from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
+from vio.sim.textures import TextureKind
 from vio.sim.world import MovingBox, SceneName, World, corridor, room, street
 
 ReadyMotion: TypeAlias = Literal["handheld", "car"]
@@ -60,6 +64,7 @@ _EUROC_AXES = ("euroc", "euroc-rectified")  # rigs whose IMU axes are up, right,
 _MARGIN_S = 0.25  # of motion before the first and after the last frame, for shutters and clock offsets
 _AHEAD = 3  # pending frames per process
 _LEAD_M = 14.0  # to the car ahead
+_WINDOWS = 2  # of a room with lighting
 _WALL_GAP_M = 0.4  # from a wall to the middle of a box that moves along it
 
 FLIGHT_FILES = ("groundtruth_tum.txt", "image_timestamps_ns.txt", "imu0.csv")
@@ -72,8 +77,11 @@ class Conditions:
     effects: SensorEffects = field(default_factory=SensorEffects)
     faults: FrameFaults = field(default_factory=FrameFaults)
     imu_noise: ImuNoise = field(default_factory=ImuNoise)  # of the simulated IMU
-    bare_wall: bool = False  # two walls without texture
-    moving: bool = False  # boxes that move on their own
+    calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
+    bare_wall: bool = setting(False, "two walls without texture; in the street a third of the houses")
+    moving: bool = setting(False, "boxes that move on their own")
+    people: int = setting(0, "people who walk near the path")
+    lighting: bool = setting(False, "light from two windows, in the street from a low sun; else even light")
 
 
 def _with_effects(**values: Any) -> Callable[[Conditions], Conditions]:
@@ -100,13 +108,37 @@ EFFECTS: dict[str, Callable[[Conditions], Conditions]] = {
 }
 
 
-def conditions_of(names: Sequence[str]) -> Conditions:
-    """Return the conditions that named effects produce, applied in order.
+def real_conditions(scene: SceneName) -> Conditions:
+    """Return the conditions of `--realism real`: what real cameras and places do, all at once."""
+    outdoors = scene == "street"
+    effects = SensorEffects(
+        right_gain=0.85,
+        vignetting=0.35,
+        read_noise=0.8,
+        full_well=8000.0,
+        auto_exposure=True,
+        shutter_ms=2.0 if outdoors else 14.0,
+        shutter_max_ms=8.0 if outdoors else 15.0,
+        camera_difference=0.15,
+        glare=1.0,
+    )
+    return Conditions(
+        effects=effects,
+        calibration=CalibrationErrors(scale=1.0),
+        bare_wall=True,
+        moving=outdoors,
+        people=12 if outdoors else 4,
+        lighting=True,
+    )
+
+
+def conditions_of(names: Sequence[str], start: Conditions | None = None) -> Conditions:
+    """Return the conditions that named effects produce, applied in order to those at the start (None: the defaults).
 
     Raises:
         SimulationError: there is no effect of that name.
     """
-    conditions = Conditions()
+    conditions = Conditions() if start is None else start
     for name in names:
         if name not in EFFECTS:
             raise SimulationError(f"there is no effect {name!r}; choose from {', '.join(EFFECTS)}")
@@ -155,6 +187,7 @@ def plan(scenario: Scenario) -> Simulation:
         velocity=velocity,
         effects=scenario.conditions.effects,
         faults=scenario.conditions.faults,
+        calibration_errors=scenario.conditions.calibration,
         seed=scenario.seed,
     )
 
@@ -171,8 +204,8 @@ def _check(scenario: Scenario) -> None:
         raise SimulationError(f"a recording of {scenario.duration_s:g} s cannot be rendered; choose up to 36000 s")
     if scenario.seed < 0:
         raise SimulationError(f"the seed must not be negative, got {scenario.seed}")
-    if scenario.conditions.bare_wall and scenario.scene == "street":
-        raise SimulationError("a street has no bare walls; use that effect in a room or a corridor")
+    if not 0 <= scenario.conditions.people <= 100:
+        raise SimulationError(f"{scenario.conditions.people} people cannot be placed; choose 0 to 100")
 
 
 def scaled(rig: StereoRig, width: int | None) -> StereoRig:
@@ -263,29 +296,54 @@ def _regular(start_ns: int, duration_s: float, rate_hz: float, *, first: int = 0
 
 def _world(scenario: Scenario, motion: MotionSpline) -> World:
     hard, seed = scenario.conditions, scenario.seed
+    walks: tuple[Walk, ...] = ()
+    if hard.people:
+        reach_m, clearance_m = (6.0, 2.0) if scenario.scene == "street" else (2.0, 0.5)
+        free = _scene(scenario, motion, furnished=False)
+        walks = plan_walks(free, motion, hard.people, seed=seed, reach_m=reach_m, clearance_m=clearance_m)
+    moving = walking_people(walks, seed=seed)
+    if hard.moving:
+        moving = (*_moving_boxes(scenario, motion, _scene(scenario, motion)), *moving)
+    return _scene(scenario, motion, moving, walks)
+
+
+def _scene(
+    scenario: Scenario,
+    motion: MotionSpline,
+    moving: Sequence[MovingBox] = (),
+    walks: Sequence[Walk] = (),
+    *,
+    furnished: bool = True,
+) -> World:
+    """The scene with some boxes moving in it; the furniture of a room stays off the ways of people."""
+    hard, seed = scenario.conditions, scenario.seed
+    bare: TextureKind = "plaster" if hard.lighting else "bare"  # in uneven light even a blank wall shows something
     if scenario.scene == "street":
-        return street(seed, moving=_traffic(motion, seed) if hard.moving else ())
+        return street(seed, moving=moving, sunlit=hard.lighting, bare_houses=hard.bare_wall)
     if scenario.scene == "corridor":
-        lane = np.array([[3.0, 0.95, 1.1], [27.0, 0.95, 1.1]])
-        moving = (_oscillating_box(lane, motion.start_ns, 25.0),) if hard.moving else ()
-        return corridor(seed, bare_walls=("+y", "-y") if hard.bare_wall else ("+y",), moving=moving)
-    walls = ("+x", "+y") if hard.bare_wall else ()
-    if not isinstance(scenario.trajectory, Path):
-        plain = room(seed)
-        return room(seed, bare_walls=walls, moving=_boxes_along_walls(plain, motion) if hard.moving else ())
-    around = room_around(motion, seed=seed)
-    if not (walls or hard.moving):
+        sides = ("+y", "-y") if hard.bare_wall else ("+y",)
+        return corridor(seed, bare_walls=sides, bare_kind=bare, moving=moving)
+    walls, windows = ("+x", "+y") if hard.bare_wall else (), _WINDOWS if hard.lighting else 0
+    inside = functools.partial(room, seed, bare_walls=walls, bare_kind=bare, moving=moving, windows=windows)
+    recorded = isinstance(scenario.trajectory, Path)
+    around = room_around(motion, seed=seed) if recorded else room(seed)
+    if not furnished:
+        return inside(bounds=around.bounds, furniture=0, pictures=0)
+    if not (walks or recorded):
+        return inside()
+    if not (walls or moving or windows):
         return around
     times = np.arange(motion.start_ns, motion.end_ns, 100_000_000)
-    return room(
-        seed,
-        bounds=around.bounds,
-        furniture=20,
-        pictures=20,
-        keep_clear=evaluate(motion, times).T_world_imu[:, :3, 3],
-        bare_walls=walls,
-        moving=_boxes_along_walls(around, motion) if hard.moving else (),
-    )
+    keep_clear = np.concatenate([evaluate(motion, times).T_world_imu[:, :3, 3], along_walks(walks)])
+    return inside(bounds=around.bounds, furniture=20, pictures=20, keep_clear=keep_clear)
+
+
+def _moving_boxes(scenario: Scenario, motion: MotionSpline, empty: World) -> tuple[MovingBox, ...]:
+    if scenario.scene == "street":
+        return _traffic(motion, scenario.seed)
+    if scenario.scene == "corridor":
+        return (_oscillating_box(np.array([[3.0, 0.95, 1.1], [27.0, 0.95, 1.1]]), motion.start_ns, 25.0),)
+    return _boxes_along_walls(empty, motion)
 
 
 def _boxes_along_walls(world: World, motion: MotionSpline) -> tuple[MovingBox, ...]:

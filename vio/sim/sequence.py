@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -28,9 +29,12 @@ from vio.records import (
     Trajectory,
     VelocitySample,
 )
-from vio.sim.effects import SensorEffects, apply_effects, average_exposures, blur_along_flow
+from vio.sim.effects import Exposure, SensorEffects, apply_effects, average_exposures, blur_along_flow
 from vio.sim.errors import SimulationError
+from vio.sim.exposure import ExposurePlan, plan_exposures
+from vio.sim.glare import glare
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
+from vio.sim.miscalibration import CalibrationErrors, miscalibrated
 from vio.sim.motion import FitReport, MotionSpline, evaluate, recorded_motion
 from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
 from vio.sim.world import World, check_clear, room
@@ -40,6 +44,8 @@ logger = logging.getLogger(__name__)
 
 _CLEARANCE_STEP_NS = 20_000_000
 _FLOW_GRID = 16  # pixels between exact flow vectors of the approximate blur
+_TAP_SPACING_PX = 1.2  # between samples along a blur; linear interpolation fills the gaps
+_MOST_TAPS = 21
 _WALL_MARGIN_M = 1.2  # of a room built around a recorded flight
 
 
@@ -57,7 +63,7 @@ class Simulation:
     """The full definition of a simulated recording; equal definitions give the same bits."""
 
     world: World
-    rig: StereoRig
+    rig: StereoRig  # the true cameras
     motion: MotionSpline
     taken_ns: IntArray  # (F,) when the content of each frame was exposed, true time; repeats where duplicated
     stamps_ns: IntArray  # (F,) time stamp of each frame, strictly increasing
@@ -65,6 +71,8 @@ class Simulation:
     velocity: tuple[VelocitySample, ...]
     effects: SensorEffects
     seed: int
+    calibration: StereoRig  # as calibrated, which is what is written and read; `rig` is the true one
+    exposures: ExposurePlan | None = None  # of exposure control; None: it is off
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,13 +100,14 @@ def simulate(
     velocity_rate_hz: float | None = None,
     effects: SensorEffects | None = None,
     faults: FrameFaults | None = None,
+    calibration_errors: CalibrationErrors | None = None,
     seed: int = 0,
 ) -> Simulation:
     """Plan a recording and check that it can be simulated; nothing is rendered yet.
 
     Args:
         world: scene.
-        rig: cameras, mounted on the body that `motion` moves.
+        rig: cameras as calibrated, mounted on the body that `motion` moves.
         motion: motion of the body.
         rate_hz: frames per second.
         frame_times_ns: true times (F,) of the frames instead of a fixed rate; those outside the motion are left out.
@@ -108,6 +117,7 @@ def simulate(
         velocity_rate_hz: its rate; None: that of the frames.
         effects: camera effects; None: the defaults of `SensorEffects`.
         faults: dropped and repeated frames, clock offset.
+        calibration_errors: how far the true cameras are from `rig`; None: not at all.
         seed: seed of all random numbers.
 
     Raises:
@@ -115,14 +125,18 @@ def simulate(
     """
     faults = FrameFaults() if faults is None else faults
     effects = SensorEffects() if effects is None else effects
+    true_rig = rig if calibration_errors is None else miscalibrated(rig, calibration_errors, seed=seed)
     times = _frame_times(motion, rate_hz, frame_times_ns, effects, faults)
-    _check_cameras(world, rig, motion, times)
+    _check_cameras(world, true_rig, motion, times)
     taken, stamps = _apply_faults(times, faults, seed)
     record = simulate_imu(motion, rate_hz=imu_rate_hz, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
     samples: tuple[VelocitySample, ...] = ()
     if velocity is not None:
         samples = simulate_velocity(motion, rate_hz=velocity_rate_hz or rate_hz, noise=velocity, seed=seed)
-    return Simulation(world, rig, motion, taken, stamps, record, samples, effects, seed)
+    exposures = None
+    if effects.auto_exposure:
+        exposures = plan_exposures(world, true_rig, motion, taken, effects, seed=seed)
+    return Simulation(world, true_rig, motion, taken, stamps, record, samples, effects, seed, rig, exposures)
 
 
 def _frame_times(
@@ -134,7 +148,7 @@ def _frame_times(
         times = motion.start_ns + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     else:
         times = check_increasing(given, lambda k: f"frame time {k}")
-    half_shutter = int(effects.blur_exposure_ms * 0.5e6) + 1 if effects.blur_exposure_ms > 0 else 0
+    half_shutter = int(effects.longest_shutter_ms * 0.5e6) + 1 if effects.longest_shutter_ms > 0 else 0
     offset = _offset_ns(faults)
     inside = (times - half_shutter >= motion.start_ns) & (times + half_shutter <= motion.end_ns)
     inside &= (times + offset >= motion.start_ns) & (times + offset <= motion.end_ns)
@@ -221,7 +235,7 @@ class SimulatedRecording:
         """
         simulation = self.simulation
         try:
-            camera = rectified_camera(simulation.rig)
+            camera = rectified_camera(simulation.calibration)
         except CalibrationError as error:
             raise SimulationError(
                 "an unrectified rig has no rectified recording; export it as an EuRoC folder and read that"
@@ -236,7 +250,7 @@ class SimulatedRecording:
             kind="simulated",
             path=Path(f"simulated-{simulation.world.name}-{simulation.seed}"),
             camera=camera,
-            T_cam0_imu=se3_inverse(simulation.rig.T_imu_cam0),
+            T_cam0_imu=se3_inverse(simulation.calibration.T_imu_cam0),
             frame_times_ns=stamps,
             has_images=True,
             motion=frozenset(motion),
@@ -287,33 +301,61 @@ class SimulatedRecording:
         time_ns = int(simulation.taken_ns[index])
         # A repeated frame is identical to the bit, so its noise is seeded by the frame it repeats.
         source = int(np.searchsorted(simulation.taken_ns, time_ns))
-        left, right = self.radiance(time_ns)
+        exposures = [self.exposure(index, camera) for camera in (0, 1)]
         images = [
             apply_effects(
-                image, simulation.effects, time_ns=time_ns, frame_index=source, camera=camera, seed=simulation.seed
+                self._seen(camera, time_ns, exposure),
+                simulation.effects,
+                time_ns=time_ns,
+                frame_index=source,
+                camera=camera,
+                seed=simulation.seed,
+                exposure=exposure,
             )
-            for camera, image in enumerate((left, right))
+            for camera, exposure in enumerate(exposures)
         ]
         return images[0], images[1]
 
+    def exposure(self, index: int, camera: int) -> Exposure | None:
+        """Exposure of one image as the camera's control has set it; None where there is no control."""
+        plan = self.simulation.exposures
+        return None if plan is None else plan.at(index, camera)
+
     def radiance(self, time_ns: int) -> tuple[Radiance, Radiance]:
-        """Render both linear images (H, W) at a true time, with motion blur where the effects set it."""
+        """Render both linear images (H, W) at a true time, with the blur and glare that the effects set.
+
+        With exposure control the blur is that of the nominal shutter time.
+        """
         effects = self.simulation.effects
-        if effects.blur_exposure_ms <= 0:
-            return self._sharp(0, time_ns), self._sharp(1, time_ns)
-        return self._blurred(0, time_ns), self._blurred(1, time_ns)
+        exposure = Exposure(effects.shutter_ms) if effects.auto_exposure else None
+        return self._seen(0, time_ns, exposure), self._seen(1, time_ns, exposure)
+
+    def _seen(self, camera: int, time_ns: int, exposure: Exposure | None) -> Radiance:
+        """Light (H, W) that reaches the sensor: blurred over the shutter time, with the lens's glare."""
+        shutter_ms = self.simulation.effects.blur_exposure_ms if exposure is None else exposure.shutter_ms
+        image = self._blurred(camera, time_ns, shutter_ms) if shutter_ms > 0 else self._sharp(camera, time_ns)
+        if self.simulation.effects.glare > 0 and self.simulation.world.lights:
+            view = views(self.simulation, time_ns)[camera]
+            image += glare(self.simulation.world, view, self.rays[camera], self.simulation.effects.glare)
+        return image
 
     def _sharp(self, camera: int, time_ns: int) -> Radiance:
         view = views(self.simulation, time_ns)[camera]
         return render(self.simulation.world, self.rays[camera], view.T_world_cam, time_ns)
 
-    def _blurred(self, camera: int, time_ns: int) -> Radiance:
+    def _blurred(self, camera: int, time_ns: int, shutter_ms: float) -> Radiance:
         effects = self.simulation.effects
         if effects.blur_exact:
-            return average_exposures(lambda t: self._sharp(camera, t), time_ns, effects)
-        half = round(effects.blur_exposure_ms * 0.5e6)
+            return average_exposures(lambda t: self._sharp(camera, t), time_ns, shutter_ms, effects.blur_samples)
+        taps = effects.blur_samples
+        if taps == 1:
+            return self._sharp(camera, time_ns)
+        half = round(shutter_ms * 0.5e6)
         before, after = (self.flow(camera, time_ns, time_ns + sign * half) for sign in (-1, 1))
-        return blur_along_flow(self._sharp(camera, time_ns), before, after, effects)
+        if effects.auto_exposure:  # short shutters need fewer taps, and long ones leave no gaps between them
+            length = max(float(np.abs(before).max()), float(np.abs(after).max()))
+            taps = int(np.clip(2 * round(length / _TAP_SPACING_PX) + 1, 1, _MOST_TAPS))
+        return blur_along_flow(self._sharp(camera, time_ns), before, after, taps)
 
     def flow(self, camera: int, from_ns: int, to_ns: int, *, step_px: int = _FLOW_GRID) -> FloatArray:
         """Optical flow (H, W, 2) of one camera between two true times, exact on a grid and interpolated between nodes.
@@ -339,12 +381,17 @@ class SimulatedRecording:
 
 def _dense(grid: FloatArray, width: int, height: int) -> FloatArray:
     """Bilinear interpolation of a grid (R, C, 2) whose outer rows and columns are at the image's outer pixels."""
-    rows, columns = grid.shape[:2]
-    y, x = np.linspace(0, rows - 1, height), np.linspace(0, columns - 1, width)
-    r, c = np.minimum(y.astype(int), rows - 2), np.minimum(x.astype(int), columns - 2)
-    fy, fx = (y - r)[:, None, None], (x - c)[None, :, None]
-    along = grid[r] * (1 - fy) + grid[r + 1] * fy
-    out: FloatArray = along[:, c] * (1 - fx) + along[:, c + 1] * fx
+    down, across = _weights(grid.shape[0], height), _weights(grid.shape[1], width)
+    return np.stack([down @ grid[..., k] @ across.T for k in (0, 1)], axis=-1)
+
+
+@functools.lru_cache(maxsize=8)
+def _weights(nodes: int, size: int) -> FloatArray:
+    """Matrix (size, nodes) of linear interpolation between nodes that are spread over `size` pixels."""
+    at = np.linspace(0, nodes - 1, size)
+    first = np.minimum(at.astype(int), nodes - 2)
+    out = np.zeros((size, nodes))
+    out[np.arange(size), first], out[np.arange(size), first + 1] = 1 - (at - first), at - first
     return out
 
 

@@ -19,7 +19,21 @@ from vio.records import Image
 from vio.sim.errors import SimulationError
 
 TextureKind: TypeAlias = Literal[
-    "wall", "bare", "floor", "ceiling", "wood", "picture", "crate", "facade", "asphalt", "sky", "skyline"
+    "wall",
+    "bare",
+    "plaster",
+    "floor",
+    "ceiling",
+    "wood",
+    "picture",
+    "crate",
+    "facade",
+    "asphalt",
+    "sky",
+    "skyline",
+    "window",
+    "clothes",
+    "skin",
 ]
 _Canvas: TypeAlias = npt.NDArray[np.float32]
 
@@ -28,6 +42,7 @@ _MAX_SIDE = 32000  # cv2.remap addresses its source with 16-bit integers
 _SMALLEST_LEVEL = 4
 _MOST_MARKS = 6000  # of one kind on one surface
 LEVELS_PER_OCTAVE = 2
+_COARSE_TEXELS = 16  # of the shorter side of the copy that exposure is metered on
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +52,16 @@ class MipTexture:
     page: Image  # (H, W)
     size: tuple[int, int]  # texels of level 0: along s, along t
     levels: npt.NDArray[np.float32]  # (L, 4) scale_s, scale_t, offset_s, offset_t: level-0 texels to page pixels
+    gain: float = 1.0  # radiance over the page's gray levels
+
+    def coarse(self, share: FloatArray) -> FloatArray:
+        """Radiance (N,) at places (N, 2) given as shares of width and height, of a copy about 16 texels small."""
+        sizes = self.levels[:, :2] * self.size  # texels of each level
+        level = self.levels[int(np.argmin(np.abs(np.log2(sizes.min(axis=1) / _COARSE_TEXELS))))]
+        x, y = (np.clip(share, 0, 1) * self.size * level[:2] + level[2:]).T
+        height, width = self.page.shape
+        column, row = np.clip(np.rint(x), 0, width - 1).astype(int), np.clip(np.rint(y), 0, height - 1).astype(int)
+        return self.page[row, column] * float(self.gain)
 
 
 def build_mips(texture: Image) -> MipTexture:
@@ -93,6 +118,20 @@ def paint(kind: TextureKind, size_m: FloatArray, texel_m: float, rng: np.random.
     width, height = (max(8, round(float(side) / texel_m)) for side in size_m)
     canvas = _PAINTERS[kind](width, height, 1.0 / texel_m, rng)
     return np.clip(canvas + 0.5, 4, 251).astype(np.uint8)
+
+
+def lit(texture: Image, light: FloatArray, rng: np.random.Generator) -> tuple[Image, float]:
+    """Multiply a texture (H, W) by light (R, C), given at the middles of as many equal cells.
+
+    Returns:
+        The texture under that light over its brightest value, rounded with dither so that no steps appear in the
+        dark, and that value, by which the texture is to be multiplied.
+    """
+    gain = float(light.max())
+    relative = (light / gain).astype(np.float32)
+    shaded = cv2.resize(relative, texture.shape[::-1], interpolation=cv2.INTER_LINEAR) * texture
+    shaded = shaded + rng.random(shaded.shape, dtype=np.float32)
+    return np.clip(shaded, 0, 255).astype(np.uint8), gain
 
 
 def octave_noise(
@@ -215,6 +254,17 @@ def _poster(canvas: _Canvas, per_m: float, rng: np.random.Generator) -> None:
 
 def _bare(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
     return np.full((height, width), 150.0, dtype=np.float32)
+
+
+def _plaster(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """A painted wall: stains fainter than a sensor's noise, a socket or hook here and there, a skirting board."""
+    canvas = np.ascontiguousarray(150 + 1.5 * _noise(width, height, per_m, rng, 1.5, 0.7), dtype=np.float32)
+    for _ in range(int(width * height / per_m**2 / 2) + 1):
+        side = rng.choice([0.08, 0.02]) * per_m
+        place = rng.uniform((0, 0.3 * height), (width, height - side))
+        _fill(canvas, (*place, max(side, 2), max(side, 2)), 150 + float(rng.choice([-70.0, 40.0])))
+    _fill(canvas, (0, height - 0.08 * per_m, width, 0.08 * per_m), 95.0)
+    return canvas
 
 
 def _picture(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
@@ -393,9 +443,40 @@ def _skyline(width: int, height: int, per_m: float, rng: np.random.Generator) ->
     return canvas.astype(np.float32)
 
 
+def _glass(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """A window against the light: bright panes, dark bars and frame."""
+    canvas = np.full((height, width), 235.0, dtype=np.float32)
+    bar = max(2, round(0.05 * per_m))
+    for edge in (canvas[:bar], canvas[-bar:], canvas[:, :bar], canvas[:, -bar:]):
+        edge[:] = 12.0
+    for count, along in ((max(2, round(width / per_m / 0.8)), width), (max(2, round(height / per_m / 0.9)), height)):
+        for k in range(1, count):
+            at = round(k * along / count)
+            if along == width:
+                canvas[:, at - bar // 2 : at + bar // 2 + 1] = 12.0
+            else:
+                canvas[at - bar // 2 : at + bar // 2 + 1] = 12.0
+    return canvas
+
+
+def _clothes(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    """Cloth: one shade with soft folds, sometimes a stripe or a print."""
+    canvas = rng.choice([35.0, 60.0, 95.0, 150.0]) + 9 * _noise(width, height, per_m, rng, 0.25, 0.6)
+    canvas = np.ascontiguousarray(canvas, dtype=np.float32)
+    if rng.random() < 0.5:
+        x, y, w, h = rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.5), rng.uniform(0.2, 0.5), rng.uniform(0.1, 0.3)
+        _fill(canvas, (x * width, y * height, w * width, h * height), rng.uniform(40, 200))
+    return canvas
+
+
+def _skin(width: int, height: int, per_m: float, rng: np.random.Generator) -> _Canvas:
+    return np.asarray(140 + 8 * _noise(width, height, per_m, rng, 0.1, 0.7), dtype=np.float32)
+
+
 _PAINTERS: dict[TextureKind, Callable[[int, int, float, np.random.Generator], _Canvas]] = {
     "wall": _wall,
     "bare": _bare,
+    "plaster": _plaster,
     "floor": _floor,
     "ceiling": _ceiling,
     "wood": _wood,
@@ -405,4 +486,7 @@ _PAINTERS: dict[TextureKind, Callable[[int, int, float, np.random.Generator], _C
     "asphalt": _asphalt,
     "sky": _sky,
     "skyline": _skyline,
+    "window": _glass,
+    "clothes": _clothes,
+    "skin": _skin,
 }

@@ -17,7 +17,8 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.records import IntArray
 from vio.sim.errors import SimulationError
-from vio.sim.textures import MipTexture, TextureKind, build_mips, paint
+from vio.sim.lighting import Light, Lighting, illumination, sun, window
+from vio.sim.textures import MipTexture, TextureKind, build_mips, lit, paint
 
 SceneName: TypeAlias = Literal["room", "street", "corridor"]
 ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_object (4, 4)
@@ -25,6 +26,15 @@ ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_obje
 _OF_WOOD: tuple[TextureKind, ...] = ("wood", "crate")
 _ONWARD_M = 80.0  # length of the streets beyond the block
 _CORNER_FREE_M = 13.0  # no parked box this close to a corner, which cars cut
+# Radiance over the texture's own gray levels, of what is bright by itself: nine stops of a room's light and a window
+# do not fit one exposure, and a bright sky is about a stop above sunlit walls.
+_EMISSION: dict[TextureKind, float] = {"window": 7.0, "sky": 1.5, "skyline": 1.3}
+_MOVER_LIGHT = 0.7  # illumination of moving boxes, which is the same wherever they are
+_LIGHT_CELL_M = 0.25  # at which illumination is computed; also the width of a shadow's soft edge
+_MOST_LIGHT_CELLS = 400  # along each side of a surface
+_ROOM_AMBIENT, _STREET_AMBIENT = 0.22, 0.4
+_SUN_ELEVATION_RAD = 0.3
+_BARE_HOUSES = 3  # one house in so many has a blank wall
 _FACES: dict[str, tuple[int, int]] = {
     "+x": (0, 1),
     "-x": (0, -1),
@@ -84,9 +94,14 @@ class Surfaces:
 class TextureStore:
     """The textures of a world, each painted from its own seed on first use."""
 
-    def __init__(self, patches: Sequence[Patch], seed: int) -> None:
+    def __init__(
+        self, patches: Sequence[Patch], seed: int, lighting: Lighting | None = None, movers: Sequence[int] = ()
+    ) -> None:
+        """Store what to paint; `lighting` shades it, alike all over surfaces that move (`movers` > 0)."""
         self._patches = tuple(patches)
         self._seed = seed
+        self._lighting = lighting
+        self._movers = tuple(movers)
         self._painted: dict[int, MipTexture] = {}
         self._lock = threading.Lock()
 
@@ -97,11 +112,28 @@ class TextureStore:
             with self._lock:
                 found = self._painted.get(surface)
                 if found is None:
-                    patch = self._patches[surface]
-                    rng = np.random.default_rng([self._seed, surface])
-                    found = build_mips(paint(patch.kind, patch.size, patch.texel_m, rng))
+                    found = self._paint(surface)
                     self._painted[surface] = found
         return found
+
+    def _paint(self, surface: int) -> MipTexture:
+        patch = self._patches[surface]
+        texture = paint(patch.kind, patch.size, patch.texel_m, np.random.default_rng([self._seed, surface]))
+        if self._lighting is None:
+            return build_mips(texture)
+        if patch.kind in _EMISSION or self._movers[surface]:
+            return replace(build_mips(texture), gain=_EMISSION.get(patch.kind, _MOVER_LIGHT))
+        light = _light_on(patch, self._lighting)
+        shaded, gain = lit(texture, light, np.random.default_rng([self._seed, surface, 1]))
+        return replace(build_mips(shaded), gain=gain)
+
+
+def _light_on(patch: Patch, lighting: Lighting) -> FloatArray:
+    """Illumination (R, C) at the middles of a grid of cells over a fixed surface."""
+    columns, rows = np.clip(np.ceil(patch.size / _LIGHT_CELL_M), 2, _MOST_LIGHT_CELLS).astype(int)
+    s, t = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    along = s.reshape(-1, 1) * patch.size[0] * patch.axis_s + t.reshape(-1, 1) * patch.size[1] * patch.axis_t
+    return illumination(lighting, patch.origin + along, np.cross(patch.axis_t, patch.axis_s)).reshape(rows, columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +146,7 @@ class World:
     solids: tuple[Solid, ...]
     bounds: FloatArray  # (2, 3) lower and upper corner of the space a camera may be in, m
     movers: tuple[MovingBox, ...] = ()
+    lights: tuple[Light, ...] = ()  # that a lens may flare from; none without lighting
 
 
 def surfaces_at(world: World, time_ns: int) -> Surfaces:
@@ -169,6 +202,8 @@ def room(
     keep_clear: npt.ArrayLike | None = None,
     bare_walls: tuple[str, ...] = (),
     moving: Sequence[MovingBox] = (),
+    windows: int = 0,
+    bare_kind: TextureKind = "bare",
     texel_m: float | None = None,
 ) -> World:
     """Build an indoor room with furniture boxes on the floor and framed pictures on the walls.
@@ -181,6 +216,8 @@ def room(
         keep_clear: positions (N, 3) from which furniture stays 0.6 m away; None keeps the middle of the room free.
         bare_walls: sides without texture, of "+x" "-x" "+y" "-y".
         moving: boxes that move.
+        bare_kind: texture of the bare walls; "plaster" has a few marks.
+        windows: bright windows, each on a wall of its own (up to 4), which light the room; 0: even light everywhere.
         texel_m: texture resolution; None chooses 2.5 mm, coarser in halls.
     """
     box = _bounds(bounds)
@@ -188,7 +225,7 @@ def room(
     texel = (
         texel_m if texel_m is not None else max(0.0025, 0.0025 * float(np.prod(box[1, :2] - box[0, :2]) / 60) ** 0.5)
     )
-    patches = _shell(box, bare_walls, texel)
+    patches = _shell(box, bare_walls, texel, bare_kind)
     clear = _default_clear(box) if keep_clear is None else np.asarray(keep_clear, dtype=np.float64).reshape(-1, 3)
     solids: list[Solid] = []
     scale = float(np.clip((box[1, 2] - box[0, 2]) / 2.8, 0.7, 2.5))
@@ -206,7 +243,29 @@ def room(
         if picture is not None and _is_clear(picture, clear, 0.3):
             patches += _box_patches(picture, "picture", texel)
             solids.append(picture)
-    return _build("room", patches, solids, box, seed, moving)
+    lights, panes = _windows(box, windows, seed, scale)
+    lighting = Lighting(lights, _ROOM_AMBIENT) if lights else None
+    return _build("room", patches + panes, solids, box, seed, moving, lighting)
+
+
+def _windows(box: FloatArray, count: int, seed: int, scale: float) -> tuple[tuple[Light, ...], list[Patch]]:
+    """Windows on different walls of a room: their lights and their panes."""
+    rng = np.random.default_rng([seed, 4])
+    lights, panes = [], []
+    # Illumination 0.9 at half the width of a square room of that area, from each of them.
+    power = 0.9 * float(np.prod(box[1, :2] - box[0, :2])) / 4
+    for face in rng.permutation(["+x", "-x", "+y", "-y"])[:count]:
+        axis, sign = _FACES[str(face)]
+        normal, up = np.zeros(3), np.array([0.0, 0.0, 1.0])
+        normal[axis] = -sign
+        size = np.minimum(np.array([1.9, 1.3]) * scale, 0.6 * (box[1] - box[0])[[1 - axis, 2]])
+        middle = box[0] + (box[1] - box[0]) * np.array([*rng.uniform(0.3, 0.7, 2), rng.uniform(0.5, 0.62)])
+        middle[axis] = box[1 if sign > 0 else 0, axis] - sign * 0.05  # in front of pictures
+        pane = _rectangle(middle, normal, -up, size, "window", 0.005)
+        half = np.stack([pane.axis_s * size[0], pane.axis_t * size[1]]) / 2
+        lights.append(window(middle, normal, half, power=power, radiance=235 * _EMISSION["window"]))
+        panes.append(pane)
+    return tuple(lights), panes
 
 
 def corridor(
@@ -216,13 +275,14 @@ def corridor(
     width_m: float = 2.6,
     height_m: float = 2.7,
     bare_walls: tuple[str, ...] = ("+y",),
+    bare_kind: TextureKind = "bare",
     moving: Sequence[MovingBox] = (),
     texel_m: float = 0.003,
 ) -> World:
     """Build a corridor along x whose left wall (`bare_walls`) is bare, with cupboards along the right one."""
     box = np.array([[0.0, -width_m / 2, 0.0], [length_m, width_m / 2, height_m]])
     rng = np.random.default_rng([seed, 2])
-    patches = _shell(box, bare_walls, texel_m)
+    patches = _shell(box, bare_walls, texel_m, bare_kind)
     solids: list[Solid] = []
     x = rng.uniform(2.0, 4.0)
     while x < length_m - 2:
@@ -246,12 +306,15 @@ def street(
     width_m: float = 15.0,
     parked: int = 36,
     moving: Sequence[MovingBox] = (),
+    sunlit: bool = False,
+    bare_houses: bool = False,
     texel_m: float = 0.015,
 ) -> World:
     """Build a street around a block of houses, with facades at both sides, parked boxes, poles, a distant skyline.
 
     The middle of the street is a rectangle of `loop_m` (along x, along y) about the origin, so a car loop along it
-    is about twice their sum long.
+    is about twice their sum long. `sunlit`: a low sun shines, with hard shadows, instead of even light;
+    `bare_houses`: the facades of every third house are blank.
     """
     rng = np.random.default_rng([seed, 3])
     half = np.array(loop_m) / 2
@@ -261,10 +324,11 @@ def street(
     patches: list[Patch] = []
     solids: list[Solid] = []
     houses = [*_house_row(inner, width_m, rng, outwards=True), *_house_row(outer, width_m, rng, outwards=False)]
-    for solid, back in houses:
+    for number, (solid, back) in enumerate(houses):
         solids.append(solid)
         onward = bool(abs(solid.T_world_box[0, 3]) > outer[0] + 10)
-        patches += _box_patches(solid, "facade", (2 if onward else 1) * texel_m, hidden=("-z", "+z", back))
+        kind: TextureKind = "plaster" if bare_houses and number % _BARE_HOUSES == 0 else "facade"
+        patches += _box_patches(solid, kind, (2 if onward else 1) * texel_m, hidden=("-z", "+z", back))
     patches += _road(inner, outer, 0.8 * texel_m)
     for solid in _roadside(half, width_m, parked, rng):
         solids.append(solid)
@@ -272,8 +336,17 @@ def street(
     reach = float(max(outer)) + 250.0
     patches += _far_box(reach)
     bounds = np.array([[-outer[0], -outer[1], 0.0], [outer[0], outer[1], 40.0]])
+    lighting = _sunlight(solids, seed) if sunlit else None
     solids.append(Solid(_pose((0.0, 0.0, 10.0), 0.0), np.array([inner[0] - 3.0, inner[1] - 3.0, 10.0])))
-    return _build("street", patches, solids, bounds, seed, moving)
+    return _build("street", patches, solids, bounds, seed, moving, lighting)
+
+
+def _sunlight(casters: Sequence[Solid], seed: int) -> Lighting:
+    """A low sun along the longer streets, half into the driver's face, and the shadows of all boxes."""
+    azimuth = np.random.default_rng([seed, 5]).choice([0.0, np.pi]) + 0.25
+    light = sun(float(azimuth), _SUN_ELEVATION_RAD, power=1.1, radiance=60_000.0)
+    poses, halves = np.stack([s.T_world_box for s in casters]), np.stack([s.half_size for s in casters])
+    return Lighting((light,), _STREET_AMBIENT, poses, halves)
 
 
 def _bounds(bounds: npt.ArrayLike) -> FloatArray:
@@ -284,7 +357,13 @@ def _bounds(bounds: npt.ArrayLike) -> FloatArray:
 
 
 def _build(
-    name: str, patches: list[Patch], solids: list[Solid], bounds: FloatArray, seed: int, moving: Sequence[MovingBox]
+    name: str,
+    patches: list[Patch],
+    solids: list[Solid],
+    bounds: FloatArray,
+    seed: int,
+    moving: Sequence[MovingBox],
+    lighting: Lighting | None = None,
 ) -> World:
     mover = [0] * len(patches)
     every = list(patches)
@@ -299,7 +378,9 @@ def _build(
         np.array([p.size for p in every]),
         np.array(mover, dtype=np.int64),
     )
-    return World(name, surfaces, TextureStore(every, seed), tuple(solids), bounds, tuple(moving))
+    store = TextureStore(every, seed, lighting, mover)
+    lights = () if lighting is None else lighting.lights
+    return World(name, surfaces, store, tuple(solids), bounds, tuple(moving), lights)
 
 
 def _pose(centre: npt.ArrayLike, yaw: float) -> FloatArray:
@@ -338,13 +419,13 @@ def _box_patches(solid: Solid, kind: TextureKind, texel_m: float, *, hidden: tup
     return _axis_rectangles(solid.T_world_box, solid.half_size, kinds, texel_m, inwards=False)
 
 
-def _shell(box: FloatArray, bare_walls: tuple[str, ...], texel_m: float) -> list[Patch]:
+def _shell(box: FloatArray, bare_walls: tuple[str, ...], texel_m: float, bare: TextureKind) -> list[Patch]:
     unknown = set(bare_walls) - set(_FACES)
     if unknown:
         raise SimulationError(f"unknown walls {sorted(unknown)}; use some of {', '.join(_FACES)}")
     kinds: dict[str, TextureKind] = dict.fromkeys(("+x", "-x", "+y", "-y"), "wall")
     kinds |= {"-z": "floor", "+z": "ceiling"}
-    kinds |= dict.fromkeys(bare_walls, "bare")
+    kinds |= dict.fromkeys(bare_walls, bare)
     return _axis_rectangles(_pose((box[0] + box[1]) / 2, 0.0), (box[1] - box[0]) / 2, kinds, texel_m, inwards=True)
 
 

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_log
-from vio.records import Image, ImuSample, MotionPrior, Observations, Prediction, StereoFrame
+from vio.records import Image, ImuSample, IntArray, MotionPrior, Observations, Prediction, StereoFrame
 from vio.standstill import STANDSTILL_S, blocks_agree
 from vio.statistics import chi_square_quantile
 
@@ -196,16 +197,25 @@ def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:
     height, width = before.shape
     margin, at = _RADIUS + 1, np.rint(pixels).astype(np.int64)
     inside = np.all((at >= margin) & (at < np.array([width, height]) - margin), axis=1)
-    y, x = np.mgrid[-margin : margin + 1, -margin : margin + 1]
-    rows, columns = at[inside, 1, None, None] + y, at[inside, 0, None, None] + x
-    old, new = before[rows, columns].astype(np.float64), after[rows, columns].astype(np.float64)
-    inner = slice(1, -1)
-    flat = len(old), (2 * _RADIUS + 1) ** 2
-    gu = (old[:, inner, 2:] - old[:, inner, :-2]).reshape(flat) / 2
-    gv = (old[:, 2:, inner] - old[:, :-2, inner]).reshape(flat) / 2
-    change = (new - old)[:, inner, inner].reshape(flat)
-    change = change - change.mean(axis=1, keepdims=True)
-    g = np.stack([gu, gv], axis=1)
-    normal = g @ g.transpose(0, 2, 1) + 1.0 * np.eye(2)  # one gray level squared, against patches without texture
-    flow: FloatArray = -np.linalg.solve(normal, (g @ change[..., None]))[..., 0]
+    flow = np.empty((int(inside.sum()), 2))
+    _write_flow(before, after, at[inside], flow)
     return flow
+
+
+@compiled
+def _write_flow(before: Image, after: Image, at: IntArray, flow: FloatArray) -> None:
+    """Write the flow (M, 2) of patches around whole pixels (M, 2)."""
+    size = (2 * _RADIUS + 1) ** 2
+    for m in range(len(at)):
+        uu, uv, vv = 1.0, 0.0, 1.0  # one gray level squared, against patches without texture
+        ut, vt, u_sum, v_sum, change = 0.0, 0.0, 0.0, 0.0, 0.0
+        for y in range(at[m, 1] - _RADIUS, at[m, 1] + _RADIUS + 1):
+            for x in range(at[m, 0] - _RADIUS, at[m, 0] + _RADIUS + 1):
+                gu = 0.5 * (float(before[y, x + 1]) - float(before[y, x - 1]))
+                gv = 0.5 * (float(before[y + 1, x]) - float(before[y - 1, x]))
+                t = float(after[y, x]) - float(before[y, x])
+                uu, uv, vv = uu + gu * gu, uv + gu * gv, vv + gv * gv
+                ut, vt, u_sum, v_sum, change = ut + gu * t, vt + gv * t, u_sum + gu, v_sum + gv, change + t
+        ut, vt = ut - u_sum * change / size, vt - v_sum * change / size  # less the mean change
+        det = uu * vv - uv * uv
+        flow[m, 0], flow[m, 1] = -(vv * ut - uv * vt) / det, -(uu * vt - uv * ut) / det

@@ -1,0 +1,27 @@
+"""Features instead of images: run once, keep the features, and run the filter alone on them with other settings.
+
+python examples/precomputed_features.py RECORDING
+"""
+
+import sys
+import tempfile
+from pathlib import Path
+
+import vio
+from vio.run_folder import write_run_folder
+
+config = vio.load_config()
+dataset = vio.open_dataset(sys.argv[1])
+first = vio.run(dataset, config, keep_observations=True)
+
+with tempfile.TemporaryDirectory() as folder:
+    write_run_folder(Path(folder) / "run", first, dataset.recording.reference, save_observations=True)
+    features = vio.open_dataset(Path(folder) / "run" / "observations.npz")
+    for clones in (5, 11, 20):
+        again = vio.run(features, vio.load_config(overrides=[f"msckf.clones={clones}"]))
+        end = again.trajectory.positions[-1]
+        ms = 1e3 * again.wall_s / len(again.frames)
+        print(f"window of {clones:2d} frames: ends at {end.round(3)}, {ms:.1f} ms a frame")
+
+# Features of another program: one call a frame, or a dataset of one's own (docs/recordings.md).
+#   odometry.add_observations(time_ns, ids, z, has_right)     # z = [ul vl ur vr], rectified pixels, (N, 4)

@@ -1,0 +1,132 @@
+"""Matches of the tracked features in the right image, as far as that can be used: it may be late, or another one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera, left_rays
+from vio.records import Image, IntArray, StereoFrame, TrackPrior
+
+from .outliers import Consensus
+from .patches import View
+from .prediction import prior_depths
+from .right_camera import RightCamera
+from .right_delay import PairingCounts, RightDelay, at_exposure, at_present
+from .stereo_fit import StereoFit
+from .tracks import Tracks, no_tracks
+
+_PAIRING_POINTS = 150  # features that are tried with images of other frames
+
+
+@dataclass(frozen=True, slots=True)
+class PreviousFrame:
+    """State kept from the previous frame."""
+
+    time_ns: int
+    left: View
+    right_half: Image
+    tracks: Tracks
+    twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
+    trusted: bool  # the last motion had a consensus
+
+
+class RightMatcher:
+    """Match features of known depth in the right image, and judge by the matches whether it may be used."""
+
+    def __init__(self, camera: StereoCamera, right: RightCamera, delay: RightDelay) -> None:
+        """Prepare; what is known of the right camera and of its delay is updated with each frame."""
+        self._camera, self._right, self._delay = camera, right, delay
+
+    def match(
+        self,
+        frame: StereoFrame,
+        previous: PreviousFrame,
+        tracks: Tracks,
+        left: View,
+        right: View,
+        prior: TrackPrior | None,
+        stereo: StereoFit,
+        motion: Consensus | None,
+    ) -> Tracks:
+        """Match features of known depth in the right image; no match where the right image cannot be used.
+
+        While it cannot, depths come from the prior, where it has them.
+        """
+        if not self._right.usable and prior is not None:
+            depth, known = prior_depths(self._camera, np.where(tracks.shown, tracks.ids, -1), prior)
+            point = np.where(known[:, None], left_rays(self._camera, tracks.left) * depth[:, None], tracks.point)
+            tracks = replace(tracks, point=point, has_point=tracks.has_point | known)
+        has_point, delay = tracks.has_point, self._delay.frames
+        flow = tracks.left - previous.tracks.left[_rows_by_slot(previous.tracks, tracks)]
+        if delay == 0.0:
+            matched = stereo.track_right(tracks, right, motion is not None)
+        else:
+            T = np.eye(4) if prior is None or prior.motion is None else prior.motion.T_curr_prev
+            T = T if motion is None else motion.T_curr_prev
+            matched = self._match_delayed(previous, tracks, right, flow, T, stereo)
+        frame_s = (frame.time_ns - previous.time_ns) * 1e-9
+        # Wrong matches, of rows far apart, contradict the right image that the search for the rows will need.
+        tested = motion is not None and not stereo.has_few_matches
+        if not self._right.check_matches(frame.index, matched.has_right[has_point], moved=tested):
+            if self._right.contradicts and self._delay.suspect(
+                frame.index, self._count_pairings(previous, left, tracks, right, stereo), frame_s
+            ):
+                self._right.explained()
+                stereo.restart_rows()
+                return no_tracks()
+            return tracks
+        seen = matched.has_right
+        rows = matched.right[seen, 1] - matched.left[seen, 1] - delay * flow[seen, 1]
+        if self._delay.update(frame.index, matched.left[seen], flow[seen], rows, frame_s):
+            stereo.restart_rows()
+            return no_tracks()  # their depths are those of images of different times
+        return matched
+
+    def _count_pairings(
+        self, previous: PreviousFrame, left: View, tracks: Tracks, right: View, stereo: StereoFit
+    ) -> PairingCounts:
+        """Count the features that match if the right image belongs to this frame, the one before, or the next one."""
+        before = previous.tracks.left[_rows_by_slot(previous.tracks, tracks)][:_PAIRING_POINTS]
+        now = tracks.left[:_PAIRING_POINTS]
+        return PairingCounts(
+            points=len(now),
+            same=stereo.count_on_rows(left.half, right.half, now),
+            late=stereo.count_on_rows(previous.left.half, right.half, before),
+            early=stereo.count_on_rows(left.half, previous.right_half, now),
+        )
+
+    def _match_delayed(
+        self,
+        previous: PreviousFrame,
+        tracks: Tracks,
+        right: View,
+        flow: FloatArray,
+        T: FloatArray,
+        stereo: StereoFit,
+    ) -> Tracks:
+        """Match features in a right image of another time, and bring the matches to the present.
+
+        Args:
+            previous: the last frame.
+            tracks: features at their new left pixels.
+            right: the right image.
+            flow: motion (N, 2) of the features since the last frame, pixels.
+            T: motion (4, 4) of the camera, `T_curr_prev`.
+            stereo: the matcher.
+        """
+        delay = self._delay.frames
+        then = stereo.track_right(at_exposure(tracks, flow, T, delay), right, True)
+        rows = np.flatnonzero(~then.has_right & ~then.has_point)
+        disparity, unique = stereo.search(previous.left, right, (tracks.left - flow)[rows])
+        then = stereo.match_near(then, right, rows[unique], disparity[unique])
+        stereo.update_rows(then)
+        return at_present(self._camera, tracks, then, T, delay)
+
+
+def _rows_by_slot(old: Tracks, now: Tracks) -> IntArray:
+    """Rows (N,) in `old` of the features (N,) of `now`, all of which it contains: an active feature keeps its slot."""
+    order = np.argsort(old.slot)
+    return np.asarray(order[np.searchsorted(old.slot, now.slot, sorter=order)], dtype=np.int64)

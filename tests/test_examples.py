@@ -1,0 +1,122 @@
+"""The examples run as their first lines say, and are short; the bench for front ends tells good from bad ones."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from frontend import FrontendSettings, build_frontend
+from vio.cli import main
+from vio.errors import DataError
+from vio.geometry.stereo import StereoCamera
+from vio.records import FrontendOutput, StereoFrame, observations
+from vio.testing import check_frontend
+
+ROOT = Path(__file__).resolve().parent.parent
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+
+
+def _run(name: str, *arguments: object) -> str:
+    """Run an example and return what it prints."""
+    ended = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+def test_examples_are_short_and_tested(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) < 60
+    assert f"python examples/{path.name}" in text
+    assert f'_run("{path.name}"' in Path(__file__).read_text(encoding="utf-8")
+
+
+def test_a_live_loop_prints_a_pose_for_every_frame(flight: Path) -> None:
+    text = _run("live_loop.py", flight)
+    assert len(re.findall(r"\+- \d", text)) >= 14
+    assert "20 ms later" in text
+
+
+def test_image_files_give_poses(flight: Path, tmp_path: Path) -> None:
+    cameras = [flight / "mav0" / name / "data" for name in ("cam0", "cam1")]
+    assert "landmarks, 0 warnings" in _run("image_files.py", *cameras, flight)
+
+
+def test_precomputed_features_run_again(flight: Path) -> None:
+    assert len(re.findall(r"window of +\d+ frames", _run("precomputed_features.py", flight))) == 3
+
+
+def test_results_are_read_as_arrays(flight: Path, tmp_path: Path) -> None:
+    assert main(["run", str(flight), "--quiet", "--out", str(tmp_path / "run")]) == 0
+    text = _run("read_results.py", tmp_path / "run")
+    assert "16 frames" in text
+    assert "(ATE)" in text
+
+
+def test_a_front_end_of_ones_own_is_checked_and_used(flight: Path) -> None:
+    text = _run("own_frontend.py", flight)
+    assert "survival" in text
+    ate = re.search(r"ATE ([\d.]+) m", text)
+    assert ate is not None
+    assert float(ate[1]) < 0.02
+
+
+@pytest.fixture(scope="module")
+def klt() -> object:
+    return check_frontend(lambda camera: build_frontend("klt", camera, FrontendSettings()), frames=12)
+
+
+def test_the_bench_finds_the_built_in_front_end_good(klt: object) -> None:
+    report = klt
+    assert report.survival > 0.95  # type: ignore[attr-defined]
+    assert report.step_error_px < 0.1  # type: ignore[attr-defined]
+    assert report.disparity_error_px < 0.1  # type: ignore[attr-defined]
+    assert abs(report.disparity_bias_px) < 0.02  # type: ignore[attr-defined]
+    assert report.reused_ids == 0  # type: ignore[attr-defined]
+
+
+class Shifted:
+    """The built-in front end with a known error."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._inner = build_frontend("klt", camera, FrontendSettings())
+
+    def process(self, frame: StereoFrame, prior: object = None) -> FrontendOutput:
+        seen = self._inner.process(frame).observations
+        z = seen.z + np.array([0.3 * (frame.index % 2), 0.0, 0.3 * (frame.index % 2) - 0.2, 0.0])
+        shown = (seen.ids % 2 == 0) | (frame.index % 3 > 0)  # every third frame half of them are lost, and come back
+        found = observations(frame.index, frame.time_ns, seen.ids[shown], z[shown], seen.has_right[shown])
+        return FrontendOutput(found, 0, 0, 0)
+
+
+def test_the_bench_measures_what_is_wrong() -> None:
+    report = check_frontend(Shifted, frames=12)
+    assert report.disparity_bias_px == pytest.approx(0.2, abs=0.03)
+    assert report.step_error_px == pytest.approx(0.3, abs=0.05)
+    assert report.reused_ids > 0
+    assert report.survival < 0.9
+    assert "disparity_bias_px" in str(report)
+
+
+def test_the_bench_refuses_what_is_no_front_end() -> None:
+    class Silent:
+        def __init__(self, camera: StereoCamera) -> None:
+            pass
+
+        def process(self, frame: StereoFrame, prior: object = None) -> list[int]:
+            return []
+
+    with pytest.raises(DataError, match="FrontendOutput"):
+        check_frontend(Silent, frames=2)  # type: ignore[arg-type]

@@ -1,0 +1,191 @@
+"""`vio report`: a page about finished runs."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vio.cli import main
+from vio.evaluation import evaluate
+from vio.filters.navigation import ImuMotion, NavState, TwistMotion
+from vio.filters.settings import MsckfSettings
+from vio.finished_run import read_finished_run, with_distinct_names
+from vio.geometry.lie import se3_from_parts, so3_exp
+from vio.report.curves import attitude_deg, curves_of
+from vio.report.page import page
+from vio.report.words import figures_of, summary
+from vio.trajectory_io import read_trajectory
+from vio.upright import up_of, upright_axes
+
+BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def runs(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """The flight, processed with its IMU and from images alone."""
+    out = tmp_path_factory.mktemp("runs")
+    folders = out / "imu" / "run", out / "images" / "run"
+    for folder, motion in zip(folders, ("imu", "none"), strict=True):
+        assert main(["run", str(flight), "--motion", motion, "--quiet", "--out", str(folder)]) == 0
+    return folders
+
+
+def test_the_folder_of_a_run_tells_its_errors_without_the_recording(runs: tuple[Path, Path]) -> None:
+    metrics = json.loads((runs[0] / "metrics.json").read_text())
+    own, reference = (read_trajectory(runs[0] / f"{name}.tum") for name in ("trajectory", "reference"))
+    again = evaluate(own, reference, T_cam0_imu=np.array(metrics["T_cam0_imu"]))
+    assert again.ate_m.rmse == pytest.approx(metrics["ate_m"], rel=1e-6)
+    run = read_finished_run(runs[0])
+    assert run.evaluation is not None
+    assert run.evaluation.ate_m.rmse == pytest.approx(metrics["ate_m"], rel=1e-6)
+
+
+def test_the_words_and_the_table_hold_the_figures_of_the_run(runs: tuple[Path, Path]) -> None:
+    run = read_finished_run(runs[0])
+    text = " ".join(summary(run))
+    assert "16 frames of flight (euroc)" in text
+    assert "from an IMU by msckf" in text
+    assert f"position error is {run.metrics['ate_m']:.3g} m" in text
+    assert f"{1e3 * 0.05:.1f} ms" in text  # one frame every 50 ms
+    figures = figures_of(run)
+    assert figures["ATE (m)"] == f"{run.metrics['ate_m']:.4f}"
+    assert figures["path (m)"] == f"{run.metrics['path_length_m']:.2f}"
+    assert figures["ms a frame, mean"] == f"{run.metrics['ms_per_frame']:.1f}"
+
+
+def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -> None:
+    run = read_finished_run(runs[0])
+    text = page([run])
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
+    assert text.count("plotly.js v") == 1
+    drawn = ("Path", "Position and height", "Attitude", "Velocity", "Errors", "Features", "Innovations", "IMU biases")
+    for title in ("Summary", "Figures", *drawn, "Time"):
+        assert f"<h2>{title}</h2>" in text
+    assert "All settings have their defaults" not in text  # --motion is one
+    assert "<h2>IMU biases</h2>" not in page([read_finished_run(runs[1])])
+
+
+def test_names_of_files_cannot_bring_script_into_a_page(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "<script>alert(1)"
+    shutil.copytree(runs[1], folder)
+    text = page([read_finished_run(folder)])
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert" in text
+
+
+def test_curves_lie_on_the_truth_and_bands_hold_it(runs: tuple[Path, Path]) -> None:
+    run = read_finished_run(runs[0])
+    (curve,) = curves_of([run])
+    assert curve.truth is not None
+    assert np.array_equal(curve.truth.seconds, curve.seconds)
+    distance = np.linalg.norm(curve.position - curve.truth.position, axis=1)
+    assert np.abs(distance - curve.truth.error_m).max() < 2e-3  # two alignments of nearly the same path
+    assert np.abs(curve.attitude - curve.truth.attitude).max() < 1.0
+    assert np.array_equal(curve.truth.position[0], np.zeros(3))
+    rise = np.diff(curve.position[:, 2]) / np.diff(curve.seconds)
+    assert np.abs(rise - (curve.velocity[1:, 2] + curve.velocity[:-1, 2]) / 2)[4:].max() < 0.05
+
+
+def test_runs_of_one_recording_are_drawn_in_one_frame(runs: tuple[Path, Path]) -> None:
+    curves = curves_of([read_finished_run(folder) for folder in runs])
+    assert np.linalg.norm(curves[0].position - curves[1].position, axis=1).max() < 0.02
+    assert [c.draws_truth for c in curves] == [True, False]
+    assert [run.name for run in with_distinct_names([read_finished_run(folder) for folder in runs])] == [
+        "imu/run",
+        "images/run",
+    ]
+
+
+def test_heading_pitch_and_roll_have_the_signs_that_they_say() -> None:
+    ahead = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # a level camera: x right, y down, z ahead; as columns
+    down, right, back = np.eye(3)[2] * -1, np.eye(3)[0], np.eye(3)[1]
+    turned = so3_exp(0.1 * down) @ ahead  # about down: to the right
+    lifted = so3_exp(0.1 * right) @ ahead
+    rolled = so3_exp(0.1 * back) @ ahead  # about ahead: the right side down
+    found = np.radians(attitude_deg(np.stack([ahead, turned, lifted, rolled])))
+    assert found == pytest.approx(np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]]), abs=1e-12)
+
+
+def test_up_is_that_of_gravity_else_that_of_the_first_image() -> None:
+    level = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    pitched = so3_exp(np.array([-0.4, 0, 0])) @ level  # looks down
+    T = se3_from_parts(pitched, np.zeros(3))[None]
+    assert upright_axes(T, up_of("imu", None)) == pytest.approx(np.eye(3), abs=1e-12)
+    assert upright_axes(T)[2] == pytest.approx(pitched @ [0, -1, 0])
+    straight_down = se3_from_parts(so3_exp(np.array([-np.pi / 2, 0, 0])) @ level, np.zeros(3))[None]
+    axes = upright_axes(straight_down, np.array([0.0, 0, 1]))
+    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1)
+    assert up_of("imu", np.array([0.0, 9.81, 0])) == pytest.approx([0, -9.81, 0])
+
+
+@pytest.mark.parametrize("model", [ImuMotion, TwistMotion])
+def test_the_velocity_covariance_is_that_of_the_filters_error(model: type[ImuMotion | TwistMotion]) -> None:
+    rng = np.random.default_rng(0)
+    motion = model(MsckfSettings())
+    T = se3_from_parts(so3_exp(rng.normal(size=3)), rng.normal(size=3))
+    nav = NavState(T, rng.normal(size=3), rng.normal(size=3), np.zeros(3), np.zeros(3))
+    root = 1e-4 * rng.normal(size=(15, 15))
+    found = motion.uncertainty(nav, root @ root.T)
+    steps = [motion.velocity_world(motion.corrected(nav, column)) - motion.velocity_world(nav) for column in root.T]
+    numeric = np.einsum("ka,kb->ab", steps, steps)
+    assert found.velocity_covariance == pytest.approx(numeric, rel=1e-2, abs=1e-3 * np.trace(numeric))
+
+
+def test_the_command_writes_into_the_run_and_a_new_run_may_replace_it(
+    runs: tuple[Path, Path], flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", str(runs[1])]) == 0
+    out = runs[1] / "report.html"
+    assert capsys.readouterr().out.strip() == str(out)
+    assert out.stat().st_size < 8_000_000
+    assert main(["run", str(flight), "--motion", "none", "--stop", "6", "--quiet", "--out", str(runs[1])]) == 0
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("estimates.npy", b"no table", "cannot be read"),
+        ("frames.csv", b"index,time_ns\n0,0\n", "has 1 frames"),
+        ("landmarks.ply", b"ply\nend_header\nxyz", "is damaged"),
+        ("metrics.json", b"[]", "is damaged"),
+    ],
+)
+def test_damaged_folders_are_named(
+    runs: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, content: bytes, says: str
+) -> None:
+    folder = tmp_path / "run"
+    shutil.copytree(runs[0], folder)
+    (folder / name).write_bytes(content)
+    assert main(["report", str(folder)]) == 1
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert name in message
+    assert says in message
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no Chromium here")
+def test_a_browser_draws_all_figures(runs: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "report.html"
+    assert main(["report", *map(str, runs), "--out", str(out)]) == 0
+    figures = len(re.findall(r'id="figure-\d+"', out.read_text(encoding="utf-8")))
+    assert BROWSER is not None
+    arguments = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--virtual-time-budget=9000"]
+    shown = subprocess.run(
+        [BROWSER, *arguments, f"--user-data-dir={tmp_path / 'browser'}", "--dump-dom", out.as_uri()],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
+    drawn = re.findall(r'id="figure-\d+" class="plotly-graph-div js-plotly-plot"', shown.stdout)
+    assert figures >= 9
+    assert len(drawn) == figures
+    assert "Uncaught" not in shown.stderr

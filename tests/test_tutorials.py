@@ -1,0 +1,86 @@
+"""The commands of the tutorials run as printed, and the site's pages are all in its menu."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip("rosbags", reason="needs the extra bags")
+
+from tests.bag_maker import Script
+from vio.cli import main
+from vio.datasets import open_dataset
+from vio.records import ImuSample, StereoFrame
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+_SLOW = ("vio calibrate",)  # tests/test_calibrate_cli.py runs it
+
+
+def _commands(page: Path) -> list[str]:
+    blocks = re.findall(r"^```\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return [line.partition("  #")[0] for block in blocks for line in block.splitlines() if line.startswith("vio ")]
+
+
+@pytest.fixture(scope="module")
+def workplace(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the recordings that the tutorials name."""
+    folder = tmp_path_factory.mktemp("tutorials")
+    assert main(["convert", str(flight), "--to", "plain", "--out", str(folder / "cameras")]) == 0
+    _write_bag(flight, folder / "flight.bag")
+    return folder
+
+
+def _write_bag(flight: Path, path: Path) -> None:
+    """Write a rectified flight as a ROS 1 bag with its calibration."""
+    dataset = open_dataset(flight)
+    recording, script = dataset.recording, Script("bag")
+    assert recording.T_cam0_imu is not None
+    script.static(int(recording.frame_times_ns[0]), "left", "imu", recording.T_cam0_imu)
+    for event in dataset.events():
+        if isinstance(event, ImuSample):
+            script.imu("/imu0", event)
+        elif isinstance(event, StereoFrame) and event.left is not None and event.right is not None:
+            for topic, image, right in (("/cam0/left", event.left, False), ("/cam1/right", event.right, True)):
+                name = topic.rpartition("/")[0]
+                script.image(f"{name}/image_raw", event.time_ns, image)
+                script.camera_info(f"{name}/camera_info", event.time_ns, recording.camera, right=right)
+    script.write(path)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_commands_of_a_tutorial_run(page: Path, workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(workplace)
+    for command in _commands(page):
+        if not command.startswith(_SLOW):
+            assert main(shlex.split(command)[1:]) == 0, command
+
+
+def test_every_page_is_in_the_menu_and_every_example_in_a_tutorial() -> None:
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    named = set(re.findall(r"[\w/]+\.md", text))
+    assert named == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
+    shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert all(f'--8<-- "examples/{path.name}"' in shown for path in (ROOT / "examples").glob("*.py"))
+    yaml.safe_load(text)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="mkdocs is not installed")
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    built: Any = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert built.returncode == 0, built.stderr
+    assert (tmp_path / "site" / "tutorials" / "folder" / "index.html").is_file()

@@ -1,0 +1,293 @@
+"""The field of pixels that a stereo calibration is off by, and the calibration that has none.
+
+The sliding window estimates a low-order field over the rectified images, equations (R1) to (R3) of docs/math.md. Here
+it is taken out of pixels, and turned into a rig: a rotation of the right camera, its principal point, focal lengths
+and tangential distortion against the left one, and the distortion of both. Twelve coefficients of the field determine
+these twelve parameters to first order, but three of them badly (a yaw, a principal point and a tangential distortion of
+the right camera move pixels almost alike); a prior of what real rigs do decides between them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.geometry.distortion import CameraModel, project_point, rectified_pair
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
+from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
+from vio.geometry.stereo import StereoCamera, left_rays
+from vio.records import BoolArray, Estimate, StereoFieldEstimate
+from vio.rig import Rig
+
+# Parameters of a rig's correction: rotation of the right camera (rad, in the rectified frame: its points p are seen as
+# `exp(w) p`), its principal point (focal lengths), focal ratios and tangential distortion against the left camera;
+# radial and tangential distortion of both.
+PARAMETERS = ("wx", "wy", "wz", "cu", "cv", "fu", "fv", "p1", "p2", "k", "q1", "q2")
+_BOTH = ("k", "q1", "q2")
+# What a calibration of a real rig is usually off by: mounts turn by tenths of a degree; principal point and focal
+# lengths by 2e-3 focal lengths; lens models as the sliding window takes it (msckf.stereo_field_sigma). A Cauchy
+# distribution of this width: a rig that is off by much more (KITTI's by 14 px and 1 degree) is believed.
+_PRIOR = np.array([*[np.radians(0.5)] * 3, *[2e-3] * 4, *[2e-3] * 2, 1e-2, *[2e-3] * 2])
+_MODEL = 1e-4  # focal lengths, 0.05 px: what terms beyond the second order leave in a coefficient of the field
+_BENDS = ("pinhole", "radtan", "unified")  # models that hold tangential distortion, or become one that does
+_GRID = (11, 9)  # points along the image's width and height at which field and rig are compared
+_STEP = 1e-6  # of numeric derivatives by the parameters, which are all of the size of radians
+_STEPS = 15  # of Gauss-Newton; the weights of the prior need most of them
+_LINEARISED = (0, 4)  # of these steps: at the given rig and near the solution
+_NAMED_SIGMAS = 3.0  # a parameter within so many standard deviations of zero is not named
+_TEXT = {
+    "wx": ("right camera turned by {} deg about its horizontal axis", 180 / np.pi, ".3f"),
+    "wy": ("right camera turned by {} deg about its vertical axis", 180 / np.pi, ".3f"),
+    "wz": ("right camera turned by {} deg about its optical axis", 180 / np.pi, ".3f"),
+    "cu": ("its principal point off by {} px along u", None, ".2f"),
+    "cv": ("its principal point off by {} px along v", None, ".2f"),
+    "fu": ("its focal length along u off by {} %", 100.0, ".3f"),
+    "fv": ("its focal length along v off by {} %", 100.0, ".3f"),
+    "p1": ("its tangential distortion p1 off by {} e-3", 1e3, ".2f"),
+    "p2": ("its tangential distortion p2 off by {} e-3", 1e3, ".2f"),
+    "k": ("radial distortion of both lenses off by {} e-3", 1e3, ".2f"),
+    "q1": ("tangential distortion p1 of both lenses off by {} e-3", 1e3, ".2f"),
+    "q2": ("tangential distortion p2 of both lenses off by {} e-3", 1e3, ".2f"),
+}
+
+
+def field_basis(camera: StereoCamera, z: FloatArray) -> FloatArray:
+    """Derivatives (N, 4, 12) of pixels `[ul vl ur vr]` (N, 4) by the coefficients of (R3) and the rows (R2)."""
+    x, y, xr = (z[:, 0] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv, (z[:, 2] - camera.cu) / camera.fu
+    out = np.zeros((len(z), 4, 12))
+    for column, u in ((0, x), (2, xr)):
+        r2 = u * u + y * y
+        out[:, column, 3:6] = np.stack([u * r2, 2 * u * y, r2 + 2 * u * u], axis=1)
+        out[:, column + 1, 3:6] = np.stack([y * r2, r2 + 2 * y * y, 2 * u * y], axis=1)
+    out[:, 2, 0:3] = np.stack([np.ones_like(x), xr, xr * xr + y * y], axis=1)
+    # What the rows tell of the right columns: their coefficients of y, x y and y^2 - x^2.
+    out[:, 2, 7], out[:, 2, 9], out[:, 2, 10], out[:, 2, 11] = -y, -y * y, -xr * y, xr * y
+    out[:, 3, 6:] = np.stack([np.ones_like(y), xr, y, xr * y, xr * xr, y * y], axis=1)
+    return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
+
+
+@dataclass(frozen=True, slots=True)
+class PixelField:
+    """How far the pixels of a rectified pair are off, as a run estimated it."""
+
+    camera: StereoCamera
+    coefficients: FloatArray  # (12,) of (R3) and of the rows (R2), in focal lengths
+
+    @classmethod
+    def of(cls, camera: StereoCamera, estimate: StereoFieldEstimate) -> PixelField:
+        """Return the field of an estimate, without rows where they are not known."""
+        rows = np.zeros(6) if estimate.rows is None else estimate.rows
+        return cls(camera, np.concatenate([estimate.coefficients, rows]))
+
+    def at(self, z: FloatArray) -> FloatArray:
+        """Return how far pixels `[ul vl ur vr]` (N, 4) are off, (N, 4) pixels."""
+        out: FloatArray = field_basis(self.camera, z) @ self.coefficients
+        return out
+
+    def without(self, z: FloatArray, has_right: BoolArray) -> FloatArray:
+        """Return pixels (N, 4) without the field; right pixels stay as they are where `has_right` (N,) is False."""
+        off = self.at(z)
+        off[~has_right, 2:] = 0
+        return z - off
+
+    def maps(self) -> tuple[tuple[MapArray, MapArray], tuple[MapArray, MapArray]]:
+        """Return where each pixel of the left and right images without the field lies in the images as they are.
+
+        Source u and v (H, W) of both, for cv2.remap.
+        """
+        assert self.camera.width is not None
+        assert self.camera.height is not None
+        out = np.empty((4, self.camera.height, self.camera.width), dtype=np.float32)
+        u = np.arange(self.camera.width, dtype=np.float64)
+        for row in range(self.camera.height):
+            v = np.full_like(u, row)
+            z = np.stack([u, v, u, v], axis=1)
+            seen = z + self.at(z)
+            seen[:, 3] = v  # (R2) and (R3) take the row of the left image
+            out[:, row] = (z + self.at(seen)).T
+        return (out[0], out[1]), (out[2], out[3])
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedRig:
+    """A rig as a run corrected it."""
+
+    rig: Rig
+    parameters: FloatArray  # (12,) what the given rig was off by, in the order and units of `PARAMETERS`
+    covariance: FloatArray  # (12, 12)
+    left_px: float  # root mean square over the images of the field that the rig cannot express
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations (12,) of the parameters."""
+        return np.sqrt(np.diag(self.covariance))
+
+    def lines(self) -> tuple[str, ...]:
+        """Return one line for each parameter that is off by more than three standard deviations."""
+        out = []
+        for name, value, sigma in zip(PARAMETERS, self.parameters, self.sigmas, strict=True):
+            if abs(value) > _NAMED_SIGMAS * sigma:
+                text, scale, form = _TEXT[name]
+                unit = getattr(self.rig.cam1, "f" + name[1]) if scale is None else scale
+                out.append(text.format(f"{unit * value:+{form}} ± {unit * sigma:{form}}"))
+        return tuple(out)
+
+
+def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
+    """Return a given rig with all that a run estimated of it: stereo field, extrinsics and time offset of the IMU.
+
+    What the run did not estimate stays as given, with its prior standard deviations.
+
+    Args:
+        given: the calibration that the run used.
+        estimate: the run's last one.
+
+    Raises:
+        CalibrationError: the given rig cannot be rectified.
+    """
+    field = estimate.stereo_field
+    known = field is not None and field.rows is not None and field.rows_covariance is not None
+    if known:
+        assert field is not None
+        out = _with_field(given, field)
+    else:
+        out = CalibratedRig(given, np.zeros(len(PARAMETERS)), np.diag(_PRIOR**2), 0.0)
+    rig = out.rig
+    if estimate.T_cam0_imu is not None:
+        R_cam0_rect = _Frame.of(given).R_rect_cam0.T
+        rig = replace(rig, T_cam0_imu=se3_from_parts(R_cam0_rect, np.zeros(3)) @ estimate.T_cam0_imu)
+    if estimate.time_offset_s is not None:
+        rig = replace(rig, time_offset_s=given.time_offset_s + estimate.time_offset_s)
+    return replace(out, rig=rig)
+
+
+def field_of(camera: StereoCamera, parameters: FloatArray) -> PixelField:
+    """Return the field of a rectified pair, with image size, that is off by parameters (12,)."""
+    assert camera.width is not None
+    assert camera.height is not None
+    c = camera
+    given = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height)
+    return PixelField(camera, _Frame.of(given).coefficients(parameters))
+
+
+def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
+    """Fit the parameters to the field's coefficients with their covariance and the prior, by Gauss-Newton.
+
+    The Cauchy prior is a Gaussian one whose weights follow the parameters.
+    """
+    frame = _Frame.of(given)
+    measured = PixelField.of(frame.camera, field).coefficients
+    assert field.rows_covariance is not None
+    P = np.zeros((12, 12))
+    P[:6, :6], P[6:, 6:] = field.covariance, field.rows_covariance
+    P += _MODEL**2 * np.eye(12)
+    W = np.linalg.inv(P)
+    free = _expressible(given)
+    x = np.zeros(len(PARAMETERS))
+    J, information = np.zeros((12, 12)), np.diag(1 / _PRIOR**2)
+    for round_ in range(_STEPS):
+        prior = np.diag(1 / (_PRIOR**2 + x**2))
+        for k in np.flatnonzero(free & (round_ in _LINEARISED)):
+            step = _STEP * np.eye(12)[k]
+            J[:, k] = (frame.coefficients(x + step) - frame.coefficients(x - step)) / (2 * _STEP)
+        information = J.T @ W @ J + prior
+        gradient = J.T @ W @ (measured - frame.coefficients(x)) - prior @ x
+        x = x + np.linalg.solve(information, gradient * free)
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
+    seen = frame.as_seen(x)
+    left = seen - frame.grid - field_basis(frame.camera, frame.where_read(seen)) @ measured
+    return CalibratedRig(frame.moved(x), x, covariance, float(np.sqrt(np.mean(left**2))))
+
+
+def _expressible(given: Rig) -> BoolArray:
+    """Return which parameters (12,) the lens models of a rig can hold."""
+    bends = all(c.model in _BENDS for c in (given.cam0, given.cam1))
+    radial = all(c.model != "double_sphere" for c in (given.cam0, given.cam1))
+    held = {"p1": bends, "p2": bends, "q1": bends, "q2": bends, "k": radial}
+    return np.array([held.get(name, True) for name in PARAMETERS])
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A given rig, its rectification, and the pixels at which rigs are compared with fields."""
+
+    given: Rig
+    camera: StereoCamera
+    R_rect_cam0: FloatArray  # (3, 3)
+    R_rect_cam1: FloatArray  # (3, 3)
+    grid: FloatArray  # (N, 4) equal left and right positions over the rectified image
+
+    @classmethod
+    def of(cls, rig: Rig) -> _Frame:
+        """Rectify a rig."""
+        camera, R_rect_cam0, R_rect_cam1 = rig.camera, np.eye(3), np.eye(3)
+        if rectified_pair(rig.stereo) is None:
+            pair = rectified_cameras(rig.stereo)
+            camera, R_rect_cam0, R_rect_cam1 = pair.camera, pair.R_rect_cam0, pair.R_rect_cam1
+        assert camera.width is not None
+        assert camera.height is not None
+        u, v = np.meshgrid(np.linspace(0, camera.width - 1, _GRID[0]), np.linspace(0, camera.height - 1, _GRID[1]))
+        return cls(rig, camera, R_rect_cam0, R_rect_cam1, np.stack([u, v, u, v], axis=-1).reshape(-1, 4))
+
+    def moved(self, x: FloatArray) -> Rig:
+        """Return the rig whose calibration differs from the given one by parameters (12,)."""
+        if not np.any(x):
+            return self.given
+        given, named = self.given, dict(zip(PARAMETERS, x.tolist(), strict=True))
+        k, q1, q2 = (named[name] for name in _BOTH)
+        b = given.cam1
+        b = replace(
+            b,
+            cu=b.cu + b.fu * named["cu"],
+            cv=b.cv + b.fv * named["cv"],
+            fu=b.fu * (1 + named["fu"]),
+            fv=b.fv * (1 + named["fv"]),
+        )
+        cam0, cam1 = _bent(given.cam0, k, q1, q2), _bent(b, k, q1 + named["p1"], q2 + named["p2"])
+        R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
+        centre = se3_inverse(given.T_cam1_cam0)[:3, 3]
+        return replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
+
+    def as_seen(self, x: FloatArray) -> FloatArray:
+        """Return where the given rectification shows the grid's pixels (N, 4) if it is off by parameters (12,)."""
+        true, out = self.moved(x), np.empty(self.grid.shape)
+        turn1 = true.T_cam1_cam0[:3, :3] @ self.R_rect_cam0.T
+        sides = (
+            (self.given.cam0, true.cam0, self.R_rect_cam0.T, self.R_rect_cam0),
+            (self.given.cam1, true.cam1, turn1, self.R_rect_cam1),
+        )
+        for column, (believed, real, turn, R_rect_cam) in zip((0, 2), sides, strict=True):
+            raw, _ = project_point(real, left_rays(self.camera, self.grid[:, column : column + 2]) @ turn.T)
+            out[:, column : column + 2], _ = rectify_pixels(believed, R_rect_cam, self.camera, raw)
+        return out
+
+    def where_read(self, seen: FloatArray) -> FloatArray:
+        """Return the pixels (N, 4) at which (R2) and (R3) are evaluated: those seen, in the rows of the left image."""
+        return np.stack([seen[:, 0], seen[:, 1], seen[:, 2], self.grid[:, 3]], axis=1)
+
+    def coefficients(self, x: FloatArray) -> FloatArray:
+        """Return the field's coefficients (12,) that fit best what parameters (12,) do to the grid's pixels."""
+        seen = self.as_seen(x)
+        D = field_basis(self.camera, self.where_read(seen)).reshape(-1, 12)
+        return np.asarray(np.linalg.lstsq(D, (seen - self.grid).ravel(), rcond=None)[0], dtype=np.float64)
+
+
+def rig_off_by(given: Rig, parameters: FloatArray) -> Rig:
+    """Return the rig whose calibration differs from a given one by parameters (12,)."""
+    return _Frame.of(given).moved(parameters)
+
+
+def _bent(camera: CameraModel, k: float, p1: float, p2: float) -> CameraModel:
+    """Return a camera with more radial and tangential distortion, as far as its model holds it."""
+    c = camera.coefficients
+    if camera.model == "pinhole":
+        return replace(camera, model="radtan", coefficients=(k, 0.0, p1, p2))
+    if camera.model == "unified":
+        bend = c[1:] or (0.0, 0.0, 0.0, 0.0)
+        return replace(camera, coefficients=(c[0], bend[0] + k, bend[1], bend[2] + p1, bend[3] + p2))
+    if camera.model == "radtan":
+        return replace(camera, coefficients=(c[0] + k, c[1], c[2] + p1, c[3] + p2, *c[4:]))
+    if camera.model == "equidistant":
+        return replace(camera, coefficients=(c[0] + k, *c[1:]))
+    return camera

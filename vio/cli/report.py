@@ -1,0 +1,38 @@
+"""`vio report`: one HTML page about finished runs."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "report",
+        help="write a page about one or several runs",
+        description="Write one self-contained HTML page about finished runs: summary, path, attitude, errors, "
+        "features, innovations, biases, time, warnings and settings. Several runs are shown side by side. The page "
+        "needs no network.",
+    )
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folders that `vio run` wrote")
+    parser.add_argument("--reference", type=Path, metavar="F", help="ground truth in place of that of the runs")
+    parser.add_argument("--out", type=Path, metavar="F", help="the page (default report.html in the first RUN)")
+    parser.set_defaults(execute=execute)
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    from vio.errors import DataError
+    from vio.finished_run import read_finished_run, with_distinct_names
+
+    try:
+        from vio.report.page import write_report
+    except ImportError as error:  # pragma: no cover - plotly is installed with this package
+        raise DataError(f"the report needs plotly ({error}); install it with: pip install plotly") from error
+    runs = with_distinct_names([read_finished_run(folder, args.reference) for folder in args.runs])
+    out: Path = args.out or args.runs[0] / "report.html"
+    write_report(out, runs)
+    print(out)
+    return 0

@@ -1,0 +1,66 @@
+"""PNG files of 8-bit gray pixels, in about half the time that OpenCV takes for them.
+
+Such files hold the images of most recordings, and libpng takes more of a frame's time than Lucas-Kanade. Here zlib
+inflates all pixels at once, and a compiled loop undoes the filters. Nearly all rows of a photograph have Paeth's, which
+predicts a byte from its neighbours left, above, and above left, so that a row waits for itself at each pixel; rows are
+therefore decoded side by side, each one pixel behind the row above it.
+Reference: PNG specification (W3C), sections 7 to 10.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+
+from vio.records import Image
+
+_START = b"\x89PNG\r\n\x1a\n"
+_GRAY_8 = (8, 0, 0, 0, 0)  # depth, colour type, compression, filter method, no interlacing
+# Chunks that change no pixel. With any other, such as transparency or an animation, the file is left to OpenCV.
+_PASSED_OVER = frozenset({b"tEXt", b"zTXt", b"iTXt", b"pHYs", b"tIME", b"gAMA", b"cHRM", b"sRGB", b"iCCP", b"sBIT"})
+_LAST_FILTER = 4  # Paeth's
+
+
+def decode_gray8(data: bytes) -> Image | None:
+    """Return the pixels (H, W) of a PNG file in memory whose chunks are intact.
+
+    None where the file is not of 8-bit gray without interlacing, or where its pixels are damaged: OpenCV reads the
+    other kinds, and says what it cannot read.
+    """
+    parts, size = [], None
+    at = len(_START)
+    while at + 12 <= len(data):
+        length, kind = struct.unpack_from(">I4s", data, at)
+        if kind == b"IDAT":
+            parts.append(data[at + 8 : at + 8 + length])
+        elif kind == b"IHDR" and length == 13:
+            width, height, *form = struct.unpack_from(">IIBBBBB", data, at + 8)
+            size = (height, width) if tuple(form) == _GRAY_8 else None
+        elif kind != b"IEND" and kind not in _PASSED_OVER:
+            return None
+        if kind == b"IEND" or size is None:
+            break
+        at += 12 + length
+    return None if size is None else _pixels(b"".join(parts), *size)
+
+
+def _pixels(compressed: bytes, height: int, width: int) -> Image | None:
+    """Inflate and unfilter the rows of an image."""
+    size = height * (width + 1)
+    stream = zlib.decompressobj()
+    try:
+        raw = stream.decompress(compressed, size)  # no more than the header states
+    except zlib.error:
+        return None
+    if len(raw) != size:
+        return None
+    rows = np.frombuffer(raw, dtype=np.uint8).reshape(height, width + 1)
+    if int(rows[:, 0].max()) > _LAST_FILTER:
+        return None
+    from vio.datasets.png_rows import unfilter  # it loads numba
+
+    out: Image = np.empty((height, width), dtype=np.uint8)
+    unfilter(rows, out)
+    return out

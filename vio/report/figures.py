@@ -1,0 +1,338 @@
+"""The interactive figures of a report, by plotly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vio.finished_run import FinishedRun
+from vio.geometry.lie import FloatArray
+from vio.pipeline import STAGES
+from vio.report.curves import Curves, Truth, thinned
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+COLOURS = ("#1f5fbf", "#d9822b", "#2e8b57", "#a83279", "#7a5195", "#0f8b8d", "#b5533c", "#6b7280")
+_TRUTH, _POINTS = "#111111", "#9aa5b1"
+_SIGMAS = 3.0  # half width of the bands
+_BULK = (10, 90)  # percentiles of the bands' edges that an axis shows at least
+_AXES = ("right", "ahead", "up")
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the page."""
+
+    title: str
+    figure: go.Figure
+    remark: str = ""  # how to read it
+
+
+def sections(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Section]:
+    """Return all figures that these runs have the data for."""
+    found = [_maps(runs, curves), _position(runs, curves), _attitude(runs, curves)]
+    found += [f(runs, curves) for f in (_velocity, _errors) if _applies(f, curves)]
+    found += [_features(runs), _innovations(runs), *_biases(runs), _timing(runs), *_stereo(runs)]
+    return found
+
+
+def _applies(section: Any, curves: Sequence[Curves]) -> bool:
+    if section is _velocity:
+        return any(np.isfinite(c.velocity).any() for c in curves)
+    return any(c.truth is not None for c in curves)
+
+
+def _maps(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+    """Draw the path from above and from the side, with the landmarks."""
+    figure = _subplots(1, 2, titles=("from above", "from the side"), shared=False)
+    for column, (first, second) in enumerate(((0, 1), (1, 2)), start=1):
+        low, high = _extent([c.position for c in curves], (first, second))
+        points = curves[0].points[:, (first, second)]
+        points = points[np.all((points >= low) & (points <= high), axis=1)]
+        _line(figure, points, "landmarks", _POINTS, 1, column, mode="markers", marker={"size": 2, "opacity": 0.6})
+        for truth in _truths(curves):
+            _line(figure, truth.position[:, (first, second)], "ground truth", _TRUTH, 1, column, width=3)
+        for run, curve, colour in zip(runs, curves, COLOURS, strict=False):
+            if curve.dead_reckoning is not None:
+                label = "dead reckoning" if len(runs) == 1 else f"{run.name}, dead reckoning"
+                _line(figure, curve.dead_reckoning[:, (first, second)], label, colour, 1, column, dash="dash", width=1)
+            _line(figure, curve.position[:, (first, second)], run.name, colour, 1, column)
+        figure.update_xaxes(title_text=f"{_AXES[first]} (m)", row=1, col=column)
+        figure.update_yaxes(title_text=f"{_AXES[second]} (m)", row=1, col=column)
+        figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
+    figure.update_layout(height=560)
+    return Section("Path", figure, "Axes are right, ahead and up at the start.")
+
+
+def _position(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+    figure = _three(runs, [(c.seconds, c.position, c.position_sigma) for c in curves], [f"{a} (m)" for a in _AXES])
+    for truth in _truths(curves):
+        _dotted(figure, truth.seconds, truth.position)
+    return _over_time("Position and height", figure, "Bands are three standard deviations of the filter.")
+
+
+def _attitude(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+    names = ("heading (deg)", "pitch (deg)", "roll (deg)")
+    figure = _three(runs, [(c.seconds, c.attitude, c.attitude_sigma) for c in curves], names)
+    for truth in _truths(curves):
+        _dotted(figure, truth.seconds, truth.attitude)
+    text = "Of the left camera: heading to the right, pitch up, roll with the right side down."
+    return _over_time("Attitude", figure, text)
+
+
+def _velocity(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+    figure = _three(runs, [(c.seconds, c.velocity, c.velocity_sigma) for c in curves], [f"{a} (m/s)" for a in _AXES])
+    for truth in _truths(curves):
+        if len(truth.seconds) > 2:
+            _dotted(figure, truth.seconds, np.gradient(truth.position, truth.seconds, axis=0))
+    return _over_time("Velocity", figure, "Ground truth: differences of its positions.")
+
+
+def _three(
+    runs: Sequence[FinishedRun], found: Sequence[tuple[FloatArray, FloatArray, FloatArray]], names: Sequence[str]
+) -> go.Figure:
+    """Draw three components of runs over time: seconds (N,), values (N, 3), sigmas (N, 3) of each."""
+    figure = _subplots(3, 1)
+    for row, name in enumerate(names, start=1):
+        for run, (seconds, values, sigmas), colour in zip(runs, found, COLOURS, strict=False):
+            _band(figure, seconds, values[:, row - 1], sigmas[:, row - 1], run.name, colour, row)
+        figure.update_yaxes(title_text=name, row=row, col=1)
+    return figure
+
+
+def _truths(curves: Sequence[Curves]) -> list[Truth]:
+    """Return the references, that of each recording once."""
+    return [c.truth for c in curves if c.truth is not None and c.draws_truth]
+
+
+def _dotted(figure: go.Figure, seconds: FloatArray, values: FloatArray) -> None:
+    """Draw three components (K, 3) of the ground truth."""
+    for row in (1, 2, 3):
+        _xy(figure, seconds, values[:, row - 1], "ground truth", _TRUTH, row, dash="dot")
+
+
+def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+    figure = _subplots(2, 1)
+    for run, curve, colour in zip(runs, curves, COLOURS, strict=False):
+        if curve.truth is not None:
+            _xy(figure, curve.truth.seconds, curve.truth.error_m, run.name, colour, 1)
+            _xy(figure, curve.truth.seconds, curve.truth.error_deg, run.name, colour, 2)
+    figure.update_yaxes(title_text="position (m)", rangemode="tozero", row=1, col=1)
+    figure.update_yaxes(title_text="attitude (deg)", rangemode="tozero", row=2, col=1)
+    return _over_time("Errors", figure, "Against the reference, after one rigid alignment of the whole path.")
+
+
+def _features(runs: Sequence[FinishedRun]) -> Section:
+    figure = _subplots(1, 1)
+    for run, colour in zip(runs, COLOURS, strict=False):
+        for name, dash in (("matched", "dot"), ("selected", "dash"), ("used", "solid")):
+            label = name if len(runs) == 1 else f"{run.name}, {name}"
+            shade = colour if len(runs) > 1 else {"matched": _POINTS, "selected": COLOURS[1], "used": COLOURS[0]}[name]
+            _frame_curve(figure, run, name, label, shade, 1, dash=dash if len(runs) > 1 else "solid")
+    figure.update_yaxes(title_text="features", rangemode="tozero", row=1, col=1)
+    return _over_time(
+        "Features", figure, "With a match in the right image; chosen by the selector; used by the filter."
+    )
+
+
+def _innovations(runs: Sequence[FinishedRun]) -> Section:
+    figure = _subplots(2, 1)
+    for run, colour in zip(runs, COLOURS, strict=False):
+        _frame_curve(figure, run, "innovation_median_px", run.name, colour, 1)
+        _frame_curve(figure, run, "nis_per_dof", run.name, colour, 2)
+    figure.update_yaxes(title_text="median (px)", rangemode="tozero", row=1, col=1)
+    figure.update_yaxes(title_text="NIS per dof", rangemode="tozero", row=2, col=1)
+    text = "How far features lie from where the filter expects them, and that squared over its covariance: 1 is "
+    return _over_time("Innovations", figure, text + "consistent, less is cautious, more is overconfident.")
+
+
+def _biases(runs: Sequence[FinishedRun]) -> list[Section]:
+    """Draw the biases of runs with an IMU."""
+    chosen = [(run, c) for run, c in zip(runs, COLOURS, strict=False) if run.metrics.get("motion") == "imu"]
+    if not chosen:
+        return []
+    figure = _subplots(3, 2, titles=("gyroscope", "accelerometer"))
+    for run, colour in chosen:
+        rows = thinned(len(run.estimates))
+        for column, (name, factor) in enumerate((("gyro_bias", np.degrees(1.0)), ("accel_bias", 1.0)), start=1):
+            values, sigmas = (factor * run.estimates[key][rows] for key in (name, f"{name}_sigma"))
+            for axis in range(3):
+                _band(figure, run.seconds[rows], values[:, axis], sigmas[:, axis], run.name, colour, axis + 1, column)
+    for axis, name in enumerate("xyz"):
+        figure.update_yaxes(title_text=f"{name} (deg/s)", row=axis + 1, col=1)
+        figure.update_yaxes(title_text=f"{name} (m/s²)", row=axis + 1, col=2)
+    return [_over_time("IMU biases", figure, "Axes of the IMU; bands are three standard deviations.")]
+
+
+def _timing(runs: Sequence[FinishedRun]) -> Section:
+    figure = _subplots(len(runs), 1, titles=[run.name for run in runs] if len(runs) > 1 else ())
+    shades = ("#c9d1d9", "#6aa2d8", "#b7a2d8", "#e8b04b", "#1f5fbf")
+    for row, run in enumerate(runs, start=1):
+        rows = thinned(len(run.estimates), 600)
+        for stage, shade in zip(STAGES, shades, strict=True):
+            values = np.nan_to_num(run.frames[f"{stage}_ms"])
+            median = np.array([np.median(part) for part in np.array_split(values, len(rows))])
+            more: dict[str, Any] = {"stackgroup": "stages", "line": {"width": 0}, "fillcolor": shade}
+            _xy(figure, run.seconds[rows], median, stage, shade, row, **more)
+        figure.update_yaxes(title_text="ms a frame", row=row, col=1)
+    return _over_time("Time", figure, "Wall time by stage; long runs are shown by the medians of groups of frames.")
+
+
+def _stereo(runs: Sequence[FinishedRun]) -> list[Section]:
+    """Draw what the stereo calibration is off by, of runs that estimated it."""
+    chosen = [
+        (run, c) for run, c in zip(runs, COLOURS, strict=False) if np.isfinite(run.estimates["stereo_field"]).any()
+    ]
+    if not chosen:
+        return []
+    figure = _subplots(1, 1)
+    for run, colour in chosen:
+        rows = thinned(len(run.estimates))
+        found = run.estimates[rows]
+        sigma = np.sqrt(np.maximum(found["stereo_field_covariance"][:, 0, 0], 0))
+        milli = 1e3  # of a focal length
+        values = found["stereo_field"][:, 0]
+        _band(figure, run.seconds[rows], milli * values, milli * sigma, run.name, colour, 1)
+    figure.update_yaxes(title_text="a0 (1/1000 focal length)", row=1, col=1)
+    text = "By how much right columns are off at the image's centre; three standard deviations."
+    return [_over_time("Stereo calibration", figure, text)]
+
+
+# --- drawing --------------------------------------------------------------------------------------------------------
+
+
+def _subplots(rows: int, columns: int, *, titles: Sequence[str] = (), shared: bool = True) -> go.Figure:
+    from plotly.subplots import make_subplots
+
+    figure = make_subplots(
+        rows=rows,
+        cols=columns,
+        subplot_titles=list(titles) or None,
+        shared_xaxes="all" if shared else False,
+        vertical_spacing=0.25 / rows**1.5 if rows > 1 else None,
+        horizontal_spacing=0.09,
+    )
+    figure.update_layout(
+        template="plotly_white",
+        margin={"l": 60, "r": 30, "t": 64 if titles else 30, "b": 44},
+        legend={"orientation": "h", "y": 1.08 if titles else 1.02, "yanchor": "bottom", "x": 0, "xanchor": "left"},
+        modebar={"orientation": "v"},
+        font={"family": "system-ui, sans-serif", "size": 12},
+        height=max(170 * rows, 300) + 60,
+    )
+    return figure
+
+
+def _over_time(title: str, figure: go.Figure, remark: str) -> Section:
+    for row, columns in enumerate(figure._grid_ref, start=1):
+        for column in range(1, len(columns) + 1):
+            _fit_bands(figure, row, column)
+    figure.update_xaxes(title_text="time in the recording (s)", row=len(figure._grid_ref))
+    return Section(title, figure, remark)
+
+
+def _fit_bands(figure: go.Figure, row: int, column: int) -> None:
+    """Set an axis by its curves and the bulk of their bands: a filter that does not yet know has bands without end."""
+    traces = list(figure.select_traces(row=row, col=column))
+    bands, curves = [t for t in traces if t.fill == "toself"], [t for t in traces if t.fill != "toself"]
+    values = [np.array(t.y, dtype=np.float64) for t in curves]
+    if not bands or not values:
+        return
+    edges = np.concatenate([np.array(t.y, dtype=np.float64) for t in bands])
+    shown = np.concatenate([*values, np.nanpercentile(edges, _BULK)])
+    low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
+    margin = 0.05 * max(high - low, 1e-9)
+    figure.update_yaxes(range=[low - margin, high + margin], row=row, col=column)
+
+
+def _named(figure: go.Figure, label: str) -> dict[str, Any]:
+    """Return what ties traces of one label together: one entry in the legend shows and hides them all."""
+    return {"name": label, "legendgroup": label, "showlegend": all(trace.name != label for trace in figure.data)}
+
+
+def _line(
+    figure: go.Figure,
+    points: FloatArray,
+    label: str,
+    colour: str,
+    row: int,
+    column: int,
+    *,
+    dash: str = "solid",
+    width: float = 1.8,
+    **more: Any,
+) -> None:
+    """Draw a path (N, 2) in a plane."""
+    import plotly.graph_objects as go
+
+    line = {"color": colour, "dash": dash, "width": width}
+    more = {"mode": "lines", **more}
+    if "marker" in more:
+        more["marker"] = {"color": colour, **more["marker"]}
+    trace = go.Scatter(x=_short(points[:, 0]), y=_short(points[:, 1]), line=line, **_named(figure, label), **more)
+    figure.add_trace(trace, row=row, col=column)
+
+
+def _xy(
+    figure: go.Figure, x: FloatArray, y: FloatArray, label: str, colour: str, row: int, column: int = 1, **more: Any
+) -> None:
+    """Draw a curve (N,) over time."""
+    import plotly.graph_objects as go
+
+    more["line"] = {"color": colour, "width": 1.5, "dash": more.pop("dash", "solid"), **more.get("line", {})}
+    trace = go.Scatter(x=_short(x), y=_short(y), mode="lines", **_named(figure, label), **more)
+    figure.add_trace(trace, row=row, col=column)
+
+
+def _band(
+    figure: go.Figure,
+    x: FloatArray,
+    y: FloatArray,
+    sigma: FloatArray,
+    label: str,
+    colour: str,
+    row: int,
+    column: int = 1,
+) -> None:
+    """Draw a curve (N,) with a band of three standard deviations."""
+    import plotly.graph_objects as go
+
+    if np.isfinite(sigma).any():
+        red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
+        edges = np.concatenate([y + _SIGMAS * sigma, (y - _SIGMAS * sigma)[::-1]])
+        band = go.Scatter(
+            x=_short(np.concatenate([x, x[::-1]])),
+            y=_short(edges),
+            fill="toself",
+            fillcolor=f"rgba({red},{green},{blue},0.15)",
+            line={"width": 0},
+            hoverinfo="skip",
+            legendgroup=label,
+            showlegend=False,
+        )
+        figure.add_trace(band, row=row, col=column)
+    _xy(figure, x, y, label, colour, row, column)
+
+
+def _frame_curve(
+    figure: go.Figure, run: FinishedRun, name: str, label: str, colour: str, row: int, *, dash: str = "solid"
+) -> None:
+    rows = thinned(len(run.estimates))
+    _xy(figure, run.seconds[rows], run.frames[name][rows], label, colour, row, dash=dash)
+
+
+def _extent(paths: Sequence[FloatArray], axes: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of the box around paths with a margin, metres."""
+    every = np.concatenate(paths)[:, axes]
+    low, high = every.min(axis=0), every.max(axis=0)
+    margin = max(0.25 * float((high - low).max()), 2.0)
+    return low - margin, high + margin
+
+
+def _short(values: FloatArray) -> list[float | None]:
+    """Return values with six digits, which a screen does not tell from all of them, None for NaN."""
+    return [None if v != v else float(f"{v:.6g}") for v in values.tolist()]

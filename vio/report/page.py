@@ -1,0 +1,114 @@
+"""One self-contained HTML page: text, tables and figures, with plotly's script embedded once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from vio._version import __version__
+from vio.atomic import atomic_write_text
+from vio.finished_run import FinishedRun
+from vio.printable import printable
+from vio.report.curves import curves_of
+from vio.report.figures import COLOURS, Section, sections
+from vio.report.words import figures_of, summary
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 15px/1.5 system-ui, sans-serif; color: #1d2733; background: #f4f6f8; margin: 0; }
+main { max-width: 1180px; margin: 0 auto; padding: 24px; }
+h1 { font-size: 24px; margin: 0 0 4px; } h2 { font-size: 18px; margin: 0 0 4px; }
+section { background: #fff; border: 1px solid #dfe4ea; border-radius: 6px; padding: 16px 20px; margin: 16px 0; }
+p { margin: 4px 0; } .remark { color: #5b6876; font-size: 13px; }
+table { border-collapse: collapse; } th, td { text-align: left; padding: 3px 18px 3px 0; font-weight: normal; }
+thead th { border-bottom: 1px solid #c4ccd5; font-weight: 600; } tbody th { color: #5b6876; }
+td { font-variant-numeric: tabular-nums; } li { margin: 3px 0; overflow-wrap: anywhere; }
+.swatch { display: inline-block; width: 11px; height: 11px; border-radius: 2px; margin-right: 6px; }
+.scroll { overflow-x: auto; }
+"""
+
+
+def write_report(path: Path, runs: Sequence[FinishedRun]) -> None:
+    """Write the page about one or several runs.
+
+    Args:
+        path: the file, replaced at once when it is complete.
+        runs: in the order of their colours; the first 8 get one each.
+
+    Raises:
+        VioError: the file cannot be written.
+    """
+    atomic_write_text(path, page(runs))
+
+
+def page(runs: Sequence[FinishedRun]) -> str:
+    """Return the page about one or several runs as HTML."""
+    from plotly.offline import get_plotlyjs
+
+    title = _text(", ".join(run.name for run in runs))
+    parts = [_words(runs), _table(runs), _warnings(runs), _settings(runs)]
+    parts += [_figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs)))]
+    return (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><style>{_STYLE}</style>'
+        f"<script>{get_plotlyjs()}</script></head>\n<body><main><h1>{title}</h1>"
+        f'<p class="remark">stereo-vio {_text(__version__)}</p>\n' + "\n".join(parts) + "\n</main></body></html>\n"
+    )
+
+
+def _words(runs: Sequence[FinishedRun]) -> str:
+    paragraphs = []
+    for run, colour in zip(runs, [*COLOURS, *COLOURS], strict=False):
+        head = f'<h2><span class="swatch" style="background:{colour}"></span>{_text(run.name)}</h2>'
+        paragraphs.append((head if len(runs) > 1 else "<h2>Summary</h2>") + f"<p>{_text(' '.join(summary(run)))}</p>")
+    return f"<section>{''.join(paragraphs)}</section>"
+
+
+def _table(runs: Sequence[FinishedRun]) -> str:
+    columns = [figures_of(run) for run in runs]
+    head = "".join(f"<th>{_text(run.name)}</th>" for run in runs)
+    cells = {name: "".join(f"<td>{_text(c[name])}</td>" for c in columns) for name in columns[0]}
+    rows = "".join(f"<tr><th>{_text(name)}</th>{cell}</tr>" for name, cell in cells.items())
+    table = f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>"
+    return f'<section><h2>Figures</h2><div class="scroll">{table}</div></section>'
+
+
+def _warnings(runs: Sequence[FinishedRun]) -> str:
+    lists = []
+    for run in runs:
+        found = run.metrics.get("warnings") or []
+        if found:
+            head = f"<p>{_text(run.name)}</p>" if len(runs) > 1 else ""
+            lists.append(f"{head}<ul>{''.join(f'<li>{_text(str(line))}</li>' for line in found)}</ul>")
+    return f"<section><h2>Warnings</h2>{''.join(lists)}</section>" if lists else ""
+
+
+def _settings(runs: Sequence[FinishedRun]) -> str:
+    keys = sorted({key for run in runs for key in run.changed})
+    if not keys:
+        return "<section><h2>Settings</h2><p>All settings have their defaults.</p></section>"
+    head = "".join(f"<th>{_text(run.name)}</th>" for run in runs)
+    rows = []
+    for key in keys:
+        default = next(run.changed[key][1] for run in runs if key in run.changed)
+        values = (run.changed[key][0] if key in run.changed else default for run in runs)
+        cells = "".join(f"<td>{_text(str(value))}</td>" for value in values)
+        rows.append(f"<tr><th>{_text(key)}</th><td>{_text(str(default))}</td>{cells}</tr>")
+    return (
+        "<section><h2>Settings that differ from the default</h2><div class='scroll'><table><thead><tr><th></th>"
+        f"<th>default</th>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table></div></section>"
+    )
+
+
+def _figure(section: Section, number: int) -> str:
+    drawing = section.figure.to_html(
+        full_html=False, include_plotlyjs=False, div_id=f"figure-{number}", config={"displaylogo": False}
+    )
+    remark = f'<p class="remark">{_text(section.remark)}</p>' if section.remark else ""
+    return f"<section><h2>{_text(section.title)}</h2>{remark}{drawing}</section>"
+
+
+def _text(value: str) -> str:
+    """Return text for HTML; control characters and surrogates of file names are escaped."""
+    return escape(printable(value))

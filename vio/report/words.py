@@ -1,0 +1,100 @@
+"""A finished run in words and in a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vio.finished_run import FinishedRun
+
+_MOTION = {"imu": "an IMU", "velocity": "velocities", "none": "images alone"}
+
+
+def summary(run: FinishedRun) -> list[str]:
+    """Return what happened in a run, one sentence a line."""
+    m, span_s = run.metrics, float(run.seconds[-1])
+    frames = len(run.estimates)
+    source = str(m.get("source", "")).replace("\\", "/").rstrip("/").rpartition("/")[2]
+    lines = [
+        f"{frames} frames of {source or 'a recording'} ({m.get('kind', 'unknown kind')}), {span_s:.1f} s and "
+        f"{_path_m(run):.1f} m, processed from {_MOTION.get(str(m.get('motion')), 'images alone')} by "
+        f"{m.get('backend', 'the filter')}."
+    ]
+    if m.get("complete") is False:
+        why = m.get("stopped")
+        lines.append(f"The run is not complete{f': {why}' if why else ''}.")
+    evaluation = run.evaluation
+    if evaluation is None:
+        sigma = np.sqrt(np.trace(run.estimates["covariance"][-1][:3, :3]))
+        lines.append(
+            f"There is no reference. The filter's own standard deviation of the last position is {sigma:.3g} m."
+        )
+    else:
+        share = 100 * evaluation.ate_m.rmse / max(evaluation.reference_path_length_m, 1e-9)
+        lines.append(
+            f"The position error is {evaluation.ate_m.rmse:.3g} m (root mean square after alignment, {share:.2g} % of "
+            f"the path), at most {evaluation.ate_m.max:.3g} m; the attitude error {evaluation.ate_deg.rmse:.2g} deg."
+        )
+        if evaluation.kitti is not None:
+            lengths = ", ".join(f"{e.length_m:g}" for e in evaluation.kitti.per_length if e.segments)
+            lines.append(
+                f"Drift over {lengths} m is {evaluation.kitti.t_err_percent:.2g} % and "
+                f"{evaluation.kitti.r_err_deg_per_100m:.2g} deg per 100 m."
+            )
+    lines.append(_speed(run))
+    nis = np.nanmedian(run.frames["nis_per_dof"]) if np.isfinite(run.frames["nis_per_dof"]).any() else None
+    if nis is not None:
+        lines.append(f"The median innovation (NIS) is {nis:.2g} of its covariance.")
+    warnings = m.get("warnings") or []
+    lines.append(f"{len(warnings)} warnings, below." if len(warnings) > 1 else _one(warnings))
+    return lines
+
+
+def _one(warnings: Sequence[str]) -> str:
+    return "One warning, below." if warnings else "No warnings."
+
+
+def _path_m(run: FinishedRun) -> float:
+    return float(np.linalg.norm(np.diff(run.trajectory.positions, axis=0), axis=1).sum())
+
+
+def _speed(run: FinishedRun) -> str:
+    ms = float(np.nanmean(_work_ms(run)))
+    frames, span_s = len(run.estimates), float(run.seconds[-1])
+    if frames < 2 or span_s <= 0:
+        return f"A frame took {ms:.1f} ms."
+    given_ms = 1e3 * span_s / (frames - 1)
+    verdict = "faster than" if ms < given_ms else "slower than"
+    return f"A frame took {ms:.1f} ms; the recording has one every {given_ms:.1f} ms, so this is {verdict} real time."
+
+
+def _work_ms(run: FinishedRun) -> Any:
+    return np.sum([run.frames[name] for name in run.frames if name in _TIMES], axis=0)
+
+
+_TIMES = ("read_ms", "frontend_ms", "watch_ms", "select_ms", "filter_ms")
+
+
+def figures_of(run: FinishedRun) -> dict[str, str]:
+    """Return a run's figures for a table, in a fixed order; a dash where there is none."""
+    m, evaluation = run.metrics, run.evaluation
+    work = _work_ms(run)
+    kitti = None if evaluation is None else evaluation.kitti
+    return {
+        "frames": str(len(run.estimates)),
+        "path (m)": f"{_path_m(run):.2f}",
+        "back end": f"{m.get('backend', '–')}, motion {m.get('motion', '–')}",
+        "ATE (m)": "–" if evaluation is None else f"{evaluation.ate_m.rmse:.4f}",
+        "largest error (m)": "–" if evaluation is None else f"{evaluation.ate_m.max:.4f}",
+        "attitude error (deg)": "–" if evaluation is None else f"{evaluation.ate_deg.rmse:.3f}",
+        "drift (%)": "–" if kitti is None else f"{kitti.t_err_percent:.3f}",
+        "drift (deg/100 m)": "–" if kitti is None else f"{kitti.r_err_deg_per_100m:.3f}",
+        "features used, median": f"{np.nanmedian(run.frames['used']):.0f}",
+        "ms a frame, mean": f"{np.nanmean(work):.1f}",
+        "ms a frame, 95 %": f"{np.nanpercentile(work, 95):.1f}",
+        "landmarks": str(len(run.points)),
+        "warnings": str(len(m.get("warnings") or [])),
+        "version": str(m.get("version", "–")),
+    }

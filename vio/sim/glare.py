@@ -1,0 +1,100 @@
+"""Light that a lens scatters: a halo about bright sources, also outside the image, and ghosts that move against them.
+
+The halo falls with the square of the angle from the source (the veiling glare of dust and of the lens barrel); ghosts
+are discs on the line through the image's centre, reflections between lens surfaces. Both are light added before the
+shutter closes, so they follow the exposure and saturate.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray
+from vio.sim.lighting import Light
+from vio.sim.render import CameraRays, Radiance, View, cast
+from vio.sim.world import Surfaces, World, surfaces_at
+
+_GRID_PX = 4  # pixels between computed values; halos and ghosts are smooth
+_CORE_RAD, _CORE = 0.012, 3.0  # the sun's bright centre: its radius, and its light over the source's
+_HALO_RAD, _HALO = 0.12, 0.035  # the wide part of the halo: its radius, and its light over the source's
+_USUAL_SR = 0.05  # solid angle of a source for which these hold; the sun's light is stated for its small disc
+_SUN_STRENGTH = 0.025  # the sun instead of a source of that solid angle
+_DISTANT_M = 100.0  # what is farther away than this is sky and does not hide the sun
+_GHOSTS = ((-0.45, 0.05, 70.0), (-0.9, 0.03, 120.0), (0.4, 0.022, 90.0), (-1.5, 0.09, 40.0))  # place, radius, level
+_GHOST_REACH_RAD = 0.9  # beyond this angle from the axis a source makes no ghosts
+
+
+def glare(world: World, view: View, rays: CameraRays, strength: float) -> Radiance:
+    """Return the scattered light (H, W) in one image, gray levels of the scene.
+
+    Args:
+        world: scene; its lights are the sources.
+        view: the camera.
+        rays: of the same camera.
+        strength: 1 for a usual, slightly dusty lens.
+    """
+    surfaces = surfaces_at(world, view.time_ns)
+    coarse = rays.centre[:, ::_GRID_PX, ::_GRID_PX].astype(np.float32)
+    directions = coarse / np.linalg.norm(coarse, axis=0)
+    total = np.zeros(directions.shape[1:], dtype=np.float32)
+    for light in world.lights:
+        sources, weight = _sources(light, view, surfaces)
+        for source in sources:
+            total += np.float32(weight) * _halo(directions, source, light)
+        if len(sources):
+            share = min(1.0, weight * len(sources))
+            total += _ghosts(directions, sources.mean(axis=0), np.float32(share))
+    height, width = view.camera.height, view.camera.width
+    size = (directions.shape[2] * _GRID_PX, directions.shape[1] * _GRID_PX)
+    # Values belong to every fourth pixel; `resize` puts them at the middles of four by four.
+    shift = np.array([[1, 0, -(_GRID_PX - 1) / 2], [0, 1, -(_GRID_PX - 1) / 2]], dtype=np.float32)
+    large = cv2.resize(strength * total, size, interpolation=cv2.INTER_LINEAR)
+    out = cv2.warpAffine(large, shift, (width, height), borderMode=cv2.BORDER_REPLICATE)
+    return out.astype(np.float32, copy=False)
+
+
+def _sources(light: Light, view: View, surfaces: Surfaces) -> tuple[FloatArray, float]:
+    """Visible points of a light as unit rays (N, 3) of the camera frame, and the strength of each of them."""
+    R, centre = view.T_world_cam[:3, :3], view.T_world_cam[:3, 3]
+    if light.distant:
+        rays = (light.position @ R)[None]
+        hits = cast(surfaces, view.T_world_cam, rays)
+        open_sky = ~hits.found | (hits.distance > _DISTANT_M)
+        return rays[open_sky], _SUN_STRENGTH
+    corners = np.array([(i, j) for i in (-0.7, 0.0, 0.7) for j in (-0.7, 0.0, 0.7)])
+    towards = light.position + corners @ light.extent - centre
+    distance = np.linalg.norm(towards, axis=1)
+    rays = (towards / distance[:, None]) @ R
+    hits = cast(surfaces, view.T_world_cam, rays)
+    seen = hits.found & (hits.distance > distance - 0.05)
+    facing = max(0.0, float(-(light.normal @ towards[4]) / distance[4]))
+    area = 4 * float(np.linalg.norm(np.cross(*light.extent)))
+    solid_angle = area * facing / max(float(distance[4]) ** 2, 0.1)
+    return rays[seen], min(solid_angle / _USUAL_SR, 3.0) / len(corners)
+
+
+def _halo(directions: npt.NDArray[np.float32], source: FloatArray, light: Light) -> npt.NDArray[np.float32]:
+    """Halo (h, w) of a point of a source along unit rays (3, h, w)."""
+    cosine = np.tensordot(source.astype(np.float32), directions, axes=1)
+    square = 2 * np.maximum(1 - cosine, 0)  # of the chord, about the angle
+    out = _HALO * light.radiance / (1 + square / _HALO_RAD**2)
+    if light.distant:  # a window's own surface shows its bright centre
+        out += _CORE * light.radiance / (1 + square / _CORE_RAD**2) ** 2
+    return out.astype(np.float32)
+
+
+def _ghosts(directions: npt.NDArray[np.float32], source: FloatArray, share: np.float32) -> npt.NDArray[np.float32]:
+    """Ghosts (h, w): discs on the line from the source through the optical axis."""
+    total = np.zeros(directions.shape[1:], dtype=np.float32)
+    angle = float(np.arccos(np.clip(source[2] / np.linalg.norm(source), -1, 1)))
+    if angle > _GHOST_REACH_RAD:
+        return total
+    x, y = directions[0] / directions[2], directions[1] / directions[2]
+    at = source[:2] / source[2]
+    fade = float(np.cos(angle / _GHOST_REACH_RAD * np.pi / 2))
+    for place, radius, level in _GHOSTS:
+        from_edge = (np.hypot(x - place * at[0], y - place * at[1]) - radius) / (0.2 * radius)
+        total += share * np.float32(level * fade) * np.clip(0.5 - from_edge, 0, 1).astype(np.float32)
+    return total

@@ -1,0 +1,155 @@
+"""People who walk through a scene: three boxes each, which sway, rise and fall with their steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
+from vio.records import NS_PER_S, IntArray
+from vio.sim.motion import MotionSpline, evaluate
+from vio.sim.world import MovingBox, ObjectMotion, Solid, World
+
+_STEPS_PER_S = 1.8
+_PAUSE_S = 1.2  # at each end of the way, in which the person turns round
+_SWAY_M, _BOB_M, _TWIST_RAD, _LEAN_RAD = 0.03, 0.025, 0.08, 0.03
+_RADIUS_M, _HEIGHT_M = 0.3, 1.8  # of the space that a person takes
+_SPACING_NS = 50_000_000  # between the times at which camera and person are kept apart
+_COARSE = 20  # of these times one is tried first
+_ATTEMPTS = 300  # for each person
+_KEEP_CLEAR_M = 0.3  # height of the points on a way that keep furniture off
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """A person's way to and fro along a straight line."""
+
+    start: FloatArray  # (3,) world, m, on the ground
+    end: FloatArray  # (3,)
+    speed: float  # m/s
+    phase_s: float  # time since the start of the way at `origin_ns`
+    origin_ns: int
+
+
+def plan_walks(
+    world: World, motion: MotionSpline, count: int, *, seed: int, reach_m: float, clearance_m: float
+) -> tuple[Walk, ...]:
+    """Return ways that cross a camera's surroundings and never touch a box or come close to the camera.
+
+    Args:
+        world: the scene; its boxes are walked around.
+        motion: motion of the cameras' body.
+        count: people wanted; fewer where there is no room for them.
+        seed: seed of all random numbers.
+        reach_m: standard deviation of the ways' middles about the path.
+        clearance_m: least distance from the camera.
+    """
+    rng = np.random.default_rng([seed, 6])
+    times: IntArray = np.arange(motion.start_ns, motion.end_ns, _SPACING_NS, dtype=np.int64)
+    path = evaluate(motion, times).T_world_imu[:, :3, 3]
+    walks: list[Walk] = []
+    for _ in range(count):
+        for _ in range(_ATTEMPTS):
+            walk = _random_walk(world, path, rng, reach_m, motion.start_ns)
+            # A few of the times show at once that most ways will not do.
+            if _unobstructed(world, walk) and all(
+                _clearance(walk, times[::step], path[::step]) > clearance_m for step in (_COARSE, 1)
+            ):
+                walks.append(walk)
+                break
+    return tuple(walks)
+
+
+def along_walks(walks: Sequence[Walk]) -> FloatArray:
+    """Return points (N, 3) along the ways, a little above the ground, from which furniture is to stay away."""
+    shares = np.linspace(0, 1, 12)[:, None]
+    points = [walk.start + shares * (walk.end - walk.start) + [0.0, 0.0, _KEEP_CLEAR_M] for walk in walks]
+    return np.concatenate(points) if points else np.zeros((0, 3))
+
+
+def walking_people(walks: Sequence[Walk], *, seed: int) -> tuple[MovingBox, ...]:
+    """Return the boxes of people on their ways, three for each of them."""
+    rng = np.random.default_rng([seed, 7])
+    return tuple(box for walk in walks for box in _body(walk, rng))
+
+
+def _random_walk(world: World, path: FloatArray, rng: np.random.Generator, reach_m: float, origin_ns: int) -> Walk:
+    near = path[rng.integers(len(path))]
+    middle = np.array([*(near[:2] + reach_m * rng.standard_normal(2)), world.bounds[0, 2]])
+    angle, half = rng.uniform(0, 2 * np.pi), rng.uniform(0.8, 2.0) * max(1.0, reach_m / 2)
+    along = half * np.array([np.cos(angle), np.sin(angle), 0.0])
+    return Walk(middle - along, middle + along, rng.uniform(0.9, 1.5), rng.uniform(0.0, 10.0), origin_ns)
+
+
+def _unobstructed(world: World, walk: Walk) -> bool:
+    """Whether the way is within the scene and clear of its boxes."""
+    points = walk.start + np.linspace(0, 1, 30)[:, None] * (walk.end - walk.start)
+    low, high = world.bounds[0, :2] + _RADIUS_M, world.bounds[1, :2] - _RADIUS_M
+    if ((points[:, :2] < low) | (points[:, :2] > high)).any():
+        return False
+    return all(_apart(solid, points) for solid in world.solids)
+
+
+def _apart(solid: Solid, points: FloatArray) -> bool:
+    """Whether people at points (N, 3) on the ground stay off a box."""
+    T, half = solid.T_world_box, solid.half_size
+    if T[2, 3] - half[2] > points[0, 2] + _HEIGHT_M:
+        return True
+    local = (points - T[:3, 3]) @ T[:3, :3]
+    return bool((np.abs(local[:, :2]) > half[:2] + _RADIUS_M).any(axis=1).all())
+
+
+def _clearance(walk: Walk, times: IntArray, path: FloatArray) -> float:
+    """Least distance (m) of a camera at positions (N, 3) at times (N,) from a person."""
+    at = np.array([_place(walk, int(t))[0] for t in times])
+    aside = np.maximum(np.linalg.norm(path[:, :2] - at[:, :2], axis=1) - _RADIUS_M, 0.0)
+    above = np.maximum(path[:, 2] - at[:, 2] - _HEIGHT_M, 0.0)
+    return float(np.hypot(aside, above).min())
+
+
+def _place(walk: Walk, time_ns: int) -> tuple[FloatArray, float, float]:
+    """Position (3,) on the ground, heading in radians, and whether the person walks (1) or turns (0)."""
+    way = walk.end - walk.start
+    length = float(np.linalg.norm(way))
+    leg_s = length / walk.speed + _PAUSE_S
+    elapsed = (time_ns - walk.origin_ns) / NS_PER_S + walk.phase_s
+    leg, within = divmod(elapsed, leg_s)
+    forth = leg % 2 == 0
+    share = min(within * walk.speed / length, 1.0)
+    walking = share < 1.0
+    turned = 0.0 if walking else (within - length / walk.speed) / _PAUSE_S * np.pi
+    heading = float(np.arctan2(way[1], way[0])) + (0.0 if forth else np.pi) + turned
+    return walk.start + way * (share if forth else 1 - share), heading, float(walking)
+
+
+def _body(walk: Walk, rng: np.random.Generator) -> Sequence[MovingBox]:
+    """Legs, trunk and head of one person."""
+    scale = rng.uniform(0.92, 1.06)
+
+    def part(height: float) -> ObjectMotion:
+        def pose(time_ns: int) -> FloatArray:
+            return _step(walk, time_ns) @ se3_from_parts(np.eye(3), [0.0, 0.0, height * scale])
+
+        return pose
+
+    def size(depth: float, width: float, height: float) -> FloatArray:
+        return scale * np.array([depth, width, height])
+
+    return (
+        MovingBox(size(0.24, 0.36, 0.84), part(0.42), "clothes"),
+        MovingBox(size(0.26, 0.48, 0.66), part(1.17), "clothes"),
+        MovingBox(size(0.20, 0.17, 0.25), part(1.65), "skin"),
+    )
+
+
+def _step(walk: Walk, time_ns: int) -> FloatArray:
+    """Pose (4, 4) of a person's middle line on the ground."""
+    ground, heading, walking = _place(walk, time_ns)
+    step = np.pi * _STEPS_PER_S * (time_ns - walk.origin_ns) / NS_PER_S
+    swing = walking * float(np.sin(step))  # from foot to foot, so once in two steps
+    left = np.array([-np.sin(heading), np.cos(heading), 0.0])
+    at = ground + _SWAY_M * swing * left + np.array([0.0, 0.0, _BOB_M * walking * abs(float(np.cos(step)))])
+    turn = so3_exp([0.0, 0.0, heading + _TWIST_RAD * swing]) @ so3_exp([_LEAN_RAD * swing, 0.0, 0.0])
+    return se3_from_parts(turn, at)

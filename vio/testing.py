@@ -1,0 +1,181 @@
+"""A test bench for front ends: rendered images in which the true match of every pixel is known.
+
+```python
+from vio.testing import check_frontend
+
+report = check_frontend(MyFrontend)  # called with the camera; has process(frame, prior)
+assert report.survival > 0.9
+assert report.disparity_error_px < 0.3
+```
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Literal
+
+import numpy as np
+
+from vio.errors import DataError
+from vio.geometry.distortion import rectified_camera
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.protocols import Frontend
+from vio.records import Observations, StereoFrame
+from vio.sim.render import View, correspondence, inside_image
+from vio.sim.scenarios import Scenario, conditions_of, plan
+from vio.sim.sequence import SimulatedRecording, Simulation, views
+
+_CORRECT_PX = 1.0  # largest error of a feature that follows its point
+_MARGIN_PX = 12.0  # points closer to the border need not be followed
+
+
+@dataclass(frozen=True, slots=True)
+class FrontendReport:
+    """How well a front end follows points and finds them in the right image, in pixels."""
+
+    frames: int
+    features: float  # median number in a frame
+    matched: float  # median number with a right match
+    survival: float  # share of features, visible in the next frame too, that are followed there within 1 px
+    wrong: float  # share of followed features that are off by more than 1 px
+    step_error_px: float  # median error of a step to the next frame, of those within 1 px
+    step_bias_px: tuple[float, float]  # their median error in u and v: a bias becomes drift
+    disparity_error_px: float  # median error of disparities within 1 px
+    disparity_bias_px: float  # their signed median: a bias becomes an error of scale
+    wrong_matches: float  # share of right matches that are off by more than 1 px
+    row_error_px: float  # median difference of rows to the true ones
+    reused_ids: int  # ids that came back after their feature was lost; must be 0
+
+    def __str__(self) -> str:
+        """Return one line a figure."""
+        return "\n".join(f"{f.name:<20} {_shown(getattr(self, f.name))}" for f in fields(self))
+
+
+@dataclass(slots=True)
+class _Errors:
+    """Errors of all frames, one array a frame."""
+
+    step: list[FloatArray] = field(default_factory=list)  # (N, 2)
+    right: list[FloatArray] = field(default_factory=list)  # (N, 2)
+    features: list[int] = field(default_factory=list)
+    matched: list[int] = field(default_factory=list)
+    visible: int = 0  # features whose point is visible in the next frame
+    followed: int = 0  # of these, followed within `_CORRECT_PX`
+    lost: set[int] = field(default_factory=set)
+    reused: int = 0
+
+
+def check_frontend(
+    build: Callable[[StereoCamera], Frontend],
+    *,
+    frames: int = 40,
+    width: int = 320,
+    scene: Literal["room", "street", "corridor"] = "room",
+    effects: Sequence[str] = (),
+    seed: int = 0,
+) -> FrontendReport:
+    """Run a front end over rendered images and compare what it finds with the truth; a few seconds.
+
+    Args:
+        build: called with the rectified camera; returns the front end.
+        frames: at 20 Hz along a hand-held flight (`room`, `corridor`), at 10 Hz along a drive (`street`).
+        width: of the images, pixels.
+        scene: what is rendered.
+        effects: names of `vio render --effects`, such as blur, noise, dark, moving.
+        seed: of scene, motion and noise.
+
+    Raises:
+        VioError: an argument is invalid.
+        DataError: the front end returned something else than observations of the frame that it was given.
+    """
+    rate_hz = 10.0 if scene == "street" else 20.0
+    scenario = Scenario(
+        scene=scene,
+        trajectory="car" if scene == "street" else "handheld",
+        rig="kitti" if scene == "street" else "euroc-rectified",
+        width=width,
+        rate_hz=rate_hz,
+        duration_s=frames / rate_hz,
+        conditions=conditions_of(effects),
+        seed=seed,
+    )
+    simulation = plan(scenario)
+    recording = SimulatedRecording(simulation)
+    frontend, errors = build(rectified_camera(simulation.rig)), _Errors()
+    before: Observations | None = None
+    for frame in recording.events():
+        if isinstance(frame, StereoFrame):
+            now = _process(frontend, frame)
+            _compare(errors, simulation, before, now)
+            before = now
+    return _report(errors)
+
+
+def _process(frontend: Frontend, frame: StereoFrame) -> Observations:
+    """Return the fresh observations of a frame.
+
+    Raises:
+        DataError: they are of another kind, or of another frame.
+    """
+    output = frontend.process(frame)
+    found = getattr(output, "observations", None)
+    if not isinstance(found, Observations):
+        raise DataError(f"process() returned {type(output).__name__}; it returns a FrontendOutput with observations")
+    if (found.frame_index, found.time_ns) != (frame.index, frame.time_ns):
+        raise DataError(f"observations of frame {found.frame_index} were returned for frame {frame.index}")
+    return found.take(~found.stale)
+
+
+def _compare(errors: _Errors, simulation: Simulation, before: Observations | None, now: Observations) -> None:
+    left, right = _views(simulation, now)
+    seen = now.take(now.has_right)
+    true, visible = correspondence(simulation.world, left, right, seen.z[:, :2])
+    errors.right.append((seen.z[:, 2:] - true)[visible])
+    errors.features.append(len(now))
+    errors.matched.append(len(seen))
+    errors.reused += sum(name in errors.lost for name in now.ids.tolist())
+    if before is None:
+        return
+    true, visible = correspondence(simulation.world, _views(simulation, before)[0], left, before.z[:, :2])
+    _, i, j = np.intersect1d(before.ids, now.ids, assume_unique=True, return_indices=True)
+    error = now.z[j, :2] - true[i]
+    expected = visible & inside_image(left.camera, true, margin_px=_MARGIN_PX)
+    errors.step.append(error[visible[i]])
+    errors.visible += int(expected.sum())
+    errors.followed += int((expected[i] & (np.linalg.norm(error, axis=1) <= _CORRECT_PX)).sum())
+    errors.lost |= set(before.ids.tolist()) - set(now.ids.tolist())
+
+
+def _views(simulation: Simulation, seen: Observations) -> tuple[View, View]:
+    return views(simulation, int(simulation.taken_ns[seen.frame_index]))
+
+
+def _report(errors: _Errors) -> FrontendReport:
+    step, right = (np.concatenate(part) if part else np.zeros((0, 2)) for part in (errors.step, errors.right))
+    good_step, good_right = (part[np.linalg.norm(part, axis=1) <= _CORRECT_PX] for part in (step, right))
+    return FrontendReport(
+        frames=len(errors.features),
+        features=float(np.median(errors.features)),
+        matched=float(np.median(errors.matched)),
+        survival=errors.followed / max(errors.visible, 1),
+        wrong=1 - len(good_step) / len(step) if len(step) else 0.0,
+        step_error_px=_median(np.linalg.norm(good_step, axis=1)),
+        step_bias_px=(_median(good_step[:, 0]), _median(good_step[:, 1])),
+        disparity_error_px=_median(np.abs(good_right[:, 0])),
+        disparity_bias_px=_median(-good_right[:, 0]),
+        wrong_matches=1 - len(good_right) / len(right) if len(right) else 0.0,
+        row_error_px=_median(np.abs(good_right[:, 1])),
+        reused_ids=errors.reused,
+    )
+
+
+def _median(values: FloatArray) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, tuple):
+        return " ".join(f"{part:.4f}" for part in value)
+    return f"{value:.4f}" if isinstance(value, float) else str(value)

@@ -1,0 +1,40 @@
+"""The upright view of a run: which way is up, and which is ahead, in its world frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+
+_LEVEL = 0.1  # horizontal part of the first optical axis below which the camera looks up or down: the path then leads
+
+
+def upright_axes(T_world_cam0: FloatArray, up_world: FloatArray | None = None) -> FloatArray:
+    """Return the rotation (3, 3) whose rows are right, ahead and up in the world frame, at the first camera pose.
+
+    Args:
+        T_world_cam0: poses (N, 4, 4) of the left camera.
+        up_world: (3,) opposite to gravity where it is known; None: cameras are mounted upright, so the upper edge of
+            the first image tells.
+    """
+    first = T_world_cam0[0]
+    up = -first[:3, 1] if up_world is None else np.asarray(up_world, dtype=np.float64)
+    up = up / np.linalg.norm(up)
+    for ahead in (first[:3, 2], T_world_cam0[-1, :3, 3] - first[:3, 3], *np.eye(3)):
+        level = ahead - up * (up @ ahead)
+        if np.linalg.norm(level) > _LEVEL * max(float(np.linalg.norm(ahead)), 1e-9):
+            break
+    level = level / np.linalg.norm(level)
+    return np.stack([np.cross(level, up), level, up])
+
+
+def up_of(motion: str | None, gravity_world: FloatArray | None) -> FloatArray | None:
+    """Return the up direction (3,) of a run's world frame; None where only an IMU could tell and there was none.
+
+    Args:
+        motion: the run's motion input; with an IMU the world is upright, z up.
+        gravity_world: (3,) of the newest estimate, where the IMU began late and the world is not upright.
+    """
+    if gravity_world is not None and np.isfinite(gravity_world).all():
+        return -np.asarray(gravity_world, dtype=np.float64)
+    return np.array([0.0, 0.0, 1.0]) if motion == "imu" else None

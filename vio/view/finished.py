@@ -1,0 +1,85 @@
+"""A finished run in the rerun viewer, from its folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vio.datasets import open_dataset
+from vio.datasets.observation_log import read_observation_log
+from vio.errors import DataError, VioError
+from vio.finished_run import FinishedRun
+from vio.geometry.stereo import StereoCamera
+from vio.records import Image, Landmarks, StereoFrame, UpdateReport
+from vio.run_tables import estimate_of
+from vio.saved_run import OBSERVATIONS
+from vio.view.live import SERIES, RerunViewer, ViewedRig, states_of
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+log = logging.getLogger(__name__)
+
+_EVERY_IMAGE = 5  # frames of a finished run of which one shows its image
+_NOTHING_DONE = UpdateReport(0, 0, 0, 0, None, None)
+
+
+def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
+    """Show a run from its folder, with its features where they were saved, and its images where they still are.
+
+    Raises:
+        DataError: the folder was written by a version that did not keep the camera.
+    """
+    viewer = RerunViewer(stream, _rig_of(run), share=1.0)
+    saved = run.folder / OBSERVATIONS
+    log_of_features = read_observation_log(saved) if saved.is_file() else None
+    images = _images_of(run)
+    names = {
+        "features": ("tracked", "matched", "selected", "used", "gated"),
+        "innovation": ("innovation_median_px", "nis_per_dof"),
+        "time": [f"{name}_ms" for name in SERIES["time"]],
+    }
+    for row, estimate in enumerate(map(estimate_of, run.estimates)):
+        index = int(run.estimates["index"][row])
+        numbers = {curve: [float(run.frames[name][row]) for name in columns] for curve, columns in names.items()}
+        seen = None if log_of_features is None else log_of_features.observations(index)
+        states = None if seen is None else states_of(seen, seen.has_right, _NOTHING_DONE)
+        image = next(images, None) if row % _EVERY_IMAGE == 0 else None
+        viewer.show(index, estimate, numbers, image, seen, states)
+    ids = np.arange(len(run.points))
+    viewer.landmarks(Landmarks(ids, run.points, np.zeros((len(ids), 3, 3))))
+    viewer.close()
+
+
+def _rig_of(run: FinishedRun) -> ViewedRig:
+    """Return the rig of a run from its folder.
+
+    Raises:
+        DataError: the folder does not hold it.
+    """
+    try:
+        camera = StereoCamera(**run.metrics["camera"])
+    except (KeyError, TypeError) as error:
+        raise DataError(f"{run.folder}: its metrics.json does not hold the camera; repeat the run") from error
+    reference = None if run.evaluation is None else run.evaluation.reference
+    return ViewedRig(camera, run.T_cam0_body, run.metrics.get("motion"), reference)
+
+
+def _images_of(run: FinishedRun) -> Iterator[Image]:
+    """Yield the left images of every fifth frame of a run; none where the recording is not there any more."""
+    source = f"{run.metrics.get('kind')}:{run.metrics.get('source')}"
+    try:
+        dataset = open_dataset(source)
+    except VioError as error:
+        log.warning("the images are not shown: %s", error)
+        return
+    if not dataset.recording.has_images:
+        return
+    for index in run.estimates["index"][::_EVERY_IMAGE].tolist():
+        found = [e for e in dataset.events(index, index + 1) if isinstance(e, StereoFrame) and e.left is not None]
+        if not found or found[0].left is None:
+            return
+        yield found[0].left

@@ -1,0 +1,65 @@
+"""Where a run is shown: a window, a browser, or a file."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from vio.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+log = logging.getLogger(__name__)
+
+_WEB_PORT = 9090
+
+
+def open_stream(where: str, name: str) -> tuple[rr.RecordingStream, str | None]:
+    """Return a stream into the viewer (`spawn`), a file (`*.rrd`) or a browser (`web`), and the address of the latter.
+
+    Raises:
+        ConfigError: rerun is not installed, `where` is something else, or there is no screen for a window.
+        DataError: the file cannot be written.
+    """
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise ConfigError("--view needs rerun; install it with: pip install 'stereo-vio[view]'") from error
+    stream = rr.RecordingStream("stereo-vio", recording_id=None)
+    stream.send_recording_name(name)
+    address = None
+    if where == "spawn":
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            raise ConfigError("--view: there is no screen here; use --view web, or --view FILE.rrd")
+        stream.spawn()
+    elif where == "web":
+        served = stream.serve_grpc()
+        rr.serve_web_viewer(web_port=_WEB_PORT, connect_to=served, open_browser=False)
+        address = f"http://127.0.0.1:{_WEB_PORT}/?url={quote(served, safe='')}"
+    elif where.endswith(".rrd"):
+        path = Path(where)
+        if not path.parent.is_dir():
+            raise DataError(f"{path}: its folder does not exist; create it or choose another")
+        try:
+            path.open("wb").close()
+        except OSError as error:
+            raise DataError(f"{path}: cannot be written ({error.strerror})") from error
+        stream.save(path)
+    else:
+        raise ConfigError(f"--view {where}: takes nothing (a window), web, or a file *.rrd; write SOURCE before it")
+    return stream, address
+
+
+def wait_for_interrupt(address: str) -> None:
+    """Serve the page until Ctrl-C."""
+    log.warning("shown at %s; Ctrl-C ends the server", address)
+    with contextlib.suppress(KeyboardInterrupt):
+        while True:
+            time.sleep(3600)
