@@ -16,7 +16,7 @@ endif
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: demo test lint unit coverage mutations results wheel docs clean constraints
+.PHONY: demo test lint unit coverage mutations bench results wheel docs clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -38,6 +38,10 @@ coverage: $(TESTED)
 # Break the code on purpose, a line at a time: some test must fail each time (half an hour).
 mutations: $(TESTED)
 	$(BIN)/python -m tools.mutate
+
+# Run the small suite of `vio bench`, rendered on the spot: exit status 1 where a run has no result (half a minute).
+bench: $(VENV)/.base
+	$(BIN)/vio bench small --out bench/small --cache bench/cache
 
 # Measure what docs/results.md tells and write its tables (VIO_DATA=recordings; half an hour and more); RESULTS="--check"
 # only compares, docs/results.md tells what must lie where.

@@ -24,6 +24,7 @@ TESTED_JACOBIANS = {
     "vio.geometry.sphere_models.unified_D_p",
     "vio.geometry.stereo.p_cam_D_z",
     "vio.geometry.stereo.z_D_p_cam",
+    "vio.mapping.pose_graph.r_D_poses",
 }
 
 

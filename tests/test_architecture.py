@@ -131,6 +131,12 @@ def test_rosbags_stays_in_its_package() -> None:
     assert all(_within(name, "vio.datasets.bags") for name in users), users
 
 
+def test_dask_stays_in_its_module() -> None:
+    users = [_name(f) for f in FILES if {"distributed", "dask"} & _heads(f, top_level_only=False)]
+    assert users == ["vio.bench.engines"]
+    assert not {"distributed", "dask"} & _heads(ROOT / "vio" / "bench" / "engines.py", top_level_only=True)
+
+
 def test_matplotlib_stays_out_of_import_time() -> None:
     assert not [_name(f) for f in FILES if "matplotlib" in _heads(f, top_level_only=True)]
 
@@ -143,7 +149,7 @@ def _loaded(code: str, suspects: set[str]) -> set[str]:
 
 
 HEAVY = {"numpy", "scipy", "numba", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
-HEAVY |= {"rosbags"}
+HEAVY |= {"rosbags", "distributed", "dask"}
 HELP = """
 import contextlib, vio.cli
 with contextlib.suppress(SystemExit):

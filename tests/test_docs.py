@@ -41,6 +41,7 @@ _SMALLER = {
     "vio render --scene room --trajectory handheld --duration 10 --out room": "--duration 0.2 --rig small --width 200",
     "vio calibrate FOLDER": "--pairs 3",
     "vio check RUN": "--keyframes 4",
+    "vio run FOLDER --map yard.map": "--stop 20",
 }
 
 

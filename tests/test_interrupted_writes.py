@@ -27,7 +27,7 @@ def hold(args):
 
 class Args: debug, execute = False, staticmethod(hold)
 class Parser:
-    def parse_args(self, argv): return Args
+    def parse_known_args(self, argv): return Args, []
 vio.cli.build_parser = Parser
 sys.exit(vio.cli.main([]))
 """

@@ -338,11 +338,17 @@ def test_the_error_moves_the_images_as_much_as_it_says() -> None:
 # --- end to end -----------------------------------------------------------------------------------------------------
 
 
-def test_odometry_follows_a_real_looking_flight() -> None:
-    """Three seconds by hand with everything at once, calibration errors included, are followed to 2 % of the way."""
-    result = run(flight(), Config(motion="imu"))
-    truth = flight().reference
-    scores = evaluate(result.trajectory, truth, T_cam0_imu=flight().recording.T_cam0_imu)
-    assert len(result.estimates) == 30
-    assert scores.reference_path_length_m > 1.5
-    assert scores.ate_m.rmse < 0.03
+def test_odometry_follows_real_looking_flights() -> None:
+    """Three seconds by hand with everything at once: two flights to 1 % of the way, one with people in front to 4 %.
+
+    Measured: 6.7, 8.0 and, with people before a blank wall, 20 to 31 mm, which small changes of the front end move.
+    """
+    for seed, share in ((0, 0.01), (1, 0.01), (2, 0.04)):
+        simulated = flight() if seed == scenario().seed else SimulatedRecording(plan(replace(scenario(), seed=seed)))
+        recording = simulated.recording
+        assert recording.reference is not None
+        result = run(simulated, Config(motion="imu"))
+        scores = evaluate(result.trajectory, recording.reference, T_cam0_imu=recording.T_cam0_imu)
+        assert len(result.estimates) == 30
+        assert scores.reference_path_length_m > 1.2
+        assert scores.ate_m.rmse < share * scores.reference_path_length_m, seed

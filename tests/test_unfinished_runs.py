@@ -204,7 +204,8 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     rng = np.random.default_rng(0)
     shapes = {"T_world_imu": (4, 4), "covariance": (6, 6), "T_cam0_imu": (4, 4), "T_cam0_imu_covariance": (6, 6)}
     shapes |= {"velocity_covariance": (3, 3)}
-    values: dict[str, Any] = {f.name: rng.normal(size=shapes.get(f.name, (3,))) for f in fields(Estimate)}
+    kept = [f.name for f in fields(Estimate) if not f.name.startswith("T_map")]  # those have a table of their own
+    values: dict[str, Any] = {name: rng.normal(size=shapes.get(name, (3,))) for name in kept}
     rows, rows_P = rng.normal(size=6), rng.normal(size=(6, 6))
     field = StereoFieldEstimate(rng.normal(size=6), rng.normal(size=(6, 6)), 0.3, rows, rows_P)
     scale = StereoScaleEstimate(rng.normal(size=2), rng.normal(size=(2, 2)))

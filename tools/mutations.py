@@ -56,8 +56,15 @@ _MOVING_OBJECT = ("tests/test_moving_object.py",)
 _ODOMETRY = ("tests/test_odometry.py",)
 _UNFINISHED = ("tests/test_unfinished_runs.py",)
 _INPUTS = ("tests/test_filter_inputs.py",)
+_BENCH = ("tests/test_bench.py",)
+_BENCH_COMPARE = ("tests/test_bench_compare.py",)
 _FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
+_GRAPH = ("tests/test_pose_graph.py",)
+_PLACES = ("tests/test_map_places.py",)
+_MAPS = ("tests/test_map_builder.py",)
+_MAP_FILE = ("tests/test_map_store.py",)
+_MAP_RUN = ("tests/test_map_run.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
 MUTATIONS = (
@@ -1322,6 +1329,63 @@ MUTATIONS = (
         "math.prod(shape) * dtype.itemsize < 0",
         _FILES,
     ),
+    # --- vio/bench ---
+    Mutation(
+        "bench: errors of poses expressed in the world",
+        "vio/bench/figures.py",
+        "se3_log(se3_inverse(T_world_true @ truth) @ T)",
+        "se3_log(T @ se3_inverse(T_world_true @ truth))",
+        _BENCH,
+    ),
+    Mutation(
+        "bench: inclination of the first pose taken as known",
+        "vio/bench/figures.py",
+        "_yaw_and_position(T[0], truth[0]) if upright else T[0]",
+        "T[0]",
+        _BENCH,
+    ),
+    Mutation(
+        "bench: a recording is known by names and sizes only",
+        "vio/bench/identity.py",
+        "digest.update(block)",
+        "digest.update(b'')",
+        _BENCH,
+    ),
+    Mutation(
+        "bench: settings that are no part of a task's key",
+        "vio/bench/tasks.py",
+        '[_FORM, "run", identity, known]',
+        '[_FORM, "run", identity]',
+        _BENCH,
+    ),
+    Mutation(
+        "bench: failures of the machine kept",
+        "vio/bench/bench.py",
+        'if record.pop("keep", True):',
+        'if record.pop("keep", True) or True:',
+        _BENCH,
+    ),
+    Mutation(
+        "compare: a smaller coverage is better",
+        "vio/bench/compare.py",
+        "-ratio if metric.larger_is_better else ratio",
+        "ratio if metric.larger_is_better else ratio",
+        _BENCH_COMPARE,
+    ),
+    Mutation(
+        "compare: the spread over seeds ignored",
+        "vio/bench/compare.py",
+        "return quantile * sigma,",
+        "return 0.01 * quantile * sigma,",
+        _BENCH_COMPARE,
+    ),
+    Mutation(
+        "compare: flips of signs do not count",
+        "vio/bench/compare.py",
+        "elif p > level or low <= 0 <= high:",
+        "elif low <= 0 <= high:",
+        _BENCH_COMPARE,
+    ),
     Mutation(
         "png: rows side by side take the corner of the row before",
         "vio/datasets/png_rows.py",
@@ -1412,5 +1476,103 @@ MUTATIONS = (
         "tested = motion is not None and not stereo.has_few_matches",
         "tested = motion is not None",
         _ROWS,
+    ),
+    Mutation(
+        "map: loops not held against the odometry",
+        "vio/mapping/builder.py",
+        "return _squared(r, drift + seen.pose.covariance) < _GATE",
+        "return _squared(r, drift + seen.pose.covariance) >= 0",
+        _MAPS,
+    ),
+    Mutation(
+        "map: a place that is not the only one accepted",
+        "vio/mapping/builder.py",
+        "return float(np.linalg.norm(gap)) > _SAME_M + _SAME_DEPTHS * depth",
+        "return float(np.linalg.norm(gap)) < 0",
+        _MAPS,
+    ),
+    Mutation(
+        "map: nothing remembered of what a loop moves",
+        "vio/mapping/builder.py",
+        "            self._store.set_poses(self.graph.T_map_cam.rows)",
+        "            self._store.set_poses(self.graph.T_map_cam.rows[:0])",
+        _MAPS,
+    ),
+    Mutation(
+        "pose graph: sign of the first pose's derivative",
+        "vio/mapping/pose_graph.py",
+        "return -r_D_j @ se3_adjoint",
+        "return r_D_j @ se3_adjoint",
+        _GRAPH,
+    ),
+    Mutation(
+        "pose graph: sign of the vertical's derivative",
+        "vio/mapping/pose_graph.py",
+        "D[:, :, 3:] = so3_hat(up)",
+        "D[:, :, 3:] = -so3_hat(up)",
+        _GRAPH,
+    ),
+    Mutation(
+        "pose graph: false loops keep their weight",
+        "vio/mapping/pose_graph.py",
+        "squared >= limit * (mu + 1) / mu, 0.0",
+        "squared >= limit * (mu + 1) / mu, 1.0",
+        _GRAPH,
+    ),
+    Mutation(
+        "loops: sign of the step",
+        "vio/mapping/loop_geometry.py",
+        "T = T @ se3_exp(xi)",
+        "T = T @ se3_exp(-xi)",
+        _PLACES,
+    ),
+    Mutation(
+        "loops: uncertainty of the points ignored",
+        "vio/mapping/loop_geometry.py",
+        "C = J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2)",
+        "C = 0 * J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2)",
+        _PLACES,
+    ),
+    Mutation(
+        "places: neighbours of a candidate are candidates too",
+        "vio/mapping/place_index.py",
+        "left[max(middle - 2 * _NEIGHBOURS, 0) : middle + 2 * _NEIGHBOURS + 1] = 0.0",
+        "left[middle] = 0.0",
+        _PLACES,
+    ),
+    Mutation(
+        "map file: a row too many after a checkpoint",
+        "vio/mapping/map_store.py",
+        "WHERE {column} >= ?",
+        "WHERE {column} > ?",
+        _MAP_FILE,
+    ),
+    Mutation(
+        "map: motions before the window's last move forgotten",
+        "vio/mapping/session.py",
+        "total = total if self._base is None else self._base.then(total)",
+        "total = total if self._base is None else total",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "map: a filter that began anew knows its motion",
+        "vio/mapping/session.py",
+        "np.diag(_BROKEN)",
+        "np.diag(0 * _BROKEN)",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "map: correction between keyframes the wrong way",
+        "vio/mapped_run.py",
+        "np.clip(share, 0.0, 1.0)[:, None] * xi",
+        "np.clip(share, 0.0, 1.0)[:, None] * -xi",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "filter: motion over the window the wrong way round",
+        "vio/filters/window_posterior.py",
+        "return RelativePose(se3_inverse(T_i) @ T_j, C)",
+        "return RelativePose(se3_inverse(T_j) @ T_i, C)",
+        _MAP_RUN,
     ),
 )

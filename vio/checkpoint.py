@@ -21,10 +21,10 @@ from vio.errors import DataError
 from vio.protocols import Dataset
 
 _FORMAT = "stereo-vio checkpoint"
-_PACKAGES = ("vio.filters.", "vio.geometry.", "vio.watch.", "frontend.", "vio._frontend.")
+_PACKAGES = ("vio.filters.", "vio.geometry.", "vio.mapping.", "vio.watch.", "frontend.", "vio._frontend.")
 _MODULES = (
-    *("vio.chain", "vio.config", "vio.datasets.settings", "vio.event_order", "vio.imu_faults", "vio.odometry"),
-    *("vio.pipeline", "vio.pose_prediction", "vio.records", "vio.selectors"),
+    *("vio.chain", "vio.config", "vio.datasets.settings", "vio.event_order", "vio.imu_faults", "vio.loops"),
+    *("vio.odometry", "vio.pipeline", "vio.pose_prediction", "vio.records", "vio.selectors"),
 )
 _OTHERS = {
     ("collections", "deque"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from vio.loops import LoopEvent
 from vio.records import Estimate, FrontendOutput, Selection, StereoFrame, UpdateReport
 
 STAGES = ("read", "frontend", "watch", "select", "filter")  # of a frame's wall time
@@ -48,3 +49,4 @@ class FrameResult:
     report: UpdateReport
     estimate: Estimate
     log: FrameLog
+    loops: tuple[LoopEvent, ...] = ()  # places of the map seen again, whose results have come with this frame

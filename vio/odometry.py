@@ -6,6 +6,8 @@ import logging
 import operator
 import threading
 from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -17,10 +19,12 @@ from vio.chain import BACKENDS, Chain, build_backend
 from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.event_order import EventOrder
+from vio.filters.msckf import Msckf
 from vio.frame_result import FrameResult
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.loops import LoopEvent
 from vio.pose_prediction import PosePredictor, PredictedPose
 from vio.protocols import Backend, Frontend, Selector
 from vio.records import (
@@ -42,6 +46,7 @@ from vio.selectors import build_selector
 from vio.threads import BlasLimit
 
 if TYPE_CHECKING:
+    from vio.mapping.session import MapSession
     from vio.rig import Rectifier
 
 log = logging.getLogger(__name__)
@@ -76,6 +81,8 @@ class Odometry:
         selector: Selector | None = None,
         backend: Backend | None = None,
         on_frame: Callable[[FrameResult], None] | None = None,
+        map: Path | str | MapSession | None = None,
+        localise: bool = False,
     ) -> None:
         """Prepare; the first frame begins the trajectory.
 
@@ -87,10 +94,13 @@ class Odometry:
             selector: used in place of the configured selector.
             backend: used in place of the configured back end.
             on_frame: called with the result of each frame, by the call that processed it.
+            map: file of a map to begin or to continue (docs/maps.md): estimates have `T_map_body`, and `close` ends it.
+            localise: find poses in the map, and leave it as it is.
 
         Raises:
             CalibrationError: the rig cannot be rectified.
-            ConfigError: the settings ask for what the rig does not have.
+            ConfigError: the settings ask for what the rig does not have, or a map for another back end than msckf.
+            DataError: the map cannot be used.
         """
         self._config = Config() if config is None else config
         self._rectifier: Rectifier | None = None
@@ -110,6 +120,9 @@ class Odometry:
         self._on_frame = on_frame
         self._lock = threading.RLock()
         self._blas = BlasLimit()
+        if map is not None and (self._config.backend != "msckf" or backend is not None):
+            raise ConfigError("a map needs the back end msckf, which tells the covariance of motions; configure that")
+        self._map = self._opened(map, localise=localise) if isinstance(map, (str, Path)) else map
         self.reset()
 
     def reset(self) -> None:
@@ -120,6 +133,8 @@ class Odometry:
         """
         if getattr(self, "_chain", None) is not None and any(part is not None for part in self._parts):
             raise ConfigError("reset: front end, selector or back end were given; build a new Odometry with new ones")
+        if getattr(self, "_chain", None) is not None and self._map is not None:
+            raise ConfigError("reset: a map takes one trajectory of an Odometry; close it, and build a new one")
         self._chain: Chain | None = None
         self._order = EventOrder(wait_for_imu=self.motion == "imu")
         self._predictor = PosePredictor(self._config.msckf.gravity_mps2)
@@ -234,7 +249,15 @@ class Odometry:
             self._deliver(results)
             if self._chain is not None:
                 self._chain.watch.close()
+            if self._map is not None:
+                self._map.finish()
             return results
+
+    def close(self) -> None:
+        """Write the map and let its file go; without a map, nothing is held."""
+        with self._lock:
+            if self._map is not None:
+                self._map.close()
 
     # What comes out
 
@@ -256,6 +279,16 @@ class Odometry:
         if rig is None:
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
         return calibrated_rig(rig, estimate)
+
+    @property
+    def map_session(self) -> MapSession | None:
+        """The trajectory's part of the map; None without a map."""
+        return self._map
+
+    @property
+    def loops(self) -> tuple[LoopEvent, ...]:
+        """The places of the map that were seen again so far."""
+        return () if self._map is None else tuple(self._map.loops)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -312,8 +345,11 @@ class Odometry:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Finish, unless an error ended the block."""
-        if kind is None:
-            self.finish()
+        try:
+            if kind is None:
+                self.finish()
+        finally:
+            self.close()
 
     # How
 
@@ -391,10 +427,31 @@ class Odometry:
                     continue
                 result = self._chain.frame(event)
                 if result is not None:
+                    result = self._in_map(event, result)
                     results.append(result)
                     self._estimate = result.estimate
                     self._order.exposed_after_ns = max(round(1e9 * (result.estimate.time_offset_s or 0.0)), 0)
         return results
+
+    def _opened(self, path: Path | str, *, localise: bool) -> MapSession:
+        from vio.mapping.session import MapSession
+
+        imu = self.motion == "imu"
+        return MapSession(Path(path), self.camera, self.T_cam0_body, source="live", imu=imu, localise=localise)
+
+    def _in_map(self, frame: StereoFrame, result: FrameResult) -> FrameResult:
+        """Add what the map says of a frame."""
+        if self._map is None or self._chain is None:
+            return result
+        backend = self._chain.backend
+        assert isinstance(backend, Msckf)
+        loops = self._map.frame(frame, result.output.observations, result.estimate, backend.relative)
+        T = self._map.T_map_odom
+        if T is not None:
+            T_map_body, covariance = T @ result.estimate.T_world_imu, self._map.covariance
+            estimate = replace(result.estimate, T_map_body=T_map_body, T_map_body_covariance=covariance)
+            result = replace(result, estimate=estimate)
+        return replace(result, loops=loops)
 
     def _build(self) -> Chain:
         """Build the chain once the first frame says whether images or observations come."""

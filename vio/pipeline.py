@@ -8,7 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from vio.filters.vislam import Vislam
 from vio.frame_result import STAGES, FrameLog, FrameResult
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray, se3_inverse
+from vio.mapped_run import MappedRun, mapped_run
 from vio.odometry import Odometry, rig_of_rectified
 from vio.protocols import Backend, Dataset, Frontend, RectifyingDataset, Selector, Viewer
 from vio.records import (
@@ -39,6 +41,9 @@ from vio.run_recorder import GrowingFolder, RunRecorder
 from vio.selectors import build_selector
 from vio.tables import Records
 from vio.threads import one_blas_thread
+
+if TYPE_CHECKING:
+    from vio.mapping.session import MapSession
 
 log = logging.getLogger(__name__)
 
@@ -66,6 +71,7 @@ class RunResult:
     wall_s: float
     stopped: str | None = None  # why the run ended before the recording; None: it did not
     rig: Rig | None = None  # the calibration as given; None: features without an image size
+    mapped: MappedRun | None = None  # where a map was built or used
 
     def calibrated_rig(self) -> CalibratedRig | None:
         """Return the calibration with what the run found it to be off by; None: features without an image size."""
@@ -105,6 +111,8 @@ def run(
     folder: GrowingFolder | None = None,
     resume: bool = False,
     should_stop: Callable[[], str | None] = lambda: None,
+    map_file: Path | None = None,
+    localise: bool = False,
 ) -> RunResult:
     """Process a recording from its frame `start` to before frame `stop`, with BLAS pinned to one thread meanwhile.
 
@@ -121,6 +129,8 @@ def run(
         folder: where to write while the run goes on; None: everything stays in memory.
         resume: go on from the checkpoint in `folder`.
         should_stop: asked after each event; a reason ends the run in order, and the result names it.
+        map_file: a map to begin or to continue.
+        localise: find poses in the map, and leave it as it is.
 
     Raises:
         VioError: the configuration, the data or the estimation is at fault; the message says which. With a folder, a
@@ -138,22 +148,30 @@ def run(
         state = recorder.restore(features)
         viewer = _skipped(viewer, len(recorder))
     else:
+        run_config = replace(config, motion=motion or "none")
+        session = None if map_file is None else _map_session(map_file, recording, run_config, localise=localise)
         odometry = Odometry(
             recording.camera,
-            replace(config, motion=motion or "none"),
+            run_config,
             T_cam0_imu=T_cam0_body,
             frontend=frontend or _build_frontend(features, config),
             selector=selector or _build_selector(features, config),
-            backend=backend or build_backend(recording.camera, T_cam0_body, config, motion),
+            backend=backend or (None if session else build_backend(recording.camera, T_cam0_body, config, motion)),
+            map=session,
         )
         dead_reckoning = _DeadReckoning(recording, config, T_cam0_body) if motion == "velocity" else None
         state = _RunState(odometry, dead_reckoning, start)
     stopped = None
-    with contextlib.closing(recorder), contextlib.closing(viewer or NullViewer()) as shown:
+    with (
+        contextlib.closing(recorder),
+        contextlib.closing(viewer or NullViewer()) as shown,
+        contextlib.closing(state.odometry),
+    ):
         loop = _Loop(state, recorder, shown)
         try:
             with _opencv_threads(dataset, config, frontend):
-                events = dataset.events(state.next_frame, stop, images=_needs_images(dataset, config))
+                images = _needs_images(dataset, config) or state.odometry.map_session is not None
+                events = dataset.events(state.next_frame, stop, images=images)
                 stopped = loop.run(events, features, should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
@@ -162,7 +180,7 @@ def run(
         odometry = state.odometry
         if not len(recorder):
             _nothing_done(recording, odometry, stopped)
-        reckoned = state.dead_reckoning is not None
+        reckoned, session = state.dead_reckoning is not None, odometry.map_session
         return RunResult(
             recording=recording,
             config=config,
@@ -179,6 +197,7 @@ def run(
             wall_s=time.perf_counter() - began,
             stopped=stopped,
             rig=given_rig(dataset),
+            mapped=None if session is None else mapped_run(session, recorder.estimates, recorder.mapped),
         )
 
 
@@ -195,6 +214,24 @@ def given_rig(dataset: Dataset) -> Rig | None:
     if T_cam0_imu is not None:
         T_cam0_imu = se3_inverse(rig.T_imu_cam0)
     return Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1), T_cam0_imu, dataset.imu_noise, made.time_offset_s)
+
+
+def _map_session(path: Path, recording: Recording, config: Config, *, localise: bool) -> MapSession:
+    """Open a map for a recording.
+
+    Raises:
+        ConfigError: the recording has no images, or the back end is not msckf.
+        DataError: the map cannot be used.
+    """
+    from vio.mapping.session import MapSession
+
+    if not recording.has_images:
+        raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
+    if config.backend != "msckf":
+        raise ConfigError(f"a map needs the back end msckf, not {config.backend}; leave --backend out")
+    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    source, imu = str(recording.path.absolute()), config.motion == "imu"
+    return MapSession(path, recording.camera, T_cam0_body, source=source, imu=imu, localise=localise)
 
 
 def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:

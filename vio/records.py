@@ -344,6 +344,9 @@ class Estimate:
     time_offset_sigma_s: float | None = None
     stereo_field: StereoFieldEstimate | None = None
     stereo_scale: StereoScaleEstimate | None = None
+    # The pose in a map; None without one, or without a place in it yet.
+    T_map_body: FloatArray | None = None  # (4, 4)
+    T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi), given the map
 
 
 def _no_ids() -> IntArray:
@@ -360,8 +363,8 @@ class UpdateReport:
     landmarks: int  # landmarks in the map
     innovation_median_px: float | None  # median absolute innovation before the update, all gated-in rows
     nis_per_dof: float | None  # normalised innovation squared over its degrees of freedom; about 1 when consistent
-    gated_ids: IntArray = field(default_factory=_no_ids)  # of the observations rejected, where the back end says it
-    landmark_ids: IntArray = field(default_factory=_no_ids)  # of the landmarks in the map, likewise
+    gated_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of those rejected, where the back end says it
+    landmark_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of the landmarks in the map, likewise
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.input_files import read_input
+from vio.mapped_run import MappedRun
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.printable import json_text, printable
 from vio.protocols import Dataset
@@ -38,6 +39,7 @@ log = logging.getLogger(__name__)
 MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
 CALIBRATION = "camchain-imucam.yaml"  # the corrected calibration, where no other file is named for it
 REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
+LOOP_COLUMNS = ("frame", "time_ns", "keyframe", "keyframe_time_ns", "inliers", "gap_m", "joined")
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 FILES = (
     MARKER,
@@ -45,6 +47,10 @@ FILES = (
     "config.yaml",
     "trajectory.tum",
     "trajectory.kitti",
+    "map_trajectory.tum",
+    "map_causal.tum",
+    "map_covariance.npy",
+    "loops.csv",
     "estimates.npy",
     "reference.tum",
     "dead_reckoning.tum",
@@ -183,6 +189,8 @@ def _write_files(
         write_tum(target / "reference.tum", replace(evaluation.reference, times_ns=times_ns[evaluation.rows]))
     if result.dead_reckoning is not None:
         write_tum(target / "dead_reckoning.tum", result.dead_reckoning)
+    if result.mapped is not None:
+        metrics["map"] = _write_mapped(target, result, result.mapped, reference)
     write_landmarks_ply(target / "landmarks.ply", result.landmarks)
     _write_frames(target / "frames.csv", result.frames)
     if save_observations:
@@ -194,18 +202,46 @@ def _write_files(
     return metrics
 
 
+def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference: Trajectory | None) -> dict[str, Any]:
+    """Write the poses in the map and the loops, and return their metrics."""
+    final = replace(result.trajectory, T_world_body=mapped.T_map_body)
+    write_tum(target / "map_trajectory.tum", final)
+    causal = mapped.causal
+    if len(causal):
+        poses = Trajectory(np.array(causal["T_map_body"]), np.array(causal["time_ns"]), result.body)
+        write_tum(target / "map_causal.tum", poses)
+    np.save(target / "map_covariance.npy", causal["covariance"])
+    lines = [",".join(LOOP_COLUMNS), *(",".join(str(getattr(o, c)) for c in LOOP_COLUMNS) for o in mapped.loops)]
+    (target / "loops.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    evaluation, _ = score(replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body)
+    return {
+        "joined": mapped.joined,
+        "keyframes": mapped.keyframes,
+        "loops": len(mapped.loops),
+        "placed": len(causal) / len(final),
+        "ate_m": None if evaluation is None else evaluation.as_dict()["ate_m"],
+    }
+
+
 def score(
-    result: RunResult, reference: Trajectory | None, *, lengths_m: Sequence[float] = KITTI_LENGTHS_M
+    result: RunResult,
+    reference: Trajectory | None,
+    *,
+    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    T_world_body: FloatArray | None = None,
 ) -> tuple[Evaluation | None, Evaluation | None]:
     """Evaluate a run's trajectory and its dead reckoning; None without a reference or dead reckoning.
 
-    A reference that cannot be compared (too short, no common time) gives a warning only.
+    A reference that cannot be compared (too short, no common time) gives a warning only. `T_world_body` (N, 4, 4)
+    takes the place of the run's own poses.
     """
     if reference is None:
         return None, None
     try:
         truth = _with_times(reference, result)
-        own = evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
+        poses = result.trajectory
+        poses = poses if T_world_body is None else replace(poses, T_world_body=T_world_body)
+        own = evaluate(poses, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
         for note in own.notes:
             log.warning("%s", note)
         other = result.dead_reckoning

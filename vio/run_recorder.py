@@ -28,6 +28,7 @@ from vio.records import BodyFrame, Estimate, Landmarks, MotionSample, Observatio
 from vio.run_tables import (
     ESTIMATE,
     FRAME,
+    MAPPED,
     OBSERVATION,
     POINT,
     SAMPLE,
@@ -36,6 +37,7 @@ from vio.run_tables import (
     estimate_of,
     estimate_row,
     frames_csv,
+    mapped_row,
     observation_rows,
     sample_of,
     sample_row,
@@ -59,6 +61,7 @@ _TABLES = {
     "seen": SEEN,
     "observations": OBSERVATION,
     "samples": SAMPLE,
+    "mapped": MAPPED,
 }
 Smoothed = Callable[[int], Estimate | None]  # of a frame by its number, with all frames since
 
@@ -133,6 +136,8 @@ class RunRecorder:
         with self._writing():
             estimates.append(estimate_row(index, result.estimate))
             self._tables["frames"].append(self._rows.row(replace(result.log, read_ms=read_ms)))
+            if result.estimate.T_map_body is not None:
+                self._tables["mapped"].append(mapped_row(index, result.estimate))
             if self._keep:
                 seen = result.output.observations
                 self._tables["observations"].append(observation_rows(seen))
@@ -188,6 +193,11 @@ class RunRecorder:
     def frames(self) -> Records[FrameLog]:
         """Logs of all frames."""
         return Records(self._tables["frames"], self._rows.frame)
+
+    @property
+    def mapped(self) -> Rows:
+        """The poses in the map as known at the time, one row a frame that had one."""
+        return self._tables["mapped"].rows()
 
     @property
     def observations(self) -> Sequence[Observations] | None:

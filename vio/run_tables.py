@@ -76,7 +76,17 @@ FRAME = np.dtype(
 OBSERVATION = np.dtype([("id", "<i8"), ("z", "<f8", (4,)), ("has_right", "?"), ("stale", "?")])
 SEEN = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("count", "<i8")])  # one row a frame: its observations
 SAMPLE = np.dtype([("time_ns", "<i8"), ("is_imu", "?"), ("values", "<f8", (6,))])
+MAPPED = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("T_map_body", "<f8", (4, 4)), ("covariance", "<f8", (6, 6))])
 POINT = np.dtype([("id", "<i8"), ("p_world", "<f8", (3,)), ("covariance", "<f8", (3, 3))])
+
+
+def mapped_row(index: int, estimate: Estimate) -> Rows:
+    """Return the place in the map of an estimate that has one as a row (1,)."""
+    row = np.zeros(1, dtype=MAPPED)
+    row["index"], row["time_ns"], row["T_map_body"] = index, estimate.time_ns, estimate.T_map_body
+    covariance = estimate.T_map_body_covariance
+    row["covariance"] = np.nan if covariance is None else covariance
+    return row
 
 
 def estimate_row(index: int, estimate: Estimate) -> Rows:

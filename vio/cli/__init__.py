@@ -19,6 +19,7 @@ from types import FrameType
 
 from vio._version import __version__
 from vio.cli import (
+    bench,
     calibrate,
     check,
     completion,
@@ -28,6 +29,8 @@ from vio.cli import (
     evaluate,
     export,
     inspect,
+    localise,
+    map,
     rectify,
     refine,
     render,
@@ -41,10 +44,13 @@ from vio.printable import printable
 
 _COMMANDS = (
     run,
+    localise,
+    map,
     inspect,
     convert,
     evaluate,
     report,
+    bench,
     view,
     check,
     refine,

@@ -23,7 +23,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)")
     parser.add_argument(
         "--scene",
-        choices=("room", "street", "corridor"),
+        choices=("room", "street", "corridor", "doors"),
         default="room",
         help="the scene (default room; it is built around a recorded trajectory)",
     )

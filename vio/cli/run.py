@@ -31,6 +31,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map: loops are closed in it")
     parser.add_argument(
         "--save-calibration",
         type=Path,
@@ -60,6 +61,7 @@ _OF_A_NEW_RUN = (
     "out",
     "save_observations",
     "save_calibration",
+    "map",
     "view",
     "set",
     "config",
@@ -94,6 +96,7 @@ def execute(args: argparse.Namespace) -> int:
         save_observations=args.save_observations,
         save_calibration=args.save_calibration,
         progress=not args.quiet,
+        map_file=args.map,
         view=args.view,
     )
     return print_result(metrics, rows_of(metrics), as_json=args.json)

@@ -99,6 +99,8 @@ def process(
     save_observations: bool = False,
     save_calibration: Path | None = None,
     progress: bool = True,
+    map_file: Path | None = None,
+    localise: bool = False,
     view: str | None = None,
 ) -> dict[str, Any]:
     """Process a source into a run folder, which grows meanwhile, and return its metrics.
@@ -119,6 +121,8 @@ def process(
         "lengths_m": None if lengths_m is None else list(lengths_m),
         "save_observations": save_observations,
         "save_calibration": None if calibration is None else str(calibration.absolute()),
+        "map": None if map_file is None else str(map_file.absolute()),
+        "localise": localise,
     }
     return _process(dataset, config, folder, request, progress=progress, resume=False, view=view)
 
@@ -170,6 +174,8 @@ def _process(
                 folder=growing_folder(folder, dataset, config, request),
                 resume=resume,
                 should_stop=asked.reason,
+                map_file=Path(request["map"]) if request.get("map") else None,
+                localise=request.get("localise", False),
             )
             file = request.get("save_calibration")  # unfinished runs of earlier versions have none
             calibration = None if file is None else calibration_text(result)
@@ -291,6 +297,8 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("ATE", f"{metrics['ate_m']:.3f} m after SE(3) alignment{beside}"))
     if metrics["t_err_percent"] is not None:
         rows.append(("drift", f"{metrics['t_err_percent']:.2f} %, {metrics['r_err_deg_per_100m']:.3f} deg/100 m"))
+    if metrics.get("map") is not None:
+        rows.append(("map", _map_row(metrics["map"])))
     if metrics["landmark_error"] is not None:
         score = metrics["landmark_error"]
         rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
@@ -322,3 +330,11 @@ def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
             words.append(f"time {found_imu['time_offset_ms']:+.2f} ± {found_imu['time_offset_sigma_ms']:.2f} ms")
         rows.append(("camera-IMU", "off by " + ", ".join(words)))
     return rows
+
+
+def _map_row(of_map: dict[str, Any]) -> str:
+    """Return what a run made of its map as one table row."""
+    ate = "" if of_map["ate_m"] is None else f", ATE {of_map['ate_m']:.3f} m"
+    place = "" if of_map["joined"] else "; its place in the map was not found"
+    placed = f", {100 * of_map['placed']:.1f} % of the frames placed at the time"
+    return f"{of_map['keyframes']} keyframes, {of_map['loops']} loops{ate}{placed}{place}"

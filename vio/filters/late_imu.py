@@ -14,6 +14,7 @@ import numpy as np
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
+from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, Landmarks, Observations, Prediction, UpdateReport, no_landmarks
 
@@ -75,6 +76,10 @@ class LateImuMsckf(Msckf):
             return self._early.smoothed(frame_index)
         own = super().smoothed(frame_index)
         return None if own is None else self._in_first_world(own)
+
+    def relative(self, older: int, newer: int) -> RelativePose | None:
+        """Return the body's motion between two frames of the window, see `Msckf`."""
+        return super().relative(older, newer) if self._early is None else self._early.relative(older, newer)
 
     def landmarks(self) -> Landmarks:
         """Return the points of all tracks that fix their depth, see `Msckf`."""

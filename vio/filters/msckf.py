@@ -46,6 +46,7 @@ from vio.filters.window import NO_TWIST, Clone, Fit, Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
+from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import (
     BoolArray,
@@ -401,6 +402,13 @@ class Msckf:
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where it has left the window."""
         return None if self._smoothed is None else self._smoothed.estimate(frame_index)
+
+    def relative(self, older: int, newer: int) -> RelativePose | None:
+        """Return the body's motion between two frames of the window, by numbers, with all frames since.
+
+        None where one of them is not in the window.
+        """
+        return None if self._smoothed is None else self._smoothed.motion(older, newer)
 
     def landmarks(self) -> Landmarks:
         """Return the points of all tracks that were used and fix their depth, with their covariance given the poses.

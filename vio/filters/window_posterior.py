@@ -9,6 +9,7 @@ import numpy as np
 from vio.filters.navigation import ImuMotion
 from vio.filters.window import Clone, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log
+from vio.geometry.relative_pose import RelativePose
 from vio.records import Estimate
 from vio.statistics import chi_square_quantile
 
@@ -58,6 +59,20 @@ class WindowPosterior:
             gyro_bias=self.gyro_bias,
             accel_bias=self.accel_bias,
         )
+
+    def motion(self, older: int, newer: int) -> RelativePose | None:
+        """Return the body's motion between two frames of the window; None where one of them is not in it.
+
+        With right-invariant errors, `T_i^-1 T_j = T_ij_hat exp(Ad(T_j_hat^-1) (xi_j - xi_i))`.
+        """
+        place = {c.frame_index: k for k, c in enumerate(self.clones)}
+        if older not in place or newer not in place:
+            return None
+        T_i, T_j = (self.clones[place[frame]].T_world_imu for frame in (older, newer))
+        a, b = (slice(6 * place[frame], 6 * place[frame] + 6) for frame in (older, newer))
+        A = se3_adjoint(se3_inverse(T_j))
+        C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
+        return RelativePose(se3_inverse(T_i) @ T_j, C)
 
     def is_stationary(self, velocity_sigma_mps: float, rate_sigma_radps: float) -> bool:
         """Test whether the motion from the oldest to the newest clone is indistinguishable from none.

@@ -47,7 +47,7 @@ from vio.sim.rigs import (
 )
 from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
 from vio.sim.textures import TextureKind
-from vio.sim.world import MovingBox, SceneName, World, corridor, room, street
+from vio.sim.world import MovingBox, SceneName, World, corridor, equal_doors, room, street
 
 ReadyMotion: TypeAlias = Literal["handheld", "car"]
 RigName: TypeAlias = Literal["euroc", "euroc-rectified", "kitti", "fisheye", "small"]
@@ -206,6 +206,9 @@ def _check(scenario: Scenario) -> None:
         raise SimulationError(f"the seed must not be negative, got {scenario.seed}")
     if not 0 <= scenario.conditions.people <= 100:
         raise SimulationError(f"{scenario.conditions.people} people cannot be placed; choose 0 to 100")
+    hard = scenario.conditions
+    if scenario.scene == "doors" and (hard.bare_wall or hard.moving or hard.people or hard.lighting):
+        raise SimulationError("the corridor of equal doors has no effects of a scene; use corridor")
 
 
 def scaled(rig: StereoRig, width: int | None) -> StereoRig:
@@ -265,7 +268,7 @@ def _ready(scenario: Scenario) -> tuple[MotionSpline, IntArray, None]:
 def _motion(scenario: Scenario, duration_s: float) -> MotionSpline:
     if scenario.trajectory == "car":
         return car_loop(duration_s=duration_s, seed=scenario.seed)
-    if scenario.scene == "corridor":
+    if scenario.scene in ("corridor", "doors"):
         return _walk(duration_s, scenario.seed)
     centre = (0.0, -37.8, 1.5) if scenario.scene == "street" else (0.0, 0.0, 1.4)
     return hand_held(centre=centre, duration_s=duration_s, seed=scenario.seed)
@@ -320,6 +323,8 @@ def _scene(
     bare: TextureKind = "plaster" if hard.lighting else "bare"  # in uneven light even a blank wall shows something
     if scenario.scene == "street":
         return street(seed, moving=moving, sunlit=hard.lighting, bare_houses=hard.bare_wall)
+    if scenario.scene == "doors":
+        return equal_doors(seed)
     if scenario.scene == "corridor":
         sides = ("+y", "-y") if hard.bare_wall else ("+y",)
         return corridor(seed, bare_walls=sides, bare_kind=bare, moving=moving)

@@ -20,7 +20,7 @@ from vio.sim.errors import SimulationError
 from vio.sim.lighting import Light, Lighting, illumination, sun, window
 from vio.sim.textures import MipTexture, TextureKind, build_mips, lit, paint
 
-SceneName: TypeAlias = Literal["room", "street", "corridor"]
+SceneName: TypeAlias = Literal["room", "street", "corridor", "doors"]
 ObjectMotion: TypeAlias = Callable[[int], FloatArray]  # time_ns to T_world_object (4, 4)
 
 _OF_WOOD: tuple[TextureKind, ...] = ("wood", "crate")
@@ -55,6 +55,7 @@ class Patch:
     size: FloatArray  # (2,) m along s and t
     kind: TextureKind
     texel_m: float
+    twins: int | None = None  # patches with equal numbers look the same; None: this one looks like no other
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,8 +113,14 @@ class TextureStore:
             with self._lock:
                 found = self._painted.get(surface)
                 if found is None:
-                    found = self._paint(surface)
-                    self._painted[surface] = found
+                    patch = self._patches[surface]
+                    twin = surface
+                    if patch.twins is not None:
+                        twin = next(k for k, other in enumerate(self._patches) if other.twins == patch.twins)
+                    found = self._painted.get(twin)
+                    if found is None:
+                        found = self._paint(twin)
+                    self._painted[twin] = self._painted[surface] = found
         return found
 
     def _paint(self, surface: int) -> MipTexture:
@@ -297,6 +304,42 @@ def corridor(
             patches += _box_patches(picture, "picture", texel_m)
             solids.append(picture)
     return _build("corridor", patches, solids, box, seed, moving)
+
+
+def equal_doors(
+    seed: int = 0,
+    *,
+    doors: int = 10,
+    spacing_m: float = 3.0,
+    width_m: float = 2.6,
+    height_m: float = 2.7,
+    texel_m: float = 0.003,
+) -> World:
+    """Build a corridor along x that repeats to the texel from door to door: walls, floor, ceiling, doors, pictures.
+
+    Only its two end walls differ. Whoever recognises places by their looks alone takes one door for another.
+    """
+    box = np.array([[0.0, -width_m / 2, 0.0], [doors * spacing_m, width_m / 2, height_m]])
+    ends: dict[str, TextureKind] = {"+x": "wall", "-x": "wall"}
+    centre = _pose((box[0] + box[1]) / 2, 0.0)
+    patches = _axis_rectangles(centre, (box[1] - box[0]) / 2, ends, texel_m, inwards=True)
+    kinds: dict[str, TextureKind] = {"+y": "wall", "-y": "wall", "-z": "floor", "+z": "ceiling"}
+    half = np.array([spacing_m, width_m, height_m]) / 2
+    rng = np.random.default_rng([seed, 4])
+    places = [(side * (width_m / 2 - 0.02), rng.uniform(0.5, spacing_m - 0.5)) for side in (-1, 1) for _ in range(2)]
+    solids: list[Solid] = []
+    for number in range(doors):
+        middle = np.array([(number + 0.5) * spacing_m, 0.0, height_m / 2])
+        cell = _axis_rectangles(_pose(middle, 0.0), half, kinds, texel_m, inwards=True)
+        door = Solid(_pose((middle[0], -width_m / 2 + 0.03, 1.0), 0.0), np.array([0.45, 0.03, 1.0]))
+        solids.append(door)
+        cell += _box_patches(door, "wood", texel_m, hidden=("-z",))
+        for y, along in places:
+            picture = Solid(_pose((number * spacing_m + along, y, 1.6), 0.0), np.array([0.3, 0.02, 0.25]))
+            solids.append(picture)
+            cell += _box_patches(picture, "picture", texel_m)
+        patches += [replace(patch, twins=k) for k, patch in enumerate(cell)]
+    return _build("doors", patches, solids, box, seed, ())
 
 
 def street(

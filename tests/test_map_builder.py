@@ -1,0 +1,195 @@
+"""A map from rendered keyframes: loops where there are some, none in a corridor that repeats from door to door."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse
+from vio.geometry.relative_pose import RelativePose
+from vio.mapping.builder import Keyframe, MapBuilder
+from vio.mapping.features import KeyframeFeatures, extract
+from vio.mapping.map_store import MapStore
+from vio.sim.motion import look_rotation, spline_from_waypoints
+from vio.sim.rigs import small_rig
+from vio.sim.sequence import SimulatedRecording, simulate
+from vio.sim.world import World, equal_doors, room
+
+RIG = small_rig(320, 180)
+STEP_SIGMA = np.repeat([0.01, 0.002], 3)  # of the odometry between two keyframes, m and rad
+
+
+class Walk:
+    """Images of a walk through a world, and its true camera poses."""
+
+    def __init__(self, world: World, x: FloatArray, y: FloatArray, yaw: FloatArray) -> None:
+        R = look_rotation(np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=1))
+        motion = spline_from_waypoints(se3_from_parts(R, np.stack([x, y, np.full_like(x, 1.4)], axis=1)), 1.0)
+        self._recording = SimulatedRecording(simulate(world, RIG, motion, rate_hz=1.0))
+        trajectory = self._recording.recording.reference
+        assert trajectory is not None
+        self.T = trajectory.T_world_body @ RIG.T_imu_cam0
+        self.camera = self._recording.recording.camera
+        self.features = [extract(*self._recording.images(k)) for k in range(len(self._recording))]
+
+    def keyframes(self, *, seed: int, rows: slice = slice(None)) -> Iterator[tuple[Keyframe, KeyframeFeatures]]:
+        """Keyframes with the odometry's errors, in a world of its own where they begin."""
+        rng = np.random.default_rng(seed)
+        chosen = range(len(self.T))[rows]
+        T_odom, before = np.eye(4), None
+        for k in chosen:
+            motion = None
+            if before is not None:
+                step = se3_inverse(self.T[before]) @ self.T[k] @ se3_exp(STEP_SIGMA * rng.standard_normal(6))
+                motion = RelativePose(step, np.diag(STEP_SIGMA**2))
+                T_odom = T_odom @ step
+            before = k
+            yield Keyframe(k, 10**9 * k, T_odom, motion, None, 0.0), self.features[k]
+
+
+@pytest.fixture(scope="module")
+def room_walk() -> Walk:
+    """Once around in a room and half of it again, from other positions."""
+    angle = np.linspace(0, 3 * np.pi, 37)
+    radius = np.where(angle < 2 * np.pi, 1.1, 1.25)
+    return Walk(room(seed=1, texel_m=0.006), radius * np.cos(angle), 0.8 * radius * np.sin(angle), angle + np.pi / 2)
+
+
+@pytest.fixture(scope="module")
+def doors_walk() -> Walk:
+    """Along six equal doors, and four of them back, looking ahead all the time."""
+    x = np.concatenate([np.linspace(2.0, 20.0, 19), np.linspace(18.0, 7.5, 6)])
+    return Walk(equal_doors(seed=1, texel_m=0.008), x, 0 * x, 0 * x)
+
+
+@pytest.fixture(scope="module")
+def whole_map(room_walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> MapBuilder:
+    """Of the whole walk in the room, finished and closed."""
+    builder = _map(room_walk, tmp_path_factory.mktemp("maps") / "whole.map")
+    builder.finish()
+    builder.close()
+    return builder
+
+
+@pytest.fixture(scope="module")
+def first_round(room_walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of a map of the first round."""
+    path = tmp_path_factory.mktemp("maps") / "first.map"
+    builder = _map(room_walk, path, rows=slice(0, 25))
+    builder.finish()
+    builder.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def doors_map(doors_walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> MapBuilder:
+    """Of the walk along equal doors, closed."""
+    builder = _map(doors_walk, tmp_path_factory.mktemp("maps") / "doors.map")
+    builder.close()
+    return builder
+
+
+def _map(walk: Walk, path: Path, *, seed: int = 0, rows: slice = slice(None), localise: bool = False) -> MapBuilder:
+    store = MapStore(path, create=not localise, read_only=localise)
+    builder = MapBuilder(store, "walk", walk.camera, upright=False, localise=localise)
+    for keyframe, features in walk.keyframes(seed=seed, rows=rows):
+        builder.add(keyframe, features)
+    return builder
+
+
+def _errors_m(T: FloatArray, truth: FloatArray) -> FloatArray:
+    """Position errors (N,) in the frame of the first pose."""
+    aligned = truth[0] @ se3_inverse(T[0]) @ T
+    return np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1)
+
+
+def test_a_second_round_closes_loops_and_takes_the_drift_away(room_walk: Walk, whole_map: MapBuilder) -> None:
+    graph = whole_map.graph
+    loops = [o for o in graph.loops if o.kept]
+    assert len({o.second for o in loops}) >= 0.8 * 12, "of the keyframes of the second round"
+    for o in loops:
+        truth = se3_inverse(room_walk.T[o.first]) @ room_walk.T[o.second]
+        assert np.linalg.norm((se3_inverse(truth) @ o.pose.T_i_j)[:3, 3]) < 0.1, "no false loop"
+    odometry, optimised = (_errors_m(T.rows, room_walk.T)[25:] for T in (graph.T_odom_cam, graph.T_map_cam))
+    assert np.sqrt(np.mean(optimised**2)) < 0.6 * np.sqrt(np.mean(odometry**2))
+
+
+def test_equal_doors_are_told_apart_by_the_odometry(doors_walk: Walk, doors_map: MapBuilder) -> None:
+    """Three metres away everything looks the same; the loops are those with the place itself."""
+    loops = doors_map.graph.loops
+    assert len(loops) >= 2
+    for o in loops:
+        truth = se3_inverse(doors_walk.T[o.first]) @ doors_walk.T[o.second]
+        assert np.linalg.norm((se3_inverse(truth) @ o.pose.T_i_j)[:3, 3]) < 0.2
+
+
+def test_who_wakes_between_equal_doors_is_told_no_place(doors_walk: Walk, doors_map: MapBuilder) -> None:
+    lost = _map(doors_walk, doors_map.path, seed=1, rows=slice(8, 16), localise=True)
+    assert not lost.is_joined
+    assert [o for o in lost.graph.loops if o.second >= lost.first] == []
+
+
+def test_a_session_finds_its_place_in_an_earlier_map(room_walk: Walk, first_round: Path) -> None:
+    before = first_round.read_bytes()
+    found = _map(room_walk, first_round, seed=5, rows=slice(28, 35), localise=True)
+    assert found.is_joined
+    own = found.graph.T_map_cam.rows[25:]
+    errors = np.linalg.norm((room_walk.T[0] @ own - room_walk.T[28:35])[:, :3, 3], axis=1)
+    assert np.median(errors) < 0.1
+    assert first_round.read_bytes() == before
+
+
+def test_a_continued_map_joins_both_sessions(room_walk: Walk, first_round: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    shutil.copyfile(first_round, path)
+    second = _map(room_walk, path, seed=5, rows=slice(28, 35))
+    assert second.is_joined
+    second.finish()
+    second.close()
+    store = MapStore(path, read_only=True)
+    assert [s.part for s in store.sessions()] == [0, 0]
+    assert len(store.keyframes()) == 32
+    store.close()
+
+
+def test_after_a_gap_without_odometry_the_place_is_found_again(
+    room_walk: Walk, first_round: Path, tmp_path: Path
+) -> None:
+    """The camera is covered and carried to the other side: the odometry knows nothing of it, and says so."""
+    builder = _map(room_walk, tmp_path / "a.map", seed=2, rows=slice(0, 15))
+    T_last = builder.graph.T_odom_cam[-1]
+    jump = RelativePose(np.eye(4), np.diag(np.repeat([30.0**2, 1.0], 3)))
+    for n, (keyframe, features) in enumerate(room_walk.keyframes(seed=3, rows=slice(25, 31))):
+        motion = jump if n == 0 else keyframe.motion
+        builder.add(replace(keyframe, T_odom_cam=T_last @ keyframe.T_odom_cam, motion=motion), features)
+    found = room_walk.T[0] @ builder.graph.T_map_cam.rows[-3:]
+    assert np.linalg.norm((found - room_walk.T[28:31])[:, :3, 3], axis=1).max() < 0.2
+    builder.close()
+
+
+def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBuilder, tmp_path: Path) -> None:
+    keyframes = list(room_walk.keyframes(seed=0))
+    path = tmp_path / "b.map"
+    builder = _map(room_walk, path, rows=slice(0, 30))
+    builder.commit()
+    saved = pickle.dumps(builder)
+    for keyframe, features in keyframes[30:33]:  # what the first process still did before it died
+        builder.add(keyframe, features)
+    builder.commit()
+    builder.close()
+    resumed: MapBuilder = pickle.loads(saved)
+    resumed.reopen(MapStore(path))
+    for keyframe, features in keyframes[30:]:
+        resumed.add(keyframe, features)
+    resumed.finish()
+    resumed.close()
+    np.testing.assert_array_equal(resumed.graph.T_map_cam.rows, whole_map.graph.T_map_cam.rows)
+    rows = [[r.T_map_cam.tobytes() for r in MapStore(p, read_only=True).keyframes()] for p in (path, whole_map.path)]
+    assert rows[0] == rows[1]
+    assert rows[0] == [T.tobytes() for T in resumed.graph.T_map_cam.rows], "the file holds what was optimised"

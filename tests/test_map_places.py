@@ -1,0 +1,130 @@
+"""Places recognised by features: words, pairs, and the motion between two views with its covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, transform_points
+from vio.geometry.stereo import StereoCamera, project
+from vio.mapping.features import KeyframeFeatures, extract, no_features
+from vio.mapping.loop_geometry import LEAST_INLIERS, match, verify
+from vio.mapping.place_index import PlaceIndex
+
+CAMERA = StereoCamera(400.0, 400.0, 319.5, 179.5, 0.12, 640, 360)
+T_I_J = se3_exp([0.4, -0.1, 0.3, 0.05, -0.2, 0.03])
+POINTS = 120
+
+
+def _bits(count: int, rng: np.random.Generator) -> np.ndarray:
+    return rng.integers(0, 256, (count, 32), dtype=np.uint8)
+
+
+def _flipped(descriptors: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Descriptors with a share of their bits wrong, as another view gives them."""
+    wrong = rng.random((len(descriptors), 256)) < share
+    return descriptors ^ np.packbits(wrong, axis=1)
+
+
+def _views(seed: int, sigma_px: float = 1.0, outliers: float = 0.0) -> tuple[KeyframeFeatures, KeyframeFeatures]:
+    """Two views of one place, the second at T_I_J, with pixel noise and wrong positions of some features."""
+    rng = np.random.default_rng(seed)
+    p = np.stack([rng.uniform(-3, 3, POINTS), rng.uniform(-1.5, 1.5, POINTS), rng.uniform(3, 9, POINTS)], axis=1)
+    bits = _bits(POINTS, rng)
+    out = []
+    for points, names in ((p, bits), (transform_points(se3_inverse(T_I_J), p), _flipped(bits, 0.08, rng))):
+        z = project(CAMERA, points) + sigma_px * rng.standard_normal((POINTS, 4))
+        z[rng.random(POINTS) < outliers, :2] += 80.0
+        out.append(KeyframeFeatures(z, rng.random(POINTS) < 0.8, np.full(POINTS, sigma_px), names))
+    return out[0], out[1]
+
+
+def _error(seed: int, **how: float) -> tuple[FloatArray, FloatArray, int]:
+    i, j = _views(seed, **how)
+    seen = verify(CAMERA, i, CAMERA, j)
+    assert seen is not None
+    return se3_log(se3_inverse(seen.pose.T_i_j) @ T_I_J), seen.pose.covariance, seen.inliers
+
+
+def test_pairs_are_those_of_the_same_points() -> None:
+    i, j = _views(1)
+    pairs = match(i, j)
+    assert len(pairs) > 0.9 * POINTS
+    np.testing.assert_array_equal(pairs[:, 0], pairs[:, 1])
+
+
+def test_the_motion_between_two_views_is_found_within_its_covariance() -> None:
+    """Normalised errors of 15 pairs; the covariance is inflated fourfold on purpose, so 6 is not reached."""
+    squared = [float(r @ np.linalg.solve(C, r)) for r, C, _ in (_error(seed) for seed in range(15))]
+    assert 0.5 < np.mean(squared) < 6.0
+    assert max(squared) < 16.8  # the 99 % quantile of six degrees of freedom
+
+
+def test_a_third_of_wrong_pairs_changes_little() -> None:
+    r, C, inliers = _error(2, outliers=0.2)
+    assert inliers > 0.5 * POINTS
+    assert float(r @ np.linalg.solve(C, r)) < 16.8
+
+
+def test_another_place_does_not_verify() -> None:
+    i, _ = _views(1)
+    _, j = _views(2)
+    assert verify(CAMERA, i, CAMERA, j) is None
+
+
+def test_equal_descriptors_at_other_positions_do_not_verify() -> None:
+    """The geometry decides: the same looks without a common motion."""
+    i, j = _views(1)
+    order = np.random.default_rng(0).permutation(POINTS)
+    moved = KeyframeFeatures(j.z[order], j.has_right[order], j.sigma_px, j.descriptors)
+    assert len(match(i, moved)) > LEAST_INLIERS
+    assert verify(CAMERA, i, CAMERA, moved) is None
+
+
+def test_too_few_features_do_not_verify() -> None:
+    i, j = _views(1)
+    assert verify(CAMERA, i, CAMERA, no_features()) is None
+    few = KeyframeFeatures(j.z[:15], j.has_right[:15], j.sigma_px[:15], j.descriptors[:15])
+    assert verify(CAMERA, i, CAMERA, few) is None
+
+
+@pytest.mark.parametrize("size", [(64, 64), (180, 320)])
+def test_an_image_without_texture_has_no_features(size: tuple[int, int]) -> None:
+    gray = np.full(size, 90, dtype=np.uint8)
+    assert len(extract(gray, gray)) == 0
+
+
+def test_the_index_finds_the_place_that_shares_most_features() -> None:
+    rng = np.random.default_rng(5)
+    index = PlaceIndex()
+    places = [_bits(200, rng) for _ in range(40)]
+    for place in places:
+        index.add(place)
+    query = _flipped(places[17], 0.1, rng)
+    query[:80] = _bits(80, rng)  # features that are new
+    found = index.candidates(query, np.ones(40, dtype=np.bool_), 3)
+    assert found[0] == 17
+    forbidden = np.arange(40) != 17
+    assert 17 not in index.candidates(query, forbidden, 3)
+
+
+def test_candidates_are_of_different_places() -> None:
+    rng = np.random.default_rng(6)
+    index = PlaceIndex()
+    one, other = _bits(200, rng), _bits(200, rng)
+    for k in range(20):
+        near = one if k in (4, 5, 6) else other if k in (14, 15) else _bits(200, rng)
+        index.add(_flipped(near, 0.05, rng))
+    query = np.concatenate([_flipped(one, 0.05, rng), _flipped(other[:100], 0.05, rng)])
+    found = index.candidates(query, np.ones(20, dtype=np.bool_), 2).tolist()
+    assert found[0] in (4, 5, 6)
+    assert found[1] in (14, 15)
+
+
+def test_an_empty_index_and_an_empty_view_have_no_candidates() -> None:
+    index = PlaceIndex()
+    bits = _bits(10, np.random.default_rng(0))
+    assert index.candidates(bits, np.zeros(0, dtype=np.bool_), 3).tolist() == []
+    index.add(no_features().descriptors)
+    assert index.candidates(bits, np.ones(1, dtype=np.bool_), 3).tolist() == []
+    assert index.candidates(no_features().descriptors, np.ones(1, dtype=np.bool_), 3).tolist() == []

@@ -1,0 +1,248 @@
+"""Runs with a map: the odometry stays as it is, resumed runs keep their map, localised ones leave it alone."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vio
+from tests.test_msckf import CAMERA, T_CAM0_IMU, Flight
+from tests.test_unfinished_runs import Stop
+from vio.cli import main
+from vio.config import Config
+from vio.datasets import open_dataset
+from vio.errors import ConfigError
+from vio.filters.msckf import Msckf
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
+from vio.geometry.relative_pose import RelativePose
+from vio.mapped_run import corrected
+from vio.mapping.map_store import MapStore
+from vio.mapping.session import MapSession
+from vio.pipeline import run
+from vio.records import Estimate, StereoFrame, observations
+from vio.run_recorder import GrowingFolder
+from vio.trajectory_io import read_trajectory
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered flight as an EuRoC folder: 20 frames of 320 pixels with an IMU, over 2 s."""
+    folder = tmp_path_factory.mktemp("flight") / "flight"
+    options = {"rig": "small", "width": "320", "rate": "10", "duration": "2", "workers": "1", "format": "euroc"}
+    arguments = [word for name, value in options.items() for word in (f"--{name}", value)]
+    assert main(["render", "--out", str(folder), "--json", *arguments]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mapped(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run with a map, `yard.map` beside it."""
+    folder = tmp_path_factory.mktemp("mapped")
+    arguments = ["--map", str(folder / "yard.map"), "--out", str(folder / "run"), "--json", "--quiet"]
+    assert main(["run", str(flight), *arguments]) == 0
+    return folder / "run"
+
+
+def test_the_odometry_of_a_run_with_a_map_is_that_of_one_without(flight: Path, mapped: Path, tmp_path: Path) -> None:
+    assert main(["run", str(flight), "--out", str(tmp_path / "run"), "--json", "--quiet"]) == 0
+    for name in ("trajectory.tum", "trajectory.kitti"):
+        assert (mapped / name).read_bytes() == (tmp_path / "run" / name).read_bytes()
+    assert np.load(mapped / "estimates.npy").tobytes() == np.load(tmp_path / "run" / "estimates.npy").tobytes()
+    assert not list((tmp_path / "run").glob("map*"))
+
+
+def test_a_run_with_a_map_writes_its_poses_and_its_metrics(mapped: Path) -> None:
+    metrics = json.loads((mapped / "metrics.json").read_text())["map"]
+    assert metrics["joined"]
+    assert metrics["placed"] == 1.0
+    assert metrics["keyframes"] >= 2
+    odometry, final = (read_trajectory(mapped / f"{name}.tum") for name in ("trajectory", "map_trajectory"))
+    assert len(final) == len(odometry)
+    np.testing.assert_allclose(final.T_world_body, odometry.T_world_body, atol=1e-7)  # there is no loop
+    causal = read_trajectory(mapped / "map_causal.tum")
+    covariance = np.load(mapped / "map_covariance.npy")
+    assert len(causal) == len(covariance) == len(odometry)
+    assert (np.linalg.eigvalsh(covariance)[1:] > 0).all()
+    assert (mapped / "loops.csv").read_text().startswith("frame,time_ns,keyframe")
+
+
+def test_a_run_goes_on_to_the_same_map(flight: Path, mapped: Path, tmp_path: Path) -> None:
+    folder, path = GrowingFolder(tmp_path / "run", {}), tmp_path / "yard.map"
+    first = run(open_dataset(flight), Config(), folder=folder, should_stop=Stop(300), map_file=path)
+    assert 5 < len(first.frames) < 20
+    second = run(open_dataset(flight), Config(), folder=folder, resume=True)
+    assert second.mapped is not None
+    final = read_trajectory(mapped / "map_trajectory.tum")
+    np.testing.assert_allclose(second.mapped.T_map_body, final.T_world_body, atol=1e-8)
+    rows = [
+        [(r.frame, r.T_map_cam.tobytes()) for r in MapStore(p, read_only=True).keyframes()]
+        for p in (path, mapped.parent / "yard.map")
+    ]
+    assert rows[0] == rows[1]
+
+
+def test_localising_finds_the_place_and_leaves_the_map(flight: Path, mapped: Path, tmp_path: Path) -> None:
+    path = mapped.parent / "yard.map"
+    before = path.read_bytes()
+    arguments = ["--map", str(path), "--out", str(tmp_path / "run"), "--json", "--quiet", "--start", "2"]
+    assert main(["localise", str(flight), *arguments]) == 0
+    assert path.read_bytes() == before
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())["map"]
+    assert metrics["joined"]
+    # The world of this run begins at frame 2, the map's at frame 0.
+    expected = read_trajectory(mapped / "trajectory.tum").T_world_body[2:]
+    found = read_trajectory(tmp_path / "run" / "map_trajectory.tum").T_world_body
+    assert np.abs(se3_log(se3_inverse(expected) @ found)[:, :3]).max() < 0.05
+
+
+def test_maps_are_shown_and_merged(mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = mapped.parent / "yard.map", tmp_path / "both.map"
+    shutil.copyfile(path, tmp_path / "other.map")
+    assert main(["map", "merge", str(path), str(tmp_path / "other.map"), "--out", str(out), "--json"]) == 0
+    merged = json.loads(capsys.readouterr().out)
+    assert main(["map", "show", str(path), "--json"]) == 0
+    single = json.loads(capsys.readouterr().out)
+    assert merged["keyframes"] == 2 * single["keyframes"]
+    assert [s["joined"] for s in merged["sessions"]] == [True, True]
+    assert main(["map", "show", str(out)]) == 0
+    assert "session 1" in capsys.readouterr().out
+    assert main(["map", "merge", str(path), str(path), "--out", str(out)]) == 1
+    assert "exists; give another name" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["localise", "{flight}", "--map", "{none}"], "there is no such map; vio run --map"),
+        (["run", "{flight}", "--map", "{none}", "--backend", "vislam"], "a map needs the back end msckf"),
+        (["run", "{log}", "--map", "{none}"], "a map is made of images, and this recording has features only"),
+    ],
+)
+def test_what_no_map_can_be_made_of_is_refused_in_a_line(
+    arguments: list[str], message: str, flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "run" / "observations.npz"
+    if "{log}" in arguments:
+        assert main(["run", str(flight), "--out", str(log.parent), "--save-observations", "--stop", "3", "--json"]) == 0
+    names = {"{flight}": str(flight), "{none}": str(tmp_path / "none.map"), "{log}": str(log)}
+    out = str(tmp_path / "refused")
+    assert main([names.get(a, a) for a in arguments] + ["--out", out, "--quiet", "--json"]) == 1
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "none.map").exists()
+
+
+def test_live_estimates_have_their_pose_in_the_map(flight: Path, mapped: Path, tmp_path: Path) -> None:
+    dataset = open_dataset(flight)
+    recording = dataset.recording
+    config = replace(Config(), motion="none")
+    path = tmp_path / "live.map"
+    with vio.Odometry(recording.camera, config, T_cam0_imu=recording.T_cam0_imu, map=path) as odometry:
+        for event in dataset.events(0, 6):
+            if isinstance(event, StereoFrame):
+                assert event.left is not None
+                assert event.right is not None
+                estimate = odometry.add_stereo(event.time_ns, event.left, event.right)
+                assert estimate is not None
+                assert estimate.T_map_body is not None
+                np.testing.assert_allclose(estimate.T_map_body, estimate.T_world_imu, atol=1e-12)
+        assert odometry.loops == ()
+        with pytest.raises(ConfigError, match="a map takes one trajectory"):
+            odometry.reset()
+    assert len(MapStore(path, read_only=True).keyframes()) >= 1
+    with pytest.raises(ConfigError, match="a map needs the back end msckf"):
+        vio.Odometry(recording.camera, replace(config, backend="vislam"), map=path)
+
+
+def _motions(seed: int) -> tuple[FloatArray, FloatArray]:
+    """Normalised squared errors of motions over the filter's window, and of two joined motions."""
+    flight, rng = Flight(frames=16), np.random.default_rng(seed)
+    filter_ = Msckf(CAMERA, T_CAM0_IMU, Config().msckf, motion=None)
+    for k in range(16):
+        filter_.update(flight.observe(k, 0.5, rng))
+    whole = filter_.relative(6, 15)
+    assert whole is not None
+    truth = se3_inverse(flight.T_world_imu(6)) @ flight.T_world_imu(15)
+    r = se3_log(se3_inverse(whole.T_i_j) @ truth)
+    parts = [filter_.relative(6, 10), filter_.relative(10, 15)]
+    assert parts[0] is not None
+    assert parts[1] is not None
+    joined = parts[0].then(parts[1]).T_i_j
+    return np.array(r @ np.linalg.solve(whole.covariance, r)), se3_log(se3_inverse(whole.T_i_j) @ joined)
+
+
+def test_motions_between_frames_of_the_window_are_consistent() -> None:
+    squared, gaps = zip(*(_motions(seed) for seed in range(6)), strict=True)
+    assert np.abs(gaps).max() < 1e-9
+    assert 2.0 < np.mean(squared) < 12.0  # of 6 degrees of freedom, 6 runs
+
+
+def test_motions_beyond_the_window_are_not_known() -> None:
+    flight, rng = Flight(frames=16), np.random.default_rng(0)
+    filter_ = Msckf(CAMERA, T_CAM0_IMU, Config().msckf, motion=None)
+    assert filter_.relative(0, 0) is None
+    for k in range(16):
+        filter_.update(flight.observe(k, 0.5, rng))
+    assert filter_.relative(0, 15) is None
+    assert filter_.relative(15, 16) is None
+
+
+def test_motions_are_joined_where_the_window_moves_on(tmp_path: Path) -> None:
+    """Eight frames between two keyframes, and a filter that knows the motion over three only."""
+    steps = se3_exp(np.random.default_rng(0).normal(0, 0.1, (9, 6)))
+    poses = [np.eye(4)]
+    for step in steps[:-1]:
+        poses.append(poses[-1] @ step)
+
+    def relative(older: int, newer: int) -> RelativePose | None:
+        if newer - older > 3:
+            return None
+        return RelativePose(se3_inverse(poses[older]) @ poses[newer], max(newer - older, 0) * np.eye(6))
+
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    gray = np.zeros((64, 64), dtype=np.uint8)
+    for k in range(9):
+        ids = np.arange(40) + 1000 * (k == 8)
+        seen = observations(k, k, ids, np.tile([9.0, 9, 5, 9], (40, 1)))
+        session.frame(StereoFrame(k, k, gray, gray), seen, Estimate(k, poses[k], np.eye(6)), relative)
+    session.finish()
+    session.close()
+    ((first, second, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    assert (first, second) == (0, 1)
+    np.testing.assert_allclose(motion.T_i_j, poses[8], atol=1e-12)
+    assert np.linalg.eigvalsh(motion.covariance)[0] > 7.0, "of eight steps of unit variance each"
+
+
+def test_where_the_filter_began_anew_the_motion_is_not_known(tmp_path: Path) -> None:
+    def relative(older: int, newer: int) -> RelativePose | None:
+        return None if older < 5 <= newer else RelativePose(np.eye(4), 1e-6 * np.eye(6))
+
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    gray = np.zeros((64, 64), dtype=np.uint8)
+    for k in range(9):
+        seen = observations(k, k, np.arange(40) + 1000 * (k == 8), np.tile([9.0, 9, 5, 9], (40, 1)))
+        session.frame(StereoFrame(k, k, gray, gray), seen, Estimate(k, np.eye(4), np.eye(6)), relative)
+    session.finish()
+    session.close()
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    assert np.sqrt(motion.covariance[0, 0]) >= 30.0
+
+
+def test_corrections_are_spread_between_keyframes() -> None:
+    T_odom = se3_exp(np.random.default_rng(1).normal(0, 0.5, (11, 6)))
+    frames = np.array([2, 6])
+    T_map = se3_exp([[1.0, 0, 0, 0, 0, 0.1], [1.2, 0.1, 0, 0, 0, 0.2]]) @ T_odom[frames]
+    out = corrected(T_odom, np.arange(11), frames, T_map, T_odom[frames])
+    np.testing.assert_allclose(out[frames], T_map, atol=1e-12)
+    for k, keyframe in ((0, 2), (10, 6)):  # outside, they move with the nearest keyframe
+        np.testing.assert_allclose(
+            se3_inverse(out[keyframe]) @ out[k], se3_inverse(T_odom[keyframe]) @ T_odom[k], atol=1e-12
+        )
+    jumps = [se3_log(se3_inverse(T_odom[k]) @ T_odom[k + 1] @ se3_inverse(out[k + 1]) @ out[k]) for k in range(2, 6)]
+    assert np.linalg.norm(jumps, axis=1).max() < 0.4, "no frame takes the whole correction"

@@ -1,0 +1,158 @@
+"""The map's file: what is written comes back, a crash leaves the last good state, foreign files are refused."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.conftest import ROOT
+from vio.errors import DataError
+from vio.geometry.lie import se3_exp
+from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import StereoCamera
+from vio.mapping.features import KeyframeFeatures
+from vio.mapping.map_store import VERSION, KeyframeRow, LoopRow, MapStore, SessionRow
+
+CAMERA = StereoCamera(400.0, 401.0, 319.5, 179.5, 0.12, 640, 360)
+
+
+def _features(seed: int) -> KeyframeFeatures:
+    rng = np.random.default_rng(seed)
+    z = rng.uniform(0, 300, (13, 4)).astype(np.float32).astype(np.float64)
+    return KeyframeFeatures(z, rng.random(13) < 0.5, np.full(13, 1.5), rng.integers(0, 256, (13, 32), dtype=np.uint8))
+
+
+def _row(k: int) -> KeyframeRow:
+    T = se3_exp(np.full(6, 0.1 * k))
+    up = np.array([0.0, 0.6, 0.8]) if k % 2 else None
+    return KeyframeRow(0, 5 * k, 10**18 + k, T, se3_exp(np.full(6, 0.2)), 0.1 * np.eye(6), 1.5 * k, up, 0.01)
+
+
+def _pose(k: int) -> RelativePose:
+    return RelativePose(se3_exp(np.full(6, 0.01 * k)), (1 + k) * np.eye(6))
+
+
+def fill(path: Path, count: int = 4) -> MapStore:
+    store = MapStore(path, create=True)
+    store.add_session(SessionRow("a place", CAMERA, True, 0))
+    for k in range(count):
+        store.add_keyframe(_row(k), _features(k))
+        if k:
+            store.add_odometry(k - 1, k, _pose(k))
+    store.add_loop(LoopRow(0, count - 1, _pose(9), 40, True))
+    return store
+
+
+def test_what_is_written_comes_back_to_the_bit(tmp_path: Path) -> None:
+    fill(tmp_path / "a.map").close()
+    store = MapStore(tmp_path / "a.map", read_only=True)
+    assert store.sessions() == [SessionRow("a place", CAMERA, True, 0)]
+    rows = store.keyframes()
+    for k, row in enumerate(rows):
+        expected = _row(k)
+        assert (row.frame, row.time_ns, row.path_m) == (expected.frame, expected.time_ns, expected.path_m)
+        np.testing.assert_array_equal(row.T_map_cam, expected.T_map_cam)
+        np.testing.assert_array_equal(row.drift, expected.drift)
+        assert (row.up_cam is None) == (expected.up_cam is None)
+        features, given = store.features(k), _features(k)
+        for name in ("z", "has_right", "sigma_px", "descriptors"):
+            np.testing.assert_array_equal(getattr(features, name), getattr(given, name))
+    assert [(i, j) for i, j, _ in store.odometry()] == [(0, 1), (1, 2), (2, 3)]
+    np.testing.assert_array_equal(store.odometry()[1][2].covariance, _pose(2).covariance)
+    (loop,) = store.loops()
+    assert (loop.first, loop.second, loop.inliers, loop.kept) == (0, 3, 40, True)
+    store.close()
+
+
+def test_what_came_after_a_checkpoint_is_forgotten(tmp_path: Path) -> None:
+    store = fill(tmp_path / "a.map", 6)
+    store.truncate(1, 4, 0)
+    assert len(store.keyframes()) == 4
+    assert [j for _, j, _ in store.odometry()] == [1, 2, 3]
+    assert store.loops() == []
+    with pytest.raises(DataError, match="keyframe 4 has no features"):
+        store.features(4)
+    store.close()
+
+
+CRASH = """
+import os, sys
+from pathlib import Path
+import numpy as np
+from tests.test_map_store import _features, _row, fill
+store = fill(Path(sys.argv[1]))
+store.commit()
+store.add_keyframe(_row(4), _features(4))
+store.set_poses(np.array([np.eye(4)] * 5))
+print("written", flush=True)
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_a_killed_process_leaves_the_last_commit(tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    done = subprocess.run(
+        [sys.executable, "-c", CRASH, str(path)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.stdout, done.returncode) == ("written\n", -signal.SIGKILL)
+    store = MapStore(path)
+    assert len(store.keyframes()) == 4
+    np.testing.assert_array_equal(store.keyframes()[2].T_map_cam, _row(2).T_map_cam)
+    store.close()
+
+
+def test_a_missing_map_is_refused_with_the_remedy(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="there is no such map; vio run --map"):
+        MapStore(tmp_path / "none.map")
+
+
+def test_files_that_are_no_map_are_refused_and_left_alone(tmp_path: Path) -> None:
+    text, other = tmp_path / "text.map", tmp_path / "other.map"
+    text.write_text("not a database, but long enough to look like one: " * 40)
+    with pytest.raises(DataError, match="is damaged or no map"):
+        MapStore(text, create=True)
+    foreign = sqlite3.connect(other)
+    foreign.execute("CREATE TABLE mine (x)")
+    foreign.commit()
+    foreign.close()
+    before = other.read_bytes()
+    with pytest.raises(DataError, match="is no map of this program"):
+        MapStore(other, create=True)
+    assert other.read_bytes() == before
+
+
+def test_a_map_of_another_version_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    fill(path).close()
+    database = sqlite3.connect(path)
+    database.execute(f"PRAGMA user_version = {VERSION + 1}")
+    database.close()
+    with pytest.raises(DataError, match=f"is a map of version {VERSION + 1}, this program reads {VERSION}"):
+        MapStore(path)
+
+
+def test_a_map_in_use_is_refused(tmp_path: Path) -> None:
+    store = fill(tmp_path / "a.map")
+    with pytest.raises(DataError, match="wait for the run that uses it"):
+        MapStore(tmp_path / "a.map", create=True)
+    store.close()
+
+
+def test_a_truncated_map_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    fill(path).close()
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(DataError, match="is damaged or no map"):
+        MapStore(path, read_only=True).features(3)

@@ -1,0 +1,139 @@
+"""The optimum of a pose graph: Jacobians, exact recovery, false loops, gravity, and consistency of the result."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.numerics import numeric_jacobian, right_retract
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
+from vio.geometry.relative_pose import RelativePose
+from vio.mapping.pose_graph import (
+    Edges,
+    Uprights,
+    no_uprights,
+    optimise,
+    r_D_poses,
+    residual,
+    up_residual,
+)
+
+COUNT = 60
+SIGMA = np.repeat([0.02, 0.004], 3)  # of a step of the odometry, m and rad
+LOOP_SIGMA = np.repeat([0.01, 0.002], 3)
+RNG = np.random.default_rng
+
+
+def _circle() -> FloatArray:
+    """Poses (K, 4, 4) once around a circle and a tenth of it again."""
+    angle = np.linspace(0, 2.2 * np.pi, COUNT)
+    T = np.broadcast_to(np.eye(4), (COUNT, 4, 4)).copy()
+    T[:] = se3_exp(np.stack([0 * angle, 0 * angle, 0 * angle, 0 * angle, 0 * angle, angle], axis=1))
+    T[:, :3, 3] = np.stack([10 * np.sin(angle), 10 - 10 * np.cos(angle), 0 * angle], axis=1)
+    return T
+
+
+def _measured(T: FloatArray, i: int, j: int, sigma: FloatArray, rng: np.random.Generator) -> RelativePose:
+    noise = se3_exp(sigma * rng.standard_normal(6))
+    return RelativePose(se3_inverse(T[i]) @ T[j] @ noise, np.diag(sigma**2))
+
+
+def _problem(seed: int, false_loops: int = 0) -> tuple[FloatArray, FloatArray, Edges, Edges]:
+    """Truth, start by odometry, odometry and loops; the last `false_loops` loops are wrong by metres."""
+    rng, T = RNG(seed), _circle()
+    odometry = [(k, k + 1, _measured(T, k, k + 1, SIGMA, rng)) for k in range(COUNT - 1)]
+    start = [T[0]]
+    for _, _, motion in odometry:
+        start.append(start[-1] @ motion.T_i_j)
+    period = round((COUNT - 1) / 1.1)
+    loops = [(k, k + period, _measured(T, k, k + period, LOOP_SIGMA, rng)) for k in range(COUNT - period)]
+    for _ in range(false_loops):
+        i, j = sorted(rng.choice(COUNT, 2, replace=False).tolist())
+        wrong = se3_exp(np.concatenate([rng.uniform(-5, 5, 3), rng.uniform(-1, 1, 3)]))
+        loops.append((i, j, RelativePose(wrong, np.diag(LOOP_SIGMA**2))))
+    return T, np.array(start), Edges.of(odometry), Edges.of(loops)
+
+
+def _fixed() -> np.ndarray:
+    return np.arange(COUNT) == 0
+
+
+def _rmse_m(T: FloatArray, truth: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.sum((T[:, :3, 3] - truth[:, :3, 3]) ** 2, axis=1))))
+
+
+def test_jacobians_of_a_motion_agree_with_differences_far_from_the_optimum() -> None:
+    rng = RNG(3)
+    T = se3_exp(rng.normal(size=(2, 6)))
+    edges = Edges.of([(0, 1, RelativePose(se3_exp(0.8 * rng.normal(size=6)), np.eye(6)))])
+    A, B = r_D_poses(T, edges, residual(T, edges))
+    for number, D in ((0, A), (1, B)):
+
+        def moved(X: FloatArray, number: int = number) -> FloatArray:
+            return residual(np.array([X, T[1]] if number == 0 else [T[0], X]), edges)[0]
+
+        np.testing.assert_allclose(D[0], numeric_jacobian(moved, T[number], right_retract), atol=1e-7)
+
+
+def test_jacobian_of_the_vertical_agrees_with_differences() -> None:
+    T = se3_exp(RNG(4).normal(size=(1, 6)))
+    ups = Uprights(np.array([0]), np.array([[0.0, 0.6, 0.8]]), np.array([0.1]))
+    numeric = numeric_jacobian(lambda X: up_residual(X[None], ups)[0][0], T[0], right_retract)
+    np.testing.assert_allclose(up_residual(T, ups)[1][0], numeric, atol=1e-8)
+
+
+def test_loops_take_the_drift_away() -> None:
+    T, start, odometry, loops = _problem(1)
+    best = optimise(start, odometry, loops, no_uprights(), _fixed())
+    assert best.kept.all()
+    assert _rmse_m(best.T_map_cam, T) < 0.5 * _rmse_m(start, T)
+    np.testing.assert_array_equal(best.T_map_cam[0], start[0])
+
+
+def test_without_loops_the_odometry_is_the_optimum() -> None:
+    _, start, odometry, _ = _problem(1)
+    best = optimise(start, odometry, Edges.of([]), no_uprights(), _fixed())
+    np.testing.assert_allclose(best.T_map_cam, start, atol=1e-9)
+
+
+def test_false_loops_end_without_weight_and_change_nothing() -> None:
+    _, start, odometry, loops = _problem(2)
+    _, _, _, mixed = _problem(2, false_loops=4)
+    clean = optimise(start, odometry, loops, no_uprights(), _fixed())
+    robust = optimise(start, odometry, mixed, no_uprights(), _fixed())
+    assert robust.kept[: len(loops)].all()
+    assert not robust.kept[len(loops) :].any()
+    np.testing.assert_allclose(robust.T_map_cam, clean.T_map_cam, atol=1e-5)
+
+
+def test_the_error_at_the_optimum_is_that_of_its_covariance() -> None:
+    """Chi-square of the last pose, whose covariance is that of odometry and loops: 6 on average."""
+    squared = []
+    for seed in range(12):
+        _, start, odometry, loops = _problem(seed)
+        best = optimise(start, odometry, loops, no_uprights(), _fixed()).T_map_cam
+        r = np.concatenate([residual(best, odometry).ravel(), residual(best, loops).ravel()])
+        sigma = np.concatenate([np.tile(SIGMA, len(odometry)), np.tile(LOOP_SIGMA, len(loops))])
+        squared.append(float(np.sum((r / sigma) ** 2)))
+
+    dof = 6 * (len(odometry) + len(loops) - (COUNT - 1))
+    assert abs(np.mean(squared) - dof) < 4 * np.sqrt(2 * dof / 12)
+
+
+def test_the_vertical_keeps_the_map_upright() -> None:
+    T, start, odometry, loops = _problem(5)
+    ups = Uprights(np.arange(COUNT), T[:, 2, :3], np.full(COUNT, 0.002))
+    tilt = [
+        np.abs(best.T_map_cam[:, 2, :3] - T[:, 2, :3]).max()
+        for best in (optimise(start, odometry, loops, given, _fixed()) for given in (no_uprights(), ups))
+    ]
+    assert tilt[1] < 0.3 * tilt[0]
+    assert tilt[1] < 0.004
+
+
+def test_fixed_poses_stay_and_the_others_follow() -> None:
+    T, start, odometry, loops = _problem(6)
+    fixed = np.arange(COUNT) < COUNT // 2
+    start[fixed] = T[fixed]
+    best = optimise(start, odometry, loops, no_uprights(), fixed)
+    np.testing.assert_array_equal(best.T_map_cam[fixed], T[fixed])
+    assert np.linalg.norm(se3_log(se3_inverse(best.T_map_cam[-1]) @ T[-1])[:3]) < 0.1

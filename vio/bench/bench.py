@@ -1,0 +1,171 @@
+"""A whole bench: tasks from the store or an engine, and the tables, the report and the list of results."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from vio._version import __version__
+from vio.atomic import atomic_write_text, check_writable, locked_folder
+from vio.bench.engines import run_here, run_on_dask
+from vio.bench.execute import failed
+from vio.bench.identity import Identity, InputDigests, code_digest, package_versions
+from vio.bench.report import write_report
+from vio.bench.store import Record, Store
+from vio.bench.suite import Suite
+from vio.bench.tables import Outcome, csv_of_rows, csv_of_runs, markdown, rows_of
+from vio.bench.tasks import Task, tasks_of
+from vio.errors import DataError
+from vio.input_files import read_input
+from vio.printable import json_text
+
+log = logging.getLogger(__name__)
+RESULTS = "bench.json"
+FILES = (RESULTS, "tables.md", "table.csv", "runs.csv", "report.html")
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a bench finds and keeps things, and what does its tasks."""
+
+    data: Path  # the recordings
+    out: Path  # tables and report
+    cache: Path  # results of tasks, renders, digests: shared by all benches that name it
+    workers: int = 1
+    scheduler: str | None = None  # address of a Dask scheduler in the place of processes here
+    identity: Identity = "content"
+    peers: Path | None = None  # SEQUENCE.SYSTEM.tum
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a bench found."""
+
+    outcomes: tuple[Outcome, ...]
+    reused: int  # of them taken from the store
+    facts: dict[str, Any]  # as in bench.json
+
+    @property
+    def failures(self) -> tuple[Outcome, ...]:
+        """Runs without a result."""
+        return tuple(outcome for outcome in self.outcomes if outcome.failure is not None)
+
+
+def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: None) -> Result:
+    """Run all tasks of a suite that have no result yet, and write tables and report.
+
+    Args:
+        suite: what to run.
+        place: where.
+        progress: called with the number of tasks done and of all tasks.
+
+    Raises:
+        VioError: the folders cannot be written, or the scheduler is missing.
+    """
+    check_writable(place.out)
+    store = Store(place.cache / "results")
+    digests = InputDigests(place.cache / "inputs.json", place.identity)
+    tasks = tasks_of(suite, place.data, digests, place.peers)
+    digests.save()
+    with locked_folder(place.out):
+        records: dict[str, Record] = {}
+        missing: dict[str, dict[str, Any]] = {}
+        for task in sorted(tasks, key=lambda task: -task.size):  # a long one that begins last keeps all others waiting
+            if task.failure is None and task.key not in records:
+                record = store.get(task.key)
+                if record is None:
+                    missing[task.key] = task.job
+                else:
+                    records[task.key] = _without_poses(record)
+        reused = len(records)
+        progress(len(tasks) - len(missing), len(tasks))
+        for key, record in _results(missing, place):
+            if record.pop("keep", True):
+                store.put(key, record)
+            records[key] = _without_poses(record)
+            progress(len(tasks) - len(missing) + len(records) - reused, len(tasks))
+        return _write(suite, place, tasks, records, store, reused)
+
+
+def read_bench(folder: Path) -> tuple[tuple[Outcome, ...], dict[str, Any]]:
+    """Read the results of a bench's folder, and what it says of itself.
+
+    Raises:
+        DataError: it is no bench's folder, or damaged.
+    """
+    path = folder / RESULTS
+    try:
+        facts = json.loads(read_input(path))
+        outcomes = tuple(Outcome(**{**values, "curve": None}) for values in facts["outcomes"])
+    except FileNotFoundError as error:
+        raise DataError(f"{folder}: no results (it has no {RESULTS}); give the --out folder of a vio bench") from error
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise DataError(f"{path}: is damaged ({error}); repeat the bench, finished tasks are not run again") from error
+    return outcomes, facts
+
+
+def _results(jobs: Mapping[str, dict[str, Any]], place: Place) -> Iterator[tuple[str, Record]]:
+    cache = str(place.cache.absolute())
+    if place.scheduler is not None and jobs:
+        return run_on_dask(jobs, cache, address=place.scheduler)
+    return run_here(jobs, cache, workers=place.workers)
+
+
+def _without_poses(record: Record) -> Record:
+    """Return a record for tables alone: ten thousand trajectories would fill the memory."""
+    return {name: value for name, value in record.items() if name != "trajectory"}
+
+
+def _write(
+    suite: Suite, place: Place, tasks: Sequence[Task], records: Mapping[str, Record], store: Store, reused: int
+) -> Result:
+    outcomes = tuple(_outcome(task, records) for task in tasks)
+    facts = {
+        "suite": suite.name,
+        "version": __version__,
+        "code": code_digest(),
+        "packages": package_versions(),
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "seeds": list(suite.seeds),
+        "outcomes": [outcome.as_dict() for outcome in outcomes],
+    }
+    rows = rows_of(outcomes)
+    texts = {
+        "tables.md": markdown(suite, rows, outcomes, facts),
+        "table.csv": csv_of_rows(rows),
+        "runs.csv": csv_of_runs(outcomes),
+        RESULTS: json_text(facts, indent=1) + "\n",
+    }
+    for name, text in texts.items():
+        atomic_write_text(place.out / name, text)
+    write_report(place.out / "report.html", suite, rows, outcomes, facts)
+    trajectories = place.out / "trajectories"
+    trajectories.mkdir(exist_ok=True)
+    for task in tasks:
+        poses = (store.get(task.key) or {}).get("trajectory") if task.key in records else None
+        if poses is not None:
+            atomic_write_text(trajectories / f"{task.sequence}.{task.system}.{task.seed}.tum", "\n".join([*poses, ""]))
+    return Result(outcomes, reused, facts)
+
+
+def _outcome(task: Task, records: Mapping[str, Record]) -> Outcome:
+    record = records.get(task.key) if task.failure is None else failed(task.failure, keep=False)
+    if record is None:
+        record = failed("it was not done", keep=False)
+    return Outcome(
+        sequence=task.sequence,
+        system=task.system,
+        seed=task.seed,
+        key=task.key,
+        figures=record["figures"],
+        measured=record["measured"],
+        failure=record["failure"],
+        curve=record["curve"],
+        warnings=tuple(record.get("warnings", ())),
+    )

@@ -1,0 +1,104 @@
+"""Where tasks are done: processes of this machine, or a Dask cluster. Both do the same with each task."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from typing import Any
+
+from vio.bench.execute import end_processes, failed, perform_job
+from vio.errors import MissingDependencyError, VioError
+
+log = logging.getLogger(__name__)
+Job = dict[str, Any]
+Record = dict[str, Any]
+Perform = Callable[[Job, str], Record]
+_POLL_S = 0.5
+
+
+def run_here(
+    jobs: Mapping[str, Job], cache: str, *, workers: int, perform: Perform = perform_job
+) -> Iterator[tuple[str, Record]]:
+    """Yield key and record of each job as it is done, by up to `workers` processes of this machine at a time."""
+    with ThreadPoolExecutor(workers) as pool:
+        futures: dict[Future[Record], str] = {pool.submit(perform, job, cache): key for key, job in jobs.items()}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:  # also where the consumer stops: nothing goes on behind it
+            pool.shutdown(wait=False, cancel_futures=True)
+            end_processes()
+
+
+def run_on_dask(
+    jobs: Mapping[str, Job], cache: str, *, address: str, wait_s: float = 300.0, perform: Perform = perform_job
+) -> Iterator[tuple[str, Record]]:
+    """Yield key and record of each job as it is done by the workers of a Dask scheduler.
+
+    A worker that is lost costs its tasks a repetition. A scheduler that is lost is waited for, and what has not come
+    back is sent again.
+
+    Args:
+        jobs: by key.
+        cache: folder on the workers for rendered recordings and temporary files.
+        address: of the scheduler, such as tcp://10.0.0.1:8786.
+        wait_s: how long a lost scheduler is waited for.
+        perform: what a worker does with a job.
+
+    Raises:
+        MissingDependencyError: Dask is not installed.
+        VioError: there is no scheduler at the address, or it did not come back.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise MissingDependencyError(
+            "--scheduler needs Dask; install it with pip install 'stereo-vio[cluster]'"
+        ) from error
+    connect: Any = Client  # its annotations are incomplete
+    pending = dict(jobs)
+    last_s, first = time.monotonic(), True
+    while pending:
+        try:
+            with connect(address, timeout=min(wait_s, 10.0), set_as_default=False) as client:
+                first, last_s = False, time.monotonic()
+                for key, record in _session(client, pending, cache, perform):
+                    del pending[key]
+                    yield key, record
+        except (OSError, TimeoutError, ValueError) as error:
+            if first or time.monotonic() - last_s > wait_s:
+                raise VioError(
+                    f"no Dask scheduler at {address} ({' '.join(str(error).split()) or type(error).__name__}); start "
+                    "one with dask scheduler, and workers with dask worker"
+                ) from error
+        if pending:
+            log.warning("the scheduler %s was lost; waiting for it with %d tasks left", address, len(pending))
+            time.sleep(_POLL_S)
+
+
+def _session(client: Any, jobs: Mapping[str, Job], cache: str, perform: Perform) -> Iterator[tuple[str, Record]]:
+    """Yield what one connection to the scheduler brings; return when it is lost, or all is done."""
+    from distributed import KilledWorker
+
+    futures = {client.submit(perform, job, cache, key=f"vio-{key}", pure=False): key for key, job in list(jobs.items())}
+    while futures:
+        done = [future for future in futures if future.done()]
+        if not done:
+            if client.status != "running":
+                return
+            time.sleep(_POLL_S)
+        for future in done:
+            key = futures.pop(future)
+            if future.status == "cancelled":  # as all are when the scheduler is lost
+                return
+            try:
+                yield key, future.result()
+            except KilledWorker as error:
+                yield key, failed(" ".join(str(error).split()), keep=False)
+            except ImportError as error:
+                raise VioError(
+                    f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
+                ) from error
+            future.release()

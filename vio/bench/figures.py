@@ -1,0 +1,138 @@
+"""The figures of one trajectory against its reference, as the tables of a bench show them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.errors import EvaluationError
+from vio.evaluation import Evaluation, associate_times, nees
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.records import NS_PER_S, IntArray, Trajectory
+
+_CURVE = 240  # points of the error over time that are kept; a report shows no more
+_QUANTILES = (0, 5, 25, 50, 75, 95, 100)
+_FRAME_NS = 10_000_000  # a pose within 10 ms of a frame is that frame's, as in `vio eval`
+# Condition of a pose covariance below which it is inverted: the first frames of a run know their pose exactly.
+_MOST_CONDITION = 1e14
+
+
+def figures_of(evaluation: Evaluation, *, positions_only: bool) -> dict[str, Any]:
+    """Return the figures of an evaluation by name; None where they are undefined.
+
+    Args:
+        evaluation: of the trajectory.
+        positions_only: the reference has no orientations; then all that needs them is None.
+    """
+    scores = evaluation.as_dict()
+    rpe, kitti = (None, None) if positions_only else (evaluation.rpe, evaluation.kitti)
+    return {
+        "ate_m": scores["ate_m"],
+        "ate_max_m": evaluation.ate_m.max,
+        "ate_deg": None if positions_only else scores["ate_deg"],
+        "rpe_m": None if rpe is None else rpe.trans_rmse_m,
+        "rpe_deg": None if rpe is None else rpe.rot_rmse_deg,
+        "drift_percent": None if kitti is None else kitti.t_err_percent,
+        "drift_deg_per_100m": None if kitti is None else kitti.r_err_deg_per_100m,
+        "length_ratio": _ratio(evaluation.matched_path_length_m, evaluation.reference_path_length_m),
+        "matched": evaluation.matched,
+        "reference_m": evaluation.reference_path_length_m,
+    }
+
+
+def coverage(frame_times_ns: IntArray, trajectory: Trajectory) -> float:
+    """Return the share of frames (F,) that have a pose."""
+    if trajectory.times_ns is None:
+        return min(len(trajectory) / len(frame_times_ns), 1.0)
+    rows, _ = associate_times(frame_times_ns, trajectory.times_ns, max_difference_ns=_FRAME_NS)
+    return len(rows) / len(frame_times_ns)
+
+
+def pose_nees(
+    evaluation: Evaluation,
+    T_world_imu: FloatArray,
+    covariances: FloatArray,
+    T_cam0_imu: FloatArray,
+    *,
+    upright: bool,
+) -> float | None:
+    """Return the mean NEES of the poses, 6 for a consistent filter; None where no covariance can be inverted.
+
+    The world frames are identified at the first matched pose: all of it where the filter's world is its first frame,
+    position and yaw where both worlds are upright, as the filter then estimates the inclination of its first pose.
+
+    Args:
+        evaluation: which poses match which of the reference.
+        T_world_imu: (N, 4, 4) all estimated poses.
+        covariances: (N, 6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat.
+        T_cam0_imu: (4, 4) extrinsics.
+        upright: both worlds have z up.
+    """
+    truth = evaluation.reference.in_imu(T_cam0_imu).T_world_body
+    T, P = T_world_imu[evaluation.rows], covariances[evaluation.rows]
+    T_world_true = _yaw_and_position(T[0], truth[0]) if upright else T[0] @ se3_inverse(truth[0])
+    errors = se3_log(se3_inverse(T_world_true @ truth) @ T)
+    invertible = np.linalg.cond(P) < _MOST_CONDITION
+    if not invertible.any():
+        return None
+    try:
+        return float(nees(errors[invertible], P[invertible]).mean())
+    except EvaluationError:
+        return None
+
+
+def _yaw_and_position(T: FloatArray, T_true: FloatArray) -> FloatArray:
+    """Return the motion (4, 4) of an upright world into another that fits two poses (4, 4) of one body best."""
+    C = T[:3, :3] @ T_true[:3, :3].T
+    yaw = np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1])
+    R = so3_exp(np.array([0.0, 0.0, yaw]))
+    return se3_from_parts(R, T[:3, 3] - R @ T_true[:3, 3])
+
+
+def error_curve(evaluation: Evaluation, times_ns: IntArray | None) -> dict[str, list[float]]:
+    """Return the position error over time and its quantiles, for plots.
+
+    Args:
+        evaluation: of the trajectory.
+        times_ns: (N,) of its poses; None: frames stand for seconds.
+    """
+    rows = evaluation.rows
+    seconds = rows.astype(float) if times_ns is None else (times_ns[rows] - times_ns[rows[0]]) / NS_PER_S
+    picked = np.unique(np.linspace(0, len(rows) - 1, min(_CURVE, len(rows))).round().astype(int))
+    return {
+        "seconds": _rounded(seconds[picked], 3),
+        "error_m": _rounded(evaluation.errors_m[picked], 6),
+        "quantiles_m": _rounded(np.percentile(evaluation.errors_m, _QUANTILES), 6),
+    }
+
+
+def numbered(reference: Trajectory) -> Trajectory:
+    """Number a reference without times by frame: pose k belongs to frame k of the recording."""
+    if reference.times_ns is not None or reference.frame_indices is not None:
+        return reference
+    return replace(reference, frame_indices=np.arange(len(reference), dtype=np.int64))
+
+
+def between(trajectory: Trajectory, first_ns: int, last_ns: int) -> Trajectory:
+    """Return the poses within a span of time, 10 ms at each end included."""
+    if trajectory.times_ns is None:
+        return trajectory
+    inside = (trajectory.times_ns >= first_ns - _FRAME_NS) & (trajectory.times_ns <= last_ns + _FRAME_NS)
+    indices = trajectory.frame_indices
+    return replace(
+        trajectory,
+        T_world_body=trajectory.T_world_body[inside],
+        times_ns=trajectory.times_ns[inside],
+        frame_indices=None if indices is None else indices[inside],
+    )
+
+
+def _ratio(estimate_m: float, reference_m: float) -> float | None:
+    return estimate_m / reference_m if reference_m > 0 else None
+
+
+def _rounded(values: npt.ArrayLike, digits: int) -> list[float]:
+    return [round(float(v), digits) for v in np.asarray(values)]

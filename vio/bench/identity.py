@@ -1,0 +1,174 @@
+"""Digests of inputs and code: two tasks with the same digest have the same result."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+from vio.atomic import atomic_write_text
+from vio.errors import DataError
+
+Identity = Literal["content", "stat"]
+ROOT = Path(__file__).resolve().parent.parent.parent
+# Code that changes no figure: the command line, and of the bench all but what a task runs.
+_NO_FIGURE = (
+    "vio/cli/",
+    "vio/bench/",
+    "vio/plotting.py",
+    "vio/report/",
+    "vio/inspection/",
+    "vio/colmap/",
+    "vio/offline/",
+)
+_TASK_CODE = ("vio/bench/worker.py", "vio/bench/figures.py")
+# Code on which the files that `vio render` writes depend; a test compares it with what that command loads.
+RENDER_CODE = (
+    "vio/sim/",
+    "vio/geometry/",
+    "vio/datasets/__init__.py",
+    "vio/datasets/common.py",
+    "vio/datasets/euroc_files.py",
+    "vio/datasets/image_formats.py",
+    "vio/datasets/image_pairs.py",
+    "vio/datasets/images.py",
+    "vio/datasets/kitti.py",
+    "vio/datasets/png.py",
+    "vio/datasets/settings.py",
+    "vio/datasets/yaml_files.py",
+    "vio/records.py",
+    "vio/setting.py",
+    "vio/text_files.py",
+    "vio/trajectory_io.py",
+    "vio/cli/render.py",
+)
+_PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba")  # whose versions may change bits
+_BLOCK = 2**20
+
+
+def digest_of(value: Any) -> str:
+    """Return the SHA-256 of plain data as canonical JSON."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+@cache
+def code_digest() -> str:
+    """Return the digest of all code that a run's figures depend on."""
+    kept = [path for path in _sources(("vio/", "frontend/")) if not path.startswith(_NO_FIGURE) or path in _TASK_CODE]
+    return _digest_files(kept)
+
+
+@cache
+def render_code_digest() -> str:
+    """Return the digest of all code that rendered images depend on."""
+    return _digest_files(_sources(RENDER_CODE))
+
+
+def package_versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that compute."""
+    versions = {"python": ".".join(platform.python_version_tuple()[:2])}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:  # OpenCV under another of its names
+            versions[name] = "unknown"
+    return versions
+
+
+class InputDigests:
+    """Digests of recordings, remembered with sizes and times of change so that each content is read once."""
+
+    def __init__(self, file: Path, identity: Identity = "content") -> None:
+        """Read what is remembered.
+
+        Args:
+            file: where digests are remembered, JSON.
+            identity: what a recording is known by: the bytes of its files, or their names, sizes and times of change.
+        """
+        self._file, self._identity = file, identity
+        self._known: dict[str, list[str]] = {}
+        self._bytes: dict[Path, int] = {}
+        try:
+            self._known = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            self._known = {}
+
+    def of(self, path: Path) -> str:
+        """Return the digest of a file or folder, with what readers find beside it.
+
+        Raises:
+            DataError: it does not exist or cannot be read.
+        """
+        if not path.exists():
+            raise DataError(f"{path} does not exist; name the folder of the recordings with --data")
+        try:
+            facts = [_stat(file, path) for file in _files(path)]
+            self._bytes[path] = sum(size for _, size, _ in facts)
+            signature = digest_of(facts)
+            if self._identity == "stat":
+                return f"stat:{signature}"
+            known = self._known.get(str(path.absolute()))
+            if known is None or known[0] != signature:
+                known = [signature, digest_of([[*_stat(f, path)[:2], _digest_file(f)] for f in _files(path)])]
+                self._known[str(path.absolute())] = known
+        except OSError as error:
+            raise DataError(f"cannot read {error.filename or path}: {error.strerror or error}") from error
+        return known[1]
+
+    def bytes_of(self, path: Path) -> int:
+        """Return the size of an input whose digest was asked for."""
+        return self._bytes[path]
+
+    def save(self) -> None:
+        """Remember the digests.
+
+        Raises:
+            DataError: the file cannot be written.
+        """
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        atomic_write_text(self._file, json.dumps(self._known, indent=0) + "\n")
+
+
+def _files(path: Path) -> list[Path]:
+    """All files of a recording, in the order of their names."""
+    if not path.is_dir():
+        return [path]
+    inside = [Path(folder, name) for folder, _, names in os.walk(path, followlinks=True) for name in names]
+    # KITTI: ground truth two levels up, calibration of a raw drive in the folder of its day.
+    beside = [path.parent.parent / "poses" / f"{path.name}.txt", *path.parent.glob("calib_*.txt")]
+    return sorted(inside) + [file for file in beside if file.is_file()]
+
+
+def _stat(file: Path, root: Path) -> list[Any]:
+    """Name relative to the recording, size, and time of change."""
+    facts = file.stat()
+    name = os.path.relpath(file, root) if file != root else ""
+    return [name.replace(os.sep, "/"), facts.st_size, facts.st_mtime_ns]
+
+
+def _digest_file(file: Path) -> str:
+    digest = hashlib.sha256()
+    with file.open("rb") as stream:
+        while block := stream.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def _sources(names: Iterable[str]) -> list[str]:
+    """Our Python files under some folders or names, relative to the checkout or installation."""
+    found = []
+    for name in names:
+        path = ROOT / name
+        files = sorted(path.rglob("*.py")) if name.endswith("/") else [path]
+        found += [file.relative_to(ROOT).as_posix() for file in files]
+    return found
+
+
+def _digest_files(names: Iterable[str]) -> str:
+    return digest_of([[name, _digest_file(ROOT / name)] for name in names])

@@ -1,0 +1,247 @@
+"""A suite: which recordings are run with which configurations and seeds, read from YAML."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import shlex
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from vio.config import Config, load_config, merge
+from vio.datasets.span import Seconds, parse_bound
+from vio.errors import ConfigError
+from vio.input_files import read_input
+from vio.yaml_text import MOST_BYTES, read_yaml
+
+SHIPPED = Path(__file__).resolve().parent / "suites"
+_NAME = re.compile(r"[\w.+-]+")  # of a sequence or configuration: it becomes part of a command line and of a CSV file
+_MOST_SEEDS = 1000
+_RENDER_OWN = ("--out", "--seed", "--workers", "--json")  # of `vio render`: given by the bench itself
+
+
+@dataclass(frozen=True, slots=True)
+class Sequence:
+    """One recording of a suite: exactly one of `source` and `render`."""
+
+    name: str
+    source: str | None = None  # as `vio run` takes it, relative to the data folder
+    render: tuple[str, ...] = ()  # arguments of `vio render`
+    render_each_seed: bool = False  # render anew with every seed; else with seed 0
+    reference: str | None = None  # ground truth in place of the recording's own, relative to the data folder
+    start: str = "0"  # first frame, or a time such as 12s
+    stop: str | None = None
+    lengths_m: tuple[float, ...] | None = None  # path lengths of the drift; None: KITTI's
+    positions_only: bool = False  # the reference's orientations mean nothing: no relative errors, no NEES
+    exact_truth: bool | None = (
+        None  # far more accurate than the estimate, so that NEES says something; None: if rendered
+    )
+    settings: Mapping[str, Any] | None = None  # over those of the configuration
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """Figures that others have published on sequences of the suite."""
+
+    system: str
+    source: str  # paper or page, with its table
+    figures: Mapping[str, Mapping[str, float]]  # by name of the figure, by sequence
+
+
+@dataclass(frozen=True, slots=True)
+class Suite:
+    """All that a bench runs."""
+
+    name: str
+    folder: Path  # of the file; relative paths of settings are relative to it
+    sequences: tuple[Sequence, ...]
+    configurations: Mapping[str, Mapping[str, Any]]  # deviations from the defaults
+    seeds: tuple[int, ...] = (0,)
+    published: tuple[Published, ...] = ()
+
+
+def shipped_suites() -> tuple[str, ...]:
+    """Names of the suites that come with the package."""
+    return tuple(sorted(path.stem for path in SHIPPED.glob("*.yaml")))
+
+
+def read_suite(what: str) -> Suite:
+    """Read a suite: the path of a YAML file, or the name of a shipped one.
+
+    Raises:
+        ConfigError: the file cannot be read, or a key or value is wrong; the message names file and key.
+    """
+    path = Path(what)
+    if not path.is_file() and what in shipped_suites():
+        path = SHIPPED / f"{what}.yaml"
+    try:
+        values = read_yaml(read_input(path, MOST_BYTES).decode("utf-8-sig"))
+    except OSError as error:
+        names = ", ".join(shipped_suites())
+        reason = error.strerror or error
+        raise ConfigError(f"{what}: no suite ({reason}); give a YAML file or one of {names}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not valid YAML ({error})") from error
+    return suite_from(values, path)
+
+
+def suite_from(values: Any, path: Path) -> Suite:
+    """Build a suite from the data of its file.
+
+    Raises:
+        ConfigError: a key or value is wrong.
+    """
+    where = str(path)
+    given = _mapping(values, where, "a suite")
+    _only_keys(given, ("name", "sequences", "configurations", "seeds", "published"), where)
+    sequences = _mapping(given.get("sequences"), where, "'sequences'")
+    configurations = _mapping(given.get("configurations") or {"default": {}}, where, "'configurations'")
+    for name in (*sequences, *configurations):
+        if not _NAME.fullmatch(str(name)):
+            raise ConfigError(f"{where}: '{name}' is no name; use letters, digits and . _ + -")
+    if not sequences:
+        raise ConfigError(f"{where}: no sequences; name at least one")
+    suite = Suite(
+        name=str(given.get("name", path.stem)),
+        folder=path.resolve().parent,
+        sequences=tuple(_sequence(str(name), value, where) for name, value in sequences.items()),
+        configurations={str(name): _mapping(value or {}, where, f"'{name}'") for name, value in configurations.items()},
+        seeds=_seeds(given.get("seeds", [0]), where),
+        published=tuple(_published(value, where) for value in given.get("published") or ()),
+    )
+    for configuration in suite.configurations:
+        for sequence in suite.sequences:
+            config_of(suite, sequence, configuration, suite.seeds[0])
+    return suite
+
+
+def config_of(suite: Suite, sequence: Sequence, configuration: str, seed: int) -> Config:
+    """Return every setting of one run: defaults < `config:` file < configuration < sequence < seed.
+
+    The seed is that of the front end's random sampling, `frontend.consensus.seed`.
+
+    Raises:
+        ConfigError: a setting is unknown or out of range.
+    """
+    where = f"{suite.name}, configuration {configuration}"
+    values = dict(suite.configurations[configuration])
+    file = values.pop("config", None)
+    config = load_config(None if file is None else suite.folder / str(file))
+    config = merge(config, _nested(values, where), where=where)
+    config = merge(config, _nested(sequence.settings or {}, where), where=f"{suite.name}, sequence {sequence.name}")
+    return merge(config, {"frontend": {"consensus": {"seed": seed}}}, where="seeds")
+
+
+def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> Suite:
+    """Return the suite with the named sequences and configurations alone; none named: all.
+
+    Raises:
+        ConfigError: a name is unknown.
+    """
+    sequences, configured = tuple(only), tuple(configurations)
+    for names, known in ((sequences, [s.name for s in suite.sequences]), (configured, list(suite.configurations))):
+        for name in names:
+            if name not in known:
+                near = difflib.get_close_matches(name, known, 1)
+                hint = f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
+                raise ConfigError(f"suite {suite.name} has no '{name}'{hint}")
+    return Suite(
+        suite.name,
+        suite.folder,
+        tuple(s for s in suite.sequences if not sequences or s.name in sequences),
+        {name: value for name, value in suite.configurations.items() if not configured or name in configured},
+        suite.seeds,
+        suite.published,
+    )
+
+
+def bound(text: str) -> int | Seconds:
+    """Parse a frame number or a time of a sequence, which were checked when the suite was read."""
+    return parse_bound(text)
+
+
+def _sequence(name: str, value: Any, where: str) -> Sequence:
+    given: dict[str, Any] = (
+        {"source": value} if isinstance(value, str) else dict(_mapping(value, where, f"sequence {name}"))
+    )
+    _only_keys(given, [f.name for f in fields(Sequence) if f.name != "name"], f"{where}, sequence {name}")
+    if ("source" in given) == ("render" in given):
+        raise ConfigError(f"{where}, sequence {name}: give either source or render")
+    place = f"{where}, sequence {name}"
+    if "render" in given:
+        words = given["render"]
+        given["render"] = tuple(shlex.split(words) if isinstance(words, str) else map(str, words))
+        if own := [word for word in given["render"] if word.partition("=")[0] in _RENDER_OWN]:
+            raise ConfigError(f"{place}: {own[0]} is set by the bench; leave it out")
+    try:
+        for key in ("start", "stop"):
+            if given.get(key) is not None:
+                given[key] = str(given[key])
+                parse_bound(given[key])
+        if given.get("lengths_m") is not None:
+            given["lengths_m"] = tuple(float(v) for v in given["lengths_m"])
+            if not given["lengths_m"] or any(not 0 < v < float("inf") for v in given["lengths_m"]):
+                raise ValueError(f"lengths_m {given['lengths_m']}")
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{place}: start and stop are frames or times as 12s, lengths_m metres ({error})") from error
+    for key in ("render_each_seed", "positions_only", "exact_truth"):
+        if not isinstance(given.get(key, False), bool):
+            raise ConfigError(f"{place}: {key} takes true or false, got {given[key]!r}")
+    for key in ("source", "reference"):
+        if given.get(key) is not None:
+            given[key] = str(given[key])
+    _mapping(given.get("settings") or {}, where, f"settings of sequence {name}")
+    return Sequence(name=name, **given)
+
+
+def _published(value: Any, where: str) -> Published:
+    given = dict(_mapping(value, where, "an entry of 'published'"))
+    system, source = given.pop("system", None), given.pop("source", None)
+    if not system or not source:
+        raise ConfigError(f"{where}: published figures need a system and a source")
+    figures = {}
+    for name, of_sequences in given.items():
+        figures[name] = {str(k): v for k, v in _mapping(of_sequences, where, f"'{name}' of {system}").items()}
+        for sequence, figure in figures[name].items():
+            if isinstance(figure, bool) or not isinstance(figure, (int, float)) or not figure >= 0:
+                raise ConfigError(f"{where}: {name} of {system} on {sequence} is a number, got {figure!r}")
+    return Published(str(system), str(source), figures)
+
+
+def _seeds(value: Any, where: str) -> tuple[int, ...]:
+    seeds = list(range(value)) if isinstance(value, int) and not isinstance(value, bool) else value
+    fine = isinstance(seeds, list) and 0 < len(seeds) <= _MOST_SEEDS and len(set(map(str, seeds))) == len(seeds)
+    if not fine or any(not isinstance(s, int) or isinstance(s, bool) or not 0 <= s < 2**32 for s in seeds):
+        raise ConfigError(f"{where}: seeds takes different whole numbers such as [0, 1, 2], or how many; got {value!r}")
+    return tuple(seeds)
+
+
+def _nested(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Turn `a.b: 1` into `a: {b: 1}`, as deep as the dots go, beside settings that are nested already."""
+    out: dict[str, Any] = {}
+    for key, value in values.items():
+        *sections, last = str(key).split(".")
+        inner = out
+        for section in sections:
+            inner = inner.setdefault(section, {})
+            if not isinstance(inner, dict):
+                raise ConfigError(f"{where}: '{key}' and '{section}' exclude each other; give one of them")
+        inner[last] = {**inner.get(last, {}), **value} if isinstance(value, dict) else value
+    return out
+
+
+def _mapping(value: Any, where: str, what: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"{where}: {what} is a mapping of names, not {type(value).__name__}")
+    return value
+
+
+def _only_keys(given: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+    names = list(known)
+    for key in given:
+        if key not in names:
+            near = difflib.get_close_matches(str(key), names, 1)
+            hint = f"did you mean '{near[0]}'?" if near else f"valid here: {', '.join(names)}"
+            raise ConfigError(f"{where}: unknown key '{key}'; {hint}")

@@ -1,0 +1,253 @@
+"""One task in a process of its own: `python -m vio.bench.worker FOLDER` reads job.json there and writes result.json.
+
+A process per task, wherever it was started: its memory and CPU time are its own, a crash costs one row, and the result
+is the same on any engine. The process ends when its standard input is closed, that is, with whoever started it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vio.bench.figures import between, coverage, error_curve, figures_of, numbered, pose_nees
+from vio.bench.identity import code_digest, package_versions
+from vio.bench.suite import bound
+from vio.config import Config, merge
+from vio.datasets import open_dataset
+from vio.datasets.span import frames_between
+from vio.errors import DataError, VioError
+from vio.evaluation import KITTI_LENGTHS_M, Evaluation, evaluate
+from vio.printable import json_text
+from vio.protocols import Dataset
+from vio.records import Trajectory
+from vio.trajectory_io import read_trajectory, tum_text
+
+if TYPE_CHECKING:
+    from vio.frame_result import FrameResult
+    from vio.pipeline import RunResult
+
+_WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as in tools/bench.py
+_MOST_WARNINGS = 5
+JOB, RESULT = "job.json", "result.json"
+
+
+class _CpuTimer:
+    """A viewer that notes the process's CPU time at each frame."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self._began_s = self._ended_s = time.process_time()
+        self._first = 0
+
+    def frame(self, result: FrameResult) -> None:
+        """Count a frame."""
+        self.frames += 1
+        self._ended_s = time.process_time()
+        if self.frames <= _WARM_FRAMES:
+            self._began_s, self._first = self._ended_s, self.frames
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    @property
+    def ms_per_frame(self) -> float | None:
+        """Mean CPU time of a frame after the first ones; None: there were no others."""
+        count = self.frames - self._first
+        return 1e3 * (self._ended_s - self._began_s) / count if count else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Truth:
+    """What a trajectory is compared with."""
+
+    dataset: Dataset
+    reference: Trajectory | None
+    first: int
+    end: int
+
+    @property
+    def frame_times_ns(self) -> Any:
+        """Times (F,) of the frames of the sequence."""
+        return self.dataset.recording.frame_times_ns[self.first : self.end]
+
+
+def perform(job: dict[str, Any]) -> dict[str, Any]:
+    """Do one task; return figures (the same wherever it is done), what was measured, and why it failed, if it did."""
+    began = time.perf_counter()
+    record: dict[str, Any] = {"figures": {}, "failure": None, "keep": True, "curve": None, "trajectory": None}
+    timer = _CpuTimer()
+    try:
+        _check_place(job)
+        config = merge(Config(), job["config"], where="the suite")
+        dataset = open_dataset(job["source"], config.dataset)
+        first, end = frames_between(dataset.recording, bound(job["start"]), _stop(job))
+        total = len(dataset.recording.frame_times_ns)
+        own = dataset.recording.reference
+        reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
+        truth = _Truth(dataset, reference, first, total if end is None else min(end, total))
+        record |= _peer(job, truth) if job["kind"] == "peer" else _run(job, config, truth, timer)
+    except VioError as error:
+        record["failure"] = " ".join(str(error).split())
+        record["keep"] = not (_of_the_system(error.__cause__) or isinstance(error, _WrongPlaceError))
+    except MemoryError:
+        record |= {"failure": "out of memory", "keep": False}
+    record["measured"] = {} if job["kind"] == "peer" else _measured(timer, began)
+    return record
+
+
+def _measured(timer: _CpuTimer, began: float) -> dict[str, Any]:
+    """What this process took, of which two repetitions differ."""
+    return {
+        "cpu_ms": timer.ms_per_frame,
+        "cpu_s": time.process_time(),
+        "wall_s": time.perf_counter() - began,
+        "memory_mib": _peak_memory_mib(),
+        "host": platform.node(),
+    }
+
+
+def _of_the_system(cause: BaseException | None) -> bool:
+    """Whether an error comes from the system, such as a full disk, and may not come again; parsers set no number."""
+    return isinstance(cause, OSError) and cause.errno is not None
+
+
+class _WrongPlaceError(DataError):
+    """The task was sent where its result would be another."""
+
+
+def _check_place(job: dict[str, Any]) -> None:
+    for what, wanted, here in (("code", job["code"], code_digest()), ("packages", job["packages"], package_versions())):
+        if wanted != here:
+            raise _WrongPlaceError(
+                f"the worker on {platform.node()} has other {what} than the command that sent the task: install the "
+                "same versions there; if the code was edited meanwhile, repeat the bench"
+            )
+
+
+def _stop(job: dict[str, Any]) -> Any:
+    return None if job["stop"] is None else bound(job["stop"])
+
+
+def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -> dict[str, Any]:
+    """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
+    import cv2
+
+    from vio.pipeline import run  # loads the compiled functions: not for a recording that cannot be opened
+    from vio.run_folder import growing_folder
+
+    cv2.setNumThreads(1)  # tasks run side by side; the figures do not depend on it
+    with tempfile.TemporaryDirectory(prefix="vio-bench-", dir=job["scratch"]) as folder:
+        growing = growing_folder(Path(folder) / "run", truth.dataset, config, {"source": "", "start": truth.first})
+        result = run(truth.dataset, config, start=truth.first, stop=truth.end, viewer=timer, folder=growing)
+        trajectory = result.trajectory
+        figures: dict[str, Any] = {
+            "frames": len(result.frames),
+            "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
+            "coverage": coverage(truth.frame_times_ns, trajectory),
+        }
+        record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}
+        if truth.reference is not None:
+            score = _evaluate(job, trajectory, truth.reference, result.T_cam0_body)
+            figures |= figures_of(score, positions_only=job["positions_only"])
+            figures["nees"] = _nees(result, score) if job["exact_truth"] else None
+            record["curve"] = error_curve(score, trajectory.times_ns)
+        assert trajectory.times_ns is not None
+        text = tum_text(
+            trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices
+        )
+        record["trajectory"] = text.splitlines()  # JSON of ours holds printable text only
+    return record
+
+
+def _nees(result: RunResult, score: Evaluation) -> float | None:
+    rows = result.estimates
+    T_world_imu, covariances = (np.array(rows.column(name)) for name in ("T_world_imu", "covariance"))
+    upright = result.motion == "imu"
+    return pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
+
+
+def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
+    """Evaluate another system's trajectory on the recording.
+
+    Raises:
+        VioError: the file is damaged, or the recording has no reference.
+    """
+    recording = truth.dataset.recording
+    if truth.reference is None:
+        raise DataError(f"{recording.path}: no ground truth; name one with reference: in the suite")
+    path = Path(job["trajectory"])
+    trajectory = read_trajectory(path)
+    if "# body:" not in path.read_text(encoding="utf-8", errors="replace"):
+        trajectory = read_trajectory(path, body=truth.reference.body)
+    times_ns = truth.frame_times_ns
+    trajectory = between(trajectory, int(times_ns[0]), int(times_ns[-1]))
+    T_cam0_imu = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    score = _evaluate(job, trajectory, truth.reference, T_cam0_imu)
+    figures: dict[str, Any] = {
+        "frames": len(trajectory),
+        "path_m": score.path_length_m,
+        "coverage": coverage(times_ns, trajectory),
+        **figures_of(score, positions_only=job["positions_only"]),
+        "nees": None,
+    }
+    return {"figures": figures, "curve": error_curve(score, trajectory.times_ns)}
+
+
+def _evaluate(job: dict[str, Any], trajectory: Trajectory, reference: Trajectory, T_cam0_imu: Any) -> Evaluation:
+    lengths_m = KITTI_LENGTHS_M if job["lengths_m"] is None else job["lengths_m"]
+    return evaluate(trajectory, numbered(reference), T_cam0_imu=T_cam0_imu, lengths_m=lengths_m)
+
+
+def _peak_memory_mib() -> float | None:
+    """Return the largest resident memory of this process; None where the system does not say.
+
+    On Linux that of `VmHWM`: `ru_maxrss` would count the process that started this one.
+    """
+    try:
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith("VmHWM:"):
+                return float(line.split()[1]) / 1024
+    except OSError:
+        pass
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (2**20 if sys.platform == "darwin" else 1024)
+
+
+def _end_with_parent() -> None:
+    """End this process when its standard input is closed."""
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 1):
+            pass
+        os._exit(3)
+
+    threading.Thread(target=wait, daemon=True).start()
+
+
+def main(folder: Path) -> int:
+    """Do the task of a folder."""
+    _end_with_parent()
+    job = json.loads((folder / JOB).read_text(encoding="utf-8"))
+    text = json_text(perform(job))
+    partial = folder / f"{RESULT}.partial"
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(folder / RESULT)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

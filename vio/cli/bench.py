@@ -1,0 +1,145 @@
+"""`vio bench`: many recordings, configurations and seeds in one table; comparison of two of them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import Any
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "bench",
+        help="run a suite of recordings into one table, or compare two",
+        description="Run every sequence of a suite with every configuration and seed, side by side, and write tables "
+        "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, kitti, euroc, tumvi. "
+        "'vio bench compare A B' tells what became better or worse from one output folder to another beyond chance.",
+    )
+    parser.add_argument("suite", metavar="SUITE", help="YAML file, name of a shipped suite, or 'compare'")
+    parser.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="compare: two output folders, A and B")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings (default: the suite's)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of tables and report (default bench/NAME)")
+    parser.add_argument(
+        "--cache", type=Path, metavar="DIR", help="results of tasks and renders, kept (default bench/cache)"
+    )
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one a processor)")
+    parser.add_argument("--scheduler", metavar="ADDRESS", help="a Dask scheduler, tcp://…; needs the extra cluster")
+    parser.add_argument("--peers", type=Path, metavar="DIR", help="other systems' SEQUENCE.SYSTEM.tum, for the tables")
+    parser.add_argument("--only", default="", metavar="NAME,…", help="these sequences alone")
+    parser.add_argument("--configurations", default="", metavar="NAME,…", help="these configurations alone")
+    parser.add_argument("--seeds", metavar="N,…", help="in the place of the suite's seeds")
+    parser.add_argument(
+        "--identity",
+        choices=("content", "stat"),
+        default="content",
+        help="what an input is known by: its bytes, read once (default), or names, sizes and times of change",
+    )
+    parser.add_argument(
+        "--factor",
+        type=float,
+        default=2.0,
+        metavar="X",
+        help="compare: of one sequence without seeds, a change by more than this counts (default 2)",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--quiet", action="store_true", help="no progress bar")
+    parser.set_defaults(execute=execute)
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    from vio.errors import ConfigError
+
+    if args.suite == "compare":
+        if len(args.folders) != 2:
+            raise ConfigError(f"vio bench compare takes two output folders, got {len(args.folders)}")
+        return _compare(args)
+    if args.folders:
+        raise ConfigError(f"vio bench takes one suite; what is {args.folders[0]}? To compare: vio bench compare A B")
+    return _bench(args)
+
+
+def _bench(args: argparse.Namespace) -> int:
+    from vio.bench.bench import Place, bench
+    from vio.bench.suite import SHIPPED, chosen, read_suite
+    from vio.cli.progress import ProgressBar
+    from vio.errors import ConfigError, StoppedError
+
+    if args.workers is not None and not 1 <= args.workers <= 1024:
+        raise ConfigError(f"--workers takes 1 to 1024 processes, got {args.workers}")
+    suite = chosen(read_suite(args.suite), _names(args.only), _names(args.configurations))
+    if args.seeds is not None:
+        suite = _with_seeds(suite, args.seeds)
+    default = Path() if suite.folder == SHIPPED else suite.folder
+    place = Place(
+        data=args.data if args.data is not None else default,
+        out=args.out or Path("bench") / suite.name,
+        cache=args.cache or Path("bench") / "cache",
+        workers=args.workers or os.cpu_count() or 1,
+        scheduler=args.scheduler,
+        identity=args.identity,
+        peers=args.peers,
+    )
+    try:
+        with ProgressBar(suite.name, unit="tasks") as bar:
+            result = bench(suite, place, (lambda done, total: None) if args.quiet else bar.update)
+    except KeyboardInterrupt as stop:  # or another signal, which has a number
+        text = f"interrupted; finished tasks are kept in {place.cache}, and the same command goes on with the others"
+        raise StoppedError(text, status=128 + getattr(stop, "number", 2)) from stop
+    return _report(args, place.out, result)
+
+
+def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
+    """Print the result; the status is 1 where a run has none."""
+    import sys
+
+    from vio.bench.tables import METRICS, number, rows_of, summary_of
+    from vio.cli.output import print_result
+    from vio.printable import printable
+
+    summary = summary_of(rows_of(result.outcomes))
+    lines = []
+    for system, (done, count, cells) in summary.items():
+        shown = [f"{m.title} {number(cells[m.name].median, m.digits)}" for m in METRICS if m.name in cells]
+        lines.append((system, f"{done} of {count} sequences; median {', '.join(shown) or 'nothing'}"))
+    lines.append(("tasks", f"{len(result.outcomes)}, of which {result.reused} were done before"))
+    lines.append(("report", f"{out / 'report.html'}, tables.md, table.csv, runs.csv"))
+    facts = {**result.facts, "out": str(out), "reused": result.reused}
+    width = max(10, *(len(name) for name, _ in lines))
+    print_result(facts, lines, as_json=args.json, name_width=width)
+    for outcome in result.failures:
+        print(printable(f"failed: {outcome.sequence}, {outcome.system}: {outcome.failure}"), file=sys.stderr)
+    return 1 if result.failures else 0
+
+
+def _compare(args: argparse.Namespace) -> int:
+    """Print what changed; the status is 1 where something became worse."""
+    from vio.bench.compare import compare, comparison_lines
+    from vio.cli.output import print_result
+
+    result = compare(*args.folders, factor=args.factor)
+    if args.json:
+        print_result(result.as_dict(), (), as_json=True)
+    else:
+        print("\n".join(comparison_lines(result)))
+    return 1 if result.is_worse else 0
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def _with_seeds(suite: Any, text: str) -> Any:
+    from dataclasses import replace
+
+    from vio.errors import ConfigError
+
+    try:
+        seeds = tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        raise ConfigError(f"--seeds takes whole numbers such as 0,1,2, got '{text}'") from error
+    if len(set(seeds)) != len(seeds) or any(not 0 <= seed < 2**32 for seed in seeds):
+        raise ConfigError(f"--seeds takes different numbers from 0 to 2^32 - 1, got '{text}'")
+    return replace(suite, seeds=seeds)

@@ -1,0 +1,350 @@
+"""Keyframes in, a map out: places recognised, loops confirmed, poses optimised.
+
+A loop is accepted in five steps: words in common (`place_index`); PnP in both directions (`loop_geometry`); agreement
+with the odometry within its covariance; no second place that fits as well; and another keyframe close by that finds the
+same. All follows from the keyframes alone, so that equal keyframes give equal maps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
+from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import StereoCamera, triangulate
+from vio.loops import LoopEvent
+from vio.mapping.features import KeyframeFeatures
+from vio.mapping.loop_geometry import Verified, verify
+from vio.mapping.map_graph import UNKNOWN, MapGraph
+from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
+from vio.mapping.place_index import PlaceIndex
+from vio.records import BoolArray, IntArray
+from vio.statistics import chi_square_quantile
+
+_CANDIDATES = 3  # keyframes that are compared by geometry
+_RECENT = 10  # newest keyframes, which the filter's own tracks join
+_REVISIT_DEPTHS = 1.5  # path since a keyframe, in median depths, before it counts as seen again
+_VIEW_DEPTHS, _VIEW_RAD = 1.5, float(np.radians(70.0))  # how far apart two views of a place are, in median depths
+_SIGMAS = 3.0
+_GATE = float(chi_square_quantile(0.999, 6))
+_LOST_M = 3.0  # standard deviation of the position beyond which one confirmation is not enough …
+_CONFIRMATIONS, _CONFIRMATIONS_LOST = 1, 2  # other keyframes that must agree; … and how many then
+_SURE_INLIERS = 60  # three times what is asked of any loop: one confirmation is enough
+_CONFIRM_WITHIN = 6  # keyframes
+_OTHER_PLACE = 0.5  # share of the best candidate's inliers at which one elsewhere makes the place ambiguous
+_SAME_DEPTHS, _SAME_M = 0.1, 0.1  # by which what two candidates say of the position may differ
+_NEIGHBOURS_M = 50.0  # path between two places up to which the map's own drift between them is counted
+_SETTLED = 6.0  # squared error of a new loop, its expected value, up to which the optimisation can wait …
+_PATIENCE = 8  # … for so many loops
+_COMMIT_EVERY = 20  # keyframes
+_LOCAL = 20  # keyframes of a localised session that are optimised together
+
+
+@dataclass(frozen=True, slots=True)
+class Keyframe:
+    """A frame that enters the map."""
+
+    frame: int
+    time_ns: int
+    T_odom_cam: FloatArray  # (4, 4) by the filter
+    motion: RelativePose | None  # of the camera since the last keyframe; None: the session begins
+    up_cam: FloatArray | None  # (3,) unit vector against gravity; None: not known
+    up_sigma_rad: float  # standard deviation of its direction
+
+
+@dataclass(frozen=True, slots=True)
+class MapUpdate:
+    """What a keyframe made of the map."""
+
+    T_map_odom: FloatArray | None  # (4, 4); None: the session has not found its place in the map
+    covariance: FloatArray | None  # (6, 6) of xi in T_map_cam = T_hat exp(xi), given the map; None likewise
+    loops: tuple[LoopEvent, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundPlace:
+    """A loop before its confirmation."""
+
+    first: int  # keyframe
+    second: int  # later keyframe
+    seen: Verified
+    needed: int  # other keyframes that must confirm it
+
+
+class MapBuilder:
+    """Builds, continues, or only reads a map, one keyframe after the other."""
+
+    def __init__(self, store: MapStore, source: str, camera: StereoCamera, *, upright: bool, localise: bool) -> None:
+        """Begin a session in a map.
+
+        Args:
+            store: the map, open.
+            source: names the recording.
+            camera: rectified pair.
+            upright: whether z of the odometry's world is up.
+            localise: find poses in the map, and leave it as it is.
+        """
+        self._store, self._camera, self._localise = store, camera, localise
+        self.graph = MapGraph(store)
+        self._index = PlaceIndex()
+        for k in range(len(self.graph)):
+            self._index.add(store.features(k).descriptors)
+        self.first = len(self.graph)  # keyframe of this session
+        sessions = self.graph.sessions
+        self._own = len(sessions)
+        self._home = sessions[0].part if sessions else self._own  # the part whose frame is the map's
+        sessions.append(SessionRow(source, camera, upright, self._own))
+        if not localise:
+            store.add_session(sessions[-1])
+        self._pending: list[FoundPlace] = []
+        self._last: FoundPlace | None = None  # newest accepted loop
+        self._waiting = 0  # loops since the last optimisation
+        self._moved = False  # poses since the last commit
+
+    @property
+    def path(self) -> Path:
+        """The map's file."""
+        return self._store.path
+
+    @property
+    def index_bytes(self) -> int:
+        """Memory of the words of all keyframes."""
+        return self._index.nbytes
+
+    @property
+    def is_joined(self) -> bool:
+        """Whether this session's poses are in the map's frame."""
+        return self.graph.sessions[self._own].part == self._home
+
+    def add(self, keyframe: Keyframe, features: KeyframeFeatures) -> MapUpdate:
+        """Take the next keyframe of the session, with what `extract` made of its images.
+
+        Raises:
+            DataError: the file cannot be written or read.
+        """
+        graph, number, motion = self.graph, len(self.graph), keyframe.motion
+        drift, path = graph.gathered(keyframe.T_odom_cam, motion)
+        T = keyframe.T_odom_cam
+        if motion is not None:  # until a loop says otherwise, the map moves with the odometry
+            T = graph.T_map_cam[-1] @ (se3_inverse(graph.T_odom_cam[-1]) @ T)
+        up, sigma = keyframe.up_cam, keyframe.up_sigma_rad
+        row = KeyframeRow(self._own, keyframe.frame, keyframe.time_ns, T, keyframe.T_odom_cam, drift, path, up, sigma)
+        graph.append(row)
+        if motion is not None:
+            graph.odometry.append((number - 1, number, motion))
+        if not self._localise:
+            self._store.add_keyframe(row, features)
+            if motion is not None:
+                self._store.add_odometry(number - 1, number, motion)
+        events = self._close_loops(number, features)
+        if not self._localise:
+            self._index.add(features.descriptors)
+            if number % _COMMIT_EVERY == 0:
+                self.commit()
+        return self._update(events)
+
+    def finish(self) -> MapUpdate:
+        """Optimise once more, write everything, and return the last correction."""
+        if self._waiting:
+            self._optimise()
+        self.commit()
+        return self._update(())
+
+    def commit(self) -> None:
+        """Bring everything to the disk as one step."""
+        if self._localise:
+            return
+        if self._moved:
+            self._store.set_poses(self.graph.T_map_cam.rows)
+            self._store.set_kept([o.kept for o in self.graph.loops])
+            self._store.set_parts([s.part for s in self.graph.sessions])
+            self._moved = False
+        self._store.commit()
+
+    def close(self) -> None:
+        """Let the file go."""
+        self._store.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for a checkpoint: all but the file and the index, which is made of it."""
+        return {key: value for key, value in self.__dict__.items() if key not in ("_store", "_index")}
+
+    def reopen(self, store: MapStore) -> None:
+        """Go on from a checkpoint with the file as it was then: what was added since is forgotten."""
+        self._store, self._index = store, PlaceIndex()
+        graph = self.graph
+        if not self._localise:
+            store.truncate(len(graph.sessions), len(graph), len(graph.loops))
+            self._moved = True
+        for k in range(self.first if self._localise else len(graph)):
+            self._index.add(store.features(k).descriptors)
+
+    def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
+        if not self.is_joined:
+            return MapUpdate(None, None, events)
+        graph, k = self.graph, len(self.graph) - 1
+        T_map_odom = graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k])
+        since = self._drift_since(np.array([self.first if self._last is None else self._last.first]), k)
+        return MapUpdate(T_map_odom, since[0], events)
+
+    # Loops
+
+    def _close_loops(self, number: int, features: KeyframeFeatures) -> tuple[LoopEvent, ...]:
+        """Look for places seen again, and return what was accepted."""
+        loop = self.find(number, features)
+        if loop is None:
+            return ()
+        near = [o for o in self._pending if number - o.second <= _CONFIRM_WITHIN]
+        agree = [o for o in near if self._agree(o, loop)]
+        self._pending = [*near, loop]
+        if len(agree) < loop.needed:
+            return ()
+        known = {(o.first, o.second) for o in self.graph.loops[-4 * _CONFIRM_WITHIN :]}
+        return tuple(self._accept(o) for o in [*agree, loop] if (o.first, o.second) not in known)
+
+    def find(self, number: int, features: KeyframeFeatures) -> FoundPlace | None:
+        """Return the best place that fits by geometry and odometry, unless another one fits nearly as well.
+
+        Args:
+            number: of the keyframe, which is in the graph.
+            features: what it shows.
+        """
+        depth, known = self._median_depth(features), len(self._index)
+        if not known or depth is None:
+            return None
+        drift = self._drift_since(np.arange(known), number)
+        allowed = self._may_be_seen(number, depth, drift[:, :3, :3])
+        found: list[FoundPlace] = []
+        for i in self._index.candidates(features.descriptors, allowed, _CANDIDATES).tolist():
+            camera = self.graph.sessions[int(self.graph.session[i])].camera
+            seen = verify(camera, self._store.features(i), self._camera, features)
+            if seen is not None and self._fits(i, number, seen, drift[i]):
+                lost = drift[i, :3, :3].trace() > _LOST_M**2 and seen.inliers < _SURE_INLIERS
+                found.append(FoundPlace(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS))
+        if not found:
+            return None
+        best = max(found, key=lambda loop: loop.seen.inliers)
+        return None if any(self._is_rival(other, best, depth) for other in found) else best
+
+    def _is_rival(self, other: FoundPlace, best: FoundPlace, depth: float) -> bool:
+        """Whether another place of the same part of the map fits nearly as well as the best one."""
+        part = self.graph.part
+        if part[other.first] != part[best.first] or other.seen.inliers < _OTHER_PLACE * best.seen.inliers:
+            return False
+        gap = self._position(other) - self._position(best)
+        return float(np.linalg.norm(gap)) > _SAME_M + _SAME_DEPTHS * depth
+
+    def _position(self, loop: FoundPlace) -> FloatArray:
+        """Position (3,) of the later keyframe in the map, as a loop says it."""
+        return (self.graph.T_map_cam[loop.first] @ loop.seen.pose.T_i_j)[:3, 3]
+
+    def _median_depth(self, features: KeyframeFeatures) -> float | None:
+        p, valid = triangulate(self._camera, features.z, min_disparity_px=1.0)
+        valid &= features.has_right
+        return float(np.median(p[valid, 2])) if valid.any() else None
+
+    def _drift_since(self, i: IntArray, k: int) -> FloatArray:
+        """Covariance (N, 6, 6) of the motion from keyframes i (N,) to k, in the frame of k, before k's own loops.
+
+        The shorter of two ways: along the path, or by the newest loop.
+        """
+        graph = self.graph
+        direct = graph.drift(i, np.full(len(i), k))
+        if self._last is None:
+            return direct
+        m, n = self._last.first, self._last.second
+        A = se3_adjoint(se3_inverse(graph.T_odom_cam[k]) @ graph.T_odom_cam[n])
+        here = A @ self._last.seen.pose.covariance @ A.T + graph.drift(np.array([n]), np.array([k]))
+        there = graph.drift(i, np.full(len(i), m))
+        # The drift between i and m is known in the frame of the later one of them; its size is what matters here.
+        by_loop = there + here
+        shorter = np.trace(by_loop[:, :3, :3], axis1=1, axis2=2) < np.trace(direct[:, :3, :3], axis1=1, axis2=2)
+        return np.where(shorter[:, None, None], by_loop, direct)
+
+    def _may_be_seen(self, number: int, depth: float, covariance: FloatArray) -> BoolArray:
+        """Mask (N,) of keyframes that are not recent, and close enough to show what this one shows."""
+        graph, count = self.graph, len(covariance)
+        own = graph.session[:count] == self._own
+        passed = graph.path_m[number] - graph.path_m[:count]
+        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+        near_path = (passed < _REVISIT_DEPTHS * depth) & (sigma < _LOST_M)
+        recent = own & ((np.arange(count) > number - _RECENT) | near_path)
+        T = se3_inverse(graph.T_map_cam[number]) @ graph.T_map_cam[:count]
+        near = np.linalg.norm(T[:, :3, 3], axis=1) <= _VIEW_DEPTHS * depth + _SIGMAS * sigma
+        ahead = np.arccos(np.clip(T[:, 2, 2], -1.0, 1.0)) <= _VIEW_RAD
+        part = graph.part
+        unknown = (part[:count] != part[number]) | (sigma > 0.5 * UNKNOWN**0.5)
+        return ~recent & (unknown | (near & (ahead | (sigma > _LOST_M))))
+
+    def _fits(self, i: int, k: int, seen: Verified, drift: FloatArray) -> bool:
+        """Whether a place agrees with the odometry, where that knows anything of it."""
+        graph = self.graph
+        if graph.part[i] != graph.part[k]:
+            return True
+        r = se3_log(se3_inverse(graph.T_map_cam[k]) @ graph.T_map_cam[i] @ seen.pose.T_i_j)
+        return _squared(r, drift + seen.pose.covariance) < _GATE
+
+    def _agree(self, a: FoundPlace, b: FoundPlace) -> bool:
+        """Whether two loops say the same of where the session is in the map."""
+        graph = self.graph
+        if graph.part[a.first] != graph.part[b.first]:
+            return False
+        T = graph.T_map_cam
+        T_second = se3_inverse(T[a.second]) @ T[b.second]
+        r = se3_log(se3_inverse(T[a.first] @ a.seen.pose.T_i_j @ T_second) @ T[b.first] @ b.seen.pose.T_i_j)
+        A = se3_adjoint(se3_inverse(T_second))
+        C = A @ a.seen.pose.covariance @ A.T + b.seen.pose.covariance
+        C = C + graph.drift(np.array([a.second]), np.array([b.second]))[0]
+        if abs(graph.path_m[a.first] - graph.path_m[b.first]) < _NEIGHBOURS_M:
+            C = C + graph.drift(np.array([a.first]), np.array([b.first]))[0]
+        return _squared(r, C) < _GATE
+
+    def _accept(self, loop: FoundPlace) -> LoopEvent:
+        """Add a confirmed loop to the graph, and optimise where it moves the map."""
+        graph, i, k, pose = self.graph, loop.first, loop.second, loop.seen.pose
+        joined = bool(graph.part[i] != graph.part[k])
+        if joined:
+            self._join(i, k, graph.T_map_cam[i] @ pose.T_i_j)
+        r = se3_log(se3_inverse(graph.T_map_cam[k]) @ graph.T_map_cam[i] @ pose.T_i_j)
+        if not joined and graph.session[i] == graph.session[k]:
+            drift = graph.drift(np.array([i]), np.array([k]), systematic=False)[0]
+            excess = _squared(r, drift + pose.covariance) / 6
+            graph.odometry_scale = max(graph.odometry_scale, excess)
+        row = LoopRow(i, k, pose, loop.seen.inliers, kept=True)
+        graph.loops.append(row)
+        if not self._localise:
+            self._store.add_loop(row)
+        self._last, self._moved = loop, True
+        self._waiting += 1
+        if joined or _squared(r, pose.covariance) > _SETTLED or self._waiting >= _PATIENCE:
+            self._optimise()
+        return LoopEvent(
+            graph.frame(k), graph.time_ns(k), i, graph.time_ns(i), row.inliers, float(np.linalg.norm(r[:3])), joined
+        )
+
+    def _join(self, i: int, k: int, T_map_k: FloatArray) -> None:
+        """Bring the parts of two keyframes into one frame: that of the map's first session, if one of them is in it."""
+        part = self.graph.part
+        T = T_map_k @ se3_inverse(self.graph.T_map_cam[k])
+        if part[k] == self._home:
+            self.graph.join(int(part[i]), int(part[k]), se3_inverse(T))
+        else:
+            self.graph.join(int(part[k]), int(part[i]), T)
+
+    def _optimise(self) -> None:
+        if self._localise:
+            self.graph.optimise_end(max(len(self.graph) - _LOCAL, self.first))
+        else:
+            self.graph.optimise_part(self.graph.sessions[self._own].part)
+        if self._last is not None and not self.graph.loops[-1].kept:
+            self._last = None
+        self._waiting, self._moved = 0, True
+
+
+def _squared(r: FloatArray, covariance: FloatArray) -> float:
+    """Squared Mahalanobis distance of r (6,)."""
+    return float(r @ np.linalg.solve(covariance, r))

@@ -1,0 +1,124 @@
+"""What a keyframe keeps of its images: ORB key points with their pixels in both images.
+
+ORB (Rublee et al. 2011) from OpenCV: its bits are compared in a microsecond and its words need no training
+(`place_index`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray
+from vio.records import BoolArray, Image
+
+Bits: TypeAlias = npt.NDArray[np.uint8]
+
+DESCRIPTOR_BYTES = 32
+MOST_FEATURES = 600  # of a keyframe; 30 kB, so that 10 minutes of driving (2000 keyframes) need 60 MB
+_DETECTED = 3  # key points found for each that is kept, so that they can be spread over the image
+_CELLS = 10  # along the larger side of the image
+_LEVELS, _SCALE = 8, 1.2  # pyramid of the detector: up to 3.6 times nearer
+_CORNER_CONTRAST = 7  # gray levels; low, since the best ones of each cell are kept
+_ROWS_PX = 2.0  # of a left and a right key point, at the scale of the detector's first level
+_MOST_DISPARITY = 0.4  # of the width
+_LEAST_DISPARITY_PX = 0.5
+_MOST_BITS = 64  # in which the descriptors of one point differ: a quarter
+_LK_WINDOW = 11  # pixels
+_LK_ROWS_PX = 2.0  # by which the rows of a refined match may differ: rectifications are off by up to a pixel
+
+
+@dataclass(frozen=True, slots=True)
+class KeyframeFeatures:
+    """The key points of one keyframe."""
+
+    z: FloatArray  # (N, 4) rectified pixels [ul vl ur vr]; ur, vr are arbitrary where has_right is False
+    has_right: BoolArray  # (N,)
+    sigma_px: FloatArray  # (N,) standard deviation of a pixel coordinate: larger on the coarse levels
+    descriptors: Bits  # (N, 32)
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+def no_features() -> KeyframeFeatures:
+    """Return the features of a keyframe that shows none."""
+    return KeyframeFeatures(
+        np.zeros((0, 4)), np.zeros(0, dtype=np.bool_), np.zeros(0), np.zeros((0, DESCRIPTOR_BYTES), dtype=np.uint8)
+    )
+
+
+def extract(left: Image, right: Image, *, most: int = MOST_FEATURES) -> KeyframeFeatures:
+    """Find and describe key points (N <= `most`) of the left image (H, W), and match them in the right one."""
+    orb = cv2.ORB.create(_DETECTED * most, _SCALE, _LEVELS, fastThreshold=_CORNER_CONTRAST)
+    found = orb.detect(left, None)
+    if not found:
+        return no_features()
+    chosen = [found[k] for k in _spread(found, left.shape, most)]
+    points, described = orb.compute(left, chosen)
+    if described is None or not len(points):
+        return no_features()
+    bits = np.asarray(described, dtype=np.uint8)
+    uv = np.array([p.pt for p in points], dtype=np.float64)
+    scale = np.array([_SCALE**p.octave for p in points])
+    order = np.lexsort((uv[:, 1], uv[:, 0]))  # OpenCV's own order is that of the levels
+    uv, scale, bits = uv[order], scale[order], bits[order]
+    ur, has_right = _right_pixels(orb, left, right, uv, scale, bits)
+    z = np.concatenate([uv, ur], axis=1).astype(np.float32)  # as a map file keeps it
+    return KeyframeFeatures(z.astype(np.float64), has_right, scale.astype(np.float32).astype(np.float64), bits)
+
+
+def _spread(found: Sequence[cv2.KeyPoint], shape: tuple[int, ...], most: int) -> npt.NDArray[np.int64]:
+    """Choose up to `most` key points: the strongest of each cell first, then the second ones, and so on."""
+    uv = np.array([p.pt for p in found])
+    strength = np.array([p.response for p in found])
+    cell = (uv // (max(shape) / _CELLS)).astype(np.int64)
+    code = cell[:, 1] * _CELLS + cell[:, 0]
+    order = np.lexsort((uv[:, 1], uv[:, 0], -strength, code))
+    begins = np.flatnonzero(np.diff(code[order], prepend=-1))
+    rank = np.arange(len(order)) - np.repeat(begins, np.diff(begins, append=len(order)))
+    best: npt.NDArray[np.int64] = order[np.lexsort((-strength[order], rank))][:most]
+    return best
+
+
+def _right_pixels(
+    orb: cv2.ORB, left: Image, right: Image, uv: FloatArray, scale: FloatArray, bits: Bits
+) -> tuple[FloatArray, BoolArray]:
+    """Match key points (N, 2) in the right image by descriptor near their row, and refine by Lucas-Kanade."""
+    out, valid = np.zeros_like(uv), np.zeros(len(uv), dtype=np.bool_)
+    there, there_bits = orb.detectAndCompute(right, None)
+    if there_bits is None:
+        return out, valid
+    at = np.array([p.pt for p in there])
+    size = np.array([_SCALE**p.octave for p in there])
+    shift = uv[:, None, 0] - at[None, :, 0]
+    allowed = (np.abs(uv[:, None, 1] - at[None, :, 1]) <= _ROWS_PX * scale[:, None]) & (
+        (shift > -1.0) & (shift < _MOST_DISPARITY * left.shape[1])
+    )
+    allowed &= np.abs(np.log(scale[:, None] / size[None])) < 1.5 * np.log(_SCALE)
+    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).match(bits, there_bits, allowed.astype(np.uint8))
+    pairs = [m for m in pairs if m.distance <= _MOST_BITS]
+    if not pairs:
+        return out, valid
+    rows = np.array([m.queryIdx for m in pairs])
+    start = at[[m.trainIdx for m in pairs]].astype(np.float32)[:, None]
+    refined, status, _ = cv2.calcOpticalFlowPyrLK(
+        left,
+        right,
+        uv[rows].astype(np.float32)[:, None],
+        start.copy(),
+        winSize=(_LK_WINDOW, _LK_WINDOW),
+        maxLevel=0,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    found = refined[:, 0].astype(np.float64)
+    good = (status[:, 0] > 0) & (np.abs(found[:, 1] - uv[rows, 1]) <= _LK_ROWS_PX)
+    good &= np.abs(found[:, 0] - start[:, 0, 0]) <= _ROWS_PX * scale[rows]
+    good &= uv[rows, 0] - found[:, 0] >= _LEAST_DISPARITY_PX
+    out[rows[good]], valid[rows[good]] = found[good], True
+    return out, valid

@@ -1,0 +1,224 @@
+"""Whether two keyframes show one place, and where they stand to each other.
+
+Descriptors give pairs; PnP with RANSAC, in both directions, gives the motion; a least-squares fit of all stereo pixels
+refines it. A pair that agrees with the motion from i to j but not with that from j to i counts as wrong.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_hat, transform_points
+from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.mapping.features import KeyframeFeatures
+from vio.records import BoolArray, IntArray
+
+LEAST_INLIERS = 20
+_LEAST_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random
+_MOST_BITS = 64
+_WORSE = 1000  # more than the 256 bits in which two descriptors can differ
+_RATIO = 0.85  # to the second-best descriptor
+_MOST_PAIRS = 200  # that enter the fit, which takes 4 ms then
+_RANSAC_PX, _RANSAC_STEPS, _RANSAC_SURE = 4.0, 300, 0.999
+_SAME_M, _SAME_DEG = 0.1, 3.0  # by which both directions may differ; metres, beside a share of the depth
+_SAME_DEPTH = 0.05
+_STEPS, _CONVERGED = 10, 1e-5  # largest change, m and rad
+_GATE = 3.0  # standard deviations, of a pixel coordinate
+_LEAST_DISPARITY_PX = 1.0
+# Floor of a loop's standard deviations: errors that its points share, such as those of the calibration.
+_FLOOR_DEPTH, _FLOOR_DEG = 0.002, 0.05
+_INFLATION = 2.0  # of its standard deviations: key points of neighbouring levels and edges are not independent
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """A place seen again."""
+
+    pose: RelativePose  # of camera j in camera i
+    inliers: int
+    pairs: int  # of descriptors
+    rows_i: IntArray  # (inliers,) features of i
+    rows_j: IntArray  # (inliers,) features of j
+
+
+def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
+    """Pair features by descriptor: rows (K, 2) of i and j, each the other's best and clearly better than the next."""
+    if len(i) < 2 or len(j) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    bits = _differing_bits(i, j)
+    rows, best = np.arange(len(i)), bits.argmin(axis=1)
+    mutual = bits.argmin(axis=0)[best] == rows
+    least = bits[rows, best]
+    bits[rows, best] = _WORSE
+    good = np.flatnonzero(mutual & (least <= np.minimum(_MOST_BITS, _RATIO * bits.min(axis=1))))
+    return np.stack([good, best[good]], axis=1)
+
+
+def _differing_bits(i: KeyframeFeatures, j: KeyframeFeatures) -> npt.NDArray[np.float32]:
+    """Hamming distances (N, M) of descriptors: with bits as -1 and 1, 256 less their product, halved (exact)."""
+    a, b = (2 * np.unpackbits(f.descriptors, axis=1).astype(np.float32) - 1 for f in (i, j))
+    out: npt.NDArray[np.float32] = (np.float32(a.shape[1]) - a @ b.T) / np.float32(2)
+    return out
+
+
+def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, j: KeyframeFeatures) -> Verified | None:
+    """Return where camera j stands in the frame of camera i; None: they do not show one place."""
+    pairs = match(i, j)
+    if len(pairs) < LEAST_INLIERS:
+        return None
+    if len(pairs) > _MOST_PAIRS:  # features are in the order of their columns, so these are spread over the image
+        pairs = pairs[np.linspace(0, len(pairs) - 1, _MOST_PAIRS).astype(np.int64)]
+    a, b = pairs.T
+    T_j_i = _pnp(camera_i, i, a, camera_j, j, b)
+    T_i_j = None if T_j_i is None else _pnp(camera_j, j, b, camera_i, i, a)
+    if T_j_i is None or T_i_j is None:
+        return None
+    depth = _median_depth(camera_j, j, b)
+    gap = se3_log(T_i_j @ T_j_i)
+    if np.linalg.norm(gap[:3]) > _SAME_M + _SAME_DEPTH * depth or np.linalg.norm(gap[3:]) > np.radians(_SAME_DEG):
+        return None
+    fitted = _fit(camera_i, i, a, camera_j, j, b, T_i_j)
+    if fitted is None:
+        return None
+    pose, good = fitted
+    if good.sum() < max(LEAST_INLIERS, _LEAST_SHARE * len(pairs)):
+        return None
+    return Verified(pose, int(good.sum()), len(pairs), a[good], b[good])
+
+
+def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:
+    p, valid = triangulate(camera, f.z[rows], min_disparity_px=_LEAST_DISPARITY_PX)
+    return p, valid & f.has_right[rows]
+
+
+def _median_depth(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> float:
+    p, valid = _points(camera, f, rows)
+    return float(np.median(p[valid, 2])) if valid.any() else 0.0
+
+
+def _pnp(
+    camera_a: StereoCamera,
+    a: KeyframeFeatures,
+    rows_a: IntArray,
+    camera_b: StereoCamera,
+    b: KeyframeFeatures,
+    rows_b: IntArray,
+) -> FloatArray | None:
+    """Return T_b_a (4, 4) from the stereo points of a and the left pixels of b; None: too few agree."""
+    p, valid = _points(camera_a, a, rows_a)
+    if valid.sum() < LEAST_INLIERS:
+        return None
+    K = np.array([[camera_b.fu, 0, camera_b.cu], [0, camera_b.fv, camera_b.cv], [0, 0, 1.0]])
+    done, rotation, translation, inliers = cv2.solvePnPRansac(
+        p[valid],
+        b.z[rows_b[valid], :2],
+        K,
+        None,
+        iterationsCount=_RANSAC_STEPS,
+        reprojectionError=_RANSAC_PX,
+        confidence=_RANSAC_SURE,
+        flags=cv2.SOLVEPNP_P3P,
+    )
+    if not done or inliers is None or len(inliers) < LEAST_INLIERS:
+        return None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = so3_exp(rotation[:, 0]), translation[:, 0]
+    return T
+
+
+def _fit(
+    camera_i: StereoCamera,
+    i: KeyframeFeatures,
+    a: IntArray,
+    camera_j: StereoCamera,
+    j: KeyframeFeatures,
+    b: IntArray,
+    T_i_j: FloatArray,
+) -> tuple[RelativePose, BoolArray] | None:
+    """Fit the motion to the stereo pixels of both keyframes; return it and a mask (K,) of the pairs that agree.
+
+    The pixels of j are predicted from the points of i, whose covariance is added to theirs; where i has no right pixel,
+    the other way round. Residuals are [ul vl ur] (the right row says nothing new, see docs/math.md).
+    """
+    forward = _points(camera_i, i, a)[1]
+    order = np.concatenate([np.flatnonzero(forward), np.flatnonzero(~forward)])
+    parts = (
+        _Terms(camera_i, i, a[forward], camera_j, j, b[forward]),
+        _Terms(camera_j, j, b[~forward], camera_i, i, a[~forward]),
+    )
+    T, normal, fits = T_i_j, np.eye(6), np.zeros(len(a), dtype=np.bool_)
+    for step in range(_STEPS):
+        width = _GATE * 2.0 ** max(2 - step, 0)
+        both = parts[0].at(se3_inverse(T), inverse=True), parts[1].at(T, inverse=False)
+        r, W, H, on = (np.concatenate(one) for one in zip(*both, strict=True))
+        squared = np.einsum("ki,kij,kj->k", r, W, r)
+        weight = on / (1 + squared / (3 * width**2)) ** 2
+        fits = on & (squared < 3 * _GATE**2)
+        if fits.sum() < LEAST_INLIERS:
+            return None
+        HW = np.swapaxes(H, 1, 2) @ (W * weight[:, None, None])
+        normal = np.sum(HW @ H, axis=0)
+        xi = np.linalg.solve(normal + 1e-9 * np.eye(6), np.sum(HW @ r[..., None], axis=0)[:, 0])
+        T = T @ se3_exp(xi)
+        if step > 2 and np.abs(xi).max() < _CONVERGED:
+            break
+    good = np.zeros(len(a), dtype=np.bool_)
+    good[order] = fits
+    depth = _median_depth(camera_j, j, b[good])
+    floor = np.repeat([(_FLOOR_DEPTH * depth) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
+    covariance = _INFLATION**2 * np.asarray(np.linalg.inv(normal), dtype=np.float64) + np.diag(floor)
+    return RelativePose(T, covariance), good
+
+
+class _Terms:
+    """Residuals of the pixels of one keyframe, predicted from the stereo points of the other."""
+
+    def __init__(
+        self,
+        camera_s: StereoCamera,
+        s: KeyframeFeatures,
+        rows_s: IntArray,
+        camera_t: StereoCamera,
+        t: KeyframeFeatures,
+        rows_t: IntArray,
+    ) -> None:
+        """Prepare pairs (K,); those without a point in the source count nothing."""
+        p, self._used = _points(camera_s, s, rows_s)
+        self._camera = camera_t
+        self._p = np.where(self._used[:, None], p, [0.0, 0.0, 1.0])
+        z_s = np.where(self._used[:, None], s.z[rows_s], project(camera_s, [0.0, 0.0, 1.0]))
+        J = p_cam_D_z(camera_s, z_s)
+        self._P = np.einsum("kij,klj,k->kil", J, J, s.sigma_px[rows_s] ** 2)
+        self._z, self._stereo = t.z[rows_t], t.has_right[rows_t]
+        self._variance = t.sigma_px[rows_t] ** 2
+
+    def at(self, T_t_s: FloatArray, *, inverse: bool) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+        """Return residuals (K, 3), weights (K, 3, 3), Jacobians (K, 3, 6) for T_i_j <- T_i_j exp(xi), a mask (K,).
+
+        Args:
+            T_t_s: (4, 4) the source's frame in the target's.
+            inverse: whether T_t_s is the inverse of T_i_j.
+        """
+        q = transform_points(T_t_s, self._p)
+        on = self._used & (q[:, 2] > 0.05)
+        q = np.where(on[:, None], q, [0.0, 0.0, 1.0])
+        J = z_D_p_cam(self._camera, q)[:, :3]
+        r = (self._z - project(self._camera, q))[:, :3]
+        R = T_t_s[:3, :3]
+        C = J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2) + self._variance[:, None, None] * np.eye(3)
+        W = np.linalg.inv(C)
+        left = ~self._stereo
+        if left.any():  # of a left pixel alone
+            W[left] = 0.0
+            W[left, :2, :2] = np.linalg.inv(C[left, :2, :2])
+        if inverse:  # q = exp(-xi) T_hat^-1 p
+            q_D_xi = np.concatenate([-np.broadcast_to(np.eye(3), (len(q), 3, 3)), so3_hat(q)], axis=2)
+        else:  # q = T_hat exp(xi) p
+            q_D_xi = np.concatenate([np.broadcast_to(R, (len(q), 3, 3)), -R @ so3_hat(self._p)], axis=2)
+        W = W * on[:, None, None]
+        return r * on[:, None], W, J @ q_D_xi * on[:, None, None], on

@@ -1,0 +1,172 @@
+"""All keyframes of a map with their poses, the odometry between them, and the loops."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
+from vio.geometry.relative_pose import RelativePose
+from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
+from vio.mapping.pose_graph import Edges, Uprights, optimise
+from vio.records import BoolArray, IntArray
+
+# What the odometry may be off by beyond its own covariance, since errors of the calibration add up along the path:
+# 1 % and 0.5 deg/100 m; peers reach 1.2 % and 0.3 deg/100 m with stereo on KITTI.
+_DRIFT_SHARE, _DRIFT_RAD_PER_M = 0.01, float(np.radians(0.005))
+UNKNOWN = 1e6  # variance of the motion from one session to the next, m^2 and rad^2: nothing is known of it
+
+
+class Rows:
+    """An array that grows along its first axis."""
+
+    def __init__(self, *shape: int) -> None:
+        self._data: FloatArray = np.zeros((64, *shape))
+        self._size = 0
+
+    def append(self, row: npt.ArrayLike) -> None:
+        """Add a row."""
+        if self._size == len(self._data):
+            self._data = np.concatenate([self._data, np.zeros_like(self._data)])
+        self._data[self._size] = row
+        self._size += 1
+
+    @property
+    def rows(self) -> FloatArray:
+        """All rows, to be read and written."""
+        return self._data[: self._size]
+
+    def __getitem__(self, index: int | slice | IntArray) -> FloatArray:
+        return self.rows[index]
+
+
+class MapGraph:
+    """Sessions, keyframes, odometry and loops; keyframes are numbered in the order in which they came."""
+
+    def __init__(self, store: MapStore) -> None:
+        """Read a map."""
+        self.sessions: list[SessionRow] = store.sessions()
+        self.T_map_cam, self.T_odom_cam, self._drift = Rows(4, 4), Rows(4, 4), Rows(6, 6)
+        self.path_m, self._session, self._frame = Rows(), Rows(), Rows()
+        self._times: list[int] = []  # ns; too large for float64
+        self._ups: list[tuple[int, FloatArray, float]] = []
+        self.odometry: list[tuple[int, int, RelativePose]] = store.odometry()
+        self.loops: list[LoopRow] = store.loops()
+        self.odometry_scale = 1.0  # on the covariance of the odometry, so that the loops fit to it
+        for row in store.keyframes():
+            self.append(row)
+
+    def __len__(self) -> int:
+        """Number of keyframes."""
+        return len(self.path_m.rows)
+
+    @property
+    def session(self) -> IntArray:
+        """Session (K,) of each keyframe."""
+        return self._session.rows.astype(np.int64)
+
+    @property
+    def part(self) -> IntArray:
+        """Part (K,) of the map that each keyframe is in; loops join parts."""
+        return np.array([s.part for s in self.sessions], dtype=np.int64)[self.session]
+
+    def frame(self, keyframe: int) -> int:
+        """Frame number of a keyframe in its recording."""
+        return int(self._frame.rows[keyframe])
+
+    def time_ns(self, keyframe: int) -> int:
+        """Time of a keyframe."""
+        return self._times[keyframe]
+
+    def append(self, row: KeyframeRow) -> None:
+        """Add a keyframe."""
+        if row.up_cam is not None:
+            self._ups.append((len(self), row.up_cam, row.up_sigma_rad))
+        self.T_map_cam.append(row.T_map_cam)
+        self.T_odom_cam.append(row.T_odom_cam)
+        self._drift.append(row.drift)
+        self.path_m.append(row.path_m)
+        self._session.append(row.session)
+        self._frame.append(row.frame)
+        self._times.append(row.time_ns)
+
+    def gathered(self, T_odom_cam: FloatArray, motion: RelativePose | None) -> tuple[FloatArray, float]:
+        """Return the covariance (6, 6) and the path that the odometry has gathered at a new keyframe.
+
+        The covariance is that of right-invariant errors, which add up: `xi_k = xi_i + Ad(T_k) xi_i_k`. From session to
+        session it grows by `UNKNOWN`.
+        """
+        before = (self._drift.rows[-1], float(self.path_m.rows[-1])) if len(self) else (np.zeros((6, 6)), 0.0)
+        if motion is None:
+            return before[0] + (UNKNOWN if len(self) else 0.0) * np.eye(6), before[1]
+        A = se3_adjoint(T_odom_cam)
+        moved = float(np.linalg.norm(motion.T_i_j[:3, 3]))
+        return before[0] + A @ motion.covariance @ A.T, before[1] + moved
+
+    def drift(self, i: IntArray, k: IntArray, *, systematic: bool = True) -> FloatArray:
+        """Covariance (N, 6, 6) of the motion between keyframes i and k (N,) along the path, in the frame of the later.
+
+        Args:
+            i: keyframes.
+            k: keyframes.
+            systematic: add what errors of the calibration may do.
+        """
+        late, early = np.maximum(i, k), np.minimum(i, k)
+        A = se3_adjoint(se3_inverse(self.T_odom_cam[late]))
+        C: FloatArray = A @ (self._drift[late] - self._drift[early]) @ np.swapaxes(A, 1, 2)
+        if systematic:
+            path = (self.path_m[late] - self.path_m[early])[:, None]
+            sigma = path * np.repeat([_DRIFT_SHARE, _DRIFT_RAD_PER_M], 3)
+            C = C + sigma[:, :, None] ** 2 * np.eye(6)
+        return C
+
+    def join(self, moved: int, into: int, T_into_moved: FloatArray) -> None:
+        """Take the keyframes of one part into the frame of another."""
+        rows = self.part == moved
+        self.T_map_cam.rows[rows] = T_into_moved @ self.T_map_cam.rows[rows]
+        self.sessions = [replace(s, part=into) if s.part == moved else s for s in self.sessions]
+
+    def optimise_part(self, part: int) -> None:
+        """Optimise all keyframes of a part but the first one."""
+        rows = self.part == part
+        fixed = np.zeros(len(self), dtype=np.bool_)
+        fixed[int(np.argmax(rows))] = True
+        self._optimise(rows, fixed)
+
+    def optimise_end(self, first: int) -> None:
+        """Optimise the keyframes from `first` on against those before it that loops join them to, which stay."""
+        ends = np.array([(o.first, o.second) for o in self.loops], dtype=np.int64).reshape(-1, 2)
+        linked = ends[(ends[:, 1] >= first) & (ends[:, 0] < first)][:, 0]
+        if not len(linked):
+            return
+        fixed = np.zeros(len(self), dtype=np.bool_)
+        fixed[linked] = True
+        self._optimise(fixed | (np.arange(len(self)) >= first), fixed)
+
+    def _optimise(self, rows: BoolArray, fixed: BoolArray) -> None:
+        """Optimise the keyframes of a mask (K,); mark the loops that contradict the rest."""
+        place = np.cumsum(rows) - 1
+        odometry = [(int(place[i]), int(place[j]), m) for i, j, m in self.odometry if rows[i] and rows[j]]
+        scaled = [(i, j, RelativePose(m.T_i_j, self.odometry_scale * m.covariance)) for i, j, m in odometry]
+        inside = [n for n, o in enumerate(self.loops) if rows[o.first] and rows[o.second]]
+        loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
+        best = optimise(
+            self.T_map_cam.rows[rows], Edges.of(scaled), Edges.of(loops), self._uprights(rows, place), fixed[rows]
+        )
+        self.T_map_cam.rows[rows] = best.T_map_cam
+        for n, kept in zip(inside, best.kept.tolist(), strict=True):
+            self.loops[n] = replace(self.loops[n], kept=kept)
+
+    def _uprights(self, rows: BoolArray, place: IntArray) -> Uprights:
+        ups = [up for up in self._ups if rows[up[0]]] if self._is_upright(rows) else []
+        return Uprights(
+            np.array([place[k] for k, _, _ in ups], dtype=np.int64),
+            np.array([up for _, up, _ in ups]).reshape(-1, 3),
+            np.array([sigma for _, _, sigma in ups]),
+        )
+
+    def _is_upright(self, rows: BoolArray) -> bool:
+        """Whether z is up in the frame of these keyframes: it is that of the first one's session."""
+        return self.sessions[int(self._session.rows[int(np.argmax(rows))])].upright

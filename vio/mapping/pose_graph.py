@@ -1,0 +1,187 @@
+"""The optimum of a graph of camera poses: odometry between keyframes, gravity, and loops that may be wrong.
+
+Equations (G1) to (G5) of docs/math.md. Gauss-Newton on SE(3) over a sparse normal matrix. Loops are truncated least
+squares by graduated non-convexity (Yang et al., 2020): one that contradicts the others ends with weight zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.linalg import splu
+
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, se3_left_jacobian, se3_log, so3_hat
+from vio.geometry.relative_pose import RelativePose
+from vio.records import BoolArray, IntArray
+from vio.statistics import chi_square_quantile
+
+_TRUNCATION = 0.999  # probability at which a loop's residual is cut off
+_MU_GROWTH = 1.6  # of the control parameter, from one step to the next
+_MOST_STEPS, _MOST_GNC_STEPS = 15, 30
+_CONVERGED = 1e-6  # largest change, m and rad
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Measured motions between pairs of poses."""
+
+    first: IntArray  # (E,) index of pose i
+    second: IntArray  # (E,) index of pose j
+    T_i_j: FloatArray  # (E, 4, 4)
+    information: FloatArray  # (E, 6, 6) inverse covariance of xi in T_i_j = T_hat exp(xi)
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @classmethod
+    def of(cls, rows: Sequence[tuple[int, int, RelativePose]]) -> Edges:
+        """Collect edges (i, j, motion)."""
+        return cls(
+            np.array([i for i, _, _ in rows], dtype=np.int64),
+            np.array([j for _, j, _ in rows], dtype=np.int64),
+            np.array([pose.T_i_j for _, _, pose in rows]).reshape(-1, 4, 4),
+            np.linalg.inv(np.array([pose.covariance for _, _, pose in rows]).reshape(-1, 6, 6)),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Uprights:
+    """The direction of the vertical, as the IMU gives it in each camera."""
+
+    pose: IntArray  # (U,) index
+    up_cam: FloatArray  # (U, 3) unit vector
+    sigma_rad: FloatArray  # (U,)
+
+
+def no_uprights() -> Uprights:
+    """Return none, as without an IMU."""
+    return Uprights(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Optimum:
+    """Poses that fit a graph best."""
+
+    T_map_cam: FloatArray  # (K, 4, 4)
+    kept: BoolArray  # (L,) loops that agree with the rest
+    weight: FloatArray  # (L,) of each loop, 0 to 1
+
+
+def optimise(T_map_cam: FloatArray, odometry: Edges, loops: Edges, uprights: Uprights, fixed: BoolArray) -> Optimum:
+    """Return the poses (K, 4, 4) that minimise the squared errors of odometry, gravity and truncated loops.
+
+    Args:
+        T_map_cam: (K, 4, 4) where to start; the map's z axis is up if there are uprights.
+        odometry: edges that are trusted.
+        loops: edges that may be wrong.
+        uprights: directions of the vertical.
+        fixed: (K,) poses that stay; at least one of each connected part.
+    """
+    limit = float(chi_square_quantile(_TRUNCATION, 6))
+    T, weight = T_map_cam.copy(), np.ones(len(loops))
+    if not len(loops):
+        return Optimum(_descend(T, odometry, loops, weight, uprights, fixed, _MOST_STEPS), weight > 0.5, weight)
+    T = _descend(T, odometry, loops, weight, uprights, fixed, _MOST_STEPS)
+    squared = _squared(T, loops)
+    worst = float(squared.max())
+    if worst > limit:  # else every loop fits with full weight, and there is nothing to decide
+        mu = limit / (2 * worst - limit)
+        for _ in range(_MOST_GNC_STEPS):
+            weight = _gnc_weight(squared, mu, limit)
+            T = _descend(T, odometry, loops, weight, uprights, fixed, 2)
+            squared = _squared(T, loops)
+            if ((weight == 0) | (weight == 1)).all() and mu > 1:
+                break
+            mu *= _MU_GROWTH
+        weight = (squared < limit).astype(np.float64)
+        T = _descend(T, odometry, loops, weight, uprights, fixed, _MOST_STEPS)
+    return Optimum(T, weight > 0.5, weight)
+
+
+def _gnc_weight(squared: FloatArray, mu: float, limit: float) -> FloatArray:
+    """Weights (L,) of truncated least squares, Yang et al. (2020), equation (14)."""
+    middle = np.sqrt(limit * mu * (mu + 1) / np.maximum(squared, 1e-12)) - mu
+    out: FloatArray = np.where(
+        squared >= limit * (mu + 1) / mu, 0.0, np.where(squared <= limit * mu / (mu + 1), 1.0, middle)
+    )
+    return out
+
+
+def _squared(T: FloatArray, edges: Edges) -> FloatArray:
+    r = residual(T, edges)
+    out: FloatArray = np.einsum("ei,eij,ej->e", r, edges.information, r)
+    return out
+
+
+def residual(T: FloatArray, edges: Edges) -> FloatArray:
+    """Residuals (E, 6) of edges at poses (K, 4, 4): `log(T_i_j^-1 T_i^-1 T_j)`, equation (G1)."""
+    out: FloatArray = se3_log(se3_inverse(edges.T_i_j) @ se3_inverse(T[edges.first]) @ T[edges.second])
+    return out
+
+
+def r_D_poses(T: FloatArray, edges: Edges, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Jacobians (E, 6, 6) of `residual` with respect to xi_i and xi_j in T <- T exp(xi), equation (G2)."""
+    r_D_j = np.asarray(np.linalg.inv(se3_left_jacobian(-r)), dtype=np.float64)  # the right Jacobian's inverse
+    return -r_D_j @ se3_adjoint(se3_inverse(T[edges.second]) @ T[edges.first]), r_D_j
+
+
+def up_residual(T: FloatArray, uprights: Uprights) -> tuple[FloatArray, FloatArray]:
+    """Residuals (U, 3) `R^T e_z - up_cam` at poses (K, 4, 4), and their Jacobians (U, 3, 6), equation (G3)."""
+    up = T[uprights.pose, 2, :3]  # R^T e_z
+    D = np.zeros((len(up), 3, 6))
+    D[:, :, 3:] = so3_hat(up)
+    return up - uprights.up_cam, D
+
+
+def _descend(
+    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, uprights: Uprights, fixed: BoolArray, steps: int
+) -> FloatArray:
+    """Gauss-Newton with fixed weights (L,) of the loops."""
+    for _ in range(steps):
+        xi = _step(T, odometry, loops, weight, uprights, fixed)
+        T = T @ se3_exp(xi)
+        if np.abs(xi).max(initial=0.0) < _CONVERGED:
+            break
+    return T
+
+
+def _step(
+    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, uprights: Uprights, fixed: BoolArray
+) -> FloatArray:
+    """Solve the normal equations (G4) for xi (K, 6)."""
+    count = len(T)
+    blocks: list[tuple[IntArray, IntArray, FloatArray]] = []
+    gradient = np.zeros((count, 6))
+    for edges, scale in ((odometry, np.ones(len(odometry))), (loops, weight)):
+        if not len(edges):
+            continue
+        r = residual(T, edges)
+        A, B = r_D_poses(T, edges, r)
+        W = edges.information * scale[:, None, None]
+        AW, BW = np.swapaxes(A, 1, 2) @ W, np.swapaxes(B, 1, 2) @ W
+        i, j = edges.first, edges.second
+        AB = AW @ B
+        blocks += [(i, i, AW @ A), (j, j, BW @ B), (i, j, AB), (j, i, np.swapaxes(AB, 1, 2))]
+        np.add.at(gradient, i, -np.einsum("eij,ej->ei", AW, r))
+        np.add.at(gradient, j, -np.einsum("eij,ej->ei", BW, r))
+    if len(uprights.pose):
+        r, D = up_residual(T, uprights)
+        D, r = D / uprights.sigma_rad[:, None, None], r / uprights.sigma_rad[:, None]
+        blocks.append((uprights.pose, uprights.pose, np.swapaxes(D, 1, 2) @ D))
+        np.add.at(gradient, uprights.pose, -np.einsum("eji,ej->ei", D, r))
+    free = np.flatnonzero(np.repeat(~fixed, 6))
+    xi = np.zeros(6 * count)
+    xi[free] = splu(_sparse(blocks, count)[free][:, free].tocsc()).solve(gradient.ravel()[free])
+    return xi.reshape(count, 6)
+
+
+def _sparse(blocks: list[tuple[IntArray, IntArray, FloatArray]], count: int) -> coo_matrix:
+    """Assemble 6 x 6 blocks at block rows and columns into a sparse matrix (6K, 6K) in columns."""
+    inner_row, inner_column = np.divmod(np.arange(36), 6)
+    rows = np.concatenate([(6 * i[:, None] + inner_row).ravel() for i, _, _ in blocks])
+    columns = np.concatenate([(6 * j[:, None] + inner_column).ravel() for _, j, _ in blocks])
+    values = np.concatenate([M.reshape(-1) for _, _, M in blocks])
+    return coo_matrix((values, (rows, columns)), shape=(6 * count, 6 * count)).tocsr()

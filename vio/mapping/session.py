@@ -1,0 +1,248 @@
+"""Between odometry and map: chooses keyframes, hands them to the map's thread, and takes back what it finds.
+
+What a keyframe brings is taken over a fixed number of frames after it, by waiting if need be. So the result does not
+depend on how fast the thread was, and repeats to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_hat
+from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import StereoCamera
+from vio.loops import LoopEvent
+from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate
+from vio.mapping.features import extract
+from vio.mapping.map_store import MapStore
+from vio.records import Estimate, Image, IntArray, Observations, StereoFrame
+
+Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
+
+_SHARED = 0.6  # of the last keyframe's features that are still seen: below it, a new keyframe
+_LEAST_FEATURES = 30  # with a right pixel
+_LOCALISE_STEP = 5  # frames between keyframes of a session that is localised, where nothing is stored
+_LOST_STEP = 3  # likewise while it has no place
+_LOST_M = 1.0  # standard deviation of the position, likewise
+HANDOVER_FRAMES = 10  # from a keyframe to the frame at which its result is taken over
+# On the standard deviations of a motion: errors of a track last longer than a frame, which the window does not count.
+# Measured over a keyframe's step: 1.6 to 3.1 times the standard deviation (street), 1.2 to 3.1 (room).
+_MOTION_INFLATION = 2.0
+_LEAST_UP_SIGMA_RAD = float(np.radians(0.1))  # errors of the vertical last longer than from keyframe to keyframe
+_BROKEN = np.repeat([30.0**2, 1.0**2], 3)  # variance of the motion where the filter began anew, m^2 and rad^2
+
+
+class MapSession:
+    """One trajectory in a map."""
+
+    def __init__(
+        self, path: Path, camera: StereoCamera, T_cam0_body: FloatArray, *, source: str, imu: bool, localise: bool
+    ) -> None:
+        """Open the map.
+
+        Args:
+            path: the map's file; made where it does not exist, unless `localise`.
+            camera: rectified pair.
+            T_cam0_body: (4, 4) extrinsics of the body whose poses come.
+            source: names the recording.
+            imu: whether the vertical is known.
+            localise: leave the map as it is.
+
+        Raises:
+            DataError: the map cannot be used.
+        """
+        self._path, self._localise, self._imu = str(path), localise, imu
+        self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
+        store = MapStore(path, create=not localise, read_only=localise)
+        self._builder = MapBuilder(store, source, camera, upright=imu, localise=localise)
+        self._executor = ThreadPoolExecutor(1, "map")
+        self._waiting: list[tuple[int, int, Future[MapUpdate]]] = []  # when it is due, frame, result
+        self._frames = 0
+        self._ids: IntArray = np.zeros(0, dtype=np.int64)  # stereo features of the last keyframe
+        self._base: RelativePose | None = None  # from the last keyframe to the anchor
+        self._anchor: int | None = None  # a frame in the filter's window
+        # Newest frame: its number, the motion since the last keyframe, its pose by odometry.
+        self._newest: tuple[int, RelativePose, FloatArray] | None = None
+        self._since = 0  # frames since the last keyframe
+        self.T_map_odom: FloatArray | None = np.eye(4) if self._builder.first == 0 and not localise else None
+        # (6, 6) covariance in the map of the newest keyframe with a result
+        self._known: FloatArray | None = None if self.T_map_odom is None else np.zeros((6, 6))
+        self._moves: list[tuple[int, RelativePose]] = []  # later keyframes, each with the motion since the one before
+        self.loops: list[LoopEvent] = []
+
+    def frame(
+        self, frame: StereoFrame, seen: Observations, estimate: Estimate, relative: Relative
+    ) -> tuple[LoopEvent, ...]:
+        """Take a processed frame; return the loops whose time has come.
+
+        Args:
+            frame: with its images.
+            seen: what the front end saw.
+            estimate: of the filter.
+            relative: the filter's motion between two frames of its window.
+        """
+        self._frames += 1
+        events = self._take(lambda due: due <= self._frames)
+        fresh = seen.take(seen.has_right & ~seen.stale)
+        if len(fresh) < _LEAST_FEATURES or frame.left is None or frame.right is None:
+            return events
+        motion = self._motion_to(frame.index, estimate, relative)
+        self._since += 1
+        if motion is None and self._newest is not None:
+            return events
+        if self._is_due(fresh.ids, motion):
+            self._submit(frame, fresh.ids, estimate, motion)
+        return events
+
+    def finish(self) -> tuple[LoopEvent, ...]:
+        """Wait for everything, and write the map."""
+        events = self._take(lambda due: True)
+        if self._frames:
+            self.T_map_odom = self._executor.submit(self._builder.finish).result().T_map_odom
+        return events
+
+    def close(self) -> None:
+        """Write what there is, end the thread and let the file go."""
+        self._executor.shutdown(wait=True)
+        self._builder.commit()
+        self._builder.close()
+
+    def keyframes(self) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Return frame numbers (K,) of this session's keyframes, optimised poses and those of the odometry.
+
+        Both (K, 4, 4), of the body.
+        """
+        graph, own = self._builder.graph, slice(self._builder.first, None)
+        frames = np.array([graph.frame(k) for k in range(self._builder.first, len(graph))], dtype=np.int64)
+        return frames, graph.T_map_cam[own] @ self._T_cam_body, graph.T_odom_cam[own] @ self._T_cam_body
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """Covariance (6, 6) of xi in T_map_body = T_hat exp(xi), [rho; phi], at the newest frame, given the map.
+
+        That of the newest keyframe whose place is known, grown by the odometry since; None without a place.
+        """
+        if self._known is None:
+            return None
+        now = RelativePose(np.eye(4), self._known)
+        for _, motion in self._moves:
+            now = now.then(motion)
+        if self._newest is not None:
+            now = now.then(self._newest[1])
+        A = se3_adjoint(self._T_body_cam)
+        return A @ now.covariance @ A.T
+
+    @property
+    def is_joined(self) -> bool:
+        """Whether the session's poses are in the map's frame."""
+        return self._builder.is_joined
+
+    # Keyframes
+
+    def _motion_to(self, frame: int, estimate: Estimate, relative: Relative) -> RelativePose | None:
+        """Return the camera's motion since the last keyframe with its covariance; None before the first keyframe.
+
+        The anchor follows where the filter's window moves on; motions from anchor to anchor are taken as independent.
+        """
+        if self._anchor is None:
+            return None
+        motion = relative(self._anchor, frame)
+        if motion is None and self._newest is not None:
+            self._anchor, self._base = self._newest[0], self._newest[1]
+            motion = relative(self._anchor, frame)
+        T_odom_cam = estimate.T_world_imu @ self._T_body_cam
+        if motion is None:  # the filter began anew, or is blind
+            if relative(frame, frame) is None or self._newest is None:
+                return None
+            last = self._newest
+            jump = RelativePose(se3_inverse(last[2]) @ T_odom_cam, np.diag(_BROKEN))
+            self._base, self._anchor = last[1].then(jump), frame
+            total = self._base
+        else:
+            total = motion.seen_by(self._T_cam_body)
+            total = total if self._base is None else self._base.then(total)
+        self._newest = frame, total, T_odom_cam
+        return total
+
+    def _is_due(self, ids: IntArray, motion: RelativePose | None) -> bool:
+        """Whether a frame becomes a keyframe: it shows little of what the last one showed."""
+        if motion is None:
+            return True
+        if self._localise and self._since >= _LOST_STEP:
+            covariance = self.covariance
+            lost = covariance is None or covariance[:3, :3].trace() > _LOST_M**2
+            if lost or self._since >= _LOCALISE_STEP:
+                return True
+        return bool(np.isin(self._ids, ids).mean() < _SHARED)
+
+    def _submit(self, frame: StereoFrame, ids: IntArray, estimate: Estimate, motion: RelativePose | None) -> None:
+        assert frame.left is not None
+        assert frame.right is not None
+        T_odom_cam = estimate.T_world_imu @ self._T_body_cam
+        up, sigma = self._vertical(estimate)
+        if motion is not None:
+            motion = RelativePose(motion.T_i_j, _MOTION_INFLATION**2 * motion.covariance)
+        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, motion, up, sigma)
+        result = self._executor.submit(_add, self._builder, keyframe, frame.left, frame.right)
+        self._waiting.append((self._frames + HANDOVER_FRAMES, frame.index, result))
+        if motion is not None:
+            self._moves.append((frame.index, motion))
+        self._ids, self._base, self._anchor, self._since = ids, None, frame.index, 0
+        self._newest = frame.index, RelativePose(np.eye(4), np.zeros((6, 6))), T_odom_cam
+
+    def _vertical(self, estimate: Estimate) -> tuple[FloatArray | None, float]:
+        """Direction against gravity in the camera (3,) and its standard deviation; None where it is not known.
+
+        With `T_imu_world = exp(xi) T_hat`, phi moves the direction u in the body by `phi x u`.
+        """
+        if not self._imu or estimate.gravity_world is not None:
+            return None, 0.0
+        up_body = estimate.T_world_imu[2, :3]
+        D = so3_hat(up_body)
+        sigma = float(np.sqrt(np.linalg.eigvalsh(D @ estimate.covariance[3:, 3:] @ D.T)[-1]))
+        return self._T_cam_body[:3, :3] @ up_body, max(sigma, _LEAST_UP_SIGMA_RAD)
+
+    # Results
+
+    def _take(self, is_due: Callable[[int], bool]) -> tuple[LoopEvent, ...]:
+        """Take over what is due, waiting for it; errors of the map's thread are raised here."""
+        events: list[LoopEvent] = []
+        while self._waiting and is_due(self._waiting[0][0]):
+            _, frame, result = self._waiting.pop(0)
+            update = result.result()
+            self.T_map_odom, self._known = update.T_map_odom, update.covariance
+            self._moves = [move for move in self._moves if move[0] > frame]
+            events += update.loops
+        self.loops += events
+        return tuple(events)
+
+    # Checkpoints
+
+    def __getstate__(self) -> dict[str, Any]:
+        """State for a checkpoint: waits for the thread, and brings the map to the disk."""
+        results = [(due, frame, future.result()) for due, frame, future in self._waiting]
+        self._executor.submit(self._builder.commit).result()
+        state = {key: value for key, value in self.__dict__.items() if key not in ("_executor", "_waiting")}
+        return {**state, "_results": results}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Restore a checkpoint, with the map as it was then."""
+        results = state.pop("_results")
+        self.__dict__.update(state)
+        self._executor = ThreadPoolExecutor(1, "map")
+        self._waiting = []
+        for due, frame, update in results:
+            done: Future[MapUpdate] = Future()
+            done.set_result(update)
+            self._waiting.append((due, frame, done))
+        self._builder.reopen(MapStore(Path(self._path), read_only=self._localise))
+
+
+def _add(builder: MapBuilder, keyframe: Keyframe, left: Image, right: Image) -> MapUpdate:
+    """What the map's thread does with a keyframe."""
+    return builder.add(keyframe, extract(left, right))
