@@ -184,27 +184,34 @@ def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatAr
 
 
 def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the six coefficients of (R3), (..., 4, 6), pixels."""
+    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the coefficients of (R3) and (R4), (..., 4, 8), pixels."""
     x, y = (z[..., 0] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
     xr = (z[..., 2] - camera.cu) / camera.fu
-    out = np.zeros((*z.shape[:-1], 4, 6))
+    out = np.zeros((*z.shape[:-1], 4, 8))
     for row, u in ((0, x), (2, xr)):
         r2 = u * u + y * y
         out[..., row, 3], out[..., row, 4], out[..., row, 5] = u * r2, 2 * u * y, r2 + 2 * u * u
     r2 = x * x + y * y
     out[..., 1, 3], out[..., 1, 4], out[..., 1, 5] = y * r2, r2 + 2 * y * y, 2 * x * y
     out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 1.0, xr, xr * xr + y * y
+    out[..., 2, 6] = xr - x
+    out[..., :3, 7] = np.stack([x, y, xr], axis=-1)
     return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
 
 
 def corrected(
     camera: StereoCamera, rows: FloatArray, coefficients: FloatArray, z: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Pixels (..., 4) without the field (6,) of (R3) and without what follows from the rows (6,) of (R2)."""
+    """Pixels (..., 4) without the field of (R3) and (R4), (8,), and what follows from the rows (6,) of (R2)."""
     x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
-    out = z - field_jacobian(camera, z) @ coefficients
+    out = z - field_jacobian(camera, z)[..., :6] @ coefficients[:6]
     out[..., 2] -= camera.fu * (-rows[1] * y + (rows[5] - rows[4]) * x * y - rows[3] * y * y)
-    return np.where(weight > 0, out, z)
+    out = np.where(weight > 0, out, z)
+    baseline, focal = np.exp(coefficients[6:])
+    left = [camera.cu, camera.cv] + (out[..., :2] - [camera.cu, camera.cv]) / focal
+    right = left[..., 0] - (out[..., 0] - out[..., 2]) / (focal * baseline)
+    scaled = np.concatenate([left, right[..., None], out[..., 3:]], axis=-1)
+    return np.where((weight > 0) & (np.arange(4) < 3), scaled, out)
 
 
 def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: FloatArray) -> StereoColumns:

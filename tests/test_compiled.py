@@ -146,10 +146,9 @@ def test_tracks_are_linearised_and_eliminated_as_in_numpy() -> None:
 def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     T, p, views = _scene()
     rng = np.random.default_rng(13)
-    rows, states = stereo_calibration.RowField(CAMERA), rng.normal(0, 0.01, 6)
-    rows.coefficients = rng.normal(0, 0.01, 6)
-    expected = numpy_twins.corrected(CAMERA, rows.coefficients, states, views.z, views.weight)
-    views = stereo_calibration.StereoField(CAMERA, rows, states).corrected(views)
+    rows, states = rng.normal(0, 0.01, 6), rng.normal(0, 0.01, 8)
+    expected = numpy_twins.corrected(CAMERA, rows, states, views.z, views.weight)
+    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(8)).corrected(views)
     np.testing.assert_allclose(views.z, expected, rtol=1e-12)
     at = multiview.residuals(CAMERA, T, p, views)
     at, p = at.take(at.ahead), p[at.ahead]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vio.records import Estimate, UpdateReport
+from vio.records import Estimate, StereoScaleEstimate, UpdateReport
 from vio.watch.health import RunHealth
 
 GOOD = UpdateReport(50, 2, 1, 30, 0.3, 1.0)
@@ -35,6 +35,20 @@ def test_reports_when_features_are_missing_and_when_they_are_back() -> None:
     assert "no usable feature since frame 9" in gone
     assert "standard deviation of its position is 0.02 m" in gone
     assert back == "frame 55: features again, after 2.3 s without"
+
+
+@pytest.mark.parametrize(
+    ("percent", "sigma", "word"), [(5.0, 0.1, "longer"), (-5.0, 0.1, "shorter"), (0.9, 0.1, None), (5.0, 2.0, None)]
+)
+def test_reports_once_a_focal_length_that_differs_beyond_doubt_and_beyond_harm(
+    percent: float, sigma: float, word: str | None
+) -> None:
+    scale = StereoScaleEstimate(np.array([0.0, np.log1p(percent / 100)]), np.diag([0.0, (sigma / 100) ** 2]))
+    health = RunHealth()
+    lines = [line for k in range(5) for line in health.frame(k, GOOD, _estimate(k, stereo_scale=scale))]
+    assert [f"frame 0: the focal length is 5.0 % {word} than calibrated" in line for line in lines] == [True] * (
+        word is not None
+    )
 
 
 def test_a_restart_is_one_event_and_its_jump_is_not_reported_as_a_speed() -> None:

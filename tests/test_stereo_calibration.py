@@ -67,13 +67,16 @@ def _grid() -> FloatArray:
 
 
 def test_field_jacobian_equals_central_differences_of_distorted_projections() -> None:
-    """Both lenses distorted alike, and columns of the right camera moved as (R3) says."""
+    """Both lenses distorted alike, columns of the right camera moved as (R3) says, and both scaled as by (R4)."""
     z = _grid()
 
     def seen(s: FloatArray) -> FloatArray:
         left, right = (_distorted(_rays(CAMERA, z[:, c]), s[3], (s[4], s[5])) for c in (slice(0, 2), slice(2, 4)))
         x, y = _rays(CAMERA, z[:, 2:])[:, :2].T
         right[:, 0] += CAMERA.fu * (s[0] + s[1] * x + s[2] * (x * x + y * y))
+        left = [CAMERA.cu, CAMERA.cv] + (left - [CAMERA.cu, CAMERA.cv]) * np.exp(s[7])
+        right[:, 0] = CAMERA.cu + (right[:, 0] - CAMERA.cu) * np.exp(s[7])
+        right[:, 0] += (z[:, 0] - z[:, 2]) * (1 - np.exp(s[6]))
         right[:, 1] = z[:, 3]  # right rows are not measured
         return np.concatenate([left, right], axis=1)
 
@@ -83,7 +86,25 @@ def test_field_jacobian_equals_central_differences_of_distorted_projections() ->
 
 def _right_columns(rows: RowField, states: FloatArray, z: FloatArray) -> FloatArray:
     """The field (M,) of the right columns at pixels (M, 4)."""
-    return (z - StereoField(CAMERA, rows, states).corrected(Views(z, np.ones(z.shape))).z)[:, 2]
+    field = StereoField(CAMERA, rows.coefficients, np.concatenate([states, np.zeros(2)]), np.arange(TERMS))
+    return (z - field.corrected(Views(z, np.ones(z.shape))).z)[:, 2]
+
+
+def test_a_wrong_baseline_and_focal_length_are_taken_out_of_the_pixels() -> None:
+    """(R4): what a pair of 3 % longer focal length and 7 % longer baseline sees, and back."""
+    true = replace(CAMERA, fu=1.03 * CAMERA.fu, fv=1.03 * CAMERA.fv, baseline_m=1.07 * CAMERA.baseline_m)
+    p = np.random.default_rng(3).uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 6.0], (20, 3))
+    z, expected = project(true, p), project(CAMERA, p)
+    scale = np.concatenate([np.zeros(6), np.log([1.07, 1.03])])
+    field = StereoField(CAMERA, np.zeros(6), scale, np.array([6, 7]))
+    weight = np.tile([1.0, 1.0, 1.0, 0.0], (20, 1))
+    weight[3, 2] = 0.0
+    corrected = field.corrected(Views(z, weight)).z
+    np.testing.assert_allclose(corrected[:, :2], expected[:, :2], atol=1e-9)
+    np.testing.assert_allclose(np.delete(corrected, 3, axis=0)[:, 2], np.delete(expected, 3, axis=0)[:, 2], atol=1e-9)
+    assert corrected[3, 2] == z[3, 2]
+    np.testing.assert_allclose(field.seen(expected), z, atol=1e-9)
+    assert field.jacobian(z).shape == (20, 4, 2)
 
 
 def _turned_right(z: FloatArray, camera: StereoCamera, w: FloatArray) -> FloatArray:
@@ -260,7 +281,7 @@ def test_points_follow_the_coefficients_as_their_triangulation_does() -> None:
     columns = stereo_columns(at, field_jacobian(CAMERA, z), info.q.p_D_q, np.ones((1, CLONES)))
 
     def triangulated(s: FloatArray) -> FloatArray:
-        field = StereoField(CAMERA, RowField(CAMERA), s)
+        field = StereoField(CAMERA, np.zeros(6), s, np.arange(TERMS))
         return refine_points(CAMERA, T_CAM0_WORLD, p, field.corrected(Views(z, weight)), 10, 1e6)[0]
 
     numeric = numeric_jacobian(triangulated, np.zeros(TERMS), eps=1e-6)
@@ -328,6 +349,41 @@ def test_a_turned_right_camera_is_found_and_its_harm_undone(motion: MotionSource
     assert found[0] > 10 * sigma[0]
     assert _rms_m(turned) < 2 * _rms_m(level)
     assert _rms_m(turned) < 0.2 * _rms_m(ignored)
+
+
+def _scaled(baseline: float, focal: float) -> Spoil:
+    """What a pair sees whose baseline and focal length differ from the calibration by factors."""
+    field = StereoField(
+        test_filter_truth.CAMERA,
+        np.zeros(6),
+        np.concatenate([np.zeros(6), np.log([baseline, focal])]),
+        np.array([6, 7]),
+    )
+
+    def spoil(k: int, seen: Observations) -> Observations:
+        return replace(seen, z=field.seen(seen.z))
+
+    return spoil
+
+
+def test_a_focal_length_that_is_off_by_5_percent_is_found() -> None:
+    """The gyro tells how far the rig turned, and pixels how far the points went."""
+    settings = replace(SETTINGS, stereo_focal_sigma=0.005)
+    off, right = fly(ROUND, "imu", settings, spoil=_scaled(1.0, 1.05)), fly(ROUND, "imu", settings)
+    for run, true in ((off, 5.0), (right, 0.0)):
+        scale = run.estimates[-1].stereo_scale
+        assert scale is not None
+        percent, sigma = scale.percent()["focal length"]
+        assert abs(percent - true) < 3 * sigma
+        assert sigma < 0.3
+    assert _rms_m(off) < 2 * _rms_m(right)
+
+
+@pytest.mark.parametrize("motion", [None, "imu"])
+def test_images_alone_say_nothing_of_the_scale(motion: MotionSource | None) -> None:
+    run = fly(replace(ROUND, seconds=0.2), motion, replace(SETTINGS, stereo_focal_sigma=0.005))
+    assert (run.estimates[-1].stereo_scale is None) == (motion is None)
+    assert fly(replace(ROUND, seconds=0.2), motion, SETTINGS).estimates[-1].stereo_scale is None
 
 
 @pytest.mark.slow

@@ -29,7 +29,7 @@ from vio.errors import DataError, EstimationError
 from vio.filters.msckf import Msckf
 from vio.pipeline import RunResult, run
 from vio.protocols import Dataset
-from vio.records import Estimate, Recording, StereoFieldEstimate
+from vio.records import Estimate, Recording, StereoFieldEstimate, StereoScaleEstimate
 from vio.run_recorder import GrowingFolder
 from vio.run_tables import estimate_of, estimate_row
 from vio.sim.effects import CLEAN
@@ -208,14 +208,18 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     values: dict[str, Any] = {name: rng.normal(size=shapes.get(name, (3,))) for name in kept}
     rows, rows_P = rng.normal(size=6), rng.normal(size=(6, 6))
     field = StereoFieldEstimate(rng.normal(size=6), rng.normal(size=(6, 6)), 0.3, rows, rows_P)
-    values |= {"time_ns": 2**60 + 1, "time_offset_s": 0.1, "time_offset_sigma_s": 0.2, "stereo_field": field}
+    scale = StereoScaleEstimate(rng.normal(size=2), rng.normal(size=(2, 2)))
+    values |= {"time_ns": 2**60 + 1, "time_offset_s": 0.1, "time_offset_sigma_s": 0.2}
+    values |= {"stereo_field": field, "stereo_scale": scale}
     back = estimate_of(estimate_row(0, Estimate(**values))[0])
     for name, value in values.items():
-        if name != "stereo_field":
+        if name not in ("stereo_field", "stereo_scale"):
             np.testing.assert_array_equal(getattr(back, name), value)
     assert back.stereo_field is not None
-    for part in fields(field):
-        np.testing.assert_array_equal(getattr(back.stereo_field, part.name), getattr(field, part.name))
+    assert back.stereo_scale is not None
+    for given, read in ((field, back.stereo_field), (scale, back.stereo_scale)):
+        for part in fields(given):
+            np.testing.assert_array_equal(getattr(read, part.name), getattr(given, part.name))
     bare = estimate_of(estimate_row(0, Estimate(0, np.eye(4), np.eye(6)))[0])
     assert [f.name for f in fields(Estimate) if getattr(bare, f.name) is not None] == [
         *("time_ns", "T_world_imu", "covariance")

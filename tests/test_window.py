@@ -85,10 +85,10 @@ def test_covariance_of_the_last_move_counts_what_both_poses_share() -> None:
     prior = fit(factor(window.P), np.zeros_like(window.P))
     np.testing.assert_allclose(window.move_covariance(2, prior), J @ window.P @ J.T, atol=1e-12)
     for index in (2, -2):
-        move = window.move_since(index)
+        move = window.camera_move_since(index)
         np.testing.assert_allclose(window.clones[2].T_world_imu @ move, window.clones[3].T_world_imu, atol=1e-12)
     assert not window.move_covariance(3, prior).any()
-    np.testing.assert_allclose(window.move_since(3), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(window.camera_move_since(3), np.eye(4), atol=1e-12)
 
 
 def test_new_landmarks_are_correlated_with_what_made_them() -> None:

@@ -172,12 +172,12 @@ class FirstEstimates(StandardErrors):
         """As above, at the first estimates."""
         return self._first_nav, _positions(self._first_clones), self._first_landmarks
 
-    def propagate(self, step: Transition) -> None:
+    def propagate(self, step: Transition, walk: FloatArray | None = None) -> None:
         """Move the navigation state; the prediction is its first estimate."""
-        super().propagate(step)
+        super().propagate(step, walk)
         self._first_nav = step.nav
 
-    def add_clone(self, frame_index: int, time_ns: int, *rest: float) -> None:
+    def add_clone(self, frame_index: int, time_ns: int, *rest: Any) -> None:
         """Copy the pose; where it is now is its first estimate."""
         with self._landmarks_at_first():
             super().add_clone(frame_index, time_ns, *rest)
@@ -332,6 +332,7 @@ class Scenario:
             gyro_bias_sigma_radps=0.02,
             accel_bias_sigma_mps2=0.05,
             rate_bias_sigma_radps=0.02,
+            calibrate="none",  # the other variants know the errors of the motion alone
         )
         if learn_noise:
             return s

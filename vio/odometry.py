@@ -240,7 +240,7 @@ class Odometry:
             the results of the frames that it completed.
         """
         with self._lock:
-            return self._process(self._order.add(event))
+            return self._add(event)
 
     def finish(self) -> list[FrameResult]:
         """Process the frames that still wait, and let the checks say what they have not yet said."""
@@ -392,11 +392,11 @@ class Odometry:
             for sample in samples:
                 self._last_ns["sample"] = sample.time_ns
                 self._predictor.sample(sample)
-                self._deliver(self._process(self._order.add(sample)))
+                self._deliver(self._add(sample))
 
     def _add_frame(self, frame: StereoFrame) -> Estimate | None:
         self._frames += 1
-        results = self._process(self._order.add(frame))
+        results = self._add(frame)
         self._deliver(results)
         return results[-1].estimate if results else None
 
@@ -405,6 +405,14 @@ class Odometry:
             self._predictor.estimate(result.estimate)
             if self._on_frame is not None:
                 self._on_frame(result)
+
+    def _add(self, event: Event) -> list[FrameResult]:
+        """Take an event, and process what is due, frame by frame."""
+        self._order.put(event)
+        results: list[FrameResult] = []
+        while events := self._order.due():
+            results += self._process(events)
+        return results
 
     def _process(self, events: list[Event]) -> list[FrameResult]:
         """Give events that are due to the chain."""
@@ -422,6 +430,7 @@ class Odometry:
                     result = self._in_map(event, result)
                     results.append(result)
                     self._estimate = result.estimate
+                    self._order.exposed_after_ns = max(round(1e9 * (result.estimate.time_offset_s or 0.0)), 0)
         return results
 
     def _opened(self, path: Path | str, *, localise: bool) -> MapSession:

@@ -307,6 +307,23 @@ class StereoFieldEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class StereoScaleEstimate:
+    """By what baseline and focal length differ from the calibration, equation (R4) of docs/math.md."""
+
+    logs: FloatArray  # (2,) of baseline over calibrated baseline, focal length over calibrated focal length
+    covariance: FloatArray  # (2, 2); zero for the baseline where it counts as known
+
+    def percent(self) -> dict[str, tuple[float, float]]:
+        """What differs by how much from the calibration and its standard deviation, %, of what is estimated."""
+        sigmas = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        return {
+            name: (100 * float(np.expm1(log)), 100 * float(sigma))
+            for name, log, sigma in zip(("baseline", "focal length"), self.logs, sigmas, strict=True)
+            if sigma > 0
+        }
+
+
+@dataclass(frozen=True, slots=True)
 class Estimate:
     """The filter's belief at one time."""
 
@@ -326,6 +343,7 @@ class Estimate:
     time_offset_s: float | None = None
     time_offset_sigma_s: float | None = None
     stereo_field: StereoFieldEstimate | None = None
+    stereo_scale: StereoScaleEstimate | None = None
     # The pose in a map; None without one, or without a place in it yet.
     T_map_body: FloatArray | None = None  # (4, 4)
     T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi), given the map

@@ -22,7 +22,7 @@ from vio.datasets.common import checked_transform
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError, EvaluationError
 from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
-from vio.geometry.lie import FloatArray, transform_points
+from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.input_files import read_input
 from vio.mapped_run import MappedRun
 from vio.pipeline import STAGES, FrameLog, RunResult
@@ -290,6 +290,8 @@ def metrics_of(
         "landmark_error": landmark_error(result, evaluation),
         "warnings": list(result.warnings),
         "stereo_field": stereo_field(result),
+        "stereo_scale": stereo_scale(result),
+        "camera_imu": camera_imu(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
         "camera": asdict(result.recording.camera),
     }
@@ -322,6 +324,37 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
         "rows_px": None if field.rows is None else (f * field.rows).tolist(),
         "rig": rig,
     }
+
+
+def stereo_scale(result: RunResult) -> dict[str, Any] | None:
+    """Return by what baseline and focal length were found to differ at the end of the run; None: not estimated."""
+    scale = result.estimates[-1].stereo_scale
+    if scale is None:
+        return None
+    return {name.replace(" ", "_"): {"percent": p, "sigma_percent": s} for name, (p, s) in scale.percent().items()}
+
+
+def camera_imu(result: RunResult) -> dict[str, Any] | None:
+    """Return the extrinsics and the time offset as estimated at the end of the run; None: neither was.
+
+    Rotation and translation are those of `T_given^-1 T_cam0_imu` on the IMU's side, the correction of the given one.
+    """
+    estimate = result.estimates[-1]
+    out: dict[str, Any] = {}
+    if estimate.time_offset_s is not None and estimate.time_offset_sigma_s is not None:
+        out["time_offset_ms"] = 1e3 * estimate.time_offset_s
+        out["time_offset_sigma_ms"] = 1e3 * estimate.time_offset_sigma_s
+    if estimate.T_cam0_imu is not None and estimate.T_cam0_imu_covariance is not None:
+        xi = se3_log(se3_inverse(result.T_cam0_body) @ estimate.T_cam0_imu)
+        sigma = np.sqrt(np.diag(estimate.T_cam0_imu_covariance))
+        out |= {
+            "T_cam0_imu": estimate.T_cam0_imu.tolist(),
+            "rotation_deg": np.degrees(xi[3:]).tolist(),
+            "rotation_sigma_deg": np.degrees(sigma[3:]).tolist(),
+            "translation_mm": (1e3 * xi[:3]).tolist(),
+            "translation_sigma_mm": (1e3 * sigma[:3]).tolist(),
+        }
+    return out or None
 
 
 def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str, Any] | None:

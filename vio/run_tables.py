@@ -15,7 +15,15 @@ import numpy as np
 
 from vio.frame_result import FrameLog
 from vio.geometry.lie import FloatArray
-from vio.records import Estimate, ImuSample, MotionSample, Observations, StereoFieldEstimate, VelocitySample
+from vio.records import (
+    Estimate,
+    ImuSample,
+    MotionSample,
+    Observations,
+    StereoFieldEstimate,
+    StereoScaleEstimate,
+    VelocitySample,
+)
 from vio.tables import Rows
 
 ESTIMATE = np.dtype(
@@ -40,6 +48,8 @@ ESTIMATE = np.dtype(
         ("stereo_rows_rms_px", "<f8"),
         ("stereo_rows", "<f8", (6,)),
         ("stereo_rows_covariance", "<f8", (6, 6)),
+        ("stereo_scale", "<f8", (2,)),
+        ("stereo_scale_covariance", "<f8", (2, 2)),
     ]
 )
 _OPTIONAL_ARRAYS = (
@@ -94,6 +104,9 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     row["stereo_rows"] = np.nan if field is None or field.rows is None else field.rows
     P = None if field is None else field.rows_covariance
     row["stereo_rows_covariance"] = np.nan if P is None else P
+    scale = estimate.stereo_scale
+    row["stereo_scale"] = np.nan if scale is None else scale.logs
+    row["stereo_scale_covariance"] = np.nan if scale is None else scale.covariance
     return row
 
 
@@ -101,12 +114,14 @@ def estimate_of(row: np.void) -> Estimate:
     """Return the estimate of a row."""
     optional: dict[str, Any] = {name: _array(row[name]) for name in _OPTIONAL_ARRAYS}
     optional |= {name: _number(row[name]) for name in _OPTIONAL_NUMBERS}
+    scale, S = _array(row["stereo_scale"]), _array(row["stereo_scale_covariance"])
     return Estimate(
         int(row["time_ns"]),
         np.array(row["T_world_imu"]),
         np.array(row["covariance"]),
         **optional,
         stereo_field=_stereo_field(row),
+        stereo_scale=None if scale is None or S is None else StereoScaleEstimate(scale, S),
     )
 
 

@@ -152,7 +152,6 @@ _CONTEXTS_OF: dict[str, str | tuple[str, ...]] = {
     "vislam.landmark_prior_sigma_m": "vislam isotropic",
     "vislam.*": "vislam",
     "msckf.calibrate": "IMU",
-    "msckf.calibrate_*": "calibrating",
     "msckf.extrinsic_*": "calibrating",
     "msckf.time_offset_*": "calibrating",
     "msckf.zero_*": "at rest",

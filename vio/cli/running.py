@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -287,6 +288,7 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         found = [] if field["rig"] is None else field["rig"]["lines"]
         if found:
             rows.append(("", "; ".join(found[:_LINES])))
+    rows += _calibration_rows(metrics)
     if metrics["ate_m"] is None:
         rows.append(("ATE", "no reference"))
     else:
@@ -305,6 +307,28 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     rows.append(("results", metrics["out"]))
     plot = Path(metrics["out"]) / "trajectory.png"
     rows.append(("plot", str(plot) if plot.is_file() else "could not be drawn"))
+    return rows
+
+
+def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+    """What was found of the camera's scale, and of camera and IMU; they are near zero where the calibration is good."""
+    rows = []
+    if scale := metrics["stereo_scale"]:
+        found = [
+            f"{name.replace('_', ' ')} off by {x['percent']:+.2f} ± {x['sigma_percent']:.2f} %"
+            for name, x in scale.items()
+        ]
+        rows.append(("cameras", ", ".join(found)))
+    if found_imu := metrics["camera_imu"]:
+        words = []
+        if "rotation_deg" in found_imu:
+            for key, unit, digits in (("rotation", "deg", 2), ("translation", "mm", 1)):
+                values, sigmas = found_imu[f"{key}_{unit}"], found_imu[f"{key}_sigma_{unit}"]
+                size, sigma = math.hypot(*values), math.hypot(*sigmas)
+                words.append(f"{key} {size:.{digits}f} ± {sigma:.{digits}f} {unit}")
+        if "time_offset_ms" in found_imu:
+            words.append(f"time {found_imu['time_offset_ms']:+.2f} ± {found_imu['time_offset_sigma_ms']:.2f} ms")
+        rows.append(("camera-IMU", "off by " + ", ".join(words)))
     return rows
 
 

@@ -18,30 +18,30 @@ _DROP = 4.5 / np.sqrt(1 - _MEMORY**2)  # running sum above which a landmark is d
 
 
 def leave_one_out_nis(
-    r: FloatArray, J: FloatArray, point_covariance: FloatArray, weight: FloatArray, variance: float
+    r: FloatArray, J: FloatArray, covariance: FloatArray, weight: FloatArray, variance: float
 ) -> FloatArray:
     """Normalised innovations squared (K,) of landmarks' pixels, predicted without these very pixels.
 
-    With `R` the variance that a pixel entered the fit with, and `C` the posterior covariance of the point relative to
-    the camera, the residual of the prediction without it is `R (R I - J C J')^-1 r`, and its covariance
-    `R^2 (R I - J C J')^-1 - R I + variance I`, exactly in a linear problem.
+    With `R` the variance that a pixel entered the fit with, and `C` the posterior covariance of what the pixels depend
+    on, the point relative to the camera and the stereo calibration, the residual of the prediction without it is
+    `R (R I - J C J')^-1 r`, and its covariance `R^2 (R I - J C J')^-1 - R I + variance I`, exactly in a linear problem.
 
     Args:
         r: residuals after the fit (K, 4), pixels, zero where not measured.
-        J: their Jacobians by the point (K, 4, 3), zero where not measured.
-        point_covariance: of the points relative to the camera after the fit (K, 3, 3), m^2.
+        J: their Jacobians by the n quantities that they depend on (K, 4, n), zero where not measured.
+        covariance: of these after the fit (K, n, n).
         weight: robust weights (K,) that the pixels entered the fit with.
         variance: of one pixel coordinate, px^2.
     """
     R = (variance / np.maximum(weight, 1e-6))[:, None, None]
-    inner = R * np.eye(4) - J @ point_covariance @ np.swapaxes(J, 1, 2)
+    inner = R * np.eye(4) - J @ covariance @ np.swapaxes(J, 1, 2)
     # Rounding, and noise that was re-estimated since, must not make a variance negative.
     values, vectors = np.linalg.eigh(0.5 * (inner + np.swapaxes(inner, 1, 2)))
     values = np.maximum(values, 1e-3 * R[:, 0])
     y = (np.swapaxes(vectors, 1, 2) @ r[..., None])[..., 0]
     predicted = R[:, 0] / values * y
-    covariance = R[:, 0] ** 2 / values - R[:, 0] + variance
-    out: FloatArray = np.sum(predicted**2 / covariance, axis=1)
+    expected = R[:, 0] ** 2 / values - R[:, 0] + variance
+    out: FloatArray = np.sum(predicted**2 / expected, axis=1)
     return out
 
 

@@ -28,22 +28,21 @@ from vio.filters.multiview import (
     landmark_residuals,
     relative_stereo_sigma,
 )
-from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, Transition, TwistMotion
+from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, NavState, Transition, TwistMotion
 from vio.filters.noise import MotionNoise, StepErrors
-from vio.filters.online_calibration import calibration_covariance, first_calibration
+from vio.filters.online_calibration import Calibration, Twist, body_twist, calibration_covariance, first_calibration
 from vio.filters.restart import GoodState, restarted
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
-    TERMS,
+    FIELD_TERMS,
     RowField,
     StereoField,
     StereoInformation,
     eliminate_points_from_columns,
-    field_jacobian,
     landmark_columns,
 )
 from vio.filters.tracks import latest_pixels
-from vio.filters.window import Clone, Fit, Window
+from vio.filters.window import NO_TWIST, Clone, Fit, Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
@@ -78,6 +77,10 @@ _TWIST_FACTORS = (1.0, 0.1, 10.0)
 # images and an IMU, position NEES after 2 s is 24 of 3 at 0.2, 15 at 0.05, 6 at 0.02, 2.8 at 0.01, 2.5 without any.
 _LANDMARK_DEPTH_SIGMA = 0.01  # by all views
 _LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scale
+# Standard deviation of the baseline over it, at most: while the scale is open, the same bias falls on the baseline.
+# With a prior of 5 % and a baseline that is off by 9.5 %, 15 s of a flight with an IMU end at 4.07 +- 0.03 % with
+# landmarks from the start, at 9.02 +- 0.29 % without any.
+_SCALE_SIGMA = 0.001
 _MAP_DEPTH_SIGMA = 0.2  # by all views; a point of the map is reported with its covariance, and not used
 _LEAST_MERGE = 1000  # stored points up to which the map is not merged
 _USELESS_RAD = 0.2  # standard deviation of a predicted rotation beyond which its pixels start no search
@@ -115,10 +118,10 @@ class Msckf:
         check_parts("msckf", camera, settings, MsckfSettings)
         if motion not in (None, *self.motion_sources):
             raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
-        if settings.calibrate != "none" and motion != "imu":
-            raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to none")
+        if settings.calibrate not in ("auto", "none") and motion != "imu":
+            raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to auto or none")
         self._camera, self._settings = camera, settings
-        self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings)
+        self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings, motion)
         self._order = InputOrder("msckf")
         self._source = motion
         self._motion: ImuMotion | TwistMotion = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
@@ -129,6 +132,9 @@ class Msckf:
         self._body_ns = 0  # time of the navigation state, on the IMU's clock
         self._blind = False  # the last frame showed nothing
         self._output: FloatArray = np.zeros((DIM, DIM))  # covariance (15 + C, 15 + C) with all that is seen
+        self._newest: FloatArray = np.zeros((DIM + 6, DIM + 6))  # the same, and the newest camera's after it
+        self._frame_pose: FloatArray = np.eye(4)  # (4, 4) of the navigation state after the last frame
+        self._expected: FloatArray = np.zeros((6, 6))  # covariance of the camera's motion since, as it was predicted
         self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._rows = RowField(camera)
         self._landmark_gate = LandmarkGate(settings.gate_probability)
@@ -172,21 +178,57 @@ class Msckf:
             except EstimationError:  # the update will say it
                 return None
             nav, growth = step.nav, growth.then(step)
-        T_cam0_imu = window.calibration.T_cam0_imu
-        T_cam0_world = T_cam0_imu @ se3_inverse(window.exposure(nav, (body_ns - time_ns) * 1e-9))
+        T_cam0_imu, late_s = window.calibration.T_cam0_imu, (body_ns - time_ns) * 1e-9
+        twist = self._twist(nav, growth)
+        T_world_imu, *camera_D_own = window.camera_D_own(late_s, twist, nav)
+        T_cam0_world = T_cam0_imu @ se3_inverse(T_world_imu)
         T_curr_prev = T_cam0_world @ window.exposures()[-1] @ se3_inverse(T_cam0_imu)
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
-        motion = MotionPrior(T_curr_prev, A @ self._expected_error(growth) @ A.T)
+        expected = self._expected_error(nav, growth, *camera_D_own)
+        motion = MotionPrior(T_curr_prev, A @ expected @ A.T)
         if np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1] > _USELESS_RAD**2:
             return None
         return Prediction(self._expected_tracks(window, T_cam0_world, motion), motion)
 
-    def _expected_error(self, growth: Growth) -> FloatArray:
-        """Covariance (6, 6) of `xi_curr - xi_prev` where the error at the last frame, xi_prev, has grown to xi_curr."""
-        M = growth.Phi[:6] - np.eye(6, DIM)
-        out: FloatArray = M @ self._output[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
+    def _expected_error(self, nav: NavState, growth: Growth, camera_D_own: FloatArray, noise: FloatArray) -> FloatArray:
+        """Covariance (6, 6) of `xi_curr - xi_prev`, of the camera, where the errors have grown since the last frame.
+
+        Args:
+            nav: the navigation state at the present frame.
+            growth: since the last frame.
+            camera_D_own: how the camera's pose at the present frame follows them, equation (C2).
+            noise: and what that leaves open.
+        """
+        if not self._started().calibration.moves_camera:
+            M = growth.Phi[:6] - np.eye(6, DIM)
+            out: FloatArray = M @ self._output[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
+            return out
+        J = camera_D_own
+        M = np.concatenate([J @ self._grown(nav, growth), -np.eye(6)], axis=1)
+        out = M @ self._newest @ M.T + J[:, :DIM] @ growth.Q @ J[:, :DIM].T + noise
+        return np.asarray(out, dtype=np.float64)
+
+    def _grown(self, nav: NavState, growth: Growth) -> FloatArray:
+        """Transition (15 + C, 15 + C) of the errors of navigation state and calibration since the last frame."""
+        out = np.eye(len(self._output))
+        out[:DIM, :DIM] = growth.Phi
+        calibration = self._started().calibration
+        if calibration.extrinsics:
+            rows = calibration.extrinsic_rows + DIM
+            out[np.ix_(rows, rows)] = se3_adjoint(nav.T_world_imu @ se3_inverse(self._frame_pose))
         return out
+
+    def _twist(self, nav: NavState, growth: Growth) -> Twist:
+        """The body's twist, and how well it is known; equation (C3)."""
+        if not isinstance(self._motion, ImuMotion) or not self._started().calibration.timing:
+            return NO_TWIST
+        R = nav.T_world_imu[:3, :3]
+        P = growth.Phi @ self._output[:DIM, :DIM] @ growth.Phi.T + growth.Q
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = R.T @ P[6:9, 6:9] @ R  # v = exp(phi) v_hat + xi_v, seen from the body turned by phi
+        covariance[3:, 3:] = P[9:12, 9:12] + np.eye(3) * self._motion.rate_variance(self._noise.factors)
+        return Twist(body_twist(nav.T_world_imu, nav.velocity, nav.rate), covariance)
 
     def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
         table = self._tracks.table
@@ -195,7 +237,10 @@ class Msckf:
         ids = np.concatenate([table.ids(rows), window.landmark_ids])
         p_cam = transform_points(T_cam0_world, np.concatenate([table.points[rows], window.landmarks]))
         ahead = p_cam[:, 2] > MIN_DEPTH * self._camera.baseline_m
-        return TrackPrior(ids[ahead], project(self._camera, p_cam[ahead]), motion.T_curr_prev[:3, :3], motion)
+        z, field = project(self._camera, p_cam[ahead]), self._field(window)
+        if field is not None:
+            z = field.seen(z)
+        return TrackPrior(ids[ahead], z, motion.T_curr_prev[:3, :3], motion)
 
     def update(self, observations: Observations) -> UpdateReport:
         """Propagate to the time of the frame and update with its observations.
@@ -219,9 +264,9 @@ class Msckf:
                 start = min(_IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MOST_START_FACTOR)
                 self._noise = MotionNoise(start, *_IMU_FACTORS[1:])
             calibration = self._calibration
-            P_calibration, _ = calibration_covariance(calibration, self._settings)
-            self._window = Window(self._motion, nav, np.asarray(block_diag(P, P_calibration)), calibration)
+            self._window = self._first_window(nav, P, calibration)
             self._time_ns = self._body_ns = self._began_ns = observations.time_ns
+            self._begin_output(self._window)
             self._measure()
         else:
             self._advance(observations.time_ns)
@@ -233,8 +278,10 @@ class Msckf:
                 raise DivergedError(self._lost(observations.frame_index))
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         self._blind = False
-        late_s = (self._body_ns - observations.time_ns) * 1e-9
-        window.add_clone(observations.frame_index, observations.time_ns, late_s)
+        late_s, twist = self._late_s, self._twist(window.nav, self._since_frame)
+        _, *camera_D_own = window.camera_D_own(late_s, twist)
+        self._expected = self._expected_error(window.nav, self._since_frame, *camera_D_own)
+        window.add_clone(observations.frame_index, observations.time_ns, late_s, twist)
         before = window.clones[len(window.clones) > self._settings.clones]  # the oldest that stays
         try:
             report = self._use(window, seen)
@@ -266,18 +313,30 @@ class Msckf:
         if good is None:
             raise EstimationError("msckf has no good state to start again from; check calibration and first frames")
         nav, P = restarted(good, observations.time_ns, self._motion, self._settings)
-        P_calibration, _ = calibration_covariance(good.calibration, self._settings)
-        self._window = Window(self._motion, nav, np.asarray(block_diag(P, P_calibration)), good.calibration)
+        self._window = self._first_window(nav, P, good.calibration)
         self._calibration = good.calibration
-        self._time_ns = self._body_ns = observations.time_ns
+        self._time_ns, self._body_ns = observations.time_ns, self._body_time(observations.time_ns)
         self._tracks = WindowTracks(self._camera, self._settings)
         self._landmark_gate = LandmarkGate(self._settings.gate_probability)
         self._smoothed, self._gyro, self._blind = None, None, False
         self._since_frame, self._predicted_step = NO_STEP, None
         self._noise = MotionNoise(*_IMU_FACTORS) if self._source == "imu" else MotionNoise(*_TWIST_FACTORS)
-        self._output = self._window.P.copy()
+        self._begin_output(self._window)
         self._map = [part for part in self._map if np.isfinite(part.p_world).all()]
         return self._update(observations)
+
+    def _begin_output(self, window: Window) -> None:
+        """Take over the covariance of a window without clones."""
+        D = len(window.P)
+        self._output, self._frame_pose = window.P.copy(), window.nav.T_world_imu
+        self._newest = np.zeros((D + 6, D + 6))
+        self._newest[:D, :D] = self._output
+
+    def _first_window(self, nav: NavState, P: FloatArray, calibration: Calibration) -> Window:
+        """A window without clones; P (15, 15) is the covariance of the navigation state."""
+        P_calibration, _ = calibration_covariance(calibration, self._settings)
+        own = calibration.in_world(P_calibration, nav.T_world_imu)
+        return Window(self._motion, nav, np.asarray(block_diag(P, own)), calibration)
 
     def _is_sane(self, window: Window) -> bool:
         """Whether the state is made of numbers, and with an IMU of a possible speed."""
@@ -289,9 +348,8 @@ class Msckf:
         """Return the estimate at the time of the last event."""
         if self._window is None:
             return Estimate(self._time_ns, np.eye(4), np.eye(6))
-        window = self._window
-        output = self._grown_output()
-        T, covariance = window.current_pose(output)
+        window, output = self._window, self._grown_output()
+        T, covariance = self._current_pose(window, output)
         # exp(xi) T_hat on the world's side is T_hat exp(Ad(T_hat^-1) xi); the inverse pose's error is its negative.
         A = se3_adjoint(se3_inverse(T))
         known = self._motion.uncertainty(window.nav, output[:DIM, :DIM])
@@ -306,7 +364,7 @@ class Msckf:
             accel_bias=window.nav.accel_bias,
             accel_bias_sigma=known.accel_bias_sigma,
         )
-        estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:])
+        estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:], window.nav.T_world_imu)
         if estimate.stereo_field is not None:
             field = estimate.stereo_field
             own, P = self._rows.without_common(field.coefficients), self._rows.covariance
@@ -314,15 +372,32 @@ class Msckf:
             estimate = replace(estimate, stereo_field=field)
         return estimate
 
+    def _current_pose(self, window: Window, output: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pose (4, 4) of the body at the newest exposure and its covariance (6, 6)."""
+        if not window.calibration.timing:
+            return window.nav.T_world_imu, output[:6, :6]
+        if not self._blind:
+            J = np.eye(6, len(self._newest), len(output))  # of the camera, and back to the body
+            J[:, : len(output)] += window.body_D_error()[-6:, : len(output)]
+            return window.clones[-1].T_world_imu, J @ self._newest @ J.T
+        twist = self._twist(window.nav, self._since_frame)
+        T, J, noise = window.camera_D_own(self._late_s, twist)
+        J[:, window.calibration.extrinsic_rows + DIM] = 0.0  # of the body
+        return T, J @ output @ J.T + noise
+
     def _grown_output(self) -> FloatArray:
         """Covariance of navigation state and calibration at the time of the last event."""
         if not self._blind:
             return self._output
-        grow = np.eye(len(self._output))
-        grow[:DIM, :DIM] = self._since_frame.Phi
+        grow = self._grown(self._started().nav, self._since_frame)
         out: FloatArray = grow @ self._output @ grow.T
         out[:DIM, :DIM] += self._since_frame.Q
         return out
+
+    @property
+    def _late_s(self) -> float:
+        """The navigation state's time on the IMU's clock minus the last frame's stamp."""
+        return (self._body_ns - self._time_ns) * 1e-9
 
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where it has left the window."""
@@ -394,8 +469,8 @@ class Msckf:
             window = self._started()
             step = self._step_to(body_ns)
             self._motion.forget_before(body_ns)
-            window.propagate(step)
-            self._propagate_calibration(window, (body_ns - self._body_ns) * 1e-9)
+            walk = calibration_covariance(window.calibration, self._settings)[1]
+            window.propagate(step, walk * ((body_ns - self._body_ns) * 1e-9))
             self._since_frame = self._since_frame.then(step)
             self._gyro = step.gyro
             self._body_ns = body_ns
@@ -408,21 +483,6 @@ class Msckf:
             step = self._motion.advance(self._started().nav, self._body_ns, body_ns, self._noise.factors)
             self._predicted_step = body_ns, step
         return self._predicted_step[1]
-
-    def _propagate_calibration(self, window: Window, step_s: float) -> None:
-        """Add the calibration's random walk; begin to estimate extrinsics and clocks once the motion is known."""
-        calibration = window.calibration
-        if not calibration.dim:
-            return
-        after_s = (self._time_ns - self._began_ns) * 1e-9
-        if (
-            calibration.dim > calibration.stereo_dim
-            and not window.calibrating
-            and after_s >= self._settings.calibrate_after_s
-        ):
-            window.start_calibration()
-        walk = calibration_covariance(calibration, self._settings)[1]
-        window.add_calibration_noise(walk * step_s)
 
     def _body_time(self, time_ns: int) -> int:
         """The time on the IMU's clock to which the navigation state is carried for a frame."""
@@ -455,6 +515,9 @@ class Msckf:
         R, M = window.turn_world(yaw, np.array([-tilt[1], tilt[0], 0.0]))
         own = slice(0, window.first_clone)
         self._output = M[own, own] @ self._output @ M[own, own].T
+        newest = np.concatenate([np.arange(window.first_clone), np.r_[window.clone_rows(len(window.clones) - 1)]])
+        turn = M[np.ix_(newest, newest)]
+        self._newest, self._frame_pose = turn @ self._newest @ turn.T, window.nav.T_world_imu
         self._tracks.table.points = self._tracks.table.points @ R.T
         if self._smoothed is not None:
             self._smoothed = self._smoothed.rotated(R)
@@ -478,11 +541,11 @@ class Msckf:
         pixels = Views(z[found], weight[found])
         self._tracks.table.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
 
-        predicted, expected = self._predicted_move(window)
+        predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
         tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _FIRST_STEPS)
         innovation = tracks.newest_innovation()
         tracks, fitted = self._fit(window, tracks, pixels, innovation)
-        step = self._step_errors(window, tracks, predicted, expected, fitted)
+        step = self._step_errors(window, tracks, predicted, fitted)
         if step is not None:
             missing = step.missing_noise()
             if missing.any() and self._tracks.agree(tracks.at):
@@ -519,8 +582,11 @@ class Msckf:
         if not len(pixels.z):
             return pixels, 0
         at = self._landmark_residuals(window, pixels)
-        covariance = window.landmark_covariance(fitted)
-        nis = leave_one_out_nis(at.r, at.J, covariance, at.weight, self._tracks.variance)
+        J, field = at.J, self._field(window)
+        if field is not None:
+            H = field.jacobian(pixels.z - at.r) * np.any(at.J, axis=2)[..., None]
+            J = np.concatenate([J, H], axis=2)
+        nis = leave_one_out_nis(at.r, J, window.landmark_covariance(fitted), at.weight, self._tracks.variance)
         dof = np.maximum(np.any(at.J, axis=2).sum(axis=1), 1)
         used, dropped = self._landmark_gate.check(window.landmark_ids, nis, dof)
         self._keep_landmarks(window, ~dropped)
@@ -549,24 +615,22 @@ class Msckf:
         if self._settings.calibrate_stereo == "off":
             return
         self._rows.update(seen)
-        if window.calibration.stereo is None and self._rows.is_significant:
-            calibration = replace(window.calibration, stereo=np.zeros(TERMS))
+        if not window.calibration.stereo_field and self._rows.is_significant:
+            calibration = replace(window.calibration, stereo_field=True)
             P, _ = calibration_covariance(calibration, self._settings)
-            window.start_stereo_field(calibration, P[:TERMS, :TERMS])
+            window.start_stereo_field(calibration, P[:FIELD_TERMS, :FIELD_TERMS])
 
     def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
         """Linearise tracks at the window's present means."""
         return self._tracks.linearise(window.T_cam0_world(), rows, steps, self._field(window))
 
     def _field(self, window: Window) -> StereoField | None:
-        """The stereo field at the window's present means; None where it is not estimated."""
-        coefficients = window.calibration.stereo
-        return None if coefficients is None else StereoField(self._camera, self._rows, coefficients)
-
-    def _predicted_move(self, window: Window) -> tuple[FloatArray | None, FloatArray]:
-        """The motion since the last frame as predicted (4, 4), None in the first frame, and its covariance (6, 6)."""
-        moved = window.move_since(-2) if len(window.clones) > 1 else None
-        return moved, self._expected_error(self._since_frame)
+        """The stereo calibration's faults at the window's present means; None where they are not estimated."""
+        calibration = window.calibration
+        if not calibration.stereo_dim:
+            return None
+        rows = self._rows.coefficients if calibration.stereo_field else np.zeros(FIELD_TERMS)
+        return StereoField(self._camera, rows, calibration.stereo, calibration.stereo_terms)
 
     def _fit(
         self, window: Window, tracks: LinearTracks, pixels: Views, innovation: float | None
@@ -607,21 +671,22 @@ class Msckf:
         window: Window,
         tracks: LinearTracks,
         predicted: FloatArray | None,
-        expected: FloatArray,
         fitted: Fit,
     ) -> StepErrors | None:
         """The predicted and the corrected motion since the last frame, and what its fit leaves of their errors.
 
-        None with too few tracks.
+        It is the camera's motion, seen from the body, so that a new estimate of the extrinsics is no motion. None with
+        too few tracks.
         """
         if predicted is None or len(tracks.rows) < MIN_TRACKS_FOR_NOISE:
             return None
-        moved = window.move_since(-2)
+        moved = window.camera_move_since(-2)
         remaining = window.move_covariance(len(window.clones) - 2, fitted)
         A = se3_adjoint(se3_inverse(window.nav.T_world_imu))
         process = A @ self._since_frame.Q[:6, :6] @ A.T
-        correction = se3_log(se3_inverse(predicted) @ moved)
-        return StepErrors(correction, A @ expected @ A.T, process, A @ remaining @ A.T)
+        B = se3_adjoint(se3_inverse(window.calibration.T_cam0_imu))
+        correction = B @ se3_log(se3_inverse(predicted) @ moved)
+        return StepErrors(correction, A @ self._expected @ A.T, process, A @ remaining @ A.T)
 
     def _information(
         self, window: Window, tracks: LinearTracks, chosen: BoolArray, pixels: Views | None
@@ -629,7 +694,9 @@ class Msckf:
         """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
         poses, size = 6 * len(window.clones), 6 * len(window.clones) + 3 * len(window.landmarks)
         A, b, variance = np.zeros((size, size)), np.zeros(size), self._tracks.variance
-        stereo = StereoInformation.none(size) if window.calibration.stereo_dim else None
+        field, stereo = self._field(window), None
+        if field is not None:
+            stereo = StereoInformation.none(len(field.terms), size)
         if chosen.any():
             A[:poses, :poses], b[:poses] = eliminate_points(tracks.information, chosen)
             if stereo is not None and tracks.stereo is not None:
@@ -637,8 +704,8 @@ class Msckf:
         if pixels is not None and len(pixels.z):
             at = self._landmark_residuals(window, pixels)
             window.add_landmark_information(A, b, *at.information())
-            if stereo is not None:
-                H = field_jacobian(self._camera, pixels.z - at.r)  # at the predicted pixels
+            if field is not None and stereo is not None:
+                H = field.jacobian(pixels.z - at.r)  # at the predicted pixels
                 stereo = stereo + landmark_columns(at, H, len(window.clones))
         scaled = None if stereo is None else stereo.scaled(1 / variance)
         return window.lift_information(A / variance, b / variance, scaled)
@@ -673,6 +740,8 @@ class Msckf:
         P = self._move_to_optimum(window, tracks, A, b, window.first_landmark).covariance()  # no landmark is in it
         own = slice(0, window.first_clone)
         self._output = P[own, own]
+        rows = np.concatenate([np.arange(window.first_clone), np.r_[window.clone_rows(newest)]])
+        self._newest, self._frame_pose = P[np.ix_(rows, rows)], window.nav.T_world_imu
         self._smoothed = WindowPosterior.of(window, P)
 
         done = np.flatnonzero(ending & good & (depth_sigma < _MAP_DEPTH_SIGMA))
@@ -697,6 +766,8 @@ class Msckf:
             candidates: mask (F,) of the tracks that may become landmarks.
             depth_sigma: (F,) standard deviation of each inverse depth, over itself.
         """
+        if window.calibration.stereo_field or window.scale_sigma() > _SCALE_SIGMA:
+            return np.zeros(0, dtype=np.int64)
         room = self._settings.max_landmarks - len(window.landmarks)
         by_stereo = np.sqrt(self._tracks.variance) * relative_stereo_sigma(tracks.at, tracks.information.q)
         has_depth = (depth_sigma < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)

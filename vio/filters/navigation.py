@@ -33,6 +33,7 @@ from vio.records import ImuSample, MotionSample, VelocitySample
 DIM = 15  # error dimensions of the navigation state
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
+_SAMPLE_S = 0.005  # between two samples of a usual IMU, where only one has come
 _START_RATE_SIGMA_RADPS = 1.0  # initial standard deviation of the angular rate without an IMU
 
 
@@ -252,6 +253,12 @@ class ImuMotion:
         xi_v = xi_v + ages_s[:, None] * (R_world_imu @ error[12:15])
         out: FloatArray = velocities @ so3_exp(phi).T + xi_v @ so3_left_jacobian(phi).T
         return out
+
+    def rate_variance(self, factors: FloatArray) -> float:
+        """Variance (rad/s)^2 of the rate that the gyro reads in one sample; factors (2,) as in `advance`."""
+        times = [x.time_ns for x in self._samples[-2:]]
+        period_s = (times[-1] - times[0]) * 1e-9 if len(times) > 1 else _SAMPLE_S
+        return float((factors[1] * self._settings.gyro_noise_density) ** 2 / period_s)
 
     def covered(self, time_ns: int) -> int:
         """The latest time, up to a given one, that the samples reach; the given one where they end long before."""

@@ -1,26 +1,28 @@
 """Online calibration: how the camera sits on the IMU and how their clocks differ, as states of the filter.
 
-A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error sits on the IMU's side,
-`T_cam0_imu = T_hat exp(delta)`. Either error then moves the pixels of a frame exactly as an error of its pose would,
-so all that is known about poses carries over by one small matrix per frame, equations (C1) to (C3) of docs/math.md.
-References: Li & Mourikis, Online temporal calibration for camera-IMU systems (2014); Qin & Shen, Online temporal
-calibration for monocular visual-inertial systems (2018).
+A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error `delta`, with
+`T_cam0_imu = T_hat exp(delta)`, is kept on the world's side, `eta = Ad(T_world_imu) delta`, and moves with the body.
+Both errors enter where the camera's pose is cloned from the body's, equations (C1) to (C4) of docs/math.md.
+Reference: Li & Mourikis, Online temporal calibration for camera-IMU systems (2014).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import TERMS
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp
-from vio.records import Estimate, IntArray, StereoFieldEstimate
+from vio.filters.stereo_calibration import FIELD_TERMS, METRIC_TERMS, TERMS
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
+from vio.records import Estimate, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
+from vio.statistics import chi_square_quantile
 
-# Columns of the full error [stereo field; delta; time offset].
-_STEREO, _DELTA, _OFFSET = np.arange(TERMS), TERMS + np.arange(6), np.array([TERMS + 6])
+# Columns of the full error [stereo field; baseline and focal length; eta; time offset].
+_STEREO, _ETA, _OFFSET = np.arange(TERMS), TERMS + np.arange(6), np.array([TERMS + 6])
 _FULL = TERMS + 7
+_PARTS = slice(0, 3), slice(3, 6)  # of a twist
+_NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
 _STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
 
@@ -33,41 +35,82 @@ class Calibration:
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
     extrinsics: bool = False  # whether T_cam0_imu is estimated
     timing: bool = False  # whether the offset is estimated
-    stereo: FloatArray | None = None  # (6,) coefficients of equation (R3); None: not estimated
+    stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))  # (8,) coefficients of (R3) and (R4)
+    stereo_field: bool = False  # whether those of (R3) are estimated
+    metric: bool = False  # whether those of (R4) are
 
     @property
     def dim(self) -> int:
-        """Error dimensions C, 0 to 13."""
+        """Error dimensions C, 0 to 15."""
         return self.stereo_dim + 6 * self.extrinsics + self.timing
 
     @property
     def stereo_dim(self) -> int:
-        """How many of the error's dimensions, the first, belong to the stereo field: 0 or 6."""
-        return 0 if self.stereo is None else TERMS
+        """How many of the error's dimensions, the first, belong to the stereo calibration: 0, 2, 6 or 8."""
+        return len(self.stereo_terms)
+
+    @property
+    def stereo_terms(self) -> IntArray:
+        """Which coefficients of the stereo calibration are estimated."""
+        return np.flatnonzero(np.repeat([self.stereo_field, self.metric], [FIELD_TERMS, TERMS - FIELD_TERMS]))
+
+    @property
+    def moves_camera(self) -> bool:
+        """Whether anything is estimated that stands between the body's pose and the camera's."""
+        return self.extrinsics or self.timing
 
     @property
     def columns(self) -> IntArray:
-        """Which entries (C,) of the full error `[stereo field; delta; time offset]`, m, rad and s, are estimated."""
-        return np.concatenate([_STEREO[: self.stereo_dim], _DELTA[: 6 * self.extrinsics], _OFFSET[: 1 * self.timing]])
+        """Which entries (C,) of the full error `[stereo; eta; time offset]`, m, rad and s, are estimated."""
+        return np.concatenate([_STEREO[self.stereo_terms], _ETA[: 6 * self.extrinsics], _OFFSET[: 1 * self.timing]])
 
-    def corrected(self, error: FloatArray) -> Calibration:
-        """Return the calibration moved by an error (C,)."""
+    @property
+    def extrinsic_rows(self) -> IntArray:
+        """Which of the error's dimensions belong to the extrinsics, 6 or none."""
+        return self.stereo_dim + np.arange(6 * self.extrinsics)
+
+    def corrected(self, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of the error."""
         full = self.full(error)
+        T = self.T_cam0_imu
+        if self.extrinsics:
+            T = T @ se3_exp(se3_adjoint(se3_inverse(T_world_imu)) @ full[_ETA])
         return replace(
             self,
-            T_cam0_imu=self.T_cam0_imu @ se3_exp(full[_DELTA]) if self.extrinsics else self.T_cam0_imu,
+            T_cam0_imu=T,
             time_offset_s=self.time_offset_s + float(full[_OFFSET[0]]),
-            stereo=None if self.stereo is None else self.stereo + full[_STEREO],
+            stereo=self.stereo + full[_STEREO],
         )
 
-    def add_to_estimate(self, estimate: Estimate, covariance: FloatArray) -> Estimate:
-        """Return an estimate with what is estimated of the calibration, whose errors have a covariance (C, C)."""
-        if self.stereo is not None:
-            field = StereoFieldEstimate(self.stereo, covariance[: self.stereo_dim, : self.stereo_dim])
-            estimate = replace(estimate, stereo_field=field)
+    def in_world(self, covariance: FloatArray, T_world_imu: FloatArray) -> FloatArray:
+        """Turn the covariance (C, C) of `[stereo; delta; time offset]` into that of the error, with eta."""
+        out, rows = covariance.copy(), self.extrinsic_rows
         if self.extrinsics:
-            rows = slice(self.stereo_dim, self.stereo_dim + 6)
-            estimate = replace(estimate, T_cam0_imu=self.T_cam0_imu, T_cam0_imu_covariance=covariance[rows, rows])
+            A = se3_adjoint(T_world_imu)
+            out[rows] = A @ out[rows]
+            out[:, rows] = out[:, rows] @ A.T
+        return out
+
+    def add_to_estimate(self, estimate: Estimate, covariance: FloatArray, T_world_imu: FloatArray) -> Estimate:
+        """Return an estimate with what is estimated of the calibration, whose errors have a covariance (C, C).
+
+        Args:
+            estimate: the rest.
+            covariance: of the calibration's errors.
+            T_world_imu: the body's pose (4, 4) of these errors.
+        """
+        if self.stereo_field:
+            own = slice(0, FIELD_TERMS)
+            estimate = replace(estimate, stereo_field=StereoFieldEstimate(self.stereo[own], covariance[own, own]))
+        if self.metric:
+            own = slice(self.stereo_dim - METRIC_TERMS, self.stereo_dim)
+            scale = StereoScaleEstimate(self.stereo[FIELD_TERMS:], covariance[own, own])
+            estimate = replace(estimate, stereo_scale=scale)
+        if self.extrinsics:
+            of_delta = self.in_world(covariance, se3_inverse(T_world_imu))[
+                np.ix_(self.extrinsic_rows, self.extrinsic_rows)
+            ]
+            estimate = replace(estimate, T_cam0_imu=self.T_cam0_imu, T_cam0_imu_covariance=of_delta)
         if self.timing:
             sigma = float(np.sqrt(covariance[-1, -1]))
             estimate = replace(estimate, time_offset_s=self.time_offset_s, time_offset_sigma_s=sigma)
@@ -80,18 +123,32 @@ class Calibration:
         return out
 
 
-def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings) -> Calibration:
-    """Return the calibration at the start."""
-    extrinsics, timing = (settings.calibrate in (kind, "both") for kind in ("extrinsics", "time_offset"))
-    stereo = np.zeros(TERMS) if settings.calibrate_stereo == "on" else None
-    return Calibration(np.asarray(T_cam0_imu, dtype=np.float64), 0.0, extrinsics, timing, stereo)
+def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: MotionSource | None) -> Calibration:
+    """Return the calibration at the start.
+
+    Of camera and IMU nothing is estimated without an IMU, and nothing metric without a metric sensor.
+    """
+    extrinsics, timing = (
+        motion == "imu" and settings.calibrate in (kind, "both", "auto") for kind in ("extrinsics", "time_offset")
+    )
+    return Calibration(
+        np.asarray(T_cam0_imu, dtype=np.float64),
+        extrinsics=extrinsics,
+        timing=timing,
+        stereo_field=settings.calibrate_stereo == "on",
+        metric=motion is not None and max(settings.stereo_focal_sigma, settings.stereo_baseline_sigma) > 0,
+    )
 
 
 def calibration_covariance(calibration: Calibration, settings: MsckfSettings) -> tuple[FloatArray, FloatArray]:
-    """Return the initial covariance (C, C) of what is estimated, and what a second of random walk adds to it (C, C)."""
+    """Return the initial covariance (C, C) of what is estimated, and what a second of random walk adds to it (C, C).
+
+    Both of `[stereo; delta; time offset]`.
+    """
     s = settings
-    yaw, field = np.radians(s.stereo_yaw_sigma_deg), s.stereo_field_sigma
-    stereo = np.array([yaw, field, field, _RADIAL * field, field, field])
+    yaw, other = np.radians(s.stereo_yaw_sigma_deg), s.stereo_field_sigma
+    metric = [s.stereo_baseline_sigma, s.stereo_focal_sigma]
+    stereo = np.array([yaw, other, other, _RADIAL * other, other, other, *metric])
     rotation, rotation_walk = np.radians([s.extrinsic_rotation_sigma_deg, s.extrinsic_rotation_walk])
     pose = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
     pose_walk = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])
@@ -99,36 +156,25 @@ def calibration_covariance(calibration: Calibration, settings: MsckfSettings) ->
     return np.diag(sigmas[calibration.columns] ** 2), np.diag(walks[calibration.columns] ** 2)
 
 
-def body_twists(T_world_imu: FloatArray, velocity_world: FloatArray, rate: FloatArray) -> FloatArray:
-    """Twists (..., 6) `[v; omega]` in the body frame of poses (..., 4, 4), world velocities and body rates (..., 3)."""
-    v = np.einsum("...ji,...j->...i", T_world_imu[..., :3, :3], velocity_world)
-    return np.concatenate([v, rate], axis=-1)
+@dataclass(frozen=True, slots=True)
+class Twist:
+    """The body twist `[v; omega]` at an exposure and how well it is known."""
+
+    mean: FloatArray  # (6,) m/s and rad/s
+    covariance: FloatArray  # (6, 6)
+
+    def significant(self) -> FloatArray:
+        """The twist (6,), each half shrunk by what its own noise may make of it, equation (C3).
+
+        An estimated twist that is noise alone would pass for a motion, from which the time offset is learned.
+        """
+        out = self.mean.copy()
+        for part in _PARTS:
+            squared = float(out[part] @ np.linalg.solve(self.covariance[part, part] + 1e-18 * np.eye(3), out[part]))
+            out[part] *= np.sqrt(max(1 - _NOISE_ONLY / max(squared, 1e-9), 0.0))
+        return out
 
 
-def pose_D_calibration(T_world_imu: FloatArray, twists: FloatArray) -> FloatArray:
-    """What errors `[delta; time offset]` of the calibration do to poses, equation (C2).
-
-    Args:
-        T_world_imu: poses (N, 4, 4) of the body at the exposures.
-        twists: their body twists (N, 6), m/s and rad/s.
-
-    Returns:
-        Jacobians (N, 6, 7): the world-side pose errors that move the pixels as the calibration's errors do.
-    """
-    A = se3_adjoint(T_world_imu)
-    return np.concatenate([-A, A @ twists[..., None]], axis=-1)
-
-
-def with_calibration(A: FloatArray, b: FloatArray, pose_D_calib: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Turn information about poses into information about calibration and poses, equation (C3).
-
-    Args:
-        A: information matrix (6N, 6N).
-        b: information vector (6N,).
-        pose_D_calib: what the calibration does to the poses (6N, C).
-
-    Returns:
-        Information matrix (C + 6N, C + 6N) and vector (C + 6N,).
-    """
-    AM = A @ pose_D_calib
-    return np.block([[pose_D_calib.T @ AM, AM.T], [AM, A]]), np.concatenate([pose_D_calib.T @ b, b])
+def body_twist(T_world_imu: FloatArray, velocity_world: FloatArray, rate: FloatArray) -> FloatArray:
+    """Twist (6,) `[v; omega]` in the body frame of a pose (4, 4), a world velocity and a body rate (3,)."""
+    return np.concatenate([T_world_imu[:3, :3].T @ velocity_world, rate])

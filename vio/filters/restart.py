@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
-from vio.filters.online_calibration import Calibration, body_twists
+from vio.filters.online_calibration import Calibration, body_twist
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, so3_hat
 
@@ -47,7 +47,7 @@ def restarted(
     elapsed_s = (time_ns - good.time_ns) * 1e-9
     nav, T = good.nav, good.nav.T_world_imu
     velocity = motion.velocity_world(nav)
-    twist = body_twists(T[None], velocity[None], nav.rate[None])[0]
+    twist = body_twist(T, velocity, nav.rate)
     moved = replace(nav, T_world_imu=T @ se3_exp(min(elapsed_s, _EXTRAPOLATED_S) * twist))
     speed = float(np.linalg.norm(velocity)) + _LEAST_SPEED_MPS
     position, rotation = speed * elapsed_s, float(np.hypot(_ROTATION_SIGMA_RAD, _RATE_SIGMA_RADPS * elapsed_s))

@@ -126,8 +126,10 @@ class MsckfSettings(Section):
     angular_acceleration_density: float = setting(
         0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
     )
-    calibrate: Literal["none", "extrinsics", "time_offset", "both"] = setting(
-        "none", "what is estimated besides the motion, with IMU only: T_cam0_imu, the time offset, or both"
+    calibrate: Literal["auto", "none", "extrinsics", "time_offset", "both"] = setting(
+        "none",
+        "what is estimated of camera and IMU besides the motion: T_cam0_imu, the time offset, or both; auto: both "
+        "where there is an IMU",
     )
     calibrate_stereo: Literal["auto", "on", "off"] = setting(
         "auto",
@@ -140,25 +142,31 @@ class MsckfSettings(Section):
     stereo_field_sigma: float = setting(
         2.0e-3, "initial standard deviation of the other terms of the field, in focal lengths", at_least=0
     )
+    stereo_focal_sigma: float = setting(
+        0.0,
+        "initial standard deviation of the focal length, over it; 0: it is known; else it is estimated, with IMU or "
+        "velocities only, on whose scale the result depends",
+        at_least=0,
+    )
+    stereo_baseline_sigma: float = setting(0.0, "the same of the baseline's length", at_least=0)
     extrinsic_rotation_sigma_deg: float = setting(
-        1.0, "calibrate: initial standard deviation of T_cam0_imu's rotation", unit="deg", at_least=0
+        0.5, "calibrate: initial standard deviation of T_cam0_imu's rotation", unit="deg", at_least=0
     )
     extrinsic_translation_sigma_m: float = setting(
-        0.03, "calibrate: initial standard deviation of T_cam0_imu's translation", unit="m", at_least=0
+        0.01, "calibrate: initial standard deviation of T_cam0_imu's translation", unit="m", at_least=0
     )
     time_offset_sigma_s: float = setting(
-        0.01, "calibrate: initial standard deviation of the time offset", unit="s", at_least=0
-    )
-    calibrate_after_s: float = setting(
-        3.0, "calibrate: time from the start until the motion is known enough", unit="s", at_least=0
+        5.0e-3, "calibrate: initial standard deviation of the time offset", unit="s", at_least=0
     )
     extrinsic_rotation_walk: float = setting(
-        0.02, "calibrate: random walk, which forgets", unit="deg/sqrt(s)", at_least=0
+        2.0e-3, "calibrate: random walk, of a mount that gives", unit="deg/sqrt(s)", at_least=0
     )
     extrinsic_translation_walk: float = setting(
-        1.0e-3, "calibrate: random walk, likewise", unit="m/sqrt(s)", at_least=0
+        1.0e-4, "calibrate: random walk, likewise", unit="m/sqrt(s)", at_least=0
     )
-    time_offset_walk: float = setting(2.0e-5, "calibrate: random walk, likewise", unit="s/sqrt(s)", at_least=0)
+    time_offset_walk: float = setting(
+        2.0e-6, "calibrate: random walk, of clocks that drift", unit="s/sqrt(s)", at_least=0
+    )
 
     def __post_init__(self) -> None:
         """Check every number, and that the pixel noise's bounds leave room for it.

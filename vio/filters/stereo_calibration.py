@@ -3,7 +3,8 @@
 A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field.
 Its rows show in `vl - vr` at once. Its columns look like depth: only motion, which gives the same points a second
 depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three of the six terms of the columns; the
-other three are states, and so are three terms of distortion that both lenses have in common.
+other three are states, and so are three terms of distortion that both lenses have in common. With a metric sensor, so
+are the length of the baseline and the focal length, equation (R4).
 References: Dang, Hoffmann & Stiller, Continuous stereo self-calibration by camera parameter tracking, IEEE TIP (2009);
 Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for improved odometry accuracy, ECMR (2021).
 """
@@ -18,9 +19,11 @@ from vio.filters import track_loops as loops
 from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, Observations
+from vio.records import BoolArray, IntArray, Observations
 
-TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
+FIELD_TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
+METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
+TERMS = FIELD_TERMS + METRIC_TERMS
 _ROW_TERMS = 6
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
@@ -31,7 +34,7 @@ _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the 
 
 
 def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the six coefficients of (R3), (..., 4, 6), pixels.
+    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the coefficients of (R3) and (R4), (..., 4, 8), pixels.
 
     The row of `vr` is zero: right rows are not measured.
     """
@@ -122,16 +125,30 @@ class StereoField:
     """The field at the present estimate: what is taken out of the pixels."""
 
     camera: StereoCamera
-    rows: RowField
-    coefficients: FloatArray  # (6,) of (R3)
+    rows: FloatArray  # (6,) of (R2), in focal lengths; zero where the rows show no fault
+    coefficients: FloatArray  # (8,) of (R3) and (R4)
+    terms: IntArray  # (S,) which of them are estimated
+
+    def jacobian(self, z: FloatArray) -> FloatArray:
+        """Derivatives of pixels (..., 4) by the coefficients that are estimated (..., 4, S)."""
+        return field_jacobian(self.camera, z)[..., self.terms]
 
     def corrected(self, views: Views) -> Views:
         """Return views (..., 4) without the field."""
         z, weight = np.ascontiguousarray(views.z), np.ascontiguousarray(views.weight)
         out = np.empty(z.shape)
         flat = z.reshape(-1, 4), weight.reshape(-1, 4), out.reshape(-1, 4)
-        loops.correct_pixels(loops.lens_of(self.camera), self.coefficients, self.rows.coefficients, *flat)
+        loops.correct_pixels(loops.lens_of(self.camera), self.coefficients, self.rows, *flat)
         return Views(out, views.weight)
+
+    def seen(self, z: FloatArray) -> FloatArray:
+        """Pixels (M, 4) that the cameras show where the calibration expects z (M, 4): with (R4), without (R3)."""
+        baseline, focal = self.coefficients[FIELD_TERMS:]
+        centre, out = np.array([self.camera.cu, self.camera.cv]), z.copy()
+        out[:, :2] = centre + (z[:, :2] - centre) * np.exp(focal)
+        out[:, 2] = out[:, 0] - (z[:, 0] - z[:, 2]) * np.exp(focal + baseline)
+        out[:, 3] = out[:, 1]
+        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,9 +197,9 @@ class StereoInformation:
     b: FloatArray  # (S,)
 
     @classmethod
-    def none(cls, size: int) -> StereoInformation:
-        """No information, beside `size` entries of poses and landmarks."""
-        return cls(np.zeros((TERMS, TERMS)), np.zeros((TERMS, size)), np.zeros(TERMS))
+    def none(cls, terms: int, size: int) -> StereoInformation:
+        """No information about some coefficients, beside `size` entries of poses and landmarks."""
+        return cls(np.zeros((terms, terms)), np.zeros((terms, size)), np.zeros(terms))
 
     def __add__(self, other: StereoInformation) -> StereoInformation:
         """Add information; the other may concern the first of the poses and landmarks only."""

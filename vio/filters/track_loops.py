@@ -228,27 +228,31 @@ def eliminate_tracks(
 
 @compiled
 def stereo_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
-    """Write the derivatives (M, 4, 6) of pixels (M, 4) by the coefficients of (R3)."""
+    """Write the derivatives (M, 4, 8) of pixels (M, 4) by the coefficients of (R3) and (R4)."""
     fu, fv, cu, cv, _ = lens
     for m in range(len(z)):
         x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
         r2, rr2 = x * x + y * y, xr * xr + y * y
         for a in range(4):
-            for s in range(6):
+            for s in range(8):
                 out[m, a, s] = 0.0
         out[m, 0, 3], out[m, 0, 4], out[m, 0, 5] = fu * x * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
         out[m, 1, 3], out[m, 1, 4], out[m, 1, 5] = fv * y * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y
         out[m, 2, 0], out[m, 2, 1], out[m, 2, 2] = fu, fu * xr, fu * rr2
         out[m, 2, 3], out[m, 2, 4], out[m, 2, 5] = fu * xr * rr2, fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
+        out[m, 2, 6] = z[m, 2] - z[m, 0]
+        out[m, 0, 7], out[m, 1, 7], out[m, 2, 7] = fu * x, fv * y, fu * xr
 
 
 @compiled
 def correct_pixels(
     lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
-    """Write pixels (M, 4) without the field (6,) of (R3) and without what follows from the rows (6,) of (R2)."""
+    """Write pixels (M, 4) without the field of (R3) and (R4), (8,), and what follows from the rows (6,) of (R2)."""
     fu, fv, cu, cv, _ = lens
-    a0, a1, a2, k, q1, q2 = coefficients
+    a0, a1, a2, k, q1, q2, baseline, focal = coefficients
+    by_focal, by_both = np.exp(-focal), np.exp(-focal - baseline)
+    metric = baseline != 0.0 or focal != 0.0
     for m in range(len(z)):
         x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
         r2, rr2 = x * x + y * y, xr * xr + y * y
@@ -260,6 +264,11 @@ def correct_pixels(
         out[m, 1] = z[m, 1] - fv * row if weight[m, 1] > 0.0 else z[m, 1]
         out[m, 2] = z[m, 2] - fu * right if weight[m, 2] > 0.0 else z[m, 2]
         out[m, 3] = z[m, 3]
+        if metric and weight[m, 0] > 0.0:
+            disparity = (out[m, 0] - out[m, 2]) * by_both
+            out[m, 0] = cu + (out[m, 0] - cu) * by_focal
+            out[m, 1] = cv + (out[m, 1] - cv) * by_focal
+            out[m, 2] = out[m, 0] - disparity if weight[m, 2] > 0.0 else z[m, 2]
 
 
 @compiled

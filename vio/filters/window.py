@@ -1,9 +1,10 @@
 """The window: navigation state, clones and landmarks, and the one covariance over all their errors.
 
-Layout of an error vector of length D: navigation state (15), calibration (C = 0, 1, 6 or 7), clones (6 each, oldest
-first), landmarks (3 each). Only this module knows it. The means are the newest estimates, at which everything is
-linearised; `P` and `prior_delta` describe the prior: by all absorbed measurements, the true error of the means has mean
-`-prior_delta` and covariance `P`.
+Layout of an error vector of length D: navigation state (15), calibration (C), clones (6 each, oldest first), landmarks
+(3 each). Only this module knows it. The error of a clone is that of the camera's pose, equation (C2), so the
+calibration of camera and IMU enters where a clone is made and nowhere else. The means are the newest estimates, at
+which everything is linearised; `P` and `prior_delta` describe the prior: by all absorbed measurements, the true error
+of the means has mean `-prior_delta` and covariance `P`.
 """
 
 from __future__ import annotations
@@ -15,26 +16,33 @@ from scipy.linalg import blas, lapack
 
 from vio.compiled import move_poses
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
-from vio.filters.online_calibration import Calibration, body_twists, pose_D_calibration, with_calibration
-from vio.filters.stereo_calibration import TERMS, StereoInformation
-from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
+from vio.filters.online_calibration import Calibration, Twist
+from vio.filters.stereo_calibration import METRIC_TERMS, StereoInformation
+from vio.geometry.lie import (
+    FloatArray,
+    se3_adjoint,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    so3_hat,
+    so3_left_jacobian,
+)
 from vio.records import BoolArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
 class Clone:
-    """The body at the time of a frame on the IMU's clock, by the time offset estimated then."""
+    """The body when a frame was exposed: its camera's pose, seen through the present extrinsics."""
 
     frame_index: int
     time_ns: int  # the frame's stamp
     T_world_imu: FloatArray  # (4, 4)
-    velocity: FloatArray  # (3,) as in NavState; follows corrections only where the time offset is estimated
-    rate: FloatArray  # (3,) likewise
-    late_s: float = 0.0  # the pose's time on the IMU's clock minus the frame's stamp
+    velocity: FloatArray  # (3,) as in NavState
 
 
-_VELOCITY_SIGMA_MPS = 0.05  # m/s, for what a wrong calibration did to the velocity
 _NO_CALIBRATION = Calibration(np.eye(4))
+NO_TWIST = Twist(np.zeros(6), np.zeros((6, 6)))
 
 
 class Window:
@@ -51,7 +59,6 @@ class Window:
         self._L: Factor | None = None  # factor of P; None: not computed since P changed
         self.nav = nav
         self.calibration = calibration
-        self.calibrating = False  # until then the calibration counts as known, its covariance stays
         self.clones: list[Clone] = []
         self.landmark_ids: IntArray = np.zeros(0, dtype=np.int64)
         self.landmarks: FloatArray = np.zeros((0, 3))
@@ -83,56 +90,25 @@ class Window:
         return slice(start, start + 6)
 
     def exposures(self) -> FloatArray:
-        """Poses (N, 4, 4) of the body when the frames were exposed, by the present time offset, equation (C1)."""
-        T = np.array([c.T_world_imu for c in self.clones])
-        if not self.calibration.timing:
-            return T
-        late = np.array([c.late_s for c in self.clones])
-        out: FloatArray = T @ se3_exp(self._twists() * (self.calibration.time_offset_s - late)[:, None])
-        return out
-
-    def exposure(self, nav: NavState, late_s: float) -> FloatArray:
-        """Pose (4, 4) at the exposure of a frame whose stamp a navigation state is late by, on the IMU's clock."""
-        if not self.calibration.timing:
-            return nav.T_world_imu
-        twist = body_twists(nav.T_world_imu, nav.velocity, nav.rate)
-        out: FloatArray = nav.T_world_imu @ se3_exp(twist * (self.calibration.time_offset_s - late_s))
-        return out
+        """Poses (N, 4, 4) of the body when the frames were exposed."""
+        return np.array([c.T_world_imu for c in self.clones])
 
     def T_cam0_world(self) -> FloatArray:
         """Camera poses (N, 4, 4) at all exposures."""
         out: FloatArray = self.calibration.T_cam0_imu @ se3_inverse(self.exposures())
         return out
 
-    def _twists(self) -> FloatArray:
-        """Body twists (N, 6) of the clones."""
-        T = np.array([c.T_world_imu for c in self.clones])
-        return body_twists(T, np.array([c.velocity for c in self.clones]), np.array([c.rate for c in self.clones]))
-
-    def _pose_D_calibration(self) -> FloatArray:
-        """What the calibration's errors do to the exposures' poses (6N, C)."""
-        if not self.calibrating:
-            return np.zeros((6 * len(self.clones), self.calibration.dim))
-        poses = pose_D_calibration(self.exposures(), self._twists())
-        full = np.concatenate([np.zeros((*poses.shape[:2], TERMS)), poses], axis=2)
-        return full[:, :, self.calibration.columns].reshape(6 * len(full), -1)
-
-    def current_pose(self, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pose (4, 4) at the newest exposure and its covariance (6, 6).
-
-        Args:
-            covariance: of the errors of navigation state and calibration (15 + C, 15 + C).
-        """
-        if not self.calibration.timing:
-            return self.nav.T_world_imu, covariance[:6, :6]
-        J = np.eye(6, self.first_clone)
-        J[:, -1] = self._pose_D_calibration()[-6:, -1]
-        return self.exposures()[-1], J @ covariance @ J.T
+    def body_D_error(self) -> FloatArray:
+        """Jacobian (6N, first_landmark) of the errors of the body's poses at the exposures, equation (C3)."""
+        out = np.eye(6 * len(self.clones), self.first_landmark, self.first_clone)
+        if self.calibration.extrinsics:
+            back = se3_inverse(self.nav.T_world_imu)
+            out[:, self.calibration.extrinsic_rows + DIM] = se3_adjoint(self.exposures() @ back).reshape(-1, 6)
+        return out
 
     def exposure_errors(self, error: FloatArray) -> FloatArray:
-        """How an error vector (D,) moves the exposures' poses (6N,), up to where they move pixels."""
-        clones = error[self.first_clone : self.first_landmark]
-        return clones + self._pose_D_calibration() @ error[DIM : self.first_clone] if self.calibration.dim else clones
+        """How an error vector (D,) moves the cameras' poses (6N,)."""
+        return error[self.first_clone : self.first_landmark]
 
     @property
     def stereo_rows(self) -> slice:
@@ -148,10 +124,8 @@ class Window:
         """
         out = np.zeros((*out_D_exposures.shape[:-1], len(self.P)))
         out[..., self.first_clone : self.first_landmark] = out_D_exposures
-        if self.calibration.dim:
-            out[..., DIM : self.first_clone] = out_D_exposures @ self._pose_D_calibration()
         if out_D_stereo is not None:
-            out[..., self.stereo_rows] += out_D_stereo
+            out[..., self.stereo_rows] = out_D_stereo
         return out
 
     def add_landmark_information(self, A: FloatArray, b: FloatArray, C: FloatArray, g: FloatArray) -> None:
@@ -184,26 +158,26 @@ class Window:
             stereo: the part that concerns the stereo field, where it is estimated.
         """
         out, vector = np.zeros_like(self.P), np.zeros(len(self.P))
-        M = self._pose_D_calibration()
-        if self.calibrating:
-            landmarks = np.zeros((3 * len(self.landmarks), self.calibration.dim))
-            A, b = with_calibration(A, b, np.concatenate([M, landmarks]))
-            out[DIM:, DIM:], vector[DIM:] = A, b
-        else:
-            first = self.first_clone
-            out[first:, first:], vector[first:] = A, b
+        first = self.first_clone
+        out[first:, first:], vector[first:] = A, b
         if stereo is not None:
             rows = self.stereo_rows
-            cross = np.concatenate([stereo.cross[:, : len(M)] @ M, stereo.cross], axis=1)  # (S, C + 6N + 3M)
-            out[rows, DIM:] += cross
-            out[DIM:, rows] += cross.T
-            out[rows, rows] += stereo.A
-            vector[rows] += stereo.b
+            out[rows, first:], out[first:, rows] = stereo.cross, stereo.cross.T
+            out[rows, rows], vector[rows] = stereo.A, stereo.b
         return out, vector
 
-    def move_since(self, index: int) -> FloatArray:
-        """Motion (4, 4) `T_clone_newest` of the body from a clone to the newest one."""
-        out: FloatArray = se3_inverse(self.clones[index].T_world_imu) @ self.clones[-1].T_world_imu
+    def scale_sigma(self) -> float:
+        """The larger one of the standard deviations of baseline and focal length, over them; 0 where they are known."""
+        if not self.calibration.metric:
+            return 0.0
+        end = DIM + self.calibration.stereo_dim
+        return float(np.sqrt(self.P.diagonal()[end - METRIC_TERMS : end].max(initial=0.0)))
+
+    def camera_move_since(self, index: int) -> FloatArray:
+        """Motion (4, 4) `T_clone_newest` of cam0 from a clone to the newest one."""
+        T = self.calibration.T_cam0_imu
+        move = se3_inverse(self.clones[index].T_world_imu) @ self.clones[-1].T_world_imu
+        out: FloatArray = T @ move @ se3_inverse(T)
         return out
 
     def move_covariance(self, index: int, fitted: Fit) -> FloatArray:
@@ -215,39 +189,39 @@ class Window:
         return S @ S.T
 
     def landmark_covariance(self, fitted: Fit) -> FloatArray:
-        """Covariance (M, 3, 3) of `xi_f - xi_rho`, landmarks relative to the newest exposure, after a fit of all."""
+        """Covariance (M, 3 + S, 3 + S) of what a landmark's pixels depend on, after a fit of all errors.
+
+        That is `xi_f - xi_rho`, the landmark relative to the newest exposure, and the coefficients of the stereo
+        calibration.
+        """
+        M, D, S = len(self.landmarks), len(self.P), self.calibration.stereo_dim
         exposure = self.chain(np.eye(6 * len(self.clones))[-6:-3])  # (3, D)
-        J = np.eye(3 * len(self.landmarks), len(self.P), self.first_landmark).reshape(-1, 3, len(self.P)) - exposure
-        S = fitted.spread(J)
-        out: FloatArray = S @ np.swapaxes(S, 1, 2)
+        J = np.eye(3 * M, D, self.first_landmark).reshape(-1, 3, D) - exposure
+        stereo = np.broadcast_to(fitted.spread(np.eye(S, D, DIM)), (M, S, D)) if S else np.zeros((M, 0, D))
+        root = np.concatenate([fitted.spread(J), stereo], axis=1)
+        out: FloatArray = root @ np.swapaxes(root, 1, 2)
         return out
 
-    def propagate(self, step: Transition) -> None:
-        """Move the navigation state by one step of its motion model."""
-        self.nav = step.nav
-        P, Phi, self._L = self.P, step.Phi, None
-        P[:DIM] = Phi @ P[:DIM]
-        P[:, :DIM] = P[:, :DIM] @ Phi.T
-        P[:DIM, :DIM] += step.Q
-        self.prior_delta[:DIM] = Phi @ self.prior_delta[:DIM]
+    def propagate(self, step: Transition, walk: FloatArray | None = None) -> None:
+        """Move the navigation state by one step of its motion model.
 
-    def start_calibration(self) -> None:
-        """Take the calibration for uncertain from now on, equation (C4).
-
-        What has been learned with a calibration that counted as known is how exposures and landmarks lie to each other
-        and how fast they pass; all of it moves with the calibration's error as one, and body and IMU do not.
+        Args:
+            step: the step.
+            walk: what the calibration's random walk adds to its covariance (C, C), equation (C4); None: nothing.
         """
-        self.calibrating = True
-        M, first = self._pose_D_calibration(), self.first_clone
-        J = np.zeros((len(self.P), self.calibration.dim))
-        J[6:9] = -so3_hat(self.nav.velocity) @ M[-3:]
-        J[first : self.first_landmark] = np.tile(M[-6:], (len(self.clones), 1)) - M
-        J[self.first_landmark :] = np.tile(M[-6:-3], (len(self.landmarks), 1))
-        S = np.eye(len(self.P))
-        S[:, DIM:first] += J
-        P = S @ self.P @ S.T
-        P[6:9, 6:9] += np.eye(3) * _VELOCITY_SIGMA_MPS**2
-        self.P, self.prior_delta = 0.5 * (P + P.T), S @ self.prior_delta
+        Phi = np.eye(self.first_clone)
+        Phi[:DIM, :DIM] = step.Phi
+        if self.calibration.extrinsics:
+            rows = self.calibration.extrinsic_rows + DIM
+            Phi[np.ix_(rows, rows)] = se3_adjoint(step.nav.T_world_imu @ se3_inverse(self.nav.T_world_imu))
+        self.nav = step.nav
+        P, self._L, own = self.P, None, slice(0, len(Phi))
+        P[own] = Phi @ P[own]
+        P[:, own] = P[:, own] @ Phi.T
+        P[:DIM, :DIM] += step.Q
+        if walk is not None:
+            P[DIM : len(Phi), DIM : len(Phi)] += self.calibration.in_world(walk, self.nav.T_world_imu)
+        self.prior_delta[own] = Phi @ self.prior_delta[own]
 
     def start_stereo_field(self, calibration: Calibration, covariance: FloatArray) -> None:
         """Add the stereo field's coefficients to the state.
@@ -263,13 +237,6 @@ class Window:
         P[DIM : DIM + S, DIM : DIM + S] = covariance
         self.P, self.prior_delta, self.calibration = P, prior_delta, calibration
 
-    def add_calibration_noise(self, extra: FloatArray) -> None:
-        """Add noise (C, C) to the errors of what is being calibrated."""
-        size = self.calibration.dim if self.calibrating else self.calibration.stereo_dim
-        rows = slice(DIM, DIM + size)
-        self.P[rows, rows] += extra[:size, :size]
-        self._L = None
-
     def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise (15, 15) to the last step, as if its motion had been known less; the newest clone ends it."""
         newest = self.clone_rows(len(self.clones) - 1)
@@ -279,23 +246,67 @@ class Window:
         J[self.first_landmark :, 3:6] = so3_hat(self.landmarks).reshape(-1, 3)
         self.P = self.P + J @ extra @ J.T
 
-    def add_clone(self, frame_index: int, time_ns: int, late_s: float = 0.0) -> None:
-        """Copy the pose as the newest clone; landmarks are anchored to its rotation from now on.
+    def add_clone(self, frame_index: int, time_ns: int, late_s: float = 0.0, twist: Twist = NO_TWIST) -> None:
+        """Add the pose at an exposure as the newest clone; landmarks are anchored to its rotation from now on.
 
         Args:
             frame_index: the frame's number.
             time_ns: the frame's stamp.
             late_s: the navigation state's time on the IMU's clock minus that stamp.
+            twist: of the body, and how well it is known; used where the time offset is estimated.
         """
-        at = self.first_landmark
-        rows = np.concatenate([np.arange(at), np.arange(6), np.arange(at, len(self.P))])
-        self.P = self.P[np.ix_(rows, rows)]
-        self.prior_delta = self.prior_delta[rows]
-        previous = len(self.clones) - 1
-        nav = self.nav
-        self.clones.append(Clone(frame_index, time_ns, nav.T_world_imu, nav.velocity, nav.rate, late_s))
+        T, camera_D_own, noise = self.camera_D_own(late_s, twist)
+        at, own, D = self.first_landmark, slice(0, self.first_clone), len(self.P)
+        if not self.clones and self.calibration.timing:
+            # The world begins at the first exposure, so it is the navigation state that the offset moves.
+            to_nav = np.eye(D)
+            to_nav[:6, self.first_clone - 1] = -camera_D_own[:, -1]
+            self.P = to_nav @ self.P @ to_nav.T
+            self.prior_delta = to_nav @ self.prior_delta
+        added, beside = camera_D_own @ self.P[own], self.P[:, own] @ camera_D_own.T  # exact copies without calibration
+        block = added[:, own] @ camera_D_own.T
+        if self.clones:
+            block = block + noise
+        else:
+            self.P[:6, :6] += noise
+        P = np.empty((D + 6, D + 6))
+        old = np.concatenate([np.arange(at), np.arange(at + 6, D + 6)])
+        new = slice(at, at + 6)
+        P[np.ix_(old, old)] = self.P
+        P[new, old], P[old, new], P[new, new] = added, beside, block
+        delta = self.prior_delta
+        self.prior_delta = np.concatenate([delta[:at], camera_D_own @ delta[own], delta[at:]])
+        self.P = P
+        self.clones.append(Clone(frame_index, time_ns, T, self.nav.velocity))
         if len(self.landmarks):
-            self._anchor_to_newest(self.clone_rows(previous).start + 3)
+            self._anchor_to_newest(self.clone_rows(len(self.clones) - 2).start + 3)
+
+    def camera_D_own(
+        self, late_s: float, twist: Twist, nav: NavState | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """How errors of navigation state and calibration move the camera at an exposure, equation (C2).
+
+        Args:
+            late_s: the navigation state's time on the IMU's clock minus the frame's stamp.
+            twist: of the body at the exposure.
+            nav: the navigation state; None: the window's.
+
+        Returns:
+            The body's pose (4, 4) at the exposure, the Jacobian (6, first_clone), and a noise covariance (6, 6).
+        """
+        T = self.nav.T_world_imu if nav is None else nav.T_world_imu
+        J, calibration = np.eye(6, self.first_clone), self.calibration
+        exposed = T
+        if calibration.timing:
+            exposed = T @ se3_exp(twist.mean * (calibration.time_offset_s - late_s))
+        if calibration.extrinsics:
+            J[:, calibration.extrinsic_rows + DIM] = -se3_adjoint(exposed @ se3_inverse(T))
+        if not calibration.timing:
+            return exposed, J, np.zeros((6, 6))
+        A, row = se3_adjoint(exposed), self.first_clone - 1
+        J[:, row] = A @ twist.significant()
+        spread = float(self.P[row, row]) + (calibration.time_offset_s - late_s) ** 2
+        return exposed, J, A @ twist.covariance @ A.T * spread
 
     def _anchor_to_newest(self, previous_rotation: int) -> None:
         """Measure the landmarks' errors from the newest exposure's rotation: xi_f += p^ (phi_new - phi_old)."""
@@ -303,20 +314,10 @@ class Window:
         turn, before = slice(newest, newest + 3), slice(previous_rotation, previous_rotation + 3)
         p_cross = so3_hat(self.landmarks).reshape(-1, 3)
         P, delta, self._L = self.P, self.prior_delta, None
-        move = p_cross @ (P[turn] - P[before])  # (3M, D)
-        delta_move = p_cross @ (delta[turn] - delta[before])
-        if self.calibration.dim:
-            M = self._pose_D_calibration()
-            own, J = slice(DIM, self.first_clone), p_cross @ (M[-3:] - M[-9:-6])
-            move += J @ P[own]
-            delta_move += J @ delta[own]
-        P[first:] += move
-        corner = (P[first:, turn] - P[first:, before]) @ p_cross.T
-        if self.calibration.dim:
-            corner += P[first:, own] @ J.T
-        P[first:, first:] += corner
+        P[first:] += p_cross @ (P[turn] - P[before])
+        P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
-        delta[first:] += delta_move
+        delta[first:] += p_cross @ (delta[turn] - delta[before])
 
     def drop_oldest_clone(self) -> None:
         """Forget the oldest clone."""
@@ -402,22 +403,23 @@ class Window:
 
     def relinearise(self, error: FloatArray) -> None:
         """Move the means by an error vector (D,); the prior stays where it is."""
-        self.nav = self.motion.corrected(self.nav, error[:DIM])
-        T = np.array([c.T_world_imu for c in self.clones])
-        move_poses(error[self.first_clone : self.first_landmark].reshape(-1, 6), T)
+        T, moves = self.exposures(), self.body_D_error() @ error[: self.first_landmark]
+        move_poses(moves.reshape(-1, 6), T)
         if len(self.landmarks):
             phi = self.exposure_errors(error)[-3:]
-            own = error[self.first_landmark :].reshape(-1, 3)
-            self.landmarks = self.landmarks @ so3_exp(phi).T + own @ so3_left_jacobian(phi).T
-        velocities, rate_error = [c.velocity for c in self.clones], np.zeros(3)
+            xi_f = error[self.first_landmark :].reshape(-1, 3)
+            self.landmarks = self.landmarks @ so3_exp(phi).T + xi_f @ so3_left_jacobian(phi).T
+        velocities = [c.velocity for c in self.clones]
         if isinstance(self.motion, ImuMotion):
-            velocities, rate_error = self._corrected_velocities(self.motion, T, error[:DIM]), error[9:12]
+            velocities = self._corrected_velocities(self.motion, T, error[:DIM])
         self.clones = [
-            Clone(c.frame_index, c.time_ns, pose, velocity, c.rate - rate_error, c.late_s)
+            Clone(c.frame_index, c.time_ns, pose, velocity)
             for c, pose, velocity in zip(self.clones, T, velocities, strict=True)
         ]
         if self.calibration.dim:
-            self.calibration = self.calibration.corrected(error[DIM : self.first_clone])
+            own = error[DIM : self.first_clone]
+            self.calibration = self.calibration.corrected(own, self.nav.T_world_imu)
+        self.nav = self.motion.corrected(self.nav, error[:DIM])
         self.prior_delta = self.prior_delta + error
 
     def turn_world(self, yaw: float, yaw_D_tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -434,7 +436,8 @@ class Window:
         yaws = np.concatenate([[5], np.arange(self.first_clone + 5, self.first_landmark, 6)])
         M = np.eye(D)
         M[yaws, 3:6] += yaw_D_tilt
-        in_world = [*range(0, 9, 3), *range(self.first_clone, D, 3)]
+        extrinsics = (self.calibration.extrinsic_rows + DIM)[::3].tolist()
+        in_world = [*range(0, 9, 3), *extrinsics, *range(self.first_clone, D, 3)]
         turn = np.eye(D)
         for k in in_world:
             turn[k : k + 3, k : k + 3] = R

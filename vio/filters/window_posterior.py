@@ -30,10 +30,9 @@ class WindowPosterior:
         """Take over the body's poses at the window's exposures, with the covariance P (k, k) up to theirs."""
         rows = slice(window.first_clone, window.first_landmark)
         clones, own = tuple(window.clones), P[rows, rows]
-        if window.calibration.timing:
-            clones = tuple(replace(c, T_world_imu=T) for c, T in zip(clones, window.exposures(), strict=True))
-            exposures_D_error = window.chain(np.eye(6 * len(clones)))[:, : len(P)]
-            own = exposures_D_error @ P @ exposures_D_error.T
+        if window.calibration.extrinsics:
+            body_D_error = window.body_D_error()
+            own = body_D_error @ P @ body_D_error.T
         if not isinstance(window.motion, ImuMotion):
             clones = _with_velocities(clones)
         return cls(clones, own, window.nav.gyro_bias, window.nav.accel_bias)

@@ -24,7 +24,7 @@ from vio.filters.multiview import (
     track_information,
 )
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import StereoColumns, StereoField, field_jacobian, stereo_columns
+from vio.filters.stereo_calibration import StereoColumns, StereoField, stereo_columns
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -134,7 +134,7 @@ class WindowTracks:
         columns = None
         if field is not None:
             # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-            H = field_jacobian(self._camera, z - at.r)
+            H = field.jacobian(z - at.r)
             columns = stereo_columns(at, H, information.q.p_D_q, weight)
         return LinearTracks(T_cam0_world, rows, p_world, at, information, columns, field)
 

@@ -14,6 +14,7 @@ _GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many ti
 _LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
 _REJECTING_FRAMES = 20
 _ROWS_OFF_PX = 0.2
+_SCALE_OFF_PERCENT, _SCALE_SIGMAS = 1.0, 3.0  # of baseline or focal length, both to be exceeded
 _RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
 _MAX_SPEED_MPS = 100.0
 _MAX_GYRO_BIAS_RADPS = 0.5
@@ -62,6 +63,7 @@ class RunHealth:
         lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
         lines += self._rejections(index, report)
         lines += self._stereo(index, estimate)
+        lines += self._scale(index, estimate)
         lines += self._implausible(index, estimate)
         return tuple(lines)
 
@@ -93,6 +95,21 @@ class RunHealth:
             "pattern: the stereo calibration is off; what it is off by is estimated while running "
             "(msckf.calibrate_stereo)"
         ]
+
+    def _scale(self, index: int, estimate: Estimate) -> list[str]:
+        """Report once that baseline or focal length differ from the calibration beyond doubt and beyond harm."""
+        lines: list[str] = []
+        found = {} if estimate.stereo_scale is None else estimate.stereo_scale.percent()
+        for name, (percent, sigma) in found.items():
+            if abs(percent) <= max(_SCALE_OFF_PERCENT, _SCALE_SIGMAS * sigma) or name in self._reported:
+                continue
+            self._reported.add(name)
+            lines.append(
+                f"frame {index}: the {name} is {abs(percent):.1f} % {'longer' if percent > 0 else 'shorter'} than "
+                f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor measures, and is taken "
+                "as that; calibrate the cameras anew, or check that images and calibration have one size"
+            )
+        return lines
 
     def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[str]:
         """Report when features have been missing for long, and when they are back."""
