@@ -15,7 +15,8 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 TESTED_JACOBIANS = {
     "vio.filters.multiview.point_D_clones",
     "vio.filters.multiview.point_D_pose",
-    "vio.filters.online_calibration.pose_D_calibration",
+    "vio.filters.window.body_D_error",
+    "vio.filters.window.camera_D_own",
     "vio.filters.stereo_calibration.point_D_stereo",
     "vio.filters.vislam.z_D_landmark",
     "vio.filters.vislam.z_D_xi",
