@@ -1018,11 +1018,11 @@ MUTATIONS = (
         _SCORE,
     ),
     Mutation(
-        "picture: a straight road seen from beside",
-        "vio/plotting.py",
-        "if len(points) and spread[second] < _STRAIGHT * spread[along]:",
-        "if False:",
-        ("tests/test_plotting.py",),
+        "picture: up is down without an IMU",
+        "vio/upright.py",
+        "up = -first[:3, 1] if up_world is None",
+        "up = first[:3, 1] if up_world is None",
+        ("tests/test_report.py",),
     ),
     Mutation(
         "alignment: scale missing in the translation",
