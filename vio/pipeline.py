@@ -140,7 +140,7 @@ def run(
     _check(recording, config, start, stop)
     motion = resolve_motion(recording, config)
     body: BodyFrame = "cam0" if recording.T_cam0_imu is None else "imu"
-    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    T_cam0_body = recording.T_cam0_body
     began = time.perf_counter()
     recorder = RunRecorder(body, lag_frames=config.lag_frames, keep_observations=keep_observations, folder=folder)
     features = _feature_source(dataset, config)
@@ -229,9 +229,8 @@ def _map_session(path: Path, recording: Recording, config: Config, *, localise: 
         raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
     if config.backend != "msckf":
         raise ConfigError(f"a map needs the back end msckf, not {config.backend}; leave --backend out")
-    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
     source, imu = str(recording.path.absolute()), config.motion == "imu"
-    return MapSession(path, recording.camera, T_cam0_body, source=source, imu=imu, localise=localise)
+    return MapSession(path, recording.camera, recording.T_cam0_body, source=source, imu=imu, localise=localise)
 
 
 def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:

@@ -412,3 +412,8 @@ class Recording:
     landmarks_reference: Landmarks | None = None  # surveyed landmark positions, covariance zero
     notes: tuple[str, ...] = ()  # what the reader found and mended; each is logged once as a warning
     run_motion: RunMotion | None = None  # observation logs: what the run behind the log used; None: not known
+
+    @property
+    def T_cam0_body(self) -> FloatArray:
+        """Extrinsics (4, 4) of the body that a run estimates: the IMU, or cam0 itself where there is none."""
+        return np.eye(4) if self.T_cam0_imu is None else self.T_cam0_imu

@@ -131,7 +131,6 @@ def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapp
         request: what `vio run --resume` needs to repeat the command.
     """
     recording = dataset.recording
-    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
     metrics = {
         "out": str(folder),
         "complete": False,
@@ -139,7 +138,7 @@ def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapp
         "kind": recording.kind,
         "version": __version__,
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "T_cam0_imu": T_cam0_body.tolist(),
+        "T_cam0_imu": recording.T_cam0_body.tolist(),
     }
     texts = {
         "config.yaml": to_yaml(config),

@@ -191,7 +191,7 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
         trajectory = read_trajectory(path, body=truth.reference.body)
     times_ns = truth.frame_times_ns
     trajectory = between(trajectory, int(times_ns[0]), int(times_ns[-1]))
-    T_cam0_imu = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    T_cam0_imu = recording.T_cam0_body
     score = _evaluate(job, trajectory, truth.reference, T_cam0_imu)
     figures: dict[str, Any] = {
         "frames": len(trajectory),

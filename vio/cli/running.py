@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from vio.atomic import atomic_write_text, check_replaceable, check_writable, locked_folder
 from vio.cli.progress import ProgressBar
 from vio.cli.stopping import StopRequest
@@ -241,8 +239,7 @@ def _open_view(where: str, dataset: Dataset, config: Config, reference: Trajecto
     from vio.view.stream import open_stream
 
     recording = dataset.recording
-    T_cam0_body = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
-    rig = ViewedRig(recording.camera, T_cam0_body, resolve_motion(recording, config), reference)
+    rig = ViewedRig(recording.camera, recording.T_cam0_body, resolve_motion(recording, config), reference)
     stream, address = open_stream(where, recording.path.name)
     if address is not None:
         log.warning("the run is shown at %s", address)

@@ -125,7 +125,7 @@ def _write_images(
 
 def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
     times = np.array(written.times_ns, dtype=np.int64)
-    T_cam0_imu = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    T_cam0_imu = recording.T_cam0_body
     rig, mav = rig_from_rectified(recording.camera, T_cam0_imu), out / "mav0"
     for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
         text = camera_yaml(camera, T_imu_cam, comment=f"rectified {name}", rate_hz=median_rate_hz(times))
@@ -164,7 +164,7 @@ def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: Imu
     at = np.searchsorted(truth.times_ns, times)
     if (at < len(truth)).all() and np.array_equal(truth.times_ns[at], times):
         here = replace(truth, T_world_body=truth.T_world_body[at], times_ns=times)
-        T_cam0_imu = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+        T_cam0_imu = recording.T_cam0_body
         rows = in_first_cam0(here, T_cam0_imu).T_world_body[:, :3].reshape(-1, 12)
         write_text(out / "poses.txt", "".join(f"{exact_text(row)}\n" for row in rows))
     else:

@@ -73,7 +73,7 @@ def open_source(text: str) -> CalibrationSource:
     if isinstance(dataset, RectifiedDataset):
         return CalibrationSource(recording.path, dataset.rectifier.rig, dataset.pairs, dataset, None)
     known = recording.camera.width is not None
-    T = np.eye(4) if recording.T_cam0_imu is None else recording.T_cam0_imu
+    T = recording.T_cam0_body
     rig = rig_from_rectified(recording.camera, T) if known else None
     pairs = dataset.pairs if isinstance(dataset, ImageDataset) else ()
     return CalibrationSource(recording.path, rig, pairs, dataset, None)
