@@ -1575,4 +1575,11 @@ MUTATIONS = (
         "return RelativePose(se3_inverse(T_j) @ T_i, C)",
         _MAP_RUN,
     ),
+    Mutation(
+        name="bundle adjustment without the matches of loops",
+        file="vio/mapping/points.py",
+        old="    loops = loop_rows(run.loops, run.frames[keyframes])",
+        new="    loops = loop_rows((), run.frames[keyframes])",
+        tests=("tests/test_colmap.py",),
+    ),
 )
