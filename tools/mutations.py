@@ -1576,10 +1576,17 @@ MUTATIONS = (
         _MAP_RUN,
     ),
     Mutation(
-        name="bundle adjustment without the matches of loops",
-        file="vio/mapping/points.py",
-        old="    loops = loop_rows(run.loops, run.frames[keyframes])",
-        new="    loops = loop_rows((), run.frames[keyframes])",
-        tests=("tests/test_colmap.py",),
+        "loops: bundle adjustment without their matches",
+        "vio/mapping/points.py",
+        "loops = loop_rows(run.loops, run.frames[keyframes])",
+        "loops = loop_rows((), run.frames[keyframes])",
+        ("tests/test_colmap.py",),
+    ),
+    Mutation(
+        "map: roll and pitch of the first keyframe held",
+        "vio/mapping/pose_graph.py",
+        "if self.levelled is not None:",
+        "if self.levelled is not None and False:",
+        ("tests/test_pose_graph.py",),
     ),
 )
