@@ -1583,6 +1583,20 @@ MUTATIONS = (
         ("tests/test_colmap.py",),
     ),
     Mutation(
+        "loops: covariance of the pixel noise stated, not found",
+        "vio/mapping/loop_geometry.py",
+        "covariance = noise * _INFLATION**2",
+        "covariance = _INFLATION**2",
+        _PLACES,
+    ),
+    Mutation(
+        "map: motions as certain as the tracks say",
+        "vio/mapping/session.py",
+        "_MOTION_INFLATION**2 * motion.covariance + np.diag(sigma**2)",
+        "_MOTION_INFLATION**2 * motion.covariance",
+        _MAP_RUN,
+    ),
+    Mutation(
         "map: roll and pitch of the first keyframe held",
         "vio/mapping/pose_graph.py",
         "if self.levelled is not None:",
