@@ -1590,6 +1590,13 @@ MUTATIONS = (
         _PLACES,
     ),
     Mutation(
+        "map: moves with the jumps of the odometry",
+        "vio/mapping/builder.py",
+        "if motion is not None and self._last is None:",
+        "if motion is not None:",
+        _MAPS,
+    ),
+    Mutation(
         "map: images alone know their motion in the dark",
         "vio/mapping/session.py",
         "return self._alone and self._seen_ns is not None and",
