@@ -24,6 +24,7 @@ from vio.errors import DataError, EvaluationError
 from vio.evaluation import Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.input_files import read_input
+from vio.loop_files import write_keyframes, write_loops
 from vio.mapped_run import MappedRun
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.printable import json_text, printable
@@ -39,7 +40,6 @@ log = logging.getLogger(__name__)
 MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
 CALIBRATION = "camchain-imucam.yaml"  # the corrected calibration, where no other file is named for it
 REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
-LOOP_COLUMNS = ("frame", "time_ns", "keyframe", "keyframe_time_ns", "inliers", "gap_m", "joined")
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 FILES = (
     MARKER,
@@ -51,6 +51,8 @@ FILES = (
     "map_causal.tum",
     "map_covariance.npy",
     "loops.csv",
+    "loop_matches.npz",
+    "map_keyframes.csv",
     "estimates.npy",
     "reference.tum",
     "dead_reckoning.tum",
@@ -210,8 +212,8 @@ def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference:
         poses = Trajectory(np.array(causal["T_map_body"]), np.array(causal["time_ns"]), result.body)
         write_tum(target / "map_causal.tum", poses)
     np.save(target / "map_covariance.npy", causal["covariance"])
-    lines = [",".join(LOOP_COLUMNS), *(",".join(str(getattr(o, c)) for c in LOOP_COLUMNS) for o in mapped.loops)]
-    (target / "loops.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_loops(target, mapped.loops)
+    write_keyframes(target, mapped.in_map)
     evaluation, _ = score(replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body)
     return {
         "joined": mapped.joined,

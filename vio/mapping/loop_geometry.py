@@ -15,6 +15,7 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.loops import LoopMatches
 from vio.mapping.features import KeyframeFeatures
 from vio.records import BoolArray, IntArray
 
@@ -44,6 +45,7 @@ class Verified:
     pairs: int  # of descriptors
     rows_i: IntArray  # (inliers,) features of i
     rows_j: IntArray  # (inliers,) features of j
+    matches: LoopMatches  # their pixels
 
 
 def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
@@ -88,7 +90,8 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
     pose, good = fitted
     if good.sum() < max(LEAST_INLIERS, _LEAST_SHARE * len(pairs)):
         return None
-    return Verified(pose, int(good.sum()), len(pairs), a[good], b[good])
+    a, b = a[good], b[good]
+    return Verified(pose, len(a), len(pairs), a, b, LoopMatches(i.z[a], j.z[b], i.has_right[a], j.has_right[b]))
 
 
 def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,7 +17,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_hat
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
-from vio.loops import LoopEvent
+from vio.loops import LoopEvent, MapKeyframes
 from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate
 from vio.mapping.features import extract
 from vio.mapping.map_store import MapStore
@@ -69,6 +70,7 @@ class MapSession:
         # Newest frame: its number, the motion since the last keyframe, its pose by odometry.
         self._newest: tuple[int, RelativePose, FloatArray] | None = None
         self._since = 0  # frames since the last keyframe
+        self._last_keyframe: int | None = None  # its frame
         self.T_map_odom: FloatArray | None = np.eye(4) if self._builder.first == 0 and not localise else None
         # (6, 6) covariance in the map of the newest keyframe with a result
         self._known: FloatArray | None = None if self.T_map_odom is None else np.zeros((6, 6))
@@ -120,6 +122,26 @@ class MapSession:
         graph, own = self._builder.graph, slice(self._builder.first, None)
         frames = np.array([graph.frame(k) for k in range(self._builder.first, len(graph))], dtype=np.int64)
         return frames, graph.T_map_cam[own] @ self._T_cam_body, graph.T_odom_cam[own] @ self._T_cam_body
+
+    def map_keyframes(self) -> MapKeyframes:
+        """Return all keyframes of the map that are in the frame of this session's poses."""
+        graph, first = self._builder.graph, self._builder.first
+        rows = np.flatnonzero(graph.part == graph.part[first]) if len(graph) > first else np.zeros(0, dtype=np.int64)
+        frames, times = (
+            np.array([of(k) for k in rows.tolist()], dtype=np.int64) for of in (graph.frame, graph.time_ns)
+        )
+        return MapKeyframes(rows, frames, times, rows >= first, graph.T_map_cam[rows] @ self._T_cam_body)
+
+    def settled_loops(self) -> tuple[LoopEvent, ...]:
+        """Return the loops so far, each with what the newest optimisation said of it."""
+        graph = self._builder.graph
+        kept = {(o.first, graph.frame(o.second)): o.kept for o in graph.loops if o.second >= self._builder.first}
+        return tuple(replace(o, kept=kept[o.keyframe, o.frame]) for o in self.loops)
+
+    @property
+    def newest_keyframe(self) -> int | None:
+        """Frame number of the session's newest keyframe."""
+        return self._last_keyframe
 
     @property
     def covariance(self) -> FloatArray | None:
@@ -193,6 +215,7 @@ class MapSession:
         if motion is not None:
             self._moves.append((frame.index, motion))
         self._ids, self._base, self._anchor, self._since = ids, None, frame.index, 0
+        self._last_keyframe = frame.index
         self._newest = frame.index, RelativePose(np.eye(4), np.zeros((6, 6))), T_odom_cam
 
     def _vertical(self, estimate: Estimate) -> tuple[FloatArray | None, float]:
