@@ -30,24 +30,22 @@ class Film:
         self.path.append(self.axes @ T_world_cam0[:3, 3])  # right, ahead, up at the start
         features = zip(seen.ids.tolist(), seen.z[:, :2], strict=True)
         self.tails = {name: [*self.tails.get(name, []), pixel][-LONGEST:] for name, pixel in features}
-        if len(self.path) % EVERY:
-            return
         image = cv2.cvtColor(result.frame.left, cv2.COLOR_GRAY2RGB)
         states = states_of(seen, result.selection.chosen, result.report)
         for tail, colour in zip(self.tails.values(), COLOURS[states].tolist(), strict=True):
             cv2.polylines(image, [np.round(tail).astype(np.int32)], False, colour, 1, cv2.LINE_AA)
             cv2.circle(image, np.round(tail[-1]).astype(int).tolist(), 3, colour, 1, cv2.LINE_AA)
-        scale = WIDTH / image.shape[1]
-        self.pictures.append(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA))
+        if len(self.path) % EVERY == 0:
+            size = WIDTH, round(image.shape[0] * WIDTH / image.shape[1])
+            self.pictures.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
 
     def close(self):  # here the size of the path is known
         height, path = self.pictures[0].shape[0], np.array(self.path)[:, :2]
         low, high = path.min(axis=0) - 1, path.max(axis=0) + 1
         zoom = (np.array([WIDTH, height]) / (high - low)).min()
-        places = (path - (low + high) / 2) * zoom * [1, -1] + [WIDTH / 2, height / 2]
+        places = np.round((path - (low + high) / 2) * zoom * [1, -1] + [WIDTH / 2, height / 2]).astype(np.int32)
         for k, picture in enumerate(self.pictures):
-            side = np.full((height, WIDTH, 3), 255, np.uint8)
-            done = np.round(places[: (k + 1) * EVERY]).astype(np.int32)
+            side, done = np.full((height, WIDTH, 3), 255, np.uint8), places[: (k + 1) * EVERY]
             cv2.polylines(side, [done], False, (31, 95, 191), 2, cv2.LINE_AA)
             cv2.circle(side, done[-1].tolist(), 5, (217, 130, 43), -1, cv2.LINE_AA)
             self.pictures[k] = np.hstack([picture, side])
@@ -56,6 +54,6 @@ class Film:
 dataset = open_dataset(sys.argv[1])
 film = Film(dataset.recording.T_cam0_body)
 run(dataset, load_config(), viewer=film)
-first, *others = [Image.fromarray(picture) for picture in film.pictures]
+first, *others = map(Image.fromarray, film.pictures)
 first.save(sys.argv[2], save_all=True, append_images=others, duration=80, loop=0, quality=45, method=6)
 print(f"{sys.argv[2]}: {1 + len(others)} pictures")
