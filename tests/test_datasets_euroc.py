@@ -210,7 +210,10 @@ def test_skips_and_counts_unmatched_images(tmp_path: Path) -> None:
     _drop_lines(right, [3, 6])
     recording = _read(tmp_path).recording
     assert recording.frame_times_ns.tolist() == [camera_stamps(6)[k] for k in (1, 3, 4)]
-    assert recording.notes == ("2 images of cam0 and 1 of cam1 have no partner and are skipped",)
+    assert recording.notes == (
+        "1 images of cam0 and 2 of cam1 are not listed in their data.csv and are skipped",
+        "2 images of cam0 and 1 of cam1 have no partner and are skipped",
+    )
 
 
 def _drop_lines(path: Path, numbers: list[int]) -> None:

@@ -24,7 +24,8 @@ class Layout:
 
 
 def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
-    """Return one note that names what lies in the folder and was not read."""
+    """Return one note that names what lies in the folder and was not read; files in `used` need not exist."""
+    used = [file for file in used if file.exists()]
     kept = {layout.left.absolute(), layout.right.absolute(), *(file.absolute() for file in used)}
     kept |= {parent for path in kept for parent in path.parents}
     for path in used:  # the other files of a calibration that lies in several
