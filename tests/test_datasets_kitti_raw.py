@@ -157,7 +157,7 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "no K": (_entry("K_01", None), CalibrationError, "calib_cam_to_cam.txt: has no entry K_01"),
     "short D": (_entry("D_00", "-0.3 0.2 0 0"), CalibrationError, "D_00 holds 4 values, expected 5"),
     "NaN in T": (_entry("T_01", "-0.5 nan 0"), CalibrationError, "T_01 holds values that are not finite"),
-    "text": (_entry("T_01", "-0.5 a 0"), CalibrationError, "T_01 holds no number"),
+    "text for a number": (_entry("T_01", "-0.5 a 0"), CalibrationError, "T_01 holds no number"),
     "no matrix": (_entry("K_00", "1 2 3 4 5 6 7 8 9"), CalibrationError, "camera 00 is no intrinsic matrix"),
     "negative focal": (
         _entry("K_00", "-40 0 31 0 40 24 0 0 1"),
@@ -167,12 +167,12 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "mirrored": (_entry("R_01", "1 0 0 0 1 0 0 0 -1"), CalibrationError, "R_01: not a rotation but a reflection"),
     "swapped": (_entry("T_01", "0.11 0 0"), CalibrationError, "cam_to_cam.txt: .*the cameras may be swapped"),
     "no baseline": (_entry("T_01", "0 0 0"), CalibrationError, "the baseline is zero"),
-    "twice": (
+    "an entry twice": (
         lambda d: (d / "calib_cam_to_cam.txt").write_text((d / "calib_cam_to_cam.txt").read_text() * 2),
         CalibrationError,
         "repeats an entry",
     ),
-    "no form": (
+    "a line without a name": (
         lambda d: (d / "calib_velo_to_cam.txt").write_text("1 0 0\n"),
         CalibrationError,
         r"calib_velo_to_cam.txt, line 1: is not of the form 'name: values'",
@@ -187,12 +187,12 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         DataError,
         r"images are 64 x 48 pixels but .* is for 100 x 80 \(raw\) or 56 x 40 \(rectified\)",
     ),
-    "names": (
+    "images without frame numbers": (
         lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/b.png") for k in (0, 1)],
         DataError,
         "b.png: an image of KITTI raw is named by its frame number",
     ),
-    "digits": (
+    "numbers of several lengths": (
         lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/0100.png") for k in (0, 1)],
         DataError,
         "0100.png: its frame number does not increase after 0000000100.png",

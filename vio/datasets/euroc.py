@@ -178,7 +178,8 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
         notes.append(f"{renamed} images have another extension than listed in their data.csv; matched by their stem")
     if left.unlisted or right.unlisted:
         notes.append(
-            f"{left.unlisted} images of cam0 and {right.unlisted} of cam1 are not listed in their data.csv and are skipped"
+            f"{left.unlisted} images of cam0 and {right.unlisted} of cam1 are not listed in their data.csv and are "
+            "skipped"
         )
     unpaired = len(left.times_ns) - len(a), len(right.times_ns) - len(b)
     if any(unpaired):
