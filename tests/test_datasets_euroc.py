@@ -403,15 +403,27 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         DataError,
         r"imu0/data.csv, line 4: a reading is not a finite number",
     ),
-    "an IMU with three columns": (_line("imu0/data.csv", 4, "1,2,3"), DataError, r"imu0/data.csv, line 4: 3 values instead of 7"),
+    "an IMU with three columns": (
+        _line("imu0/data.csv", 4, "1,2,3"),
+        DataError,
+        r"imu0/data.csv, line 4: 3 values instead of 7",
+    ),
     "IMU stamps that repeat": (
         _line("imu0/data.csv", 4, f"{imu_stamps(4)[1]},0,0,0,0,0,9.8"),
         DataError,
         r"imu0/data.csv, line 4: the clock repeats",
     ),
-    "an empty IMU": (lambda mav: (mav / "imu0/data.csv").write_text("#t\n"), DataError, r"imu0/data.csv: holds no line"),
+    "an empty IMU": (
+        lambda mav: (mav / "imu0/data.csv").write_text("#t\n"),
+        DataError,
+        r"imu0/data.csv: holds no line",
+    ),
     "an IMU without data": (lambda mav: (mav / "imu0/data.csv").unlink(), DataError, r"cannot read .*imu0/data.csv"),
-    "an IMU of another time": (_shift_clock("imu0", 10**12), DataError, r"no IMU sample is within the time of the images"),
+    "an IMU of another time": (
+        _shift_clock("imu0", 10**12),
+        DataError,
+        r"no IMU sample is within the time of the images",
+    ),
     "IMU noise of zero": (
         _edit("imu0/sensor.yaml", "accelerometer_random_walk: 3.0000e-3", "accelerometer_random_walk: 0"),
         CalibrationError,
@@ -422,7 +434,7 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         CalibrationError,
         "has no entry 'gyroscope_random_walk'",
     ),
-    "ground truth with no unit quaternion": (
+    "ground truth that turns by no rotation": (
         _line("state_groundtruth_estimate0/data.csv", 3, f"{_T1},1,2,3,1,1,1,1,0,0,0,0,0,0,0,0,0"),
         DataError,
         r"state_groundtruth_estimate0/data.csv, line 3: the quaternion has norm 2",

@@ -13,7 +13,7 @@ from tests.dataset_makers import CAMERA, T_CAM0_IMU, Drive, make_drive
 from vio.config import load_config
 from vio.datasets import open_dataset
 from vio.datasets.features import FeatureDataset
-from vio.datasets.gtsam import is_factor_file, read_gtsam
+from vio.datasets.gtsam import read_gtsam
 from vio.errors import VioError
 from vio.evaluation import evaluate
 from vio.geometry.lie import se3_inverse
@@ -82,14 +82,6 @@ def test_a_run_follows_the_drive(tmp_path: Path) -> None:
     result = run(open_dataset(make_factors(tmp_path)), load_config())
     truth = Trajectory(T_world_cam(DRIVE), result.recording.frame_times_ns, "cam0")
     assert evaluate(result.trajectory, truth).ate_m.rmse < 0.01  # exact pixels over 7 m
-
-
-def test_a_trajectory_is_no_factor_file() -> None:
-    assert is_factor_file(b"1 3 209.979 185.87 61.5418 -8.90263 -2.48003 16.0758\r\n2 3 18")
-    assert is_factor_file(b"1 3 209.979 185.87 61.5418 -8.90263 -2e-3 16.0758")
-    assert not is_factor_file(b"1403715523.912143104 3 209.979 185.87 61.5418 0 0 1\n")
-    assert not is_factor_file(b"# timestamp tx ty tz qx qy qz qw\n1 2 3 4 5 6 7 8\n")
-    assert not is_factor_file(b"1 3 209.979 185.87 61.5418 -8.9 -2.4 16 17\n")
 
 
 def _with(change: Callable[[list[str]], list[str]], name: str = FACTORS) -> Callable[[Path], Path]:

@@ -20,7 +20,9 @@ def add_parser(commands: Any) -> None:
         "folder: frame by frame, rectified as a run sees them, with IMU, velocities and ground truth.",
     )
     parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
-    parser.add_argument("--to", choices=("euroc", "kitti", "plain"), required=True, help="form of the folder")
+    parser.add_argument(
+        "--to", choices=("euroc", "kitti", "plain", "rosbag2", "mcap"), required=True, help="form of the output"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)")
     parser.add_argument("--start", type=bound, default=0, metavar="N", help="first frame, or time such as 12s")
     parser.add_argument("--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time")

@@ -206,7 +206,7 @@ def _file_kind(path: Path) -> str | None:
         return "utias"
     if is_bag(path):
         return "bag"
-    if is_factor_file(start):
+    if is_factor_file(path):
         return "gtsam"
     if not start.startswith(b"PK"):
         return None

@@ -27,8 +27,6 @@ from vio.text_files import read_numbers
 _FACTORS = "stereo_factors"
 _FRAME_NS = 100_000_000  # KITTI's cameras
 _COLUMNS = "pose landmark uL uR v X Y Z"
-_NUMBER = rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
-_FIRST_ROW = re.compile(rb"\s*\d+\s+\d+(?:\s+" + _NUMBER + rb"){6}\s*(?:\r?\n|$)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +37,14 @@ class _Poses:
     T_world_cam: FloatArray  # (P, 4, 4)
 
 
-def is_factor_file(start: bytes) -> bool:
-    """Return whether a file begins with a row of stereo factors: eight numbers, the first two of them whole."""
-    return _FIRST_ROW.match(start) is not None
+def is_factor_file(path: Path) -> bool:
+    """Return whether a file is one of stereo factors by its name, by which its calibration is found, too."""
+    return _FACTORS in path.name and path.suffix == ".txt"
 
 
 def factor_files(folder: Path) -> tuple[Path, ...]:
     """Return the factor files of a folder by their names."""
-    return tuple(sorted(path for path in folder.glob(f"*{_FACTORS}*.txt") if path.is_file()))
+    return tuple(sorted(path for path in folder.iterdir() if is_factor_file(path) and path.is_file()))
 
 
 def read_gtsam(path: Path) -> FeatureDataset:
