@@ -15,7 +15,6 @@ from vio.cli import main
 from vio.datasets import open_dataset
 from vio.records import VelocitySample
 
-
 BAGS = ("rosbag2", "mcap")
 
 

@@ -65,9 +65,7 @@ class BagWriter:
         twist = self._make("geometry_msgs/msg/Twist", self._vector(sample.linear), self._vector(sample.angular))
         self._put(topic, sample.time_ns, "geometry_msgs/msg/TwistStamped", frame, twist)
 
-    def pose(
-        self, topic: str, frame: str, time_ns: int, T: FloatArray, covariance: FloatArray | None = None
-    ) -> None:
+    def pose(self, topic: str, frame: str, time_ns: int, T: FloatArray, covariance: FloatArray | None = None) -> None:
         """Write a pose (4, 4), with the covariance (6, 6) of its position and of its rotation about fixed axes."""
         if covariance is None:
             self._put(topic, time_ns, "geometry_msgs/msg/PoseStamped", frame, self._pose(T))
@@ -99,19 +97,13 @@ class BagWriter:
         fields = [self._make("sensor_msgs/msg/PointField", name, 4 * k, _FLOAT32, 1) for k, name in enumerate(names)]
         raw = np.frombuffer(data.tobytes(), dtype=np.uint8)
         row = 16 * len(data)
-        self._put(
-            topic, time_ns, "sensor_msgs/msg/PointCloud2", frame, 1, len(data), fields, False, 16, row, raw, True
-        )
+        self._put(topic, time_ns, "sensor_msgs/msg/PointCloud2", frame, 1, len(data), fields, False, 16, row, raw, True)
 
     def _transforms(self, topic: str, time_ns: int, transforms: Sequence[tuple[str, str, FloatArray]]) -> None:
         items = []
         for parent, child, T in transforms:
-            moved = self._make(
-                "geometry_msgs/msg/Transform", self._vector(T[:3, 3]), self._quaternion(T[:3, :3])
-            )
-            items.append(
-                self._make("geometry_msgs/msg/TransformStamped", self._header(time_ns, parent), child, moved)
-            )
+            moved = self._make("geometry_msgs/msg/Transform", self._vector(T[:3, 3]), self._quaternion(T[:3, :3]))
+            items.append(self._make("geometry_msgs/msg/TransformStamped", self._header(time_ns, parent), child, moved))
         self._write(topic, time_ns, self._make("tf2_msgs/msg/TFMessage", items))
 
     def _put(self, topic: str, time_ns: int, kind: str, frame: str, *values: Any) -> None:
@@ -142,9 +134,7 @@ class BagWriter:
         return self._vector(quat_xyzw_from_rotation(R), "Quaternion")
 
     def _pose(self, T: FloatArray) -> Any:
-        return self._make(
-            "geometry_msgs/msg/Pose", self._vector(T[:3, 3], "Point"), self._quaternion(T[:3, :3])
-        )
+        return self._make("geometry_msgs/msg/Pose", self._vector(T[:3, 3], "Point"), self._quaternion(T[:3, :3]))
 
 
 def _latched_qos() -> Any:
