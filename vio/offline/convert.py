@@ -82,7 +82,7 @@ def convert(
     if not recording.has_images or recording.camera.width is None:
         raise DataError(f"{recording.path}: holds no images, so there is nothing to convert")
     noise: ImuDensities | None = getattr(dataset, "imu_noise", None)
-    if form == "rosbag2" or form == "mcap":  # noqa: PLR1714 # mypy narrows the type by these
+    if form == "rosbag2" or form == "mcap":  # mypy narrows the type by these
         counts = write_bag(dataset, out, form, start, stop, progress)
         _check_frames(counts.frames, recording)
         _write_kalibr(out, recording, noise if counts.imu_samples else None)
