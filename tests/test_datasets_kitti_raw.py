@@ -307,6 +307,32 @@ def test_real_rows_are_aligned_as_well_as_by_kitti(data_dir: Path) -> None:
     assert ours < 0.5
 
 
+def test_real_rectified_images_show_features_where_those_of_kitti_do(data_dir: Path) -> None:
+    """Corners of our images of frame 100, turned as KITTI's, are found by their texture where KITTI's own show them."""
+    dataset, published = _real(data_dir)
+    frame = next(e for e in dataset.events(0, 1) if isinstance(e, StereoFrame))
+    clip = open_dataset(data_dir / "kitti_0039")
+    theirs = next(e for e in clip.events(76, 77) if isinstance(e, StereoFrame))
+    R_ours = rectifying_rotations(dataset.rectifier.rig)[:2]
+    K_ours, K_theirs = dataset.recording.camera.K, clip.recording.camera.K
+    window = {"winSize": (21, 21), "maxLevel": 2}
+    moved = []
+    pairs = ((frame.left, theirs.left, published.R_rect_cam0), (frame.right, theirs.right, published.R_rect_cam1))
+    for (ours, other, R_theirs), R in zip(pairs, R_ours, strict=True):
+        assert ours is not None
+        assert other is not None
+        H = K_theirs @ R_theirs @ R.T @ np.linalg.inv(K_ours)
+        turned = cv2.warpPerspective(ours, H, other.shape[::-1])
+        corners = cv2.goodFeaturesToTrack(turned[20:-20, 20:-20], 300, 0.01, 12) + np.float32(20)
+        found, status, _ = cv2.calcOpticalFlowPyrLK(turned, other, corners, None, **window)  # type: ignore[call-overload]
+        assert status.mean() > 0.95
+        moved.append((found - corners)[status[:, 0] == 1, 0])
+    for shift in moved:
+        assert np.median(np.abs(shift[:, 1])) < 0.05  # rows: the epipolar residual
+        assert np.median(np.linalg.norm(shift, axis=1)) < 0.05
+    assert abs(np.median(moved[0][:, 1]) - np.median(moved[1][:, 1])) < 0.02
+
+
 def test_a_rig_of_the_real_files_is_consistent(data_dir: Path) -> None:
     """The right camera's position agrees between `R_01 T_01` and `P_rect_01`."""
     dataset, published = _real(data_dir)
