@@ -252,6 +252,25 @@ def test_motions_are_joined_where_the_window_moves_on(tmp_path: Path) -> None:
     assert np.linalg.eigvalsh(motion.covariance)[0] > 7.0, "of eight steps of unit variance each"
 
 
+def test_motions_have_errors_that_tracks_do_not_average_out(tmp_path: Path) -> None:
+    """A filter that is sure to a micrometre of a metre: the calibration is not."""
+    steps = [np.eye(4), se3_exp([0.0, 0, 1.0, 0, 0.5, 0])]
+
+    def relative(older: int, newer: int) -> RelativePose | None:
+        return RelativePose(se3_inverse(steps[older]) @ steps[newer], 1e-12 * np.eye(6))
+
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    gray = np.zeros((64, 64), dtype=np.uint8)
+    for k in range(2):
+        seen = observations(k, k, np.arange(40) + 1000 * k, np.tile([9.0, 9, 5, 9], (40, 1)))
+        session.frame(StereoFrame(k, k, gray, gray), seen, Estimate(k, steps[k], np.eye(6)), relative)
+    session.finish()
+    session.close()
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    sigma = np.sqrt(np.diag(motion.covariance))
+    np.testing.assert_allclose(sigma, np.repeat([5e-4, 1e-4], 3), rtol=0.05)
+
+
 def test_where_the_filter_began_anew_the_motion_is_not_known(tmp_path: Path) -> None:
     def relative(older: int, newer: int) -> RelativePose | None:
         return None if older < 5 <= newer else RelativePose(np.eye(4), 1e-6 * np.eye(6))

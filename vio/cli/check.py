@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 MARKER = "check.json"
 KEYFRAMES = 40
+LEAST_SHARED = 15  # points that both images of a loop show, from which the model counts as joined there
 
 
 def add_parser(commands: Any) -> None:
@@ -22,7 +23,8 @@ def add_parser(commands: Any) -> None:
         help="check a run without ground truth",
         description="Reconstruct keyframes of a run (of `vio run --save-observations`) from their images alone with "
         "COLMAP's incremental and global mapper, with a known stereo rig, and compare: ATE after SE(3) alignment, "
-        "scale, and segments that disagree. Writes RUN/check with a report, a plot and both models. Takes minutes.",
+        "scale, and segments that disagree. Loops that the run closed in its map are matched as well. Writes RUN/check "
+        "with a report, a plot and both models. Takes minutes.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
     parser.add_argument(
@@ -98,6 +100,9 @@ def _facts(result: MapperResult) -> dict[str, Any]:
         "registered": len(model.keyframes),
         "points": model.points,
         "mean_reprojection_error_px": model.mean_reprojection_error_px,
+        "loops": len(model.shared),
+        "loops_in_model": int((model.shared >= LEAST_SHARED).sum()),
+        "points_across_loops": model.shared.tolist(),
         **facts,
         "piece": comparison.frames[comparison.piece].tolist(),
         "frames": comparison.frames.tolist(),
@@ -116,6 +121,9 @@ def _rows(result: MapperResult) -> list[tuple[str, str]]:
         ("keyframes", f"{len(model.keyframes)} of {result.total} connected{in_one}, {model.points} points"),
         ("ATE", f"{comparison.ate_m:.4f} m to the run after SE(3) alignment, {comparison.ate_deg:.3f} deg"),
     ]
+    if len(model.shared):
+        joined = int((model.shared >= LEAST_SHARED).sum())
+        rows.insert(1, ("loops", f"{joined} of {len(model.shared)} in the model, with {LEAST_SHARED} points or more"))
     if comparison.scale is not None and comparison.scale_sigma is not None:
         percent, sigma = 100 * (comparison.scale - 1), 100 * comparison.scale_sigma
         rows.append(

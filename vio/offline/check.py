@@ -15,6 +15,7 @@ from vio.colmap.model import keyframe_images
 from vio.colmap.reconstruction import Mapper, match_images, reconstruct
 from vio.mapping.comparison import compare_keyframes
 from vio.mapping.keyframes import choose_keyframes
+from vio.mapping.loop_tracks import loop_pairs
 from vio.offline.images import write_images
 from vio.offline.verdict import MapperResult, overall_verdict
 from vio.plotting import write_picture
@@ -50,6 +51,8 @@ def check_run(
 ) -> tuple[MapperResult, ...]:
     """Reconstruct keyframes of a run from their images with a known stereo rig, and compare.
 
+    Of a run that closed loops, keyframes at both ends of loops are matched as well, and its poses are those in the map.
+
     Writes a folder of each mapper's name with its model, and the plot `check.png`.
 
     Args:
@@ -73,11 +76,12 @@ def check_run(
     announce(f"{len(keyframes)} keyframes: about {minutes:.2g} minutes on one slow core")
     write_images(run, source, keyframes, names, images)
     progress(1, steps)
-    match_images(database, images, names, path.camera, threads=threads)
+    loops = loop_pairs(path.loops, path.frames[keyframes])
+    match_images(database, images, names, path.camera, loops, threads=threads)
     progress(2, steps)
     results: list[MapperResult] = []
     for mapper in mappers:
-        model = reconstruct(database, images, names, mapper, folder / mapper, threads=threads)
+        model = reconstruct(database, images, names, mapper, folder / mapper, loops, threads=threads)
         found = None
         if model is not None:
             rows = keyframes[model.keyframes]
