@@ -13,7 +13,7 @@ import numpy as np
 
 from vio.config import Config, describe, load_config
 from vio.errors import ConfigError, DataError, EvaluationError
-from vio.evaluation import KITTI_LENGTHS_M, Evaluation, evaluate
+from vio.evaluation import Evaluation, evaluate
 from vio.geometry.lie import FloatArray
 from vio.input_files import read_input
 from vio.loop_files import read_keyframes, read_loops
@@ -164,7 +164,7 @@ def _evaluation(
     if truth.times_ns is None and truth.frame_indices is None:
         truth = replace(truth, frame_indices=np.arange(len(truth), dtype=np.int64))
     try:
-        return evaluate(trajectory, truth, T_cam0_imu=T_cam0_body, lengths_m=KITTI_LENGTHS_M)
+        return evaluate(trajectory, truth, T_cam0_imu=T_cam0_body)
     except EvaluationError as error:
         log.warning("%s: the reference was not used: %s", path, error)
         return None

@@ -21,7 +21,7 @@ from vio.config import Config, to_yaml
 from vio.datasets.common import checked_transform
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError, EvaluationError
-from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
+from vio.evaluation import Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.input_files import read_input
 from vio.loop_files import write_keyframes, write_loops
@@ -70,7 +70,7 @@ def write_run_folder(
     result: RunResult,
     reference: Trajectory | None,
     *,
-    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
 ) -> dict[str, Any]:
     """Write all results of a run atomically, and return the metrics.
@@ -79,7 +79,7 @@ def write_run_folder(
         folder: replaced if it is an earlier run's folder.
         result: the run.
         reference: ground truth; None without one.
-        lengths_m: path lengths of the KITTI metric.
+        lengths_m: path lengths of the drift, see `evaluate`.
         save_observations: also write `observations.npz`; the result must contain them.
 
     Raises:
@@ -95,7 +95,7 @@ def finish_run_folder(
     result: RunResult,
     reference: Trajectory | None,
     *,
-    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
 ) -> dict[str, Any]:
     """Write the results of a run into the folder in which it grew, and return the metrics.
@@ -173,7 +173,7 @@ def _write_files(
     folder: Path,
     result: RunResult,
     reference: Trajectory | None,
-    lengths_m: Sequence[float],
+    lengths_m: Sequence[float] | None,
     *,
     save_observations: bool,
 ) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def score(
     result: RunResult,
     reference: Trajectory | None,
     *,
-    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    lengths_m: Sequence[float] | None = None,
     T_world_body: FloatArray | None = None,
 ) -> tuple[Evaluation | None, Evaluation | None]:
     """Evaluate a run's trajectory and its dead reckoning; None without a reference or dead reckoning.
@@ -284,6 +284,7 @@ def metrics_of(
         "landmarks": len(result.landmarks.ids),
         "ate_m": None if scores is None else scores["ate_m"],
         "rpe": None if scores is None else scores["rpe"],
+        "drift_lengths_m": [] if scores is None else scores["drift_lengths_m"],
         "t_err_percent": None if scores is None else scores["t_err_percent"],
         "r_err_deg_per_100m": None if scores is None else scores["r_err_deg_per_100m"],
         "evaluation": scores,
