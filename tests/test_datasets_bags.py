@@ -161,15 +161,19 @@ def test_odometry_is_velocity_and_reference(tmp_path: Path) -> None:
     assert any("/odom may be ground truth: say so with --topics reference=/NAME" in n for n in by_itself.notes)
 
 
-def test_several_bags_of_a_folder_are_joined(tmp_path: Path) -> None:
+@pytest.mark.parametrize("storage", ["bag", "mcap"])
+def test_several_bags_of_a_folder_are_joined(storage: str, tmp_path: Path) -> None:
+    """Files, or the folders of ROS 2."""
     frames = list(noise_frames(6))
-    for name, part in (("a.bag", frames[:3]), ("b.bag", frames[3:])):
-        script = of_stereo(Script("bag"), part)
+    names = ("a.bag", "b.bag") if storage == "bag" else ("a", "b")
+    for name, part in zip(names, (frames[:3], frames[3:]), strict=True):
+        script = of_stereo(Script(storage), part)
         for side in ("left", "right"):
             script.camera_info(f"/{side}/camera_info", part[0][0], RIG.camera, right=side == "right")
         script.write(tmp_path / name)
     dataset = open_dataset(tmp_path)
     assert [event.time_ns for event in dataset.events()] == [time_ns for time_ns, _, _ in frames]
+    assert f"2 bags are joined: {', '.join(names)}" in dataset.recording.notes
 
 
 # --- stamps ---------------------------------------------------------------------------------------------------------
