@@ -88,14 +88,14 @@ def _colmap(args: argparse.Namespace) -> int:
             "out": str(out),
             "of": str(args.run),
             "source": run.source,
-            "poses": "refined" if args.refined else "filter",
+            "poses": "refined" if args.refined else "map" if run.tracked.loops else "filter",
             **asdict(done),
         }
         (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
     rows = (
         ("folder", str(out)),
         ("keyframes", f"{done.keyframes} stereo pairs, {done.images} images written"),
-        ("points", f"{done.points}"),
+        ("points", f"{done.points}, {done.loop_points} of them across {done.loops} loops"),
         ("residual", f"{done.mean_reprojection_error_px:.3f} px mean reprojection error, as COLMAP computes it"),
     )
     return print_result(facts, rows, as_json=args.json)
