@@ -12,7 +12,9 @@ from tests.dataset_makers import ece276a_arrays, make_drive, make_npz
 from tests.euroc_maker import make_euroc
 from tests.same_events import assert_same_events
 from vio.cli import main
+from vio.config import load_config
 from vio.datasets import open_dataset
+from vio.pipeline import run
 from vio.records import VelocitySample
 
 BAGS = ("rosbag2", "mcap")
@@ -38,7 +40,10 @@ def test_a_converted_flight_is_the_same_recording(form: str, flight: Path, tmp_p
     assert moved[0] == pytest.approx(moved[1], rel=1e-9)
     if form != "kitti":  # whose clock begins at zero
         assert a.camera == b.camera
+        np.testing.assert_array_equal(a.T_cam0_imu, b.T_cam0_imu)
         assert_same_events(before, after)
+        ours, theirs = (run(dataset, load_config(), stop=6).trajectory for dataset in (before, after))
+        np.testing.assert_array_equal(ours.T_world_body, theirs.T_world_body)
         assert after.imu_noise == before.imu_noise  # type: ignore[attr-defined]
 
 

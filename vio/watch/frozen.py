@@ -16,6 +16,7 @@ import numpy as np
 from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_log
 from vio.records import Image, ImuSample, IntArray, MotionPrior, Observations, Prediction, StereoFrame
+from vio.robust import median
 from vio.standstill import STANDSTILL_S, blocks_agree
 from vio.statistics import chi_square_quantile
 
@@ -65,7 +66,7 @@ class FrozenImages:
             _, a, b = np.intersect1d(seen.ids, self._expected.tracks.ids, assume_unique=True, return_indices=True)
             if len(a):
                 off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
-                self._errors_px.append(float(np.median(np.linalg.norm(off, axis=1))))
+                self._errors_px.append(median(np.linalg.norm(off, axis=1)))
         self._seen = seen
 
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:

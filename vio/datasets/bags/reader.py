@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vio.datasets.bags import bag_files
 from vio.datasets.bags.index import BagIndex, index_bag, info_topic, stamp_of
 from vio.datasets.bags.pictures import gray_of, white_of
 from vio.datasets.bags.store import Bag, Topic
@@ -188,11 +189,15 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     )
 
 
-def _with_calibration_beside(path: Path, settings: DatasetSettings) -> tuple[DatasetSettings, tuple[str, ...]]:
-    """Return settings that name the calibration in a bag's folder where no other is named, with a note."""
-    if settings.calibration is not None or not path.is_dir() or (file := find_calibration(path)) is None:
-        return settings, ()
-    return replace(settings, calibration=file), (f"the calibration is {file.name}, not the bag's CameraInfo",)
+def _with_calibration_beside(path: Path, settings: DatasetSettings) -> tuple[DatasetSettings, list[str]]:
+    """Return settings that name the calibration in a bag's folder where no other is named, and notes."""
+    parts = bag_files(path)
+    notes = [f"{len(parts)} bags are joined: {', '.join(part.name for part in parts)}"] if len(parts) > 1 else []
+    folders = [folder for folder in dict.fromkeys((path, *parts)) if folder.is_dir()]
+    file = next((found for folder in folders if (found := find_calibration(folder)) is not None), None)
+    if settings.calibration is not None or file is None:
+        return settings, notes
+    return replace(settings, calibration=file), [*notes, f"the calibration is {file.name}, not the bag's CameraInfo"]
 
 
 def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
