@@ -69,6 +69,7 @@ _OF_A_NEW_RUN = (
     "backend",
     "frontend",
     "calibration",
+    "camera",
     "topics",
 )
 
