@@ -20,7 +20,7 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.comparison import GroundTruth
 from vio.mapping.keyframes import TrackedPath
-from vio.records import IntArray, StereoFrame
+from vio.records import IntArray, StereoFrame, need_stereo
 from vio.rig import Rectifier
 from vio.run_folder import read_metrics
 from vio.trajectory_io import read_trajectory
@@ -60,6 +60,7 @@ def read_saved_run(folder: Path) -> SavedRun:
     if not log.is_file():
         raise DataError(f"{folder} has no {OBSERVATIONS}; repeat its run with --save-observations")
     dataset = read_observation_log(log)
+    need_stereo(replace(dataset.recording, path=folder), "checking, refining or exporting a run")
     trajectory = read_trajectory(folder / "trajectory.tum")
     frames = trajectory.frame_indices
     if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
