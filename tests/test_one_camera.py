@@ -49,6 +49,9 @@ class Path3(Flight):
         """R, p, v, a, omega (body) at a time."""
         if self.kind == "curve":
             return super().state(t)
+        if self.kind == "coasting":
+            R, p, v, a, omega = super().state(min(t, 2.0))
+            return R, p + v * max(t - 2.0, 0.0), v, a * float(t < 2.0), omega * float(t < 2.0)
         zero = np.zeros(3)
         if self.kind == "steady":
             v = np.array([0.2, 0.8, 0.1])
@@ -95,9 +98,11 @@ class Flown:
                     float(off_v @ np.linalg.solve(estimate.velocity_covariance, off_v)),
                     float(np.linalg.norm(off_p)),
                     np.nan if estimate.scale_sigma is None else estimate.scale_sigma,
+                    float(np.sqrt(np.linalg.eigvalsh(C)[-1])),
                 ]
             )
-        self.rows = np.array(rows)  # (N, 4) NEES of position and of velocity, error of position, sigma of the scale
+        # (N, 5) NEES of position and of velocity, error of position, sigma of the scale, largest sigma of the position
+        self.rows = np.array(rows)
 
 
 def _left_only(seen: Observations) -> Observations:
@@ -137,6 +142,15 @@ def test_steady_flight_never_begins_as_nothing_shows_its_scale() -> None:
     flown = Flown(Path3(35, "steady"), 0)
     assert flown.begun is None
     assert flown.filter.waits_for
+
+
+def test_steady_flight_tells_nothing_more_of_the_scale() -> None:
+    """The scale stays as uncertain as it was where the acceleration ended, and the position becomes so with the path."""
+    flown = Flown(Path3(75, "coasting"), 2)
+    assert flown.begun is not None
+    early, last = flown.rows[62 - flown.begun], flown.rows[-1]  # the window holds no acceleration in either
+    assert last[3] > 0.9 * early[3]
+    assert last[4] > 1.1 * early[4]
 
 
 def test_start_at_standstill_knows_the_velocity_and_finds_the_scale_in_flight() -> None:
