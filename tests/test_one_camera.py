@@ -160,6 +160,7 @@ def test_start_at_standstill_knows_the_velocity_and_finds_the_scale_in_flight() 
     start = flown.filter.begun
     assert start is not None
     assert start.scale_sigma is None
+    assert np.sqrt(start.P.diagonal()[6:9].max()) < 0.05
     assert flown.rows[-1, 2] < 0.1
     assert flown.rows[-1, 0] < 30
     assert flown.rows[-1, 3] < 0.1
