@@ -145,7 +145,7 @@ def test_steady_flight_never_begins_as_nothing_shows_its_scale() -> None:
 
 
 def test_steady_flight_tells_nothing_more_of_the_scale() -> None:
-    """The scale stays as uncertain as it was where the acceleration ended, and the position becomes so with the path."""
+    """The scale stays as uncertain as it was where the acceleration ended; the position becomes so with the path."""
     flown = Flown(Path3(75, "coasting"), 2)
     assert flown.begun is not None
     early, last = flown.rows[62 - flown.begun], flown.rows[-1]  # the window holds no acceleration in either

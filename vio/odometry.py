@@ -496,8 +496,15 @@ class Odometry:
     def _opened(self, path: Path | str, *, localise: bool) -> MapSession:
         from vio.mapping.session import MapSession
 
-        imu = self.motion == "imu"
-        return MapSession(Path(path), self.camera, self.T_cam0_body, source="live", imu=imu, localise=localise)
+        return MapSession(
+            Path(path),
+            self.camera,
+            self.T_cam0_body,
+            source="live",
+            imu=self.motion == "imu",
+            localise=localise,
+            alone=self.motion is None,
+        )
 
     def _in_map(self, frame: StereoFrame, result: FrameResult) -> FrameResult:
         """Add what the map says of a frame."""
@@ -511,7 +518,7 @@ class Odometry:
             T_map_body, covariance = T @ result.estimate.T_world_imu, self._map.covariance
             estimate = replace(result.estimate, T_map_body=T_map_body, T_map_body_covariance=covariance)
             result = replace(result, estimate=estimate)
-        return replace(result, loops=loops)
+        return replace(result, loops=loops, is_keyframe=self._map.newest_keyframe == frame.index)
 
     def _build(self) -> Chain:
         """Build the chain once the first frame says whether images or observations come."""

@@ -76,6 +76,12 @@ def _utias(path: Path, settings: DatasetSettings) -> Dataset:
     return read_utias(path, settings)
 
 
+def _gtsam(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.gtsam import read_gtsam
+
+    return read_gtsam(path)
+
+
 def _log(path: Path, settings: DatasetSettings) -> Dataset:
     from vio.datasets.observation_log import read_observation_log
 
@@ -93,13 +99,15 @@ READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
     "video": _video,
     "ece276a": _ece276a,
     "utias": _utias,
+    "gtsam": _gtsam,
     "log": _log,
 }
 _LOOKED_FOR = (
     "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
     "(mav0), a plain folder (left right and a calibration), one camera (left or cam0, a calibration and an IMU), one "
     "with depth images (rgb.txt depth.txt, or left depth), a ROS bag (.bag, .db3, .mcap), two videos (left.mp4 "
-    "right.mp4), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
+    "right.mp4), an ECE276A .npz, a UTIAS .mat, GTSAM's stereo factors (*stereo_factors*.txt) or an observation log "
+    ".npz"
 )
 
 
@@ -172,6 +180,7 @@ def _detect(path: Path) -> str:
 def _folder_kind(path: Path) -> str | None:
     from vio.datasets.bags import is_bag
     from vio.datasets.euroc import is_euroc_folder
+    from vio.datasets.gtsam import factor_files
     from vio.datasets.kitti import is_kitti_folder
     from vio.datasets.kitti_raw import is_kitti_raw_folder
     from vio.datasets.one_camera import is_mono_folder, is_rgbd_folder
@@ -198,6 +207,8 @@ def _folder_kind(path: Path) -> str | None:
         return "plain"
     if video_files(path) is not None:
         return "video"
+    if factor_files(path):
+        return "gtsam"
     if is_rgbd_folder(path):
         return "rgbd"
     if is_mono_folder(path):
@@ -209,6 +220,7 @@ def _folder_kind(path: Path) -> str | None:
 
 def _file_kind(path: Path) -> str | None:
     from vio.datasets.bags import is_bag
+    from vio.datasets.gtsam import is_factor_file
     from vio.datasets.observation_log import is_observation_log
 
     try:
@@ -221,6 +233,8 @@ def _file_kind(path: Path) -> str | None:
         return "utias"
     if is_bag(path):
         return "bag"
+    if is_factor_file(path):
+        return "gtsam"
     if not start.startswith(b"PK"):
         return None
     try:
