@@ -178,6 +178,22 @@ def test_a_session_finds_its_place_in_an_earlier_map(room_walk: Walk, first_roun
     assert first_round.read_bytes() == before
 
 
+def test_a_jump_of_the_odometry_that_its_motions_do_not_have_leaves_the_place(
+    room_walk: Walk, first_round: Path
+) -> None:
+    """A filter that learns what it was off by moves its newest pose by a metre, but not its window's motions."""
+    store = MapStore(first_round, read_only=True)
+    builder = MapBuilder(store, "walk", room_walk.camera, upright=False, localise=True)
+    jump = se3_exp([1.0, 0.0, 0.0, 0.0, 0.0, 0.3])
+    for keyframe, features in room_walk.keyframes(seed=5, rows=slice(27, 37)):
+        moved = jump @ keyframe.T_odom_cam if keyframe.frame > 31 else keyframe.T_odom_cam
+        builder.add(replace(keyframe, T_odom_cam=moved), features)
+    own = builder.graph.T_map_cam.rows[builder.first :]
+    errors = np.linalg.norm((room_walk.T[0] @ own - room_walk.T[27:37])[:, :3, 3], axis=1)
+    assert errors[5:].max() < 0.1
+    builder.close()
+
+
 def test_a_continued_map_joins_both_sessions(room_walk: Walk, first_round: Path, tmp_path: Path) -> None:
     path = tmp_path / "a.map"
     shutil.copyfile(first_round, path)

@@ -252,6 +252,31 @@ def test_motions_are_joined_where_the_window_moves_on(tmp_path: Path) -> None:
     assert np.linalg.eigvalsh(motion.covariance)[0] > 7.0, "of eight steps of unit variance each"
 
 
+@pytest.mark.parametrize("alone", [False, True])
+def test_what_a_covered_camera_does_to_the_place(alone: bool, tmp_path: Path) -> None:
+    """Ten dark frames of 0.1 s: the covariance grows; without a motion sensor the motion is then not known."""
+
+    def relative(older: int, newer: int) -> RelativePose | None:
+        return RelativePose(np.eye(4), 1e-4 * (newer - older) * np.eye(6))
+
+    session = MapSession(
+        tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False, alone=alone
+    )
+    gray, sigmas = np.zeros((64, 64), dtype=np.uint8), []
+    for k in range(24):
+        count = 0 if 12 <= k < 22 else 40
+        ids = np.arange(count) + 1000 * (k == 23)
+        seen = observations(k, 10**8 * k, ids, np.tile([9.0, 9, 5, 9], (count, 1)))
+        session.frame(StereoFrame(k, 10**8 * k, gray, gray), seen, Estimate(k, np.eye(4), np.eye(6)), relative)
+        covariance = session.covariance
+        sigmas.append(np.nan if covariance is None else float(np.sqrt(covariance[0, 0])))
+    session.finish()
+    session.close()
+    assert sigmas[21] > 1.2 * sigmas[12], "grows in the dark"
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    assert (np.sqrt(motion.covariance[0, 0]) >= 30.0) is np.bool_(alone)
+
+
 def test_motions_have_errors_that_tracks_do_not_average_out(tmp_path: Path) -> None:
     """A filter that is sure to a micrometre of a metre: the calibration is not."""
     steps = [np.eye(4), se3_exp([0.0, 0, 1.0, 0, 0.5, 0])]

@@ -1590,6 +1590,27 @@ MUTATIONS = (
         _PLACES,
     ),
     Mutation(
+        "map: moves with the jumps of the odometry",
+        "vio/mapping/builder.py",
+        "if motion is not None and self._last is None:",
+        "if motion is not None:",
+        _MAPS,
+    ),
+    Mutation(
+        "map: images alone know their motion in the dark",
+        "vio/mapping/session.py",
+        "return self._alone and self._seen_ns is not None and",
+        "return self._alone and self._seen_ns is None and",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "places: keyframes merged into the index count from its first one",
+        "vio/mapping/place_index.py",
+        "out_owners[t, cursor[w]] = first + k",
+        "out_owners[t, cursor[w]] = k",
+        _PLACES,
+    ),
+    Mutation(
         "map: motions as certain as the tracks say",
         "vio/mapping/session.py",
         "_MOTION_INFLATION**2 * motion.covariance + np.diag(sigma**2)",

@@ -436,8 +436,15 @@ class Odometry:
     def _opened(self, path: Path | str, *, localise: bool) -> MapSession:
         from vio.mapping.session import MapSession
 
-        imu = self.motion == "imu"
-        return MapSession(Path(path), self.camera, self.T_cam0_body, source="live", imu=imu, localise=localise)
+        return MapSession(
+            Path(path),
+            self.camera,
+            self.T_cam0_body,
+            source="live",
+            imu=self.motion == "imu",
+            localise=localise,
+            alone=self.motion is None,
+        )
 
     def _in_map(self, frame: StereoFrame, result: FrameResult) -> FrameResult:
         """Add what the map says of a frame."""

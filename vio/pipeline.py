@@ -229,8 +229,15 @@ def _map_session(path: Path, recording: Recording, config: Config, *, localise: 
         raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
     if config.backend != "msckf":
         raise ConfigError(f"a map needs the back end msckf, not {config.backend}; leave --backend out")
-    source, imu = str(recording.path.absolute()), config.motion == "imu"
-    return MapSession(path, recording.camera, recording.T_cam0_body, source=source, imu=imu, localise=localise)
+    return MapSession(
+        path,
+        recording.camera,
+        recording.T_cam0_body,
+        source=str(recording.path.absolute()),
+        imu=config.motion == "imu",
+        localise=localise,
+        alone=config.motion == "none",
+    )
 
 
 def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
@@ -65,11 +66,29 @@ def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
     return np.stack([good, best[good]], axis=1)
 
 
-def _differing_bits(i: KeyframeFeatures, j: KeyframeFeatures) -> npt.NDArray[np.float32]:
-    """Hamming distances (N, M) of descriptors: with bits as -1 and 1, 256 less their product, halved (exact)."""
-    a, b = (2 * np.unpackbits(f.descriptors, axis=1).astype(np.float32) - 1 for f in (i, j))
-    out: npt.NDArray[np.float32] = (np.float32(a.shape[1]) - a @ b.T) / np.float32(2)
+def _differing_bits(i: KeyframeFeatures, j: KeyframeFeatures) -> npt.NDArray[np.int32]:
+    """Hamming distances (N, M) of descriptors."""
+    out = np.empty((len(i), len(j)), dtype=np.int32)
+    a, b = (np.ascontiguousarray(f.descriptors).view(np.uint64) for f in (i, j))
+    _count_bits(a, b, out)
     return out
+
+
+@compiled
+def _count_bits(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64], out: npt.NDArray[np.int32]) -> None:
+    """Count in which bits the rows of two arrays (N, W) and (M, W) differ, by sums over pairs, fours and bytes."""
+    pairs, fours = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
+    bytes_, ones = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
+    for i in range(len(a)):
+        for j in range(len(b)):
+            total = np.uint64(0)
+            for w in range(a.shape[1]):
+                x = a[i, w] ^ b[j, w]
+                x = x - ((x >> np.uint64(1)) & pairs)
+                x = (x & fours) + ((x >> np.uint64(2)) & fours)
+                x = (x + (x >> np.uint64(4))) & bytes_
+                total += (x * ones) >> np.uint64(56)
+            out[i, j] = total
 
 
 def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, j: KeyframeFeatures) -> Verified | None:

@@ -39,6 +39,8 @@ _MOTION_INFLATION = 2.0
 # many times the standard deviation that the tracks leave.
 _MOTION_SHARES = (5e-4, 2e-4)
 _LEAST_UP_SIGMA_RAD = float(np.radians(0.1))  # errors of the vertical last longer than from keyframe to keyframe
+# Where images show nothing, a filter without a motion sensor holds its velocity; a hand or a car in a curve does not.
+_DARK_S = 0.5
 _BROKEN = np.repeat([30.0**2, 1.0**2], 3)  # variance of the motion where the filter began anew, m^2 and rad^2
 
 
@@ -46,7 +48,15 @@ class MapSession:
     """One trajectory in a map."""
 
     def __init__(
-        self, path: Path, camera: StereoCamera, T_cam0_body: FloatArray, *, source: str, imu: bool, localise: bool
+        self,
+        path: Path,
+        camera: StereoCamera,
+        T_cam0_body: FloatArray,
+        *,
+        source: str,
+        imu: bool,
+        localise: bool,
+        alone: bool = False,
     ) -> None:
         """Open the map.
 
@@ -57,11 +67,12 @@ class MapSession:
             source: names the recording.
             imu: whether the vertical is known.
             localise: leave the map as it is.
+            alone: whether the odometry has images alone, so that it is lost where they show nothing.
 
         Raises:
             DataError: the map cannot be used.
         """
-        self._path, self._localise, self._imu = str(path), localise, imu
+        self._path, self._localise, self._imu, self._alone = str(path), localise, imu, alone
         self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
         store = MapStore(path, create=not localise, read_only=localise)
         self._builder = MapBuilder(store, source, camera, upright=imu, localise=localise)
@@ -75,6 +86,7 @@ class MapSession:
         self._newest: tuple[int, RelativePose, FloatArray] | None = None
         self._since = 0  # frames since the last keyframe
         self._last_keyframe: int | None = None  # its frame
+        self._seen_ns: int | None = None  # newest frame with features
         self.T_map_odom: FloatArray | None = np.eye(4) if self._builder.first == 0 and not localise else None
         # (6, 6) covariance in the map of the newest keyframe with a result
         self._known: FloatArray | None = None if self.T_map_odom is None else np.zeros((6, 6))
@@ -95,9 +107,13 @@ class MapSession:
         self._frames += 1
         events = self._take(lambda due: due <= self._frames)
         fresh = seen.take(seen.has_right & ~seen.stale)
-        if len(fresh) < _LEAST_FEATURES or frame.left is None or frame.right is None:
+        shown = len(fresh) >= _LEAST_FEATURES and frame.left is not None and frame.right is not None
+        motion = self._motion_to(
+            frame.index, estimate, _unknown if shown and self._is_lost(frame.time_ns) else relative
+        )
+        if not shown:
             return events
-        motion = self._motion_to(frame.index, estimate, relative)
+        self._seen_ns = frame.time_ns
         self._since += 1
         if motion is None and self._newest is not None:
             return events
@@ -169,6 +185,10 @@ class MapSession:
         return self._builder.is_joined
 
     # Keyframes
+
+    def _is_lost(self, time_ns: int) -> bool:
+        """Whether the odometry cannot know the motion since the newest frame with features."""
+        return self._alone and self._seen_ns is not None and 1e-9 * (time_ns - self._seen_ns) > _DARK_S
 
     def _motion_to(self, frame: int, estimate: Estimate, relative: Relative) -> RelativePose | None:
         """Return the camera's motion since the last keyframe with its covariance; None before the first keyframe.
@@ -268,6 +288,11 @@ class MapSession:
             done.set_result(update)
             self._waiting.append((due, frame, done))
         self._builder.reopen(MapStore(Path(self._path), read_only=self._localise))
+
+
+def _unknown(older: int, newer: int) -> RelativePose | None:
+    """Return the motion between two frames where only that of a frame to itself is known."""
+    return RelativePose(np.eye(4), np.zeros((6, 6))) if older == newer else None
 
 
 def _inflated(motion: RelativePose) -> RelativePose:
