@@ -1597,6 +1597,13 @@ MUTATIONS = (
         _MAPS,
     ),
     Mutation(
+        "map: covariance stays in the dark",
+        "vio/mapping/session.py",
+        "if self._dark is not None:",
+        "if self._dark is None:",
+        _MAP_RUN,
+    ),
+    Mutation(
         "map: images alone know their motion in the dark",
         "vio/mapping/session.py",
         "return self._alone and self._seen_ns is not None and",
