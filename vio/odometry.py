@@ -110,7 +110,8 @@ class Odometry:
             self.camera = rig
         else:
             self._rig = rig
-            self._rectifier = rig.rectifier()
+            # Maps know pinholes only.
+            self._rectifier = rig.rectifier(projection=self._config.dataset.projection if map is None else "pinhole")
             self.camera = self._rectifier.camera
             T_cam0_imu = rig.T_rect0_imu
             self._offset_ns = round(1e9 * rig.time_offset_s)

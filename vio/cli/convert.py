@@ -33,6 +33,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import json
     import logging
+    from dataclasses import replace
 
     from vio.atomic import atomic_folder
     from vio.cli.output import print_result
@@ -43,7 +44,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.text_files import write_text
 
     log = logging.getLogger(__name__)
-    dataset = open_dataset(args.source, config_from(args).dataset)
+    dataset = open_dataset(args.source, replace(config_from(args).dataset, projection="pinhole"))
     recording = dataset.recording
     for note in recording.notes:
         log.warning("%s", note)
