@@ -25,7 +25,8 @@ from vio.evaluation import nees, nees_bounds
 from vio.filters import multiview
 from vio.filters.multiview import Views
 from vio.filters.settings import MsckfSettings
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
+from vio.filters.stereo_calibration import TERMS, RowField, StereoField, field_jacobian
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.rectify import PINHOLE_REACH
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.offline.source import open_source
@@ -167,6 +168,8 @@ def test_points_all_about_the_baseline_are_triangulated(left_only: bool) -> None
         weight[..., 2] = 0.0
     exact = Views(z, weight)
     np.testing.assert_allclose(residuals(CYLINDER, T, p, exact).r, 0.0, atol=1e-9)
+    if left_only:
+        np.testing.assert_allclose(multiview._by_parallax(CYLINDER, T, exact), p, rtol=1e-6, atol=1e-6)
     start, known = multiview.first_points(CYLINDER, T, exact)
     assert known.all()
     np.testing.assert_allclose(start, p, rtol=1e-3, atol=1e-3)
@@ -209,10 +212,72 @@ def test_the_window_is_consistent_on_a_cylinder(monkeypatch: pytest.MonkeyPatch)
     assert beside >= 10
 
 
-def test_the_stereo_field_of_pinholes_is_not_estimated_on_a_cylinder() -> None:
-    settings = MsckfSettings(calibrate_stereo="on")
-    filt = test_msckf.Msckf(CYLINDER, test_msckf.T_CAM0_IMU, settings, motion=None)
-    flight, noise = WideFlight(3), np.random.default_rng(0)
-    for k in range(3):
-        filt.update(flight.observe(k, 0.3, noise))
-    assert filt.estimate().stereo_field is None
+# --- what the calibration of a wide pair is off by, equation (R6) ----------------------------------------------------
+
+
+def _on_cylinder(rays: FloatArray) -> FloatArray:
+    """Coordinates (N, 2) of rays (N, 3): tangent along the baseline, azimuth about it."""
+    return np.stack([rays[:, 0] / np.hypot(rays[:, 1], rays[:, 2]), np.arctan2(rays[:, 1], rays[:, 2])], axis=1)
+
+
+def _through_lens(rays: FloatArray, shift: FloatArray) -> FloatArray:
+    """Rays (N, 3) whose angles off the axis, along u and v, are shifted by (N, 2) or (2,) radians."""
+    sine = np.hypot(rays[:, 0], rays[:, 1])
+    angles = rays[:, :2] * (np.arctan2(sine, rays[:, 2]) / sine)[:, None] + shift
+    theta = np.linalg.norm(angles, axis=1)
+    return np.column_stack([angles * (np.sin(theta) / theta)[:, None], np.cos(theta)])
+
+
+def _field(a: FloatArray, v: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Pixels (N, 4) without a field of states (6,) and rows (6,)."""
+    z = np.column_stack([left, right[:, 0], left[:, 1]])
+    field = StereoField(CYLINDER, v, np.concatenate([a, [0.0, 0.0]]), np.arange(TERMS))
+    return field.corrected(Views(z, np.tile([1.0, 1.0, 1.0, 0.0], (len(z), 1)))).z
+
+
+def test_the_field_takes_out_turns_and_lens_errors_of_the_right_camera() -> None:
+    """Rows and states of (R6) are exact for a small turn, for a shifted principal point and for a radial error."""
+    pixels, _ = _around(200)
+    rays = left_rays(CYLINDER, pixels)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    focal = np.array([CYLINDER.fu, CYLINDER.fv])
+    wx, wy, wz, cx, cy = 1e-3, -8e-4, 7e-4, 6e-4, -9e-4
+    turned = _through_lens(rays @ so3_exp([wx, wy, wz]).T, np.array([cx, cy]))
+    moved = pixels + focal * (_on_cylinder(turned) - _on_cylinder(rays))
+    a = np.array([cx / 4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    v = np.array([cy - wx, wz, 0.0, wy + 3 * cx / 4, cy / 3, 0.0])
+    assert np.abs(moved - pixels)[:, 0].max() > 0.5
+    np.testing.assert_allclose(_field(a, v, pixels, moved)[:, 2], pixels[:, 0], atol=5e-3)
+    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    angles = rays[:, :2] / np.hypot(rays[:, 0], rays[:, 1])[:, None] * theta[:, None]
+    bent = pixels + focal * (
+        _on_cylinder(_through_lens(rays, 1e-3 * theta[:, None] ** 2 * angles)) - _on_cylinder(rays)
+    )
+    out = _field(np.array([0.0, 0, 0, 1e-3, 0, 0]), np.zeros(6), bent, bent)
+    np.testing.assert_allclose(out[:, :3], np.column_stack([pixels, pixels[:, 0]]), atol=2e-2)
+
+
+def test_rows_show_a_turned_right_camera() -> None:
+    _, p = _around(300)
+    z = project(CYLINDER, p)
+    turned = (p - [CYLINDER.baseline_m, 0, 0]) @ so3_exp([2e-3, 1e-3, -1.5e-3]).T
+    z[:, 2:] = _on_cylinder(turned) * [CYLINDER.fu, CYLINDER.fv] + [CYLINDER.cu, CYLINDER.cv]
+    rows = RowField(CYLINDER)
+    rng = np.random.default_rng(5)
+    for k in range(20):
+        rows.update(observations(k, k, np.arange(300), z + rng.normal(0, 0.1, z.shape)))
+    assert rows.is_significant
+    np.testing.assert_allclose(rows.coefficients[[0, 1, 3]], [-2e-3, -1.5e-3, 1e-3], atol=1e-4)
+    np.testing.assert_allclose(rows.coefficients[[2, 4, 5]], 0.0, atol=1e-4)
+
+
+def test_derivatives_by_the_field_are_those_of_the_correction() -> None:
+    pixels, p = _around(50)
+    z, step = project(CYLINDER, p), 1e-4
+    H = field_jacobian(CYLINDER, z)
+    for j in range(6):
+        a = step * np.eye(6)[j]
+        change = z[:, :3] - _field(a, np.zeros(6), pixels, z[:, 2:])[:, :3]
+        np.testing.assert_allclose(H[:, :3, j], change / step, atol=1e-6)
+    assert not H[:, 3].any()
+    assert not H[:, :, 6:].any()

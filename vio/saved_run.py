@@ -15,6 +15,9 @@ from vio.datasets.common import read_npz
 from vio.datasets.features import FeatureDataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
+from vio.filters.multiview import Views
+from vio.filters.stereo_calibration import FIELD_TERMS, METRIC_TERMS, TERMS, StereoField
+from vio.filters.tracks import measured
 from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import pinhole_maps, pinhole_pixels, pinhole_within
@@ -67,29 +70,40 @@ def read_saved_run(folder: Path) -> SavedRun:
     if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
         raise DataError(f"{folder}: trajectory.tum and {OBSERVATIONS} are not of the same complete run; repeat the run")
     camera, tracks = dataset.recording.camera, dataset.tracks
-    camera, tracks = _in_pinhole(camera, tracks)
-    field = _pixel_field(folder, camera, metrics)
-    if field is not None:
+    coefficients, field = _field_coefficients(folder, camera, metrics), None
+    if camera.is_cylinder:
+        camera, tracks = _in_pinhole(camera, tracks, coefficients)
+    elif coefficients is not None:
+        field = PixelField(camera, coefficients)
         tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
     tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks)
     return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics, field)
 
 
-def _in_pinhole(camera: StereoCamera, tracks: FeatureTracks) -> tuple[StereoCamera, FeatureTracks]:
-    """Return the pinhole inside a cylinder, and those of the tracks' pixels that it shows."""
-    if not camera.is_cylinder:
-        return camera, tracks
+def _in_pinhole(
+    camera: StereoCamera, tracks: FeatureTracks, coefficients: FloatArray | None
+) -> tuple[StereoCamera, FeatureTracks]:
+    """Return the pinhole inside a cylinder, and those of the tracks' pixels that it shows.
+
+    They are without the stereo field of the coefficients (12,) of (R3) and (R2), where there is one.
+    """
+    z = tracks.z
+    if coefficients is not None:
+        states = np.concatenate([coefficients[:FIELD_TERMS], np.zeros(METRIC_TERMS)])
+        stereo = StereoField(camera, coefficients[FIELD_TERMS:], states, np.arange(TERMS))
+        z = stereo.corrected(Views(z, measured(tracks.has_right))).z
+        z[:, 3] = z[:, 1]
     pinhole = pinhole_within(camera)
-    left, kept = pinhole_pixels(camera, pinhole, tracks.z[:, :2])
-    right, has_right = pinhole_pixels(camera, pinhole, tracks.z[:, 2:])
+    left, kept = pinhole_pixels(camera, pinhole, z[:, :2])
+    right, has_right = pinhole_pixels(camera, pinhole, z[:, 2:])
     has_right &= tracks.has_right
     offsets = np.concatenate([[0], np.cumsum(kept)])[tracks.offsets]
     z = np.concatenate([left, right], axis=1)[kept]
     return pinhole, FeatureTracks(offsets, tracks.ids[kept], z, has_right[kept], tracks.stale[kept])
 
 
-def _pixel_field(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> PixelField | None:
-    """Return the field of pixels that a run's metrics state; None: the run estimated none.
+def _field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> FloatArray | None:
+    """Return the coefficients (12,) of (R3) and (R2) in a run's metrics; None: the run estimated none.
 
     Raises:
         DataError: the metrics are damaged.
@@ -103,7 +117,7 @@ def _pixel_field(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) ->
         raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
     if coefficients.shape != (12,) or not np.isfinite(coefficients).all():
         raise DataError(f"{folder}: stereo_field of its metrics holds no 12 finite numbers; repeat the run")
-    return PixelField(camera, coefficients)
+    return coefficients
 
 
 def _original_source(log: Path) -> str:

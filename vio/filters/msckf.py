@@ -120,8 +120,8 @@ class Msckf:
             raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
         if settings.calibrate not in ("auto", "none") and motion != "imu":
             raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to auto or none")
-        if camera.is_cylinder:  # what the stereo field knows of lenses and turned cameras is a pinhole's
-            settings = replace(settings, calibrate_stereo="off", stereo_focal_sigma=0.0, stereo_baseline_sigma=0.0)
+        if camera.is_cylinder:  # equation (R4) is a pinhole's
+            settings = replace(settings, stereo_focal_sigma=0.0, stereo_baseline_sigma=0.0)
         self._camera, self._settings = camera, settings
         self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings, motion)
         self._order = InputOrder("msckf")

@@ -294,6 +294,107 @@ def correct_pixels(
 
 
 @compiled
+def _lens_plane(x: float, azimuth: float) -> tuple[float, float, float, float, float, float]:
+    """Angles off the axis (along u, along v) of a cylinder's coordinates, and how the coordinates move with them (2x2).
+
+    Errors of a wide lens are low polynomials in these angles, as those of a narrow one are on the plane z = 1.
+    """
+    rho = 1.0 / np.sqrt(1.0 + x * x)
+    a, y, z = x * rho, np.sin(azimuth) * rho, np.cos(azimuth) * rho
+    sine = np.sqrt(a * a + y * y)
+    if sine < 1e-6:
+        return a, y, 1.0, 0.0, 0.0, 1.0
+    ratio = np.arctan2(sine, z) / sine
+    ca, sa = a / sine, y / sine
+    xx, xy = (z * ca * ca + sa * sa / ratio) / rho**3, ca * sa * (z - 1.0 / ratio) / rho**3
+    yx, yy = ca * sa * (1.0 - z / ratio) / rho**2, (sa * sa + ca * ca * z / ratio) / rho**2
+    return ratio * a, ratio * y, xx, xy, yx, yy
+
+
+@compiled
+def cylinder_terms(x: float, azimuth: float, out: FloatArray) -> None:
+    """Write by how much (2, 12) a right camera's coordinates on a cylinder move, for one unit of each coefficient.
+
+    Columns: a0, a1, a2, k, q1, q2 of the states, then the six of the rows, equation (R6).
+    """
+    u, v, xx, xy, yx, yy = _lens_plane(x, azimuth)
+    s, c, r2 = np.sin(azimuth), np.cos(azimuth), u * u + v * v
+    # What moves in the lens, in angles off the axis; then on the cylinder.
+    lens_u = 4.0, u, r2, r2 * u, 2.0 * u * v, r2 + 2.0 * u * u, 0.0, 0.0, 0.0, 0.0, 0.0, r2 * u
+    lens_v = 0.0, 0.0, 0.0, r2 * v, r2 + 2.0 * v * v, 2.0 * u * v, 0.0, 0.0, v, 0.0, 3.0, r2 * v
+    for j in range(12):
+        out[0, j] = xx * lens_u[j] + xy * lens_v[j]
+        out[1, j] = yx * lens_u[j] + yy * lens_v[j]
+    # The turns about y, z and x.
+    out[0, 0] -= 3.0 * (1.0 + x * x) * c
+    out[1, 0] -= 3.0 * x * s
+    out[0, 9] += (1.0 + x * x) * c
+    out[1, 9] += x * s
+    out[0, 7] -= (1.0 + x * x) * s
+    out[1, 7] += x * c
+    out[1, 6] += 1.0
+    out[1, 10] -= 3.0
+
+
+@compiled
+def cylinder_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
+    """Write the derivatives (M, 4, 8) of a cylinder's pixels (M, 4) by the coefficients of (R3); by (R4)'s, zero."""
+    fu, fv, cu, cv, _, _ = lens
+    left, right = np.empty((2, 12)), np.empty((2, 12))
+    for m in range(len(z)):
+        y = (z[m, 1] - cv) / fv
+        cylinder_terms((z[m, 0] - cu) / fu, y, left)
+        cylinder_terms((z[m, 2] - cu) / fu, y, right)
+        for j in range(8):
+            for a in range(4):
+                out[m, a, j] = 0.0
+        for j in range(6):
+            out[m, 2, j] = fu * right[0, j]
+        for j in range(3, 6):
+            out[m, 0, j], out[m, 1, j] = fu * left[0, j], fv * left[1, j]
+
+
+@compiled
+def correct_cylinder_pixels(
+    lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
+) -> None:
+    """Write a cylinder's pixels (M, 4) without the field of (R3), (8,), and what follows from the rows (6,) of (R2)."""
+    fu, fv, cu, cv, _, _ = lens
+    left, right = np.empty((2, 12)), np.empty((2, 12))
+    for m in range(len(z)):
+        y = (z[m, 1] - cv) / fv
+        for a in range(4):
+            out[m, a] = z[m, a]
+        if weight[m, 0] > 0.0:
+            cylinder_terms((z[m, 0] - cu) / fu, y, left)
+            for j in range(3, 6):
+                out[m, 0] -= fu * left[0, j] * coefficients[j]
+                out[m, 1] -= fv * left[1, j] * coefficients[j]
+        if weight[m, 2] > 0.0:
+            cylinder_terms((z[m, 2] - cu) / fu, y, right)
+            for j in range(6):
+                out[m, 2] -= fu * (right[0, j] * coefficients[j] + right[0, 6 + j] * rows[j])
+
+
+@compiled
+def cylinder_rows(lens: Lens, z: FloatArray, rows: FloatArray, common: FloatArray) -> None:
+    """Write the derivatives of right minus left rows, in focal lengths, of a cylinder's pixels (M, 4).
+
+    By the coefficients of (R2), (M, 6), and by k, q1 and q2 of (R3), (M, 3).
+    """
+    fu, fv, cu, cv, _, _ = lens
+    left, right = np.empty((2, 12)), np.empty((2, 12))
+    for m in range(len(z)):
+        y = (z[m, 1] - cv) / fv
+        cylinder_terms((z[m, 0] - cu) / fu, y, left)
+        cylinder_terms((z[m, 2] - cu) / fu, y, right)
+        for j in range(6):
+            rows[m, j] = right[1, 6 + j]
+        for j in range(3):
+            common[m, j] = right[1, 3 + j] - left[1, 3 + j]
+
+
+@compiled
 def collect_columns(
     J: FloatArray, H: FloatArray, weight: FloatArray, p_D_q: FloatArray, by_point: FloatArray, WH: FloatArray
 ) -> None:
