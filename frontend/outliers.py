@@ -22,6 +22,7 @@ from vio.compiled import compiled, move_by_twist, solve_positive
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project
 from vio.records import BoolArray, IntArray
+from vio.robust import median
 
 from .settings import ConsensusSettings
 
@@ -343,7 +344,7 @@ def _motions_agree(camera: StereoCamera, T: FloatArray, T_other: FloatArray, p_p
     if not ahead.any():
         return False
     gap = pixel_errors(camera, T_other, p_prev[ahead], project(camera, moved[ahead])[:, :2])
-    return bool(np.median(gap) <= _PRIOR_PX)
+    return bool(median(gap) <= _PRIOR_PX)
 
 
 def _rotation_difference_deg(T: FloatArray, R: FloatArray) -> float:
@@ -403,11 +404,11 @@ def predicted_motion(
         return None
     T, weight = expected, np.ones((1, len(p)))
     for _ in range(_SAMPLE_ITERATIONS):
-        if np.median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX:
+        if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX:
             return T
         T = _gauss_newton(camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6))[0]
     T = _refine(camera, T, p, z, _PRIOR_PX, slice(0, 6), converged=_PRIOR_CONVERGED)
-    return T if np.median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
+    return T if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
 
 
 # --- two views, no depth ----------------------------------------------------------------------------------------------

@@ -19,11 +19,15 @@ from vio.datasets.rigs import load_rig
 from vio.errors import VioError
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "bad_inputs.md"
+_MAKERS = {"tests.test_datasets_euroc": "make_euroc", "tests.test_datasets_kitti_raw": "make_kitti_raw"}
 MODULES = {
     "tests.test_rig": "Calibration files (`vio.load_rig`)",
     "tests.test_datasets_plain": "Plain folders",
     "tests.test_datasets_bags": "ROS bags",
     "tests.test_datasets_videos": "Videos",
+    "tests.test_datasets_euroc": "EuRoC folders",
+    "tests.test_datasets_kitti_raw": "KITTI raw drives",
+    "tests.test_datasets_gtsam": "GTSAM's stereo factors",
 }
 _HEAD = """# Bad inputs
 
@@ -47,6 +51,10 @@ def message_of(module: str, case: Any, folder: Path) -> str:
             load_rig(case[0](folder))
         elif module == "tests.test_datasets_videos":
             case[0](folder)
+            list(open_dataset(folder).events())
+        elif module in _MAKERS:
+            whole = getattr(importlib.import_module("tests.euroc_maker"), _MAKERS[module])(folder)
+            case[0](whole / "mav0" if (whole / "mav0").is_dir() else whole)
             list(open_dataset(folder).events())
         else:
             settings = DatasetSettings(topics=case[1]) if len(case) == 3 else DatasetSettings()

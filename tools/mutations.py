@@ -1645,4 +1645,32 @@ MUTATIONS = (
         "return RelativePose(se3_inverse(T_j) @ T_i, C)",
         _MAP_RUN,
     ),
+    Mutation(
+        "loops: bundle adjustment without their matches",
+        "vio/mapping/points.py",
+        "loops = loop_rows(run.loops, run.frames[keyframes])",
+        "loops = loop_rows((), run.frames[keyframes])",
+        ("tests/test_colmap.py",),
+    ),
+    Mutation(
+        "loops: covariance of the pixel noise stated, not found",
+        "vio/mapping/loop_geometry.py",
+        "covariance = noise * _INFLATION**2",
+        "covariance = _INFLATION**2",
+        _PLACES,
+    ),
+    Mutation(
+        "map: motions as certain as the tracks say",
+        "vio/mapping/session.py",
+        "_MOTION_INFLATION**2 * motion.covariance + np.diag(sigma**2)",
+        "_MOTION_INFLATION**2 * motion.covariance",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "map: roll and pitch of the first keyframe held",
+        "vio/mapping/pose_graph.py",
+        "if self.levelled is not None:",
+        "if self.levelled is not None and False:",
+        ("tests/test_pose_graph.py",),
+    ),
 )

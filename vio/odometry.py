@@ -453,7 +453,7 @@ class Odometry:
             T_map_body, covariance = T @ result.estimate.T_world_imu, self._map.covariance
             estimate = replace(result.estimate, T_map_body=T_map_body, T_map_body_covariance=covariance)
             result = replace(result, estimate=estimate)
-        return replace(result, loops=loops)
+        return replace(result, loops=loops, is_keyframe=self._map.newest_keyframe == frame.index)
 
     def _build(self) -> Chain:
         """Build the chain once the first frame says whether images or observations come."""

@@ -22,6 +22,8 @@ from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import pinhole_maps, pinhole_pixels, pinhole_within
 from vio.geometry.stereo import StereoCamera
+from vio.loop_files import read_loops
+from vio.loops import LoopEvent
 from vio.mapping.comparison import GroundTruth
 from vio.mapping.keyframes import TrackedPath
 from vio.records import FeatureTracks, IntArray, StereoFrame
@@ -53,9 +55,10 @@ class SavedRun:
 def read_saved_run(folder: Path) -> SavedRun:
     """Read the folder of `vio run --save-observations`.
 
-    Where the run estimated what its stereo calibration is off by, the tracks are those of a rectified pair without it,
-    and where its images were rectified to a cylinder, those of a pinhole inside it, as other programs know no cylinder;
-    `dataset` holds the pixels as the front end saw them.
+    Where the run estimated what its stereo calibration is off by, the tracks are those of a rectified pair without it;
+    where its images were rectified to a cylinder, those of a pinhole inside it, as other programs know no cylinder.
+    `dataset` holds the pixels as the front end saw them. Where the run had a map and closed loops between its own
+    frames, the poses are those in the map, and the tracks have the loops.
 
     Raises:
         DataError: no such folder, or the observations were not saved.
@@ -65,10 +68,12 @@ def read_saved_run(folder: Path) -> SavedRun:
     if not log.is_file():
         raise DataError(f"{folder} has no {OBSERVATIONS}; repeat its run with --save-observations")
     dataset = read_observation_log(log)
-    trajectory = read_trajectory(folder / "trajectory.tum")
+    loops = tuple(o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None and o.matches is not None)
+    poses = "map_trajectory.tum" if loops else "trajectory.tum"
+    trajectory = read_trajectory(folder / poses)
     frames = trajectory.frame_indices
     if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
-        raise DataError(f"{folder}: trajectory.tum and {OBSERVATIONS} are not of the same complete run; repeat the run")
+        raise DataError(f"{folder}: {poses} and {OBSERVATIONS} are not of the same complete run; repeat the run")
     camera, tracks = dataset.recording.camera, dataset.tracks
     coefficients, field = _field_coefficients(folder, camera, metrics), None
     if camera.is_cylinder:
@@ -76,8 +81,18 @@ def read_saved_run(folder: Path) -> SavedRun:
     elif coefficients is not None:
         field = PixelField(camera, coefficients)
         tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
-    tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks)
+        loops = tuple(_without(field, o) for o in loops)
+    tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks, loops)
     return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics, field)
+
+
+def _without(field: PixelField, loop: LoopEvent) -> LoopEvent:
+    """Return a loop with the pixels of a rectified pair without the field."""
+    m = loop.matches
+    if m is None:
+        return loop
+    z = field.without(m.z_keyframe, m.has_right_keyframe), field.without(m.z_frame, m.has_right_frame)
+    return replace(loop, matches=replace(m, z_keyframe=z[0], z_frame=z[1]))
 
 
 def _in_pinhole(

@@ -64,6 +64,12 @@ def _utias(path: Path, settings: DatasetSettings) -> Dataset:
     return read_utias(path, settings)
 
 
+def _gtsam(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.gtsam import read_gtsam
+
+    return read_gtsam(path)
+
+
 def _log(path: Path, settings: DatasetSettings) -> Dataset:
     from vio.datasets.observation_log import read_observation_log
 
@@ -79,12 +85,14 @@ READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
     "video": _video,
     "ece276a": _ece276a,
     "utias": _utias,
+    "gtsam": _gtsam,
     "log": _log,
 }
 _LOOKED_FOR = (
     "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
     "(mav0), a plain folder (left right and a calibration), a ROS bag (.bag, .db3, .mcap), two videos (left.mp4 "
-    "right.mp4), an ECE276A .npz, a UTIAS .mat or an observation log .npz"
+    "right.mp4), an ECE276A .npz, a UTIAS .mat, GTSAM's stereo factors (*stereo_factors*.txt) or an observation log "
+    ".npz"
 )
 
 
@@ -152,6 +160,7 @@ def _detect(path: Path) -> str:
 def _folder_kind(path: Path) -> str | None:
     from vio.datasets.bags import is_bag
     from vio.datasets.euroc import is_euroc_folder
+    from vio.datasets.gtsam import factor_files
     from vio.datasets.kitti import is_kitti_folder
     from vio.datasets.kitti_raw import is_kitti_raw_folder
     from vio.datasets.plain import holds_more_than_kitti, is_plain_folder, lacks_sensor_yaml
@@ -175,6 +184,8 @@ def _folder_kind(path: Path) -> str | None:
         return "plain"
     if video_files(path) is not None:
         return "video"
+    if factor_files(path):
+        return "gtsam"
     if "sequences" in names:
         raise DataError(f"{path} holds several KITTI sequences; name one of them, such as {path / 'sequences' / '00'}")
     return None
@@ -182,6 +193,7 @@ def _folder_kind(path: Path) -> str | None:
 
 def _file_kind(path: Path) -> str | None:
     from vio.datasets.bags import is_bag
+    from vio.datasets.gtsam import is_factor_file
     from vio.datasets.observation_log import is_observation_log
 
     try:
@@ -194,6 +206,8 @@ def _file_kind(path: Path) -> str | None:
         return "utias"
     if is_bag(path):
         return "bag"
+    if is_factor_file(path):
+        return "gtsam"
     if not start.startswith(b"PK"):
         return None
     try:

@@ -36,6 +36,7 @@ from vio.datasets.images import list_images
 from vio.datasets.pairing import PAIRED_NS, pair_stamps
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
 from vio.geometry.distortion import CameraModel, StereoRig, rig_from_rectified
 from vio.geometry.lie import FloatArray, se3_inverse
@@ -55,6 +56,7 @@ class _Camera:
     times_ns: IntArray  # (N,) strictly increasing
     files: tuple[Path, ...]  # N images
     renamed: int  # number of images whose extension differs from their list
+    unlisted: int  # number of images that the list does not name
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +98,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
     pairs = tuple((left.files[a], right.files[b]) for a, b in zip(of_left.tolist(), of_right.tolist(), strict=True))
     white, depth_notes = full_scale(pairs)
+    truth = _reference_file(mav)
     recording = Recording(
         kind="euroc",
         path=path,
@@ -104,8 +107,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         frame_times_ns=times_ns,
         has_images=True,
         motion=motion,
-        reference=_read_reference(mav, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes),
+        reference=None if truth is None else _read_reference(truth, imu.T_body_imu, rig.T_imu_cam0),
+        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *_unused(path, mav, truth)),
     )
     return RectifiedDataset(
         recording=recording,
@@ -136,19 +139,21 @@ def _read_camera(folder: Path) -> _Camera:
     model, T_body_cam = read_camera_yaml(folder / "sensor.yaml")
     path = folder / "data.csv"
     times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
-    files, renamed = _find_images(folder / "data", [row[0] for row in rows], path, lines)
-    return _Camera(model, T_body_cam, times_ns, files, renamed)
+    there = list_images(folder / "data")
+    files, renamed = _find_images(there, [row[0] for row in rows], path, lines)
+    return _Camera(model, T_body_cam, times_ns, files, renamed, len(set(there) - set(files)))
 
 
-def _find_images(folder: Path, names: Sequence[str], path: Path, lines: Sequence[int]) -> tuple[tuple[Path, ...], int]:
+def _find_images(
+    there: Sequence[Path], names: Sequence[str], path: Path, lines: Sequence[int]
+) -> tuple[tuple[Path, ...], int]:
     """Return the listed images, and how many have another extension than listed."""
-    there = list_images(folder)
     by_name, by_stem = {file.name: file for file in there}, {file.stem: file for file in there}
     found = [by_name.get(name) or by_stem.get(Path(name).stem) for name in names]
     missing = [k for k, file in enumerate(found) if file is None]
     if missing:
         raise DataError(
-            f"{path}, line {lines[missing[0]]}: {folder / names[missing[0]]} is missing ({len(missing)} of "
+            f"{path}, line {lines[missing[0]]}: {there[0].parent / names[missing[0]]} is missing ({len(missing)} of "
             f"{len(names)} listed images are); copy it again, or remove such lines"
         )
     files = tuple(file for file in found if file is not None)
@@ -171,6 +176,11 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
     notes: list[str] = []
     if renamed := left.renamed + right.renamed:
         notes.append(f"{renamed} images have another extension than listed in their data.csv; matched by their stem")
+    if left.unlisted or right.unlisted:
+        notes.append(
+            f"{left.unlisted} images of cam0 and {right.unlisted} of cam1 are not listed in their data.csv and are "
+            "skipped"
+        )
     unpaired = len(left.times_ns) - len(a), len(right.times_ns) - len(b)
     if any(unpaired):
         notes.append(f"{unpaired[0]} images of cam0 and {unpaired[1]} of cam1 have no partner and are skipped")
@@ -198,17 +208,26 @@ def _read_imu(folder: Path) -> _Imu:
     return _Imu(T_body_imu, noise, imu_samples(read_imu_csv(folder / "data.csv")), notes)
 
 
-def _read_reference(mav: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory | None:
+def _reference_file(mav: Path) -> Path | None:
+    """Return the file of the ground truth; None: there is none."""
+    candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory:
     """Read the ground truth of the IMU. EuRoC's describes the body; a TUM file may describe the (raw) cam0."""
-    if (path := mav / STATE_CSV).is_file():
-        truth = read_trajectory(path, fmt="euroc", body="imu")
-    elif (path := mav.absolute().parent / TUM_FILE).is_file():
-        truth = read_trajectory(path, fmt="tum")
-    else:
-        return None
+    euroc = file.name == STATE_CSV.name
+    truth = read_trajectory(file, fmt="euroc", body="imu") if euroc else read_trajectory(file, fmt="tum")
     if truth.body == "cam0":
         return truth.in_imu(se3_inverse(T_imu_cam0))
     return replace(truth, T_world_body=truth.T_world_body @ T_body_imu)
+
+
+def _unused(path: Path, mav: Path, truth: Path | None) -> list[str]:
+    """Name what lies in the folder and was not read."""
+    sensors = [mav / name / file for name in ("cam0", "cam1", "imu0") for file in ("sensor.yaml", "data.csv")]
+    layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
+    return unused_note(layout, sensors if truth is None else [*sensors, truth])
 
 
 # --- writing --------------------------------------------------------------------------------------------------------

@@ -64,6 +64,7 @@ from vio.records import (
     VelocitySample,
     no_landmarks,
 )
+from vio.robust import median
 
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 # Factors on the motion model's densities: at the start, at least, at most.
@@ -570,7 +571,7 @@ class Msckf:
             initialised=created,
             landmarks=len(window.landmarks),
             innovation_median_px=innovation,
-            nis_per_dof=float(np.median(nis / dof)) if len(nis) else None,
+            nis_per_dof=median(nis / dof) if len(nis) else None,
             gated_ids=gated_ids,
             landmark_ids=window.landmark_ids.copy(),
         )

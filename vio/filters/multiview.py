@@ -16,6 +16,7 @@ from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray, so3_hat
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 from vio.records import BoolArray, IntArray
+from vio.robust import median
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
@@ -270,7 +271,7 @@ def landmark_residuals(
     at = residuals(camera, T_cam0_world[None], p_world, one)
     r, J = at.r[:, 0], at.z_D_p[:, 0]
     squares, seen = np.sum(r**2, axis=1), at.ahead & (views.weight[:, 1] > 0)
-    scale2 = max(sigma2, float(np.median(squares[seen])) / _MEDIAN) if seen.any() else sigma2
+    scale2 = max(sigma2, median(squares[seen]) / _MEDIAN) if seen.any() else sigma2
     return LandmarkResiduals(r, J, seen / (1 + squares / (4 * scale2 * CAUCHY**2)))
 
 

@@ -20,6 +20,7 @@ from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInf
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray, Observations
+from vio.robust import median
 
 FIELD_TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
 METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
@@ -81,7 +82,7 @@ class RowField:
         rows = z[:, 3] - z[:, 1]
         # The median is taken out, as in the first frames the field itself is not yet known.
         residual = _centred(rows - camera.fv * (basis @ self.coefficients))
-        scale = max(1.48 * float(np.median(np.abs(residual))), 1e-3)
+        scale = max(1.48 * median(np.abs(residual)), 1e-3)
         weight: FloatArray = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
         self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
         self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
@@ -128,7 +129,7 @@ def _common_rows(x: FloatArray, xr: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _centred(values: FloatArray) -> FloatArray:
-    return np.asarray(values - np.median(values), dtype=np.float64)
+    return np.asarray(values - median(values), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)

@@ -323,7 +323,15 @@ class MapBuilder:
         if joined or _squared(r, pose.covariance) > _SETTLED or self._waiting >= _PATIENCE:
             self._optimise()
         return LoopEvent(
-            graph.frame(k), graph.time_ns(k), i, graph.time_ns(i), row.inliers, float(np.linalg.norm(r[:3])), joined
+            frame=graph.frame(k),
+            time_ns=graph.time_ns(k),
+            keyframe=i,
+            keyframe_time_ns=graph.time_ns(i),
+            inliers=row.inliers,
+            gap_m=float(np.linalg.norm(r[:3])),
+            joined=joined,
+            keyframe_frame=graph.frame(i) if graph.session[i] == self._own else None,
+            matches=loop.seen.matches,
         )
 
     def _join(self, i: int, k: int, T_map_k: FloatArray) -> None:

@@ -15,8 +15,10 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.loops import LoopMatches
 from vio.mapping.features import KeyframeFeatures
 from vio.records import BoolArray, IntArray
+from vio.statistics import chi_square_quantile
 
 LEAST_INLIERS = 20
 _LEAST_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random
@@ -32,6 +34,9 @@ _GATE = 3.0  # standard deviations, of a pixel coordinate
 _LEAST_DISPARITY_PX = 1.0
 # Floor of a loop's standard deviations: errors that its points share, such as those of the calibration.
 _FLOOR_DEPTH, _FLOOR_DEG = 0.002, 0.05
+# Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points lie on whole pixels
+# of their level, so that the errors are at least those of rounding.
+_LEAST_VARIANCE = 1 / 12
 _INFLATION = 2.0  # of its standard deviations: key points of neighbouring levels and edges are not independent
 
 
@@ -44,6 +49,7 @@ class Verified:
     pairs: int  # of descriptors
     rows_i: IntArray  # (inliers,) features of i
     rows_j: IntArray  # (inliers,) features of j
+    matches: LoopMatches  # their pixels
 
 
 def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
@@ -88,7 +94,8 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
     pose, good = fitted
     if good.sum() < max(LEAST_INLIERS, _LEAST_SHARE * len(pairs)):
         return None
-    return Verified(pose, int(good.sum()), len(pairs), a[good], b[good])
+    a, b = a[good], b[good]
+    return Verified(pose, len(a), len(pairs), a, b, LoopMatches(i.z[a], j.z[b], i.has_right[a], j.has_right[b]))
 
 
 def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -171,8 +178,19 @@ def _fit(
     good[order] = fits
     depth = _median_depth(camera_j, j, b[good])
     floor = np.repeat([(_FLOOR_DEPTH * depth) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
-    covariance = _INFLATION**2 * np.asarray(np.linalg.inv(normal), dtype=np.float64) + np.diag(floor)
+    stereo = np.concatenate([j.has_right[b[forward]], i.has_right[a[~forward]]])
+    noise = _variance_factor(squared[fits], stereo[fits])
+    covariance = noise * _INFLATION**2 * np.asarray(np.linalg.inv(normal), dtype=np.float64) + np.diag(floor)
     return RelativePose(T, covariance), good
+
+
+def _variance_factor(squared: FloatArray, stereo: BoolArray) -> float:
+    """Return the variance of the pixels over the one assumed, by the median of the squared residuals (K,) of a fit.
+
+    Of a left and a right pixel they have three degrees of freedom, of a left one alone two.
+    """
+    expected = np.where(stereo, *chi_square_quantile(0.5, [3, 2]))
+    return max(float(np.median(squared / expected)), _LEAST_VARIANCE)
 
 
 class _Terms:

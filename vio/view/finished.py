@@ -43,6 +43,7 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
         "innovation": ("innovation_median_px", "nis_per_dof"),
         "time": [f"{name}_ms" for name in SERIES["time"]],
     }
+    keyframes = set(run.map_keyframes.frame[run.map_keyframes.own].tolist())
     for row, estimate in enumerate(map(estimate_of, run.estimates)):
         index = int(run.estimates["index"][row])
         numbers = {curve: [float(run.frames[name][row]) for name in columns] for curve, columns in names.items()}
@@ -50,6 +51,8 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
         states = None if seen is None else states_of(seen, seen.has_right, _NOTHING_DONE)
         image = next(images, None) if row % _EVERY_IMAGE == 0 else None
         viewer.show(index, estimate, numbers, image, seen, states)
+        loops = [loop for loop in run.loops if loop.frame == index]
+        viewer.places(index, estimate, is_keyframe=index in keyframes, loops=loops)
     ids = np.arange(len(run.points))
     viewer.landmarks(Landmarks(ids, run.points, np.zeros((len(ids), 3, 3))))
     viewer.close()

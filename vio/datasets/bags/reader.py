@@ -19,7 +19,7 @@ from vio.datasets.image_pairs import BadFrame, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.datasets.overlap import check_overlap, reference_of_body
 from vio.datasets.pairing import PAIRED_NS, pair_stamps
-from vio.datasets.rigs import load_rig
+from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.rigs.camera_info import rig_from_camera_infos
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import imu_notes
@@ -136,6 +136,7 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         DataError: the bag is damaged, its topics do not make a stereo recording, or no images match.
         CalibrationError: there is no calibration, or it is invalid.
     """
+    settings, beside = _with_calibration_beside(path, settings)
     with Bag(path) as bag:
         topics = bag.topics
         roles, notes = choose(topics, settings.topics, str(path))
@@ -164,7 +165,7 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         has_images=True,
         motion=sources,
         reference=None if truth is None else reference_of_body(truth, rig, rectifier),
-        notes=(*rig.notes, *rectifier.notes, *pair_notes, *motion_notes, *_white_note(white), *notes),
+        notes=(*rig.notes, *rectifier.notes, *pair_notes, *motion_notes, *_white_note(white), *beside, *notes),
     )
     sizes = (
         ImageSize(rig.cam0.width, rig.cam0.height, Path(infos[0] or where)),
@@ -185,6 +186,13 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         unstamped,
         rig.imu_noise,
     )
+
+
+def _with_calibration_beside(path: Path, settings: DatasetSettings) -> tuple[DatasetSettings, tuple[str, ...]]:
+    """Return settings that name the calibration in a bag's folder where no other is named, with a note."""
+    if settings.calibration is not None or not path.is_dir() or (file := find_calibration(path)) is None:
+        return settings, ()
+    return replace(settings, calibration=file), (f"the calibration is {file.name}, not the bag's CameraInfo",)
 
 
 def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
