@@ -203,11 +203,10 @@ def main() -> int:
     print("| images | step | in view | kept | common: median, 95 % (mrad) | outside the pinhole: median, 95 % |")
     print("|---|---|---|---|---|---|")
     for (step, name), tally in measure(moments=args.moments, points=args.points).items():
-        common, beyond = np.concatenate(tally.common), np.concatenate(tally.beyond)
-        parts = [", ".join(f"{x:.2f}" for x in np.percentile(e, [50, 95])) if len(e) else "-" for e in (common, beyond)]
+        errors = [tally.common] if name == "pinhole" else [tally.common, tally.beyond]
+        parts = [", ".join(f"{x:.2f}" for x in np.percentile(np.concatenate(e), [50, 95])) for e in errors]
         share = 100 * tally.kept / max(tally.seen, 1)
-        outside = "-" if name == "pinhole" else parts[1]
-        print(f"| {name} | {step} | {tally.seen} | {share:.1f} % | {parts[0]} | {outside} |")
+        print(f"| {name} | {step} | {tally.seen} | {share:.1f} % | {' | '.join([*parts, '-'][:2])} |")
     return 0
 
 
