@@ -45,7 +45,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.printable import json_text
     from vio.text_files import write_text
 
-    dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation))
+    dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation, projection="pinhole"))
     recording = dataset.recording
     for note in recording.notes:
         logging.getLogger(__name__).warning("%s", note)

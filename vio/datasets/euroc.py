@@ -86,7 +86,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     imu = _read_imu(mav / "imu0")
     T_imu_body = se3_inverse(imu.T_body_imu)
     rig = StereoRig(left.model, right.model, T_imu_body @ left.T_body_cam, T_imu_body @ right.T_body_cam)
-    rectifier = make_rectifier(rig, settings.interpolation, mav)
+    rectifier = make_rectifier(rig, settings.interpolation, mav, settings.projection)
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
     if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
@@ -108,7 +108,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=motion,
         reference=None if truth is None else _read_reference(truth, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes, *depth_notes, *_unused(path, mav, truth)),
+        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *_unused(path, mav, truth)),
     )
     return RectifiedDataset(
         recording=recording,

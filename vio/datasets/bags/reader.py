@@ -153,7 +153,7 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     left_ns, right_ns, logged_ns, pair_notes = _paired(index, roles, path)
     where = file or path
     with naming(where):
-        rectifier = rig.rectifier(settings.interpolation)
+        rectifier = rig.rectifier(settings.interpolation, settings.projection)
     motion, sources, motion_notes = _motion(index, roles, rig, left_ns, path)
     truth = index.reference(imu=rig.T_cam0_imu is not None)
     white = white_of(max(index.left.white, index.right.white)) if index.left.white else white_of(65535)
@@ -166,7 +166,10 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         has_images=True,
         motion=sources,
         reference=None if truth is None else reference_of_body(truth, rig, rectifier),
-        notes=(*rig.notes, *pair_notes, *motion_notes, *_white_note(white), *notes_on_files, *rig_notes, *notes),
+        notes=(
+            *(*rig.notes, *rectifier.notes, *pair_notes, *motion_notes),
+            *(*_white_note(white), *notes_on_files, *rig_notes, *notes),
+        ),
     )
     sizes = (
         ImageSize(rig.cam0.width, rig.cam0.height, Path(infos[0] or where)),
