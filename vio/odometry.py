@@ -118,7 +118,8 @@ class Odometry:
             self._offset_ns = round(1e9 * rig.time_offset_s)
         else:
             self._rig = rig
-            self._rectifier = rig.rectifier()
+            # Maps know pinholes only.
+            self._rectifier = rig.rectifier(projection=self._config.dataset.projection if map is None else "pinhole")
             self.camera = self._rectifier.camera
             T_cam0_imu = rig.T_rect0_imu
             self._offset_ns = round(1e9 * rig.time_offset_s)
@@ -333,7 +334,8 @@ class Odometry:
         rig = self._rig or rig_of_rectified(self.camera, None if self.motion is None else self.T_cam0_body)
         if rig is None:
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
-        return calibrated_rig(rig, estimate)
+        # A stereo field on a cylinder is not expressed as a rig.
+        return calibrated_rig(rig, replace(estimate, stereo_field=None) if self.camera.is_cylinder else estimate)
 
     @property
     def map_session(self) -> MapSession | None:

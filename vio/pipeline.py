@@ -75,8 +75,14 @@ class RunResult:
     mapped: MappedRun | None = None  # where a map was built or used
 
     def calibrated_rig(self) -> CalibratedRig | None:
-        """Return the calibration with what the run found it to be off by; None: features without an image size."""
-        return None if self.rig is None else calibrated_rig(self.rig, self.estimates[-1])
+        """Return the calibration with what the run found it to be off by; None: features without an image size.
+
+        On a cylinder left and right stay as given: its stereo field is not expressed as a rig.
+        """
+        if self.rig is None:
+            return None
+        last = self.estimates[-1]
+        return calibrated_rig(self.rig, replace(last, stereo_field=None) if self.recording.camera.is_cylinder else last)
 
     @property
     def trajectory(self) -> Trajectory:

@@ -310,7 +310,7 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
     if field is None:
         return None
     f = result.recording.camera.fu
-    found = result.calibrated_rig()
+    found = None if result.recording.camera.is_cylinder else result.calibrated_rig()
     rig = None
     if found is not None:
         sigmas = found.sigmas.tolist()
@@ -396,6 +396,8 @@ def calibration_text(result: RunResult) -> str:
     lines += found.lines() or ["nothing was found to be off: the calibration as given"]
     if found.left_px:
         lines.append(f"what this calibration cannot express of it: {found.left_px:.2f} px (rms over the images)")
+    if result.recording.camera.is_cylinder and result.estimates[-1].stereo_field is not None:
+        lines.append("left and right are as given, though found to be off; run with dataset.projection=pinhole")
     if not result.recording.has_images:
         lines.append("of the rectified images that the features come from")
     return "".join(f"# {printable(line)}\n" for line in lines) + kalibr_text(found.rig)

@@ -46,7 +46,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.records import need_stereo
     from vio.text_files import write_text
 
-    dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation))
+    dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation, projection="pinhole"))
     recording = dataset.recording
     need_stereo(recording, "vio rectify")
     for note in recording.notes:

@@ -47,7 +47,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument(
         "--rig",
-        choices=("euroc", "euroc-rectified", "kitti", "fisheye", "small"),
+        choices=("euroc", "euroc-rectified", "kitti", "fisheye", "wide", "small"),
         help="cameras and their extrinsics to the IMU (default: euroc-rectified for handheld, kitti for car, euroc, "
         "which is unrectified, for a recorded trajectory)",
     )

@@ -18,7 +18,7 @@ from vio.datasets.common import checked_transform, read_npz
 from vio.datasets.features import FeatureDataset
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import CameraKind, StereoCamera
+from vio.geometry.stereo import CameraKind, Projection, StereoCamera
 from vio.records import (
     BodyFrame,
     FeatureTracks,
@@ -55,6 +55,7 @@ _REQUIRED: dict[str, tuple[str, int]] = {  # array kinds (numpy's letters) and d
 }
 _OPTIONAL = (
     "format",
+    "projection",
     "run_motion",
     "camera_kind",
     "T_cam0_imu",
@@ -104,6 +105,7 @@ def write_observation_log(
         "notes": np.array(recording.notes, dtype=np.str_),
         "intrinsics": np.array([camera.fu, camera.fv, camera.cu, camera.cv, camera.baseline_m], dtype=np.float64),
         "image_size": np.array([k for k in (camera.width, camera.height) if k is not None], dtype=np.int64),
+        **({} if camera.projection == "pinhole" else {"projection": np.array(camera.projection)}),
         "frame_times_ns": recording.frame_times_ns,
         "frame_indices": frames,
         "offsets": np.cumsum([0, *(len(o) for o in observations)], dtype=np.int64),
@@ -226,6 +228,8 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
     for first, group in _GROUPS.items():
         if first in arrays and any(key not in arrays for key in group):
             return f"{first} lacks {' '.join(key for key in group if key not in arrays)}"
+    if "projection" in arrays and str(arrays["projection"]) not in get_args(Projection):
+        return f"projection is {str(arrays['projection'])!r}, none of {', '.join(get_args(Projection))}"
     if "run_motion" in arrays and str(arrays["run_motion"]) not in get_args(RunMotion):
         return f"run_motion is {str(arrays['run_motion'])!r}, none of {', '.join(get_args(RunMotion))}"
     if "camera_kind" in arrays and str(arrays["camera_kind"]) not in get_args(CameraKind):
@@ -240,8 +244,9 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
 def _camera(arrays: Mapping[str, np.ndarray]) -> StereoCamera:
     fu, fv, cu, cv, b = arrays["intrinsics"].tolist()
     width, height = arrays["image_size"].tolist() or (None, None)
+    projection = cast(Projection, str(arrays.get("projection", "pinhole")))
     kind = cast(CameraKind, str(arrays.get("camera_kind", "stereo")))
-    return StereoCamera(fu, fv, cu, cv, b, width, height, kind)
+    return StereoCamera(fu, fv, cu, cv, b, width, height, projection=projection, kind=kind)
 
 
 def _extrinsics(arrays: Mapping[str, np.ndarray], path: Path) -> FloatArray | None:

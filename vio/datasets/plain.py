@@ -118,7 +118,7 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     times_ns, times_file, time_notes = frame_times(layout, pairs)
     motion, motion_files, motion_notes = read_motion(layout, rig, times_ns, times_file is not None)
     with naming(file):
-        rectifier = rig.rectifier(settings.interpolation)
+        rectifier = rig.rectifier(settings.interpolation, settings.projection)
     reference, reference_file = read_reference(layout, rig, rectifier, times_ns)
     sources = [file, times_file, *used, *motion_files, reference_file]
     recording = Recording(
@@ -134,6 +134,7 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
             *notes,
             *depth_notes,
             *rig.notes,
+            *rectifier.notes,
             *time_notes,
             *motion_notes,
             *unused_note(layout, [s for s in sources if s is not None]),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
-from vio.geometry.rectify import Interpolation
+from vio.geometry.rectify import Interpolation, ProjectionMode
 from vio.setting import Section, setting
 
 ExtrinsicsMode: TypeAlias = Literal["auto", "literal", "corrected"]
@@ -57,6 +57,11 @@ class DatasetSettings(Section):
         "linear",
         "unrectified images: how gray values between pixels are interpolated in rectifying (cubic and lanczos4 cost 5 "
         "and 15 times as much for barely better tracks)",
+    )
+    projection: ProjectionMode = setting(
+        "auto",
+        "unrectified images: rectify to the image of a pinhole, or to a cylinder about the baseline, which keeps what "
+        "a wide lens sees above and below; auto: a cylinder where a pinhole would crop there, beyond 54 degrees",
     )
     max_bad_frames: int | None = setting(
         None,

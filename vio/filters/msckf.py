@@ -47,7 +47,7 @@ from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
 from vio.geometry.relative_pose import RelativePose
-from vio.geometry.stereo import StereoCamera, project
+from vio.geometry.stereo import StereoCamera, depth_of, project
 from vio.records import (
     BoolArray,
     Estimate,
@@ -121,6 +121,8 @@ class Msckf:
             raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
         if settings.calibrate not in ("auto", "none") and motion != "imu":
             raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to auto or none")
+        if camera.is_cylinder:  # equation (R4) is a pinhole's
+            settings = replace(settings, stereo_focal_sigma=0.0, stereo_baseline_sigma=0.0)
         self._camera, self._settings = camera, settings
         self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings, motion)
         self._order = InputOrder("msckf")
@@ -237,7 +239,7 @@ class Msckf:
         rows = rows[table.has_point[rows]]
         ids = np.concatenate([table.ids(rows), window.landmark_ids])
         p_cam = transform_points(T_cam0_world, np.concatenate([table.points[rows], window.landmarks]))
-        ahead = p_cam[:, 2] > MIN_DEPTH * self._camera.baseline_m
+        ahead = depth_of(self._camera, p_cam) > MIN_DEPTH * self._camera.baseline_m
         z, field = project(self._camera, p_cam[ahead]), self._field(window)
         if field is not None:
             z = field.seen(z)

@@ -87,6 +87,10 @@ class MapSession:
         self._since = 0  # frames since the last keyframe
         self._last_keyframe: int | None = None  # its frame
         self._seen_ns: int | None = None  # newest frame with features
+        self._seen: Estimate | None = None  # likewise
+        self._dark: RelativePose | None = (
+            None  # motion of the body since then, of a frame that the window does not hold
+        )
         self.T_map_odom: FloatArray | None = np.eye(4) if self._builder.first == 0 and not localise else None
         # (6, 6) covariance in the map of the newest keyframe with a result
         self._known: FloatArray | None = None if self.T_map_odom is None else np.zeros((6, 6))
@@ -111,9 +115,10 @@ class MapSession:
         motion = self._motion_to(
             frame.index, estimate, _unknown if shown and self._is_lost(frame.time_ns) else relative
         )
+        self._dark = _predicted(self._seen, estimate) if motion is None and self._seen is not None else None
         if not shown:
             return events
-        self._seen_ns = frame.time_ns
+        self._seen_ns, self._seen = frame.time_ns, estimate
         self._since += 1
         if motion is None and self._newest is not None:
             return events
@@ -167,7 +172,8 @@ class MapSession:
     def covariance(self) -> FloatArray | None:
         """Covariance (6, 6) of xi in T_map_body = T_hat exp(xi), [rho; phi], at the newest frame, given the map.
 
-        That of the newest keyframe whose place is known, grown by the odometry since; None without a place.
+        That of the newest keyframe whose place is known, grown by the odometry since; None without a place. Where
+        images show nothing, it grows as the filter's own.
         """
         if self._known is None:
             return None
@@ -176,6 +182,8 @@ class MapSession:
             now = now.then(motion)
         if self._newest is not None:
             now = now.then(self._newest[1])
+        if self._dark is not None:
+            now = now.then(self._dark.seen_by(self._T_cam_body))
         A = se3_adjoint(self._T_body_cam)
         return A @ now.covariance @ A.T
 
@@ -288,6 +296,17 @@ class MapSession:
             done.set_result(update)
             self._waiting.append((due, frame, done))
         self._builder.reopen(MapStore(Path(self._path), read_only=self._localise))
+
+
+def _predicted(before: Estimate, after: Estimate) -> RelativePose:
+    """Return the motion of the body between two estimates without a measurement in between.
+
+    Errors in the body's frame go with it, `xi_j = Ad(T_i_j)^-1 xi_i + xi_i_j`, and so do their covariances.
+    """
+    T = se3_inverse(before.T_world_imu) @ after.T_world_imu
+    A = se3_adjoint(se3_inverse(T))
+    grown, V = np.linalg.eigh(after.covariance - A @ before.covariance @ A.T)
+    return RelativePose(T, (V * np.maximum(grown, 0.0)) @ V.T)
 
 
 def _unknown(older: int, newer: int) -> RelativePose | None:

@@ -63,7 +63,7 @@ def open_source(text: str) -> CalibrationSource:
         CalibrationError: the calibration is invalid, and the recording is not in EuRoC format.
     """
     try:
-        dataset = open_dataset(text, DatasetSettings(extrinsics="literal"))
+        dataset = open_dataset(text, DatasetSettings(extrinsics="literal", projection="pinhole"))
     except CalibrationError as error:
         found = _raw_euroc(Path(text.removeprefix("euroc:")), str(error))
         if found is None:
