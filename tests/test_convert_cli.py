@@ -10,6 +10,7 @@ import pytest
 
 from tests.dataset_makers import ece276a_arrays, make_drive, make_npz
 from tests.euroc_maker import make_euroc
+from tests.plain_maker import make_plain
 from tests.same_events import assert_same_events
 from vio.cli import main
 from vio.config import load_config
@@ -106,6 +107,21 @@ def test_names_of_rendered_images_sort_by_time_as_text(flight: Path, tmp_path: P
     assert main(["convert", str(flight), "--to", "plain", "--out", str(out)]) == 0
     names = sorted(path.name for path in (out / "left").iterdir())
     assert names == sorted(names, key=lambda name: int(name.split(".")[0]))
+
+
+def test_names_agree_with_their_list_where_the_last_frame_is_unreadable(tmp_path: Path) -> None:
+    """Of a clock from zero, the last frame's time has more digits than those of the frames that were written."""
+    source = make_plain(tmp_path / "plain")
+    (source / "imu.csv").unlink(missing_ok=True)
+    (source / "times.txt").write_text("0.85\n0.9\n0.95\n1.0\n")
+    last = sorted((source / "left").iterdir())[-1]
+    last.write_bytes(last.read_bytes()[:-30])
+    out = tmp_path / "out"
+    assert main(["convert", str(source), "--to", "euroc", "--out", str(out)]) == 0
+    assert open_dataset(out).recording.frame_times_ns.tolist() == [850_000_000, 900_000_000, 950_000_000]
+    names = sorted(path.name for path in (out / "mav0" / "cam0" / "data").iterdir())
+    assert names == ["0850000000.png", "0900000000.png", "0950000000.png"]
+    assert names[0] in (out / "mav0" / "cam0" / "data.csv").read_text()
 
 
 def test_velocities_and_poses_at_the_frames_go_to_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -161,6 +161,16 @@ def test_odometry_is_velocity_and_reference(tmp_path: Path) -> None:
     assert any("/odom may be ground truth: say so with --topics reference=/NAME" in n for n in by_itself.notes)
 
 
+def test_a_file_beside_the_bag_that_is_no_calibration_leaves_camera_info(tmp_path: Path) -> None:
+    path = plain_script().write(tmp_path / "f")
+    (path / "calibration.yaml").write_text("rate: 20\n")
+    recording = open_dataset(path).recording
+    assert recording.camera.baseline_m == pytest.approx(0.11, abs=1e-12)
+    (note,) = [note for note in recording.notes if "CameraInfo" in note]
+    assert note.startswith("the bag's CameraInfo serves, as ")
+    assert "calibration.yaml: is no stereo calibration of a known format" in note
+
+
 def test_the_moving_frames_of_tf_are_ground_truth_where_they_are_named(tmp_path: Path) -> None:
     """/tf moves a base, which carries the IMU; the origin of the odometry moves, too, in the frame of a map."""
     script = plain_script()

@@ -293,6 +293,7 @@ def metrics_of(
         "warnings": list(result.warnings),
         "stereo_field": stereo_field(result),
         "stereo_scale": stereo_scale(result),
+        "scale_sigma": scale_sigma(result),
         "camera_imu": camera_imu(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
         "camera": asdict(result.recording.camera),
@@ -309,7 +310,7 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
     if field is None:
         return None
     f = result.recording.camera.fu
-    found = result.calibrated_rig()
+    found = None if result.recording.camera.is_cylinder else result.calibrated_rig()
     rig = None
     if found is not None:
         sigmas = found.sigmas.tolist()
@@ -334,6 +335,12 @@ def stereo_scale(result: RunResult) -> dict[str, Any] | None:
     if scale is None:
         return None
     return {name.replace(" ", "_"): {"percent": p, "sigma_percent": s} for name, (p, s) in scale.percent().items()}
+
+
+def scale_sigma(result: RunResult) -> float | None:
+    """Return the median standard deviation of the scale over the frames, over it; None: not of one camera."""
+    known = [sigma for sigma in result.estimates.column("scale_sigma") if sigma is not None and sigma == sigma]
+    return float(np.median(known)) if known else None
 
 
 def camera_imu(result: RunResult) -> dict[str, Any] | None:
@@ -389,6 +396,8 @@ def calibration_text(result: RunResult) -> str:
     lines += found.lines() or ["nothing was found to be off: the calibration as given"]
     if found.left_px:
         lines.append(f"what this calibration cannot express of it: {found.left_px:.2f} px (rms over the images)")
+    if result.recording.camera.is_cylinder and result.estimates[-1].stereo_field is not None:
+        lines.append("left and right are as given, though found to be off; run with dataset.projection=pinhole")
     if not result.recording.has_images:
         lines.append("of the rectified images that the features come from")
     return "".join(f"# {printable(line)}\n" for line in lines) + kalibr_text(found.rig)

@@ -86,7 +86,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     imu = _read_imu(mav / "imu0")
     T_imu_body = se3_inverse(imu.T_body_imu)
     rig = StereoRig(left.model, right.model, T_imu_body @ left.T_body_cam, T_imu_body @ right.T_body_cam)
-    rectifier = make_rectifier(rig, settings.interpolation, mav)
+    rectifier = make_rectifier(rig, settings.interpolation, mav, settings.projection)
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
     if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
@@ -108,7 +108,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=motion,
         reference=None if truth is None else _read_reference(truth, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes, *depth_notes, *_unused(path, mav, truth)),
+        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *_unused(path, mav, truth)),
     )
     return RectifiedDataset(
         recording=recording,
@@ -255,15 +255,17 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progre
     for folder in folders:
         (folder / "data").mkdir(parents=True)
 
+    last_ns = int(dataset.recording.frame_times_ns[-1])
+
     def name(frame: StereoFrame, count: int) -> tuple[Path, Path]:
-        file = image_name(frame.time_ns, int(dataset.recording.frame_times_ns[-1]))
+        file = image_name(frame.time_ns, last_ns)
         return folders[0] / "data" / file, folders[1] / "data" / file
 
     times_ns = write_frames(dataset, name, progress)
     for folder, model, T_imu_cam in zip(folders, (rig.cam0, rig.cam1), (rig.T_imu_cam0, rig.T_imu_cam1), strict=True):
         comment, rate_hz = f"rectified {folder.name}", median_rate_hz(times_ns)
         write_text(folder / "sensor.yaml", camera_yaml(model, T_body_imu @ T_imu_cam, comment=comment, rate_hz=rate_hz))
-        write_text(folder / "data.csv", image_list_csv(times_ns))
+        write_text(folder / "data.csv", image_list_csv(times_ns, last_ns))
     for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV):
         _copy(source / part, mav / part)
     _copy(source.absolute().parent / TUM_FILE, out / TUM_FILE)

@@ -99,7 +99,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=frozenset(),
         reference=None,
-        notes=(*time_notes, *imu_notes, *depth_notes, *unused),
+        notes=(*time_notes, *imu_notes, *depth_notes, *rectifier.notes, *unused),
     )
     sizes = rig_sizes(rectifier.rig, (calibration_path, calibration_path))
     return RectifiedDataset(recording, pairs, (), sizes, settings, rectifier, white=white)
@@ -134,7 +134,7 @@ def _rectifier(
             f"{pairs[0][0].parent}: images are {size[0]} x {size[1]} pixels but {where} is for {raw[0]} x {raw[1]} "
             f"(raw) or {rectified[0]} x {rectified[1]} (rectified); give the calibration of these images"
         )
-    return make_rectifier(rig, settings.interpolation, where)
+    return make_rectifier(rig, settings.interpolation, where, settings.projection)
 
 
 # --- calibration ----------------------------------------------------------------------------------------------------

@@ -40,10 +40,23 @@ def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
     The row of `vr` is zero: right rows are not measured.
     """
     out = np.empty((*z.shape[:-1], 4, TERMS))
-    loops.stereo_field_jacobian(
-        loops.lens_of(camera), np.ascontiguousarray(z).reshape(-1, 4), out.reshape(-1, 4, TERMS)
-    )
+    jacobian = loops.cylinder_field_jacobian if camera.is_cylinder else loops.stereo_field_jacobian
+    jacobian(loops.lens_of(camera), np.ascontiguousarray(z).reshape(-1, 4), out.reshape(-1, 4, TERMS))
     return out
+
+
+def _row_terms(camera: StereoCamera, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives (N, 6) of right minus left rows by the coefficients of (R2), and (N, 3) by k, q1, q2 of (R3).
+
+    In focal lengths, of pixels (N, 4).
+    """
+    if camera.is_cylinder:
+        basis, common = np.empty((len(z), _ROW_TERMS)), np.empty((len(z), 3))
+        loops.cylinder_rows(loops.lens_of(camera), np.ascontiguousarray(z), basis, common)
+        return basis, common
+    x, y = (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
+    basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
+    return basis, _common_rows((z[:, 0] - camera.cu) / camera.fu, x, y)
 
 
 class RowField:
@@ -65,8 +78,7 @@ class RowField:
         if len(z) < _MIN_ROWS:
             return
         camera = self._camera
-        x, y = (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
-        basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
+        basis, common = _row_terms(camera, z)
         rows = z[:, 3] - z[:, 1]
         # The median is taken out, as in the first frames the field itself is not yet known.
         residual = _centred(rows - camera.fv * (basis @ self.coefficients))
@@ -74,7 +86,6 @@ class RowField:
         weight: FloatArray = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
         self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
         self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
-        common = _common_rows((z[:, 0] - camera.cu) / camera.fu, x, y)
         self._common = _ROW_MEMORY * self._common + (basis * weight[:, None]).T @ common
         prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
@@ -139,7 +150,8 @@ class StereoField:
         z, weight = np.ascontiguousarray(views.z), np.ascontiguousarray(views.weight)
         out = np.empty(z.shape)
         flat = z.reshape(-1, 4), weight.reshape(-1, 4), out.reshape(-1, 4)
-        loops.correct_pixels(loops.lens_of(self.camera), self.coefficients, self.rows, *flat)
+        correct = loops.correct_cylinder_pixels if self.camera.is_cylinder else loops.correct_pixels
+        correct(loops.lens_of(self.camera), self.coefficients, self.rows, *flat)
         return Views(out, views.weight)
 
     def seen(self, z: FloatArray) -> FloatArray:

@@ -39,6 +39,7 @@ Form: TypeAlias = Literal["euroc", "kitti", "plain", "rosbag2", "mcap"]
 class _Written:
     """What went into the folder."""
 
+    last_ns: int = 0  # of the last frame of the range, by whose digits images are named
     times_ns: list[int] = field(default_factory=list)
     imu: list[ImuSample] = field(default_factory=list)
     velocities: list[VelocitySample] = field(default_factory=list)
@@ -120,7 +121,7 @@ def _write_images(
         folder.mkdir(parents=True)
     count = len(dataset.recording.frame_times_ns)
     total = (count if stop is None else min(stop, count)) - start
-    last_ns = int(dataset.recording.frame_times_ns[total + start - 1])
+    written.last_ns = int(dataset.recording.frame_times_ns[total + start - 1])
     for event in dataset.events(start, stop):
         if isinstance(event, ImuSample):
             written.imu.append(event)
@@ -129,7 +130,7 @@ def _write_images(
         else:
             assert event.left is not None
             assert event.right is not None
-            name = f"{len(written.times_ns):06d}.png" if form == "kitti" else image_name(event.time_ns, last_ns)
+            name = f"{len(written.times_ns):06d}.png" if form == "kitti" else image_name(event.time_ns, written.last_ns)
             for folder, image in zip(folders, (event.left, event.right), strict=True):
                 write_png(folder / name, image)
             written.times_ns.append(event.time_ns)
@@ -144,7 +145,7 @@ def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: Imu
     for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
         text = camera_yaml(camera, T_imu_cam, comment=f"rectified {name}", rate_hz=median_rate_hz(times))
         write_text(mav / name / "sensor.yaml", text)
-        write_text(mav / name / "data.csv", image_list_csv(times))
+        write_text(mav / name / "data.csv", image_list_csv(times, written.last_ns))
     notes = []
     if written.imu:
         record = _record(written.imu)

@@ -15,7 +15,7 @@ import numpy as np
 
 from vio.frame_result import FrameResult
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, left_rays
 from vio.loops import LoopEvent
 from vio.records import BoolArray, Estimate, Image, IntArray, Landmarks, Observations, Trajectory, UpdateReport
 from vio.upright import up_of, upright_axes
@@ -301,8 +301,7 @@ class RerunViewer:
         camera, z = self._rig.camera, seen.z
         near = seen.has_right & (z[:, 0] - z[:, 2] > _LEAST_DISPARITY_PX)
         depth = camera.fu * camera.baseline_m / (z[near, 0] - z[near, 2])
-        x, y = (z[near, 0] - camera.cu) / camera.fu, (z[near, 1] - camera.cv) / camera.fv
-        p_cam = np.stack([x * depth, y * depth, depth], axis=1)
+        p_cam = left_rays(camera, z[near, :2]) * depth[:, None]
         T_world_cam0 = estimate.T_world_imu @ se3_inverse(self._rig.T_cam0_body)
         points = rr.Points3D(transform_points(T_world_cam0, p_cam), radii=rr.Radius.ui_points(2))
         self._stream.log("world/run/points_of_this_frame", points)
