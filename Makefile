@@ -29,11 +29,11 @@ lint: $(TESTED)
 	$(BIN)/mypy
 
 unit: $(TESTED)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 # All tests again, with the lines of vio/ and frontend/ that they reach; LEARNED=1 counts the learned front ends in.
 coverage: $(TESTED)
-	$(BIN)/python -m pytest --cov --cov-report=term --cov-fail-under=90
+	$(BIN)/python -m pytest -n auto --dist loadfile --cov --cov-report=term --cov-fail-under=90
 
 # Break the code on purpose, a line at a time: some test must fail each time (half an hour).
 mutations: $(TESTED)

@@ -8,7 +8,7 @@ import numpy as np
 
 from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, transform_points
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, depth_of
 from vio.records import BoolArray, IntArray
 
 from .align import align, on_peak, rounded, scale_change, shift_warps, template_points
@@ -102,10 +102,11 @@ class AnchorFit:
         point = transform_points(motion.T_curr_prev, old.point)
         predicted = moved_pixels(self._camera, motion.T_curr_prev, old.point, old.left)
         margin = self._settings.anchor_radius_px + 2.0
-        ahead = old.has_point & (point[:, 2] > 0.1)
+        depth, before = depth_of(self._camera, point), depth_of(self._camera, old.point)
+        ahead = old.has_point & (depth > 0.1)
         return _Start(
             np.where(seen[:, None], found, predicted),
-            np.where(ahead, old.point[:, 2] / np.where(ahead, point[:, 2], 1.0), 1.0),
+            np.where(ahead, before / np.where(ahead, depth, 1.0), 1.0),
             point,
             seen | (old.has_point & inside(left.full, predicted, margin)),
         )

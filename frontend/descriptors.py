@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, triangulate
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays, triangulate
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior
 
 from .align import align, cut_patches, on_peak, rounded, shift_warps, template_points, templates
@@ -282,7 +282,8 @@ class DescriptorFrontend:
         if motion is not None:
             keep[~known] = False
             twist = se3_log(motion.T_curr_prev) / seconds
-            depth = np.maximum(transform_points(motion.T_curr_prev, p_rows)[:, 2], _MIN_DEPTH_M)
+            depth = depth_of(self._camera, transform_points(motion.T_curr_prev, p_rows))
+            depth = np.maximum(depth, _MIN_DEPTH_M)
             change = np.abs(pixels[:, 0] - right[:, 0] - self._camera.fu * self._camera.baseline_m / depth)
             agrees = agrees & (~known | (change <= self._settings.consensus_px))
         rows, found = rows[keep], found[keep]

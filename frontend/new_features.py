@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from vio.geometry.lie import FloatArray, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, project
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.records import BoolArray, IntArray
 
 from .align import rounded
@@ -128,6 +128,6 @@ class NewFeatures:
         T = np.linalg.matrix_power(motion.T_curr_prev, self._settings.wanted_life_frames)
         depth = self._camera.fu * self._camera.baseline_m / np.maximum(disparity, 0.1)
         moved = transform_points(T, left_rays(self._camera, corners) * depth[:, None])
-        ahead = moved[:, 2] > 0.5
+        ahead = depth_of(self._camera, moved) > 0.5
         pixels = project(self._camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
         return np.asarray(ahead & inside(image, pixels, 0.0))

@@ -13,14 +13,16 @@ exact rotation between two images independently of the translation, ECCV (2012),
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import cv2
 import numpy as np
 
 from vio.compiled import compiled, move_by_twist, solve_positive
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, project
+from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project
 from vio.records import BoolArray, IntArray
+from vio.robust import median
 
 from .settings import ConsensusSettings
 
@@ -38,6 +40,9 @@ _MIN_BEARING_SHARE = 0.5  # two views constrain a track in one direction only, s
 _SURE_BEARING_SHARE = 0.9  # share of inliers of a predicted rotation above which no other rotation is tried
 _FIVE_POINT_CONFIDENCE = 0.999
 _EPSILON = 1e-9  # added to denominators
+_LEAST_FORWARD = 0.5  # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as large
+
+_Lens: TypeAlias = tuple[float, float, float, float, bool]  # fu, fv, cu, cv, whether the projection is a cylinder
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,21 +71,30 @@ def pixel_errors(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArr
     T = np.ascontiguousarray(T_curr_prev).reshape(-1, 4, 4)
     out = np.empty((len(T), len(p_prev)))
     points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
-    _distances(camera.fu, camera.fv, camera.cu, camera.cv, T, points, seen, out)
+    _distances(_lens(camera), T, points, seen, out)
     return out.reshape(*T_curr_prev.shape[:-2], len(p_prev))
 
 
+def _lens(camera: StereoCamera) -> _Lens:
+    return camera.fu, camera.fv, camera.cu, camera.cv, camera.is_cylinder
+
+
 @compiled
-def _distances(
-    fu: float, fv: float, cu: float, cv: float, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray
-) -> None:
+def _distances(lens: _Lens, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
     """Write the distances (H, N) of points (N, 3) moved by motions (H, 4, 4) from pixels (N, 2)."""
+    fu, fv, cu, cv, cylinder = lens
     for h in range(len(T)):
         for n in range(len(points)):
             x, y, z = points[n, 0], points[n, 1], points[n, 2]
             depth = T[h, 2, 0] * x + T[h, 2, 1] * y + T[h, 2, 2] * z + T[h, 2, 3]
-            du = fu * (T[h, 0, 0] * x + T[h, 0, 1] * y + T[h, 0, 2] * z + T[h, 0, 3]) / depth + cu - pixels[n, 0]
-            dv = fv * (T[h, 1, 0] * x + T[h, 1, 1] * y + T[h, 1, 2] * z + T[h, 1, 3]) / depth + cv - pixels[n, 1]
+            across = T[h, 0, 0] * x + T[h, 0, 1] * y + T[h, 0, 2] * z + T[h, 0, 3]
+            down = T[h, 1, 0] * x + T[h, 1, 1] * y + T[h, 1, 2] * z + T[h, 1, 3]
+            if cylinder:
+                dv = fv * np.arctan2(down, depth) + cv - pixels[n, 1]
+                depth = np.sqrt(down * down + depth * depth)
+            else:
+                dv = fv * down / depth + cv - pixels[n, 1]
+            du = fu * across / depth + cu - pixels[n, 0]
             out[h, n] = np.sqrt(du * du + dv * dv) if depth > _MIN_DEPTH_M else np.inf
 
 
@@ -100,13 +114,13 @@ def _gauss_newton(
     """
     T = np.array(T, order="C")  # of one layout, so that one version is compiled
     points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
-    _iterate((camera.fu, camera.fv, camera.cu, camera.cv), T, points, seen, w, iterations, free.stop)
+    _iterate(_lens(camera), T, points, seen, w, iterations, free.stop)
     return T
 
 
 @compiled
 def _iterate(
-    intrinsics: tuple[float, float, float, float],
+    lens: _Lens,
     T: FloatArray,
     points: FloatArray,
     pixels: FloatArray,
@@ -115,7 +129,8 @@ def _iterate(
     free: int,
 ) -> None:
     """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see `_gauss_newton`."""
-    fu, fv, cu, cv = intrinsics
+    fu, fv, cu, cv, cylinder = lens
+    azimuth, s, c = 0.0, 0.0, 1.0  # of a point about the baseline: a cylinder is a pinhole turned to it
     A, xi, u_D_xi, v_D_xi = np.empty((free, free)), np.zeros(6), np.empty(6), np.empty(6)
     for h in range(len(T)):
         for _ in range(iterations):
@@ -128,16 +143,26 @@ def _iterate(
                 x = T[h, 0, 0] * px + T[h, 0, 1] * py + T[h, 0, 2] * pz + T[h, 0, 3]
                 y = T[h, 1, 0] * px + T[h, 1, 1] * py + T[h, 1, 2] * pz + T[h, 1, 3]
                 z = T[h, 2, 0] * px + T[h, 2, 1] * py + T[h, 2, 2] * pz + T[h, 2, 3]
+                if cylinder:
+                    azimuth = np.arctan2(y, z)
+                    s, c = np.sin(azimuth), np.cos(azimuth)
+                    y, z = 0.0, np.sqrt(y * y + z * z)
                 w2 = weight[h, n] ** 2
                 if not z > _MIN_DEPTH_M or w2 == 0.0:
                     continue
                 a, b = x / z, y / z
                 du, dv = pixels[h, n, 0] - fu * a - cu, pixels[h, n, 1] - fv * b - cv
+                if cylinder:
+                    dv -= fv * azimuth
                 # pixel_D_point circledot(point)
                 u_D_xi[0], u_D_xi[1], u_D_xi[2] = fu / z, 0.0, -fu * a / z
                 u_D_xi[3], u_D_xi[4], u_D_xi[5] = -fu * a * b, fu * (1.0 + a * a), -fu * b
                 v_D_xi[0], v_D_xi[1], v_D_xi[2] = 0.0, fv / z, -fv * b / z
                 v_D_xi[3], v_D_xi[4], v_D_xi[5] = -fv * (1.0 + b * b), fv * a * b, fv * a
+                if cylinder:
+                    for i in range(1, 5, 3):  # back from the turned camera
+                        u_D_xi[i], u_D_xi[i + 1] = c * u_D_xi[i] + s * u_D_xi[i + 1], c * u_D_xi[i + 1] - s * u_D_xi[i]
+                        v_D_xi[i], v_D_xi[i + 1] = c * v_D_xi[i] + s * v_D_xi[i + 1], c * v_D_xi[i + 1] - s * v_D_xi[i]
                 for i in range(free):
                     xi[i] += w2 * (u_D_xi[i] * du + v_D_xi[i] * dv)
                     for j in range(i + 1):
@@ -315,11 +340,11 @@ def _prior_candidates(
 def _motions_agree(camera: StereoCamera, T: FloatArray, T_other: FloatArray, p_prev: FloatArray) -> bool:
     """Whether two motions (4, 4) project most points (N, 3) to nearly the same pixels."""
     moved = transform_points(T, p_prev)
-    ahead = moved[:, 2] > _MIN_DEPTH_M
+    ahead = depth_of(camera, moved) > _MIN_DEPTH_M
     if not ahead.any():
         return False
     gap = pixel_errors(camera, T_other, p_prev[ahead], project(camera, moved[ahead])[:, :2])
-    return bool(np.median(gap) <= _PRIOR_PX)
+    return bool(median(gap) <= _PRIOR_PX)
 
 
 def _rotation_difference_deg(T: FloatArray, R: FloatArray) -> float:
@@ -336,14 +361,15 @@ def epipolar_distance(
     camera only turns or stands still: it shrinks to a point.
     """
     rays = left_rays(camera, previous)
-    ends = []
-    for p in (rays @ T_curr_prev[:3, :3].T, transform_points(T_curr_prev, rays * near_m)):
+    ends, seen = [], facing(camera, current, rays)[0]
+    for moved in (rays @ T_curr_prev[:3, :3].T, transform_points(T_curr_prev, rays * near_m)):
+        p = facing(camera, current, moved)[1]
         depth = np.maximum(p[:, 2:], 1e-3)
         ends.append(p[:, :2] / depth * [camera.fu, camera.fv] + [camera.cu, camera.cv])
     far, along = ends[0], ends[1] - ends[0]
     length2 = np.maximum((along**2).sum(axis=1), 1e-12)
-    position = np.clip(((current - far) * along).sum(axis=1) / length2, 0.0, 1.0)
-    return np.linalg.norm(current - far - position[:, None] * along, axis=1)
+    position = np.clip(((seen - far) * along).sum(axis=1) / length2, 0.0, 1.0)
+    return np.linalg.norm(seen - far - position[:, None] * along, axis=1)
 
 
 def fit_motion(
@@ -378,11 +404,11 @@ def predicted_motion(
         return None
     T, weight = expected, np.ones((1, len(p)))
     for _ in range(_SAMPLE_ITERATIONS):
-        if np.median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX:
+        if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX:
             return T
         T = _gauss_newton(camera, T[None], p[None], z[None], weight, iterations=1, free=slice(0, 6))[0]
     T = _refine(camera, T, p, z, _PRIOR_PX, slice(0, 6), converged=_PRIOR_CONVERGED)
-    return T if np.median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
+    return T if median(pixel_errors(camera, T, p, z)) <= _PRIOR_PX else None
 
 
 # --- two views, no depth ----------------------------------------------------------------------------------------------
@@ -449,14 +475,15 @@ def _ray_distance(camera: StereoCamera, seen: _TwoViews, R: FloatArray, t: Float
 
     A ray is the part of the epipolar line at positive depth; before its start, the distance to the start is used.
     """
-    turned = seen.before @ np.swapaxes(R, -1, -2)
+    after, turned = facing(camera, seen.after, seen.before @ np.swapaxes(R, -1, -2))
+    t = facing(camera, seen.after, t[..., None, :])[1]
     ahead = turned[..., 2] > _MIN_DEPTH_M
     depth = np.where(ahead, turned[..., 2], 1.0)
     x, y = turned[..., 0] / depth, turned[..., 1] / depth
-    off_u = seen.after[:, 0] - camera.fu * x - camera.cu
-    off_v = seen.after[:, 1] - camera.fv * y - camera.cv
-    way_u = camera.fu * (t[..., 0, None] - x * t[..., 2, None])
-    way_v = camera.fv * (t[..., 1, None] - y * t[..., 2, None])
+    off_u = after[:, 0] - camera.fu * x - camera.cu
+    off_v = after[:, 1] - camera.fv * y - camera.cv
+    way_u = camera.fu * (t[..., 0] - x * t[..., 2])
+    way_v = camera.fv * (t[..., 1] - y * t[..., 2])
     along = np.maximum(off_u * way_u + off_v * way_v, 0.0) / (way_u**2 + way_v**2 + _EPSILON)
     distance = np.hypot(off_u - along * way_u, off_v - along * way_v)
     return np.where(ahead, distance, np.inf)
@@ -505,7 +532,8 @@ def _bearing_step(problem: RansacProblem, seen: _TwoViews, T: FloatArray) -> Flo
     R, t = T[:3, :3], T[:3, 3]
     turned = seen.before @ R.T
     line = np.cross(t, turned)
-    scale = np.hypot(line[:, 0] / camera.fu, line[:, 1] / camera.fv) + _EPSILON
+    normal = facing(camera, seen.after, line)[1]
+    scale = np.hypot(normal[:, 0] / camera.fu, normal[:, 1] / camera.fv) + _EPSILON
     distance = _ray_distance(camera, seen, R, t)
     weight = np.where(distance < 1.5 * limit, 1.0 / (1.0 + (np.minimum(distance, 1e6) / limit * 2) ** 2), 0.0) / scale
     residual = weight * np.einsum("ni,ni->n", seen.rays, line)
@@ -549,6 +577,10 @@ def _triads(rays: FloatArray, pairs: IntArray) -> FloatArray:
 def _five_point(problem: RansacProblem, previous: FloatArray, current: FloatArray) -> FloatArray | None:
     """Motions (K, 4, 4) with unit translation, decomposed from the best essential matrices; None if none fits."""
     camera = problem.camera
+    if camera.is_cylinder:
+        previous, current = _pinhole_pixels(camera, previous, current)
+        if len(current) < _MIN_POINTS:
+            return None
     K = np.array([[camera.fu, 0.0, camera.cu], [0.0, camera.fv, camera.cv], [0.0, 0.0, 1.0]])
     params = cv2.UsacParams()
     params.confidence = _FIVE_POINT_CONFIDENCE
@@ -565,3 +597,11 @@ def _five_point(problem: RansacProblem, previous: FloatArray, current: FloatArra
         R_a, R_b, t = cv2.decomposeEssentialMat(E)
         motions += [se3_from_parts(R, sign * t[:, 0]) for R in (R_a, R_b) for sign in (1.0, -1.0)]
     return np.stack(motions)
+
+
+def _pinhole_pixels(camera: StereoCamera, previous: FloatArray, current: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pixels (K, 2) and (K, 2) that a pinhole of the same intrinsics shows in the place of a cylinder's (N, 2)."""
+    rays = [left_rays(camera, pixels) for pixels in (previous, current)]
+    ahead = np.all([r[:, 2] > _LEAST_FORWARD * np.linalg.norm(r, axis=1) for r in rays], axis=0)
+    a, b = (r[ahead, :2] / r[ahead, 2:] * [camera.fu, camera.fv] + [camera.cu, camera.cv] for r in rays)
+    return a, b

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_from_parts, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, project
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.records import BoolArray, IntArray, TrackPrior
 
 from .patches import FloatImage, inside
@@ -58,7 +58,7 @@ def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tupl
 def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, left: FloatArray) -> FloatArray:
     """Left pixels (N, 2) of points (N, 3) after a camera motion; points behind the camera keep their pixels `left`."""
     moved = transform_points(T_curr_prev, p_prev)
-    ahead = moved[:, 2] > _MIN_DEPTH_M
+    ahead = depth_of(camera, moved) > _MIN_DEPTH_M
     pixels = project(camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
     return np.where(ahead[:, None], pixels, left)
 
@@ -95,7 +95,8 @@ def _points_with_borrowed_depth(camera: StereoCamera, old: Tracks) -> FloatArray
     gap = np.abs(old.left[unknown, None] - old.left[known]).sum(axis=2)
     nearest = known[np.argpartition(gap, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]]
     point = old.point.copy()
-    point[unknown] = left_rays(camera, old.left[unknown]) * np.median(old.point[nearest, 2], axis=1)[:, None]
+    depth = np.median(depth_of(camera, old.point)[nearest], axis=1)
+    point[unknown] = left_rays(camera, old.left[unknown]) * depth[:, None]
     return point
 
 

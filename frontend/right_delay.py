@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 
 from .tracks import Tracks
 
@@ -173,8 +173,9 @@ def at_present(camera: StereoCamera, tracks: Tracks, then: Tracks, T_curr_prev: 
         delay: of the right camera, frames.
     """
     moved = transform_points(se3_exp(delay * se3_log(T_curr_prev)), then.point)
-    ahead = moved[:, 2] > 1e-2
-    depth = np.where(ahead, moved[:, 2], 1.0)
+    depth = depth_of(camera, moved)
+    ahead = depth > 1e-2
+    depth = np.where(ahead, depth, 1.0)
     right = tracks.left + np.stack([-camera.fu * camera.baseline_m / depth, then.right[:, 1] - then.left[:, 1]], axis=1)
     matched = then.has_right & then.has_point & ahead
     return replace(

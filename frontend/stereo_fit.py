@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera, triangulate
+from vio.geometry.stereo import StereoCamera, depth_of, triangulate
 from vio.records import BoolArray, Image, IntArray
 
 from .align import align, on_peak
@@ -60,9 +60,10 @@ class StereoFit:
             right: the right image.
             moved: whether the depths were propagated with a consensus motion.
         """
-        rows = np.flatnonzero(tracks.has_point & (tracks.point[:, 2] > _MIN_DEPTH_M))
+        depth = depth_of(self._camera, tracks.point)
+        rows = np.flatnonzero(tracks.has_point & (depth > _MIN_DEPTH_M))
         known = take(tracks, rows)
-        expected = self._camera.fu * self._camera.baseline_m / known.point[:, 2]
+        expected = self._camera.fu * self._camera.baseline_m / depth[rows]
         pixels, skew, valid = self._fit(known, right, expected)
         if moved:
             valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= self._settings.consensus_px

@@ -131,6 +131,10 @@ class Script:
 
     def static(self, time_ns: int, parent: str, child: str, T: FloatArray) -> None:
         """Add a transform of /tf_static: coordinates of the child to those of the parent."""
+        self.moving(time_ns, parent, child, T, "/tf_static")
+
+    def moving(self, time_ns: int, parent: str, child: str, T: FloatArray, topic: str = "/tf") -> None:
+        """Add a transform of /tf."""
         kind, stamped = "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/TransformStamped"
         p, q = T[:3, 3], quat_xyzw_from_rotation(T[:3, :3])
         transform = self.make(
@@ -139,7 +143,7 @@ class Script:
             self.make("geometry_msgs/msg/Quaternion", *map(float, q)),
         )
         item = self.make(stamped, self.header(time_ns, parent), child, transform)
-        self.add("/tf_static", kind, time_ns, self.make(kind, [item]))
+        self.add(topic, kind, time_ns, self.make(kind, [item]))
 
     def _pose(self, T: FloatArray) -> Any:
         q = quat_xyzw_from_rotation(T[:3, :3])

@@ -7,8 +7,8 @@ import numpy as np
 from frontend.align import FLAT_RMS, Templates, offsets
 from vio.filters.multiview import MIN_DEPTH, InverseDepth, Residuals, TrackInformation, Views, point_D_pose
 from vio.filters.stereo_calibration import StereoColumns, StereoInformation
-from vio.geometry.lie import FloatArray, circledot, se3_exp
-from vio.geometry.stereo import StereoCamera, project, z_D_p_cam
+from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp
+from vio.geometry.stereo import StereoCamera, depth_of, project, z_D_p_cam
 from vio.records import BoolArray
 
 PRIOR = 1e-6  # per px^2, on a disparity: that of `vio.filters.multiview`
@@ -82,7 +82,7 @@ def aligned(
 def moved_errors(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray) -> FloatArray:
     """Distances (..., N) between points (N, 3) moved by motions (..., 4, 4) and left pixels (N, 2)."""
     p = p_prev @ np.swapaxes(T[..., :3, :3], -1, -2) + T[..., None, :3, 3]
-    ahead = p[..., 2] > 0.05
+    ahead = depth_of(camera, p) > 0.05
     distance = np.linalg.norm(project(camera, np.where(ahead[..., None], p, 1.0))[..., :2] - pixels, axis=-1)
     return np.where(ahead, distance, np.inf)
 
@@ -100,7 +100,7 @@ def gauss_newton(
     """Motions (H, 4, 4), each refined on its own points (H, K, 3), pixels (H, K, 2) and weights (H, K)."""
     for _ in range(iterations):
         p = p_prev @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-        ahead = p[..., 2] > 0.05
+        ahead = depth_of(camera, p) > 0.05
         p = np.where(ahead[..., None], p, np.array([0.0, 0.0, 1.0]))
         w = np.where(ahead, weight, 0.0)
         residual = pixels - project(camera, p)[..., :2]
@@ -125,7 +125,7 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
     F, N = len(p_world), len(T_cam0_world)
     p_cam = (p_world @ R.reshape(-1, 3).T).reshape(F, N, 3) + t
     seen = views.weight[..., 0] > 0
-    ok = p_cam[..., 2] > MIN_DEPTH * camera.baseline_m
+    ok = depth_of(camera, p_cam) > MIN_DEPTH * camera.baseline_m
     safe = np.where((ok & seen)[..., None], p_cam, [0.0, 0.0, 1.0])
     usable = views.weight * ok[..., None]
     r = (np.where(usable > 0, views.z, 0.0) - project(camera, safe)) * usable
@@ -140,6 +140,9 @@ def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: Float
     R, t = T_cam0_world[anchor, :3, :3], T_cam0_world[anchor, :3, 3]
     centre = -np.einsum("nji,nj->ni", T_cam0_world[:, :3, :3], T_cam0_world[:, :3, 3])[anchor]
     p_cam = np.einsum("fij,fj->fi", R, p_world) + t
+    if camera.is_cylinder:  # each as the pinhole that is turned about the baseline to the point sees it
+        turn = so3_exp(np.arctan2(p_cam[:, 1], p_cam[:, 2])[:, None] * [1.0, 0.0, 0.0])
+        R, p_cam = turn @ R, (turn @ p_cam[..., None])[..., 0]
     z = np.maximum(p_cam[:, 2], MIN_DEPTH * camera.baseline_m)
     disparity = camera.fu * camera.baseline_m / z
     p_D_q, q_D_p = np.empty((len(z), 3, 3)), np.empty((len(z), 3, 3))

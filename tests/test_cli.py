@@ -62,7 +62,8 @@ def test_run_prints_the_contract(
     assert metrics["frames"] == FRAMES
     assert metrics["ate_m"] < 0.05
     assert metrics["rpe"]["trans_rmse_m"] < 0.05
-    assert metrics["t_err_percent"] is None  # a drive of 14 m has no segment of 100 m
+    assert metrics["drift_lengths_m"] == [10]  # a drive of 14 m has no segment of 100 m
+    assert 0 < metrics["t_err_percent"] < 5
     assert metrics["motion"] == "velocity"
     assert Path(metrics["out"], "trajectory.png").stat().st_size > 10_000
 
@@ -421,7 +422,12 @@ def test_eval_aligns_as_requested(recording: Path, tmp_path: Path, capsys: pytes
     assert scores["se3"]["ate_m"] < scores["none"]["ate_m"]
     assert scores["se3"]["ate_m"] > 0.1
     assert main(["eval", str(estimate), str(larger), "--lengths", "5,10"]) == 0
-    assert "t_err_percent" in capsys.readouterr().out
+    printed = capsys.readouterr().out.splitlines()
+    assert [line[:10].strip() for line in printed] == [
+        *("compared", "path", "alignment", "ATE", "attitude", "RPE", "drift", "5 m", "10 m"),
+    ]
+    assert printed[6].endswith("over 5 to 10 m")
+    assert {len(line) - len(line.lstrip()) for line in (row[11:] for row in printed[7:])} <= {2, 3}, "aligned"
 
 
 def test_evo_reads_every_trajectory_file(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,29 +14,35 @@ import pytest
 from tests.dataset_makers import make_kitti
 from vio.cli import main
 from vio.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px, write_model
+from vio.colmap.reconstruction import pairs_to_match
 from vio.colmap.trajectory import read_colmap_trajectory
 from vio.config import Config
 from vio.datasets import open_dataset
 from vio.errors import DataError, EstimationError
 from vio.evaluation import rotation_angle_deg
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import project
+from vio.loop_files import write_loops
+from vio.loops import LoopEvent, LoopMatches
+from vio.mapped_run import corrected
 from vio.mapping.comparison import Comparison, GroundTruth, compare_keyframes
 from vio.mapping.keyframes import TrackedPath, choose_keyframes
+from vio.mapping.loop_tracks import loop_rows
 from vio.mapping.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
 from vio.mapping.poses import align_to_points, position_covariances
 from vio.pipeline import run as process
 from vio.records import Estimate
 from vio.run_folder import write_run_folder
-from vio.saved_run import read_saved_run
+from vio.saved_run import read_saved_run, with_poses
 from vio.sim.effects import CLEAN
 from vio.sim.export import export_kitti
 from vio.sim.imu import ImuNoise
-from vio.sim.motion import hand_held
+from vio.sim.motion import hand_held, look_rotation, spline_from_waypoints
 from vio.sim.oracle import OracleFrontend, OracleSettings
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, Simulation, simulate
 from vio.sim.world import room
+from vio.trajectory_io import write_tum
 
 SIGMA_PX = 0.3
 
@@ -61,6 +67,40 @@ def _make_run(simulation: Simulation, folder: Path, *, stop: int | None = None, 
 @pytest.fixture(scope="module")
 def whole_run(simulation: Simulation, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _make_run(simulation, tmp_path_factory.mktemp("runs") / "whole")
+
+
+LOOP = (1, 31)  # frames of `round_trip` that show one place
+
+
+def round_trip() -> Simulation:
+    """Once around in the room, looking ahead, in 33 frames."""
+    yaw = np.linspace(-0.3, 2 * np.pi + 0.3, 42)
+    R = look_rotation(np.stack([np.cos(yaw), np.sin(yaw), 0 * yaw], axis=1))
+    p = np.stack([0.8 * np.sin(yaw), -0.8 * np.cos(yaw), 1.4 + 0.05 * yaw], axis=1)
+    motion = spline_from_waypoints(se3_from_parts(R, p), 0.25)
+    return simulate(room(1), small_rig(320, 200), motion, rate_hz=3.2, effects=CLEAN, seed=1)
+
+
+def _add_loop(run: Path, ends: tuple[int, int], *, points: int = 120) -> None:
+    """Write a loop between two frames as a run with a map does, with exact geometry and noise, and poses in the map."""
+    saved, rng = read_saved_run(run), np.random.default_rng(6)
+    assert saved.truth is not None
+    truth = saved.truth.trajectory.in_cam0(saved.T_cam0_imu)
+    rows = [int(np.flatnonzero(saved.tracked.frames == k)[0]) for k in ends]
+    times = saved.tracked.trajectory.times_ns
+    assert times is not None
+    T = [truth.T_world_body[k] for k in rows]
+    camera, p = saved.tracked.camera, rng.uniform([-0.9, -0.6, 1.5], [0.9, 0.6, 5.0], (points, 3))
+    z = [project(camera, transform_points(se3_inverse(T_k) @ T[0], p)) for T_k in T]
+    z = [one + SIGMA_PX * rng.standard_normal((points, 4)) for one in z]
+    every = np.ones(points, dtype=np.bool_)
+    ns = times[rows].tolist()
+    loop = LoopEvent(ends[1], ns[1], 7, ns[0], points, 0.0, False, ends[0], True, LoopMatches(*z, every, every))
+    write_loops(run, [loop])
+    odometry = saved.tracked.trajectory.T_world_body
+    closed = np.stack([odometry[rows[0]], odometry[rows[0]] @ se3_inverse(T[0]) @ T[1]])
+    poses = corrected(odometry, saved.tracked.frames, np.array(ends), closed, odometry[rows])
+    write_tum(run / "map_trajectory.tum", replace(saved.tracked.trajectory, T_world_body=poses))
 
 
 @pytest.fixture
@@ -227,6 +267,47 @@ def test_refine_lowers_the_error_and_does_not_change_the_run(folder: Path, capsy
     assert 0 < float(str(scores["ate_m"])) < 2 * first["ate_before_m"]
 
 
+def test_refine_uses_the_matches_of_loops(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Tracks of three frames drift; a loop says where the camera has come back to."""
+    run = _make_run(round_trip(), tmp_path / "run", lost_after=3)
+    truth = read_saved_run(run).truth
+    assert truth is not None
+    true = truth.trajectory.in_cam0(truth.T_cam0_imu).T_world_body[list(LOOP)]
+    errors, facts = [], []
+    for with_loop in (False, True):
+        if with_loop:
+            _add_loop(run, LOOP)
+        facts.append(_json(capsys, "refine", str(run)))
+        refined = with_poses(read_saved_run(run), run / "refined").tracked.trajectory.T_world_body[list(LOOP)]
+        gap = se3_inverse(se3_inverse(true[0]) @ true[1]) @ se3_inverse(refined[0]) @ refined[1]
+        errors.append(float(np.linalg.norm(gap[:3, 3])))
+    assert [f["loops"] for f in facts] == [0, 1]
+    assert errors[1] < 0.5 * errors[0], errors
+    assert "its loops moved the poses away" in _error(capsys, "refine", str(run), "--priors", "filter")
+    exported = _json(capsys, "export", "colmap", str(run), "--no-images", "--refined", "--keyframes", "12")
+    assert exported["loops"] == 1
+    model = pycolmap.Reconstruction(run / "colmap" / "sparse" / "0")
+    images = [model.find_image_with_name(f"left/{k:06d}.png") for k in LOOP]
+    seen = [{p.point3D_id for p in image.points2D if p.has_point3D()} for image in images]
+    assert len(seen[0] & seen[1]) >= 100, "of the loop's 120 points"
+
+
+def test_a_feature_of_several_loops_is_one_point() -> None:
+    z = np.arange(24.0).reshape(6, 4)
+    both = np.ones(2, dtype=np.bool_)
+
+    def loop(first: int, second: int, one: list[int], other: list[int]) -> LoopEvent:
+        return LoopEvent(second, 0, 0, 0, 2, 0.0, False, first, True, LoopMatches(z[one], z[other], both, both))
+
+    loops = [loop(10, 30, [0, 1], [2, 3]), loop(10, 31, [0, 1], [4, 5])]
+    found = loop_rows(loops, np.array([10, 20, 30, 31]))
+    assert len(found.point) == 6
+    assert {tuple(sorted(found.keyframe[found.point == k].tolist())) for k in (0, 1)} == {(0, 2, 3)}
+    contradicting = [*loops, loop(30, 31, [2, 3], [5, 4])]  # the points 0 and 1 were exchanged
+    assert len(loop_rows(contradicting, np.array([10, 20, 30, 31])).point) == 0
+    assert len(loop_rows(loops, np.array([10, 20])).point) == 0, "without the loop's other keyframe"
+
+
 def test_priors_need_a_filter_that_reproduces_the_run(
     folder: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -317,6 +398,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     config = replace(Config(), backend="vislam", motion="none")
     result = process(dataset, config, frontend=front, keep_observations=True)
     write_run_folder(place / "run", result, dataset.recording.reference, save_observations=True)
+    _add_loop(place / "run", (3, 7))
     return place / "kitti", place / "run"
 
 
@@ -347,8 +429,19 @@ def test_check_agrees_with_a_correct_run_and_estimates_the_scale(
     assert facts["registered"] == report["keyframes"]
     assert facts["ate_m"] < 0.02
     assert facts["scale"] == pytest.approx(1.0, abs=0.02)
+    assert facts["loops_in_model"] == facts["loops"] == 1
     assert (rendered[1] / "check" / "check.png").stat().st_size > 10_000
     assert sorted(p.name for p in (rendered[1] / "check").iterdir()) == ["check.json", "check.png", "incremental"]
+
+
+def test_keyframes_at_both_ends_of_a_loop_are_matched() -> None:
+    names = keyframe_images(np.arange(40))
+    without = pairs_to_match(names, np.zeros((0, 2), dtype=np.int64))
+    pairs = pairs_to_match(names, np.array([[2, 33], [3, 33], [0, 39]]))
+    assert len(set(pairs)) == len(pairs), "each once"
+    added = {(names.left.index(a), names.left.index(b)) for a, b in set(pairs) - set(without)}
+    assert {(2, 33), (1, 32), (3, 34), (4, 33), (0, 39), (1, 38)} <= added
+    assert all(b - a > 25 for a, b in added)
 
 
 def test_images_without_texture_are_not_observable(

@@ -6,7 +6,7 @@ import importlib.util
 import os
 import subprocess
 import sys
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import numba
@@ -20,10 +20,12 @@ from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.compiled import invert_positive, move_by_twist, solve_positive
 from vio.filters import multiview, stereo_calibration
 from vio.filters.multiview import Views
-from vio.geometry.lie import FloatArray, se3_exp, transform_points
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
+CAMERAS = {"pinhole": CAMERA, "cylinder": replace(CAMERA, projection="cylinder")}
+both_cameras = pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
 
 
 def test_patches_are_sampled_exactly_inside_the_image_and_at_its_border() -> None:
@@ -60,8 +62,9 @@ def test_alignment_equals_numpy(on_rows: bool) -> None:
     assert gap.max() < 0.02
 
 
+@both_cameras
 @pytest.mark.parametrize("free", [slice(0, 6), slice(0, 3)])
-def test_gauss_newton_on_motions_equals_numpy(free: slice) -> None:
+def test_gauss_newton_on_motions_equals_numpy(free: slice, camera: StereoCamera) -> None:
     """One of the points goes behind the camera, one has no weight, and one set of three is degenerate."""
     rng = np.random.default_rng(7)
     T = se3_exp(rng.normal(0, 0.1, (20, 6)))
@@ -70,19 +73,21 @@ def test_gauss_newton_on_motions_equals_numpy(free: slice) -> None:
     pixels = rng.uniform([0, 0], [300, 200], (20, 3, 2))
     weight = rng.uniform(0, 1, (20, 3))
     weight[2, 1] = 0.0
-    ours = _gauss_newton(CAMERA, T, points, pixels, weight, iterations=2, free=free)
-    twin = numpy_twins.gauss_newton(CAMERA, T, points, pixels, weight, iterations=2, free=free)
+    ours = _gauss_newton(camera, T, points, pixels, weight, iterations=2, free=free)
+    twin = numpy_twins.gauss_newton(camera, T, points, pixels, weight, iterations=2, free=free)
     np.testing.assert_allclose(ours, twin, rtol=1e-6, atol=1e-6)
 
 
-def test_reprojection_errors_equal_numpy() -> None:
+@both_cameras
+def test_reprojection_errors_equal_numpy(camera: StereoCamera) -> None:
     rng = np.random.default_rng(8)
     T, points = se3_exp(rng.normal(0, 0.3, (2, 5, 6))), rng.uniform([-2, -2, -1], [2, 2, 8], (30, 3))
     pixels = rng.uniform([0, 0], [300, 200], (30, 2))
-    expected = numpy_twins.moved_errors(CAMERA, T, points, pixels)
+    points[0] = transform_points(se3_inverse(T[0, 0]), [0.3, 0.02, -0.01])  # too near to the line of the baseline
+    expected = numpy_twins.moved_errors(camera, T, points, pixels)
     assert 0 < np.isinf(expected).sum() < 100
-    np.testing.assert_allclose(pixel_errors(CAMERA, T, points, pixels), expected, rtol=1e-10)
-    np.testing.assert_allclose(pixel_errors(CAMERA, T[0, 1], points, pixels), expected[0, 1], rtol=1e-10)
+    np.testing.assert_allclose(pixel_errors(camera, T, points, pixels), expected, rtol=1e-10)
+    np.testing.assert_allclose(pixel_errors(camera, T[0, 1], points, pixels), expected[0, 1], rtol=1e-10)
 
 
 @pytest.mark.parametrize("size", [1e-9, 5e-3, 0.3, 3.0])
@@ -104,13 +109,16 @@ def test_small_positive_systems_are_solved_and_inverted() -> None:
     np.testing.assert_allclose(b, expected, rtol=1e-10)
 
 
-def _scene() -> tuple[FloatArray, FloatArray, Views]:
-    """Forty points in five cameras, some of them unseen, without a right view, or behind a camera."""
+def _scene(camera: StereoCamera = CAMERA) -> tuple[FloatArray, FloatArray, Views]:
+    """Forty points in five cameras, some of them unseen, without a right view, or (but of a cylinder) behind one."""
     rng = np.random.default_rng(11)
     T = se3_exp(np.cumsum(rng.normal(0, 0.1, (5, 6)), axis=0))
     p = rng.uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 6.0], (40, 3))
     p[0, 2] = -3.0
-    z = np.stack([project(CAMERA, transform_points(T_i, p)) for T_i in T], axis=1) + rng.normal(0, 0.5, (40, 5, 4))
+    if camera.is_cylinder:
+        p[1:20, 1:] *= [3.0, -1.0]
+        p[0] = transform_points(se3_inverse(T[1]), [0.5, 0.01, 0.0])  # nearly on the line of a baseline
+    z = np.stack([project(camera, transform_points(T_i, p)) for T_i in T], axis=1) + rng.normal(0, 0.5, (40, 5, 4))
     weight = np.zeros((40, 5, 4))
     seen = rng.uniform(size=(40, 5)) < 0.8
     seen[:, 1] = True
@@ -129,15 +137,16 @@ def _same(ours: object, twin: object) -> None:
             np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max(initial=0.0), err_msg=field.name)
 
 
-def test_tracks_are_linearised_and_eliminated_as_in_numpy() -> None:
-    T, p, views = _scene()
-    at = multiview.residuals(CAMERA, T, p, views)
-    _same(at, numpy_twins.residuals(CAMERA, T, p, views))
+@both_cameras
+def test_tracks_are_linearised_and_eliminated_as_in_numpy(camera: StereoCamera) -> None:
+    T, p, views = _scene(camera)
+    at = multiview.residuals(camera, T, p, views)
+    _same(at, numpy_twins.residuals(camera, T, p, views))
     assert not at.ahead.all()
     at, p = at.take(at.ahead), p[at.ahead]
     weight = np.random.default_rng(12).uniform(0.1, 1.0, at.r.shape[:2])
-    ours = multiview.track_information(CAMERA, T, at, p, weight)
-    _same(ours, numpy_twins.track_information(CAMERA, T, at, p, weight))
+    ours = multiview.track_information(camera, T, at, p, weight)
+    _same(ours, numpy_twins.track_information(camera, T, at, p, weight))
     chosen = np.arange(len(p)) % 3 > 0
     for a, b in zip(multiview.eliminate_points(ours, chosen), numpy_twins.eliminate_points(ours, chosen), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())

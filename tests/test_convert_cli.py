@@ -10,19 +10,25 @@ import pytest
 
 from tests.dataset_makers import ece276a_arrays, make_drive, make_npz
 from tests.euroc_maker import make_euroc
+from tests.plain_maker import make_plain
 from tests.same_events import assert_same_events
 from vio.cli import main
+from vio.config import load_config
 from vio.datasets import open_dataset
+from vio.pipeline import run
 from vio.records import VelocitySample
 
+BAGS = ("rosbag2", "mcap")
 
-@pytest.mark.parametrize("form", ["euroc", "plain", "kitti"])
+
+@pytest.mark.parametrize("form", ["euroc", "plain", "kitti", *BAGS])
 def test_a_converted_flight_is_the_same_recording(form: str, flight: Path, tmp_path: Path) -> None:
+    _needs_rosbags(form)
     out = tmp_path / "out"
     assert main(["convert", str(flight), "--to", form, "--out", str(out)]) == 0
     before, after = open_dataset(flight), open_dataset(out)
     a, b = before.recording, after.recording
-    assert b.kind == {"euroc": "euroc", "plain": "plain", "kitti": "plain"}[form]
+    assert b.kind == {"euroc": "euroc", "plain": "plain", "kitti": "plain"}.get(form, "bag")
     assert a.camera.baseline_m == pytest.approx(b.camera.baseline_m, abs=1e-15)
     np.testing.assert_allclose(a.T_cam0_imu, b.T_cam0_imu, atol=1e-15)
     assert a.motion == b.motion
@@ -35,8 +41,52 @@ def test_a_converted_flight_is_the_same_recording(form: str, flight: Path, tmp_p
     assert moved[0] == pytest.approx(moved[1], rel=1e-9)
     if form != "kitti":  # whose clock begins at zero
         assert a.camera == b.camera
+        np.testing.assert_array_equal(a.T_cam0_imu, b.T_cam0_imu)
         assert_same_events(before, after)
+        ours, theirs = (run(dataset, load_config(), stop=6).trajectory for dataset in (before, after))
+        np.testing.assert_array_equal(ours.T_world_body, theirs.T_world_body)
         assert after.imu_noise == before.imu_noise  # type: ignore[attr-defined]
+
+
+def _needs_rosbags(form: str) -> None:
+    if form in BAGS:
+        pytest.importorskip("rosbags", reason="needs the extra bags")
+
+
+@pytest.mark.parametrize("form", BAGS)
+def test_a_bag_without_the_files_beside_it_has_its_calibration(form: str, flight: Path, tmp_path: Path) -> None:
+    """CameraInfo and /tf_static, whose quaternions cost the last bits of the extrinsics."""
+    _needs_rosbags(form)
+    out = tmp_path / "out"
+    assert main(["convert", str(flight), "--to", form, "--out", str(out), "--stop", "4"]) == 0
+    beside = open_dataset(out).recording
+    assert "the calibration is camchain-imucam.yaml, not the bag's CameraInfo" in beside.notes
+    for name in ("camchain-imucam.yaml", "imu.yaml"):
+        (out / name).unlink()
+    alone = open_dataset(out).recording
+    assert alone.camera == beside.camera
+    assert alone.T_cam0_imu is not None
+    np.testing.assert_allclose(alone.T_cam0_imu, beside.T_cam0_imu, atol=1e-15)
+    assert any("/tf_static" in note for note in alone.notes)
+    assert alone.reference is not None
+    assert beside.reference is not None
+    np.testing.assert_array_equal(alone.reference.T_world_body, beside.reference.T_world_body)
+
+
+def test_a_bag_keeps_velocities_and_says_how_they_are_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _needs_rosbags("mcap")
+    from tests.dataset_makers import make_kitti
+
+    source = make_kitti(tmp_path / "kitti")
+    assert main(["convert", str(source), "--to", "mcap", "--out", str(tmp_path / "bag"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == []
+    a, b = (
+        [event for event in open_dataset(path).events() if isinstance(event, VelocitySample)]
+        for path in (source, tmp_path / "bag")
+    )
+    assert [s.time_ns for s in a] == [s.time_ns for s in b]
+    np.testing.assert_array_equal([s.linear for s in a], [s.linear for s in b])
+    np.testing.assert_array_equal([s.angular for s in a], [s.angular for s in b])
 
 
 def test_a_raw_recording_is_written_rectified(tmp_path: Path) -> None:
@@ -57,6 +107,21 @@ def test_names_of_rendered_images_sort_by_time_as_text(flight: Path, tmp_path: P
     assert main(["convert", str(flight), "--to", "plain", "--out", str(out)]) == 0
     names = sorted(path.name for path in (out / "left").iterdir())
     assert names == sorted(names, key=lambda name: int(name.split(".")[0]))
+
+
+def test_names_agree_with_their_list_where_the_last_frame_is_unreadable(tmp_path: Path) -> None:
+    """Of a clock from zero, the last frame's time has more digits than those of the frames that were written."""
+    source = make_plain(tmp_path / "plain")
+    (source / "imu.csv").unlink(missing_ok=True)
+    (source / "times.txt").write_text("0.85\n0.9\n0.95\n1.0\n")
+    last = sorted((source / "left").iterdir())[-1]
+    last.write_bytes(last.read_bytes()[:-30])
+    out = tmp_path / "out"
+    assert main(["convert", str(source), "--to", "euroc", "--out", str(out)]) == 0
+    assert open_dataset(out).recording.frame_times_ns.tolist() == [850_000_000, 900_000_000, 950_000_000]
+    names = sorted(path.name for path in (out / "mav0" / "cam0" / "data").iterdir())
+    assert names == ["0850000000.png", "0900000000.png", "0950000000.png"]
+    assert names[0] in (out / "mav0" / "cam0" / "data.csv").read_text()
 
 
 def test_velocities_and_poses_at_the_frames_go_to_kitti(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

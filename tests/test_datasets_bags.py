@@ -25,6 +25,7 @@ from vio.rig import Rig  # noqa: E402
 
 START_NS = 10**18
 T_CAM0_IMU = se3_exp([0.1, -0.05, 0.02, 1.2, -1.2, 1.2])
+T_BASE_IMU = se3_exp([0.3, 0.2, -0.1, 0.1, 0.0, 0.4])
 RIG = Rig.rectified(40.0, 40.0, 31.5, 23.5, 0.11, 64, 48)
 STORAGES = ("bag", "db3", "mcap")
 
@@ -87,9 +88,8 @@ def plain_script(storage: str = "mcap", frames: int = 4, *, info: bool = True, i
         for side in ("left", "right"):
             script.camera_info(f"/{side}/camera_info", START_NS, RIG.camera, right=side == "right")
     if imu:
-        T_base_imu = se3_exp([0.3, 0.2, -0.1, 0.1, 0.0, 0.4])
-        script.static(START_NS, "base", "imu", T_base_imu)
-        script.static(START_NS, "base", "left", T_base_imu @ se3_inverse(T_CAM0_IMU))
+        script.static(START_NS, "base", "imu", T_BASE_IMU)
+        script.static(START_NS, "base", "left", T_BASE_IMU @ se3_inverse(T_CAM0_IMU))
         for k in range(-4, 10 * frames - 6):
             script.imu("/imu", ImuSample(START_NS + 5_000_000 * k, np.array([0.1, 0.2, k]), np.array([0.0, 0, 9.8])))
     return script
@@ -161,15 +161,46 @@ def test_odometry_is_velocity_and_reference(tmp_path: Path) -> None:
     assert any("/odom may be ground truth: say so with --topics reference=/NAME" in n for n in by_itself.notes)
 
 
-def test_several_bags_of_a_folder_are_joined(tmp_path: Path) -> None:
+def test_a_file_beside_the_bag_that_is_no_calibration_leaves_camera_info(tmp_path: Path) -> None:
+    path = plain_script().write(tmp_path / "f")
+    (path / "calibration.yaml").write_text("rate: 20\n")
+    recording = open_dataset(path).recording
+    assert recording.camera.baseline_m == pytest.approx(0.11, abs=1e-12)
+    (note,) = [note for note in recording.notes if "CameraInfo" in note]
+    assert note.startswith("the bag's CameraInfo serves, as ")
+    assert "calibration.yaml: is no stereo calibration of a known format" in note
+
+
+def test_the_moving_frames_of_tf_are_ground_truth_where_they_are_named(tmp_path: Path) -> None:
+    """/tf moves a base, which carries the IMU; the origin of the odometry moves, too, in the frame of a map."""
+    script = plain_script()
+    expected = []
+    for k in range(4):
+        T_odom_base = se3_exp([k, 0.5 * k, 0, 0, 0, 0.1 * k])
+        expected.append(T_odom_base @ T_BASE_IMU)
+        script.moving(START_NS + 50_000_000 * k, "odom", "base", T_odom_base)
+        script.moving(START_NS + 50_000_000 * k, "map", "odom", se3_exp([0, 0, 7.0, 0, 0, 0]))
+    path = script.write(tmp_path / "f")
+    assert open_dataset(path).recording.reference is None
+    truth = open_dataset(path, DatasetSettings(topics="reference=/tf")).recording.reference
+    assert truth is not None
+    assert truth.body == "imu"
+    np.testing.assert_allclose(truth.T_world_body, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("storage", ["bag", "mcap"])
+def test_several_bags_of_a_folder_are_joined(storage: str, tmp_path: Path) -> None:
+    """Files, or the folders of ROS 2."""
     frames = list(noise_frames(6))
-    for name, part in (("a.bag", frames[:3]), ("b.bag", frames[3:])):
-        script = of_stereo(Script("bag"), part)
+    names = ("a.bag", "b.bag") if storage == "bag" else ("a", "b")
+    for name, part in zip(names, (frames[:3], frames[3:]), strict=True):
+        script = of_stereo(Script(storage), part)
         for side in ("left", "right"):
             script.camera_info(f"/{side}/camera_info", part[0][0], RIG.camera, right=side == "right")
         script.write(tmp_path / name)
     dataset = open_dataset(tmp_path)
     assert [event.time_ns for event in dataset.events()] == [time_ns for time_ns, _, _ in frames]
+    assert f"2 bags are joined: {', '.join(names)}" in dataset.recording.notes
 
 
 # --- stamps ---------------------------------------------------------------------------------------------------------
@@ -385,6 +416,11 @@ BAD = {
     "truncated mcap": (_cut("mcap", 0.6), None, "the bag is truncated or damaged"),
     "empty file": (_cut("bag", 0.0), None, "no known recording"),
     "one camera": (_bad(_without("/right/image_raw")), None, r"holds 1 image topics with messages \(/left/image_raw\)"),
+    "a /tf of other frames": (
+        _bad(lambda script: script.moving(START_NS, "map", "door", np.eye(4))),
+        "reference=/tf",
+        r"/tf: of its moving frames \(map to door\) none carries imu; name another reference=/TOPIC",
+    ),
     "two pairs": (_bad(_more_images), None, "several topics could be the pair .*; name them with --topics"),
     "a wrong topic": (
         _bad(lambda s: None),

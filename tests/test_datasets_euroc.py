@@ -210,7 +210,10 @@ def test_skips_and_counts_unmatched_images(tmp_path: Path) -> None:
     _drop_lines(right, [3, 6])
     recording = _read(tmp_path).recording
     assert recording.frame_times_ns.tolist() == [camera_stamps(6)[k] for k in (1, 3, 4)]
-    assert recording.notes == ("2 images of cam0 and 1 of cam1 have no partner and are skipped",)
+    assert recording.notes == (
+        "1 images of cam0 and 2 of cam1 are not listed in their data.csv and are skipped",
+        "2 images of cam0 and 1 of cam1 have no partner and are skipped",
+    )
 
 
 def _drop_lines(path: Path, numbers: list[int]) -> None:
@@ -323,8 +326,8 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         DataError,
         r"mav0: holds no cam1; give an EuRoC folder",
     ),
-    "no yaml": (lambda mav: (mav / "cam1/sensor.yaml").unlink(), CalibrationError, _NO_YAML_MESSAGE),
-    "no list": (lambda mav: (mav / "cam0/data.csv").unlink(), DataError, r"cannot read .*cam0/data.csv"),
+    "no sensor.yaml": (lambda mav: (mav / "cam1/sensor.yaml").unlink(), CalibrationError, _NO_YAML_MESSAGE),
+    "no list of images": (lambda mav: (mav / "cam0/data.csv").unlink(), DataError, r"cannot read .*cam0/data.csv"),
     "yaml is a list": (lambda mav: (mav / "cam0/sensor.yaml").write_text("- 1\n"), CalibrationError, "no calibration"),
     "yaml is broken": (
         _edit("cam0/sensor.yaml", "T_BS:", "T_BS: ["),
@@ -390,36 +393,48 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         r"cam0/data.csv: holds no line of data",
     ),
     "no partners": (_shift_clock("cam1", 20_000_000), DataError, r"no image of cam0 .* has one of cam1 .* within 3 ms"),
-    "imu not a number": (
+    "a NaN in the IMU readings": (
         _line("imu0/data.csv", 4, f"{imu_stamps(4)[2]},0,nan,0,0,0,9.8"),
         DataError,
         r"imu0/data.csv, line 4: a reading is not a finite number",
     ),
-    "imu text": (
+    "text in the IMU readings": (
         _line("imu0/data.csv", 4, f"{imu_stamps(4)[2]},0,x,0,0,0,9.8"),
         DataError,
         r"imu0/data.csv, line 4: a reading is not a finite number",
     ),
-    "imu columns": (_line("imu0/data.csv", 4, "1,2,3"), DataError, r"imu0/data.csv, line 4: 3 values instead of 7"),
-    "imu repeats": (
+    "an IMU with three columns": (
+        _line("imu0/data.csv", 4, "1,2,3"),
+        DataError,
+        r"imu0/data.csv, line 4: 3 values instead of 7",
+    ),
+    "IMU stamps that repeat": (
         _line("imu0/data.csv", 4, f"{imu_stamps(4)[1]},0,0,0,0,0,9.8"),
         DataError,
         r"imu0/data.csv, line 4: the clock repeats",
     ),
-    "imu empty": (lambda mav: (mav / "imu0/data.csv").write_text("#t\n"), DataError, r"imu0/data.csv: holds no line"),
-    "imu missing": (lambda mav: (mav / "imu0/data.csv").unlink(), DataError, r"cannot read .*imu0/data.csv"),
-    "imu elsewhere": (_shift_clock("imu0", 10**12), DataError, r"no IMU sample is within the time of the images"),
-    "imu noise": (
+    "an empty IMU": (
+        lambda mav: (mav / "imu0/data.csv").write_text("#t\n"),
+        DataError,
+        r"imu0/data.csv: holds no line",
+    ),
+    "an IMU without data": (lambda mav: (mav / "imu0/data.csv").unlink(), DataError, r"cannot read .*imu0/data.csv"),
+    "an IMU of another time": (
+        _shift_clock("imu0", 10**12),
+        DataError,
+        r"no IMU sample is within the time of the images",
+    ),
+    "IMU noise of zero": (
         _edit("imu0/sensor.yaml", "accelerometer_random_walk: 3.0000e-3", "accelerometer_random_walk: 0"),
         CalibrationError,
         "accelerometer_random_walk is 0; a noise density must be positive",
     ),
-    "imu noise gone": (
+    "half of the IMU noise": (
         _edit("imu0/sensor.yaml", "gyroscope_random_walk", "gyroscope"),
         CalibrationError,
         "has no entry 'gyroscope_random_walk'",
     ),
-    "truth": (
+    "ground truth that turns by no rotation": (
         _line("state_groundtruth_estimate0/data.csv", 3, f"{_T1},1,2,3,1,1,1,1,0,0,0,0,0,0,0,0,0"),
         DataError,
         r"state_groundtruth_estimate0/data.csv, line 3: the quaternion has norm 2",

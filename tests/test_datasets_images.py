@@ -184,6 +184,27 @@ def test_prefetch_runs_beside_its_consumer() -> None:
     taken.close()
 
 
+def test_prefetch_takes_its_items_in_the_thread_and_closes_them() -> None:
+    """The items of a bag are its messages: reading them is the larger part of the work."""
+    takers: set[str] = set()
+    closed = threading.Event()
+
+    def items() -> Iterator[int]:
+        try:
+            for k in range(100):
+                takers.add(threading.current_thread().name)
+                yield k
+        finally:
+            closed.set()
+
+    taken = prefetch(lambda k: k, items(), 2)
+    assert [next(taken) for _ in range(5)] == [0, 1, 2, 3, 4]
+    taken.close()
+    assert all(name.startswith("vio-prefetch") for name in takers)
+    assert closed.is_set()
+    assert _prefetch_threads() == []
+
+
 @pytest.mark.parametrize("depth", [0, 4])
 def test_prefetch_passes_exceptions_at_their_place(depth: int) -> None:
     def load(k: int) -> int:

@@ -157,7 +157,7 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "no K": (_entry("K_01", None), CalibrationError, "calib_cam_to_cam.txt: has no entry K_01"),
     "short D": (_entry("D_00", "-0.3 0.2 0 0"), CalibrationError, "D_00 holds 4 values, expected 5"),
     "NaN in T": (_entry("T_01", "-0.5 nan 0"), CalibrationError, "T_01 holds values that are not finite"),
-    "text": (_entry("T_01", "-0.5 a 0"), CalibrationError, "T_01 holds no number"),
+    "text for a number": (_entry("T_01", "-0.5 a 0"), CalibrationError, "T_01 holds no number"),
     "no matrix": (_entry("K_00", "1 2 3 4 5 6 7 8 9"), CalibrationError, "camera 00 is no intrinsic matrix"),
     "negative focal": (
         _entry("K_00", "-40 0 31 0 40 24 0 0 1"),
@@ -167,12 +167,12 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "mirrored": (_entry("R_01", "1 0 0 0 1 0 0 0 -1"), CalibrationError, "R_01: not a rotation but a reflection"),
     "swapped": (_entry("T_01", "0.11 0 0"), CalibrationError, "cam_to_cam.txt: .*the cameras may be swapped"),
     "no baseline": (_entry("T_01", "0 0 0"), CalibrationError, "the baseline is zero"),
-    "twice": (
+    "an entry twice": (
         lambda d: (d / "calib_cam_to_cam.txt").write_text((d / "calib_cam_to_cam.txt").read_text() * 2),
         CalibrationError,
         "repeats an entry",
     ),
-    "no form": (
+    "a line without a name": (
         lambda d: (d / "calib_velo_to_cam.txt").write_text("1 0 0\n"),
         CalibrationError,
         r"calib_velo_to_cam.txt, line 1: is not of the form 'name: values'",
@@ -187,12 +187,12 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
         DataError,
         r"images are 64 x 48 pixels but .* is for 100 x 80 \(raw\) or 56 x 40 \(rectified\)",
     ),
-    "names": (
+    "images without frame numbers": (
         lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/b.png") for k in (0, 1)],
         DataError,
         "b.png: an image of KITTI raw is named by its frame number",
     ),
-    "digits": (
+    "numbers of several lengths": (
         lambda d: [(d / f"image_0{k}/data/0000000101.png").rename(d / f"image_0{k}/data/0100.png") for k in (0, 1)],
         DataError,
         "0100.png: its frame number does not increase after 0000000100.png",
@@ -305,6 +305,32 @@ def test_real_rows_are_aligned_as_well_as_by_kitti(data_dir: Path) -> None:
     ours, theirs = np.array(medians) * 721.5377  # at KITTI's focal length
     assert ours < 1.1 * theirs
     assert ours < 0.5
+
+
+def test_real_rectified_images_show_features_where_those_of_kitti_do(data_dir: Path) -> None:
+    """Corners of our images of frame 100, turned as KITTI's, are found by their texture where KITTI's own show them."""
+    dataset, published = _real(data_dir)
+    frame = next(e for e in dataset.events(0, 1) if isinstance(e, StereoFrame))
+    clip = open_dataset(data_dir / "kitti_0039")
+    theirs = next(e for e in clip.events(76, 77) if isinstance(e, StereoFrame))
+    R_ours = rectifying_rotations(dataset.rectifier.rig)[:2]
+    K_ours, K_theirs = dataset.recording.camera.K, clip.recording.camera.K
+    window = {"winSize": (21, 21), "maxLevel": 2}
+    moved = []
+    pairs = ((frame.left, theirs.left, published.R_rect_cam0), (frame.right, theirs.right, published.R_rect_cam1))
+    for (ours, other, R_theirs), R in zip(pairs, R_ours, strict=True):
+        assert ours is not None
+        assert other is not None
+        H = K_theirs @ R_theirs @ R.T @ np.linalg.inv(K_ours)
+        turned = cv2.warpPerspective(ours, H, other.shape[::-1])
+        corners = cv2.goodFeaturesToTrack(turned[20:-20, 20:-20], 300, 0.01, 12) + np.float32(20)
+        found, status, _ = cv2.calcOpticalFlowPyrLK(turned, other, corners, None, **window)  # type: ignore[call-overload]
+        assert status.mean() > 0.95
+        moved.append((found - corners)[status[:, 0] == 1, 0])
+    for shift in moved:
+        assert np.median(np.abs(shift[:, 1])) < 0.05  # rows: the epipolar residual
+        assert np.median(np.linalg.norm(shift, axis=1)) < 0.05
+    assert abs(np.median(moved[0][:, 1]) - np.median(moved[1][:, 1])) < 0.02
 
 
 def test_a_rig_of_the_real_files_is_consistent(data_dir: Path) -> None:

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from vio.errors import EvaluationError
 from vio.evaluation import (
+    KITTI_LENGTHS_M,
     AlignMode,
     align_poses,
     apply_alignment,
@@ -25,6 +26,7 @@ from vio.evaluation import (
     associate_times,
     evaluate,
     kitti_error,
+    lengths_text,
     nees,
     nees_bounds,
     path_length_m,
@@ -249,12 +251,34 @@ def test_a_constant_rotation_rate_error_is_the_rotational_drift() -> None:
     assert ours.t_err_percent == pytest.approx(0, abs=1e-9)
 
 
-def test_a_record_shorter_than_every_length_has_no_kitti_metric(data_dir: Path) -> None:
+def test_a_record_shorter_than_every_length_asked_for_has_no_kitti_metric(data_dir: Path) -> None:
     reference = read_trajectory(data_dir / REAL[0])
-    assert evaluate(reference, reference).kitti is None
+    assert evaluate(reference, reference, lengths_m=KITTI_LENGTHS_M).kitti is None
     short = evaluate(reference, reference, lengths_m=(50.0,)).kitti
     assert short is not None
     assert short.t_err_percent == pytest.approx(0, abs=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("path_m", "lengths"), [(250, (100, 200)), (95, (10, 20, 30, 40, 50, 60, 70, 80)), (4.5, (1, 2, 3, 4)), (0.9, ())]
+)
+def test_the_drift_of_a_short_path_is_that_over_tenths_of_the_lengths(
+    path_m: float, lengths: tuple[float, ...]
+) -> None:
+    T_ref = straight(1000)
+    T_ref[:, :3, 3] *= path_m / 999
+    T_est = T_ref.copy()
+    T_est[:, :3, 3] *= 1.01
+    found = evaluate(kitti_form(T_est), kitti_form(T_ref), align="first")
+    if not lengths:
+        assert found.kitti is None
+        return
+    assert found.kitti is not None
+    assert found.kitti.lengths_m == pytest.approx(lengths)
+    assert found.as_dict()["drift_lengths_m"] == pytest.approx(lengths)
+    step = path_m / 999  # a segment ends with the first pose beyond its length
+    assert 1.0 <= found.kitti.t_err_percent <= 1.0 * (1 + step / lengths[0]) + 1e-9
+    assert lengths_text(found.kitti.lengths_m) == f"{lengths[0]} to {lengths[-1]} m"
 
 
 def test_exactly_the_length_is_not_yet_a_segment() -> None:
@@ -667,7 +691,7 @@ def test_reference_that_hardly_matches_is_noted() -> None:
 
 def test_as_dict_is_json_with_null_where_undefined() -> None:
     T = wander(5)
-    scores = json.loads(json.dumps(evaluate(timed(T), timed(T)).as_dict(), allow_nan=False))
+    scores = json.loads(json.dumps(evaluate(timed(T), timed(T), lengths_m=(100,)).as_dict(), allow_nan=False))
     assert scores["ate_m"] == pytest.approx(0, abs=1e-12)
     assert scores["t_err_percent"] is None
     assert scores["r_err_deg_per_100m"] is None

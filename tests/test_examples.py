@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from frontend import FrontendSettings, build_frontend
 from vio.cli import main
@@ -71,6 +73,33 @@ def test_a_front_end_of_ones_own_is_checked_and_used(flight: Path) -> None:
     ate = re.search(r"ATE ([\d.]+) m", text)
     assert ate is not None
     assert float(ate[1]) < 0.02
+
+
+def test_a_viewer_of_ones_own_makes_an_animated_picture(flight: Path, tmp_path: Path) -> None:
+    assert "8 pictures" in _run("animated_picture.py", flight, tmp_path / "run.webp")
+    with Image.open(tmp_path / "run.webp") as found:
+        assert found.n_frames == 8
+        assert found.size[0] == 960
+        first = np.array(found.convert("RGB"))
+        found.seek(7)
+        last = np.array(found.convert("RGB"))
+    assert first[:, :480].std() > 10
+    blue = [(picture[:, 480:, 2].astype(int) - picture[:, 480:, 0] > 60).sum() for picture in (first, last)]
+    assert blue[1] > max(2 * blue[0], 10), "the path grows"
+
+
+@pytest.mark.parametrize(("name", "shorter"), [("rendered_recording", ('"6"', '"1.5"')), ("frontend_under_test", None)])
+def test_notebooks_run_from_top_to_bottom(
+    name: str, shorter: tuple[str, str] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Over fewer frames; what they show was made by all of them."""
+    monkeypatch.chdir(tmp_path)
+    cells = json.loads((ROOT / "examples" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+    scope: dict[str, object] = {}
+    for cell in (cell for cell in cells if cell["cell_type"] == "code"):
+        assert cell["outputs"] or "print" not in "".join(cell["source"]), "saved with what it printed"
+        text = re.sub(r"frames=\d+", "frames=4", "".join(cell["source"]))
+        exec(text if shorter is None else text.replace(*shorter), scope)
 
 
 @pytest.fixture(scope="module")

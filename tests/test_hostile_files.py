@@ -28,7 +28,7 @@ from vio.yaml_text import read_yaml
 PIXELS = np.random.default_rng(5).integers(0, 256, (24, 32)).astype(np.uint8)
 
 
-def _png_stating(width: int, height: int) -> bytes:
+def png_stating(width: int, height: int) -> bytes:
     """A complete PNG, with right checksums, whose header states a size that its pixels do not have."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
@@ -45,7 +45,7 @@ def _jpeg(path: Path) -> bytes:
 
 @pytest.mark.parametrize(("width", "height"), [(2**15, 2**15), (2**30, 1), (2**31 - 1, 2**31 - 1)])
 def test_image_size_is_checked_before_decoding(width: int, height: int, tmp_path: Path) -> None:
-    (tmp_path / "a.png").write_bytes(_png_stating(width, height))
+    (tmp_path / "a.png").write_bytes(png_stating(width, height))
     with pytest.raises(UnreadableImageError, match=rf"a\.png: its header states {width} x {height} pixels, more than"):
         load_gray(tmp_path / "a.png")
 
@@ -109,7 +109,7 @@ def test_full_16_bits_keep_their_scale(tmp_path: Path) -> None:
 # --- archives -------------------------------------------------------------------------------------------------------
 
 
-def _add_bomb(path: Path, name: str, gib: float) -> None:
+def add_bomb(path: Path, name: str, gib: float) -> None:
     """Add an array of zeros to an archive, of which the file holds a thousandth at most."""
     shape = (int(gib * 2**27),)
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
@@ -122,7 +122,7 @@ def _add_bomb(path: Path, name: str, gib: float) -> None:
 
 def test_unused_arrays_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = make_npz(tmp_path / "drive.npz", ece276a_arrays(make_drive(6)))
-    _add_bomb(path, "unused", 3.9)
+    add_bomb(path, "unused", 3.9)
     assert len(open_dataset(path).recording.frame_times_ns) == 6
 
 
@@ -138,7 +138,7 @@ def test_needed_arrays_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_header_must_agree_with_the_archive(tmp_path: Path) -> None:
     path = make_npz(tmp_path / "a.npz", {"b": np.zeros(3)})
-    _add_bomb(path, "features", 3.9)
+    add_bomb(path, "features", 3.9)
     with pytest.raises(DataError, match=r"a\.npz: is damaged \(features\.npy states the shape"):
         read_npz(path, ["features"])
 

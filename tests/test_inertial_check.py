@@ -12,6 +12,8 @@ import pytest
 
 from vio.datasets.common import imu_samples
 from vio.datasets.euroc_files import read_imu_csv
+from vio.datasets.rigs import load_rig
+from vio.datasets.tables import read_imu_table
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
@@ -455,6 +457,30 @@ def test_real_imu_gives_a_finding_only_when_corrupted(data_dir: Path, flight: st
     for name in mistakes:
         corrupt, faults, _ = _CORRUPTED[name]
         assert _faults(_watch(it, samples=corrupt(it))) == faults, name
+
+
+def test_tumvi_agrees_with_its_motion_capture(data_dir: Path) -> None:
+    """Readings at 200 Hz, and between them those that the publishers interpolated at the cameras' times.
+
+    Two windows of 20 s; the five others of the record give no finding either.
+    """
+    folder = data_dir / "tumvi_room1_head"
+    truth, record = read_trajectory(folder / "gt_imu.csv"), imu_samples(read_imu_table(folder / "imu.txt")[0])
+    rig = load_rig(folder)
+    T, camera = rig.T_cam0_imu, StereoCamera(365.0, 365.0, 512.0, 512.0, 0.101, 1024, 1024)
+    assert truth.times_ns is not None
+    assert T is not None
+    for start_s in (0, 120):
+        begin = truth.times_ns[0] + start_s * 10**9
+        used = (truth.times_ns >= begin) & (truth.times_ns <= begin + 21 * 10**9)
+        motion, _ = fit_spline(truth.times_ns[used], truth.T_world_body[used], knot_s=0.05)
+        times = np.arange(motion.start_ns, motion.start_ns + 20 * 10**9, _FRAME_NS)
+        frames = _observe(camera, evaluate(motion, times).T_world_imu, T, times.tolist(), 2.5, 0, 0.2)
+        it = Watched(camera, T, [s for s in record if times[0] <= s.time_ns <= times[-1]], [], frames)
+        assert len(it.samples) > 4300
+        assert _watch(it) == []
+        if start_s == 0:
+            assert _faults(_watch(it, samples=_gyro(it, np.degrees))) == ["gyro units"]
 
 
 def test_reports_an_inverted_lever_arm_where_the_motion_determines_it(data_dir: Path) -> None:

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import project, triangulate
+from vio.loops import LoopEvent
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures, extract
 from vio.mapping.map_store import MapStore
@@ -69,9 +71,15 @@ def doors_walk() -> Walk:
 
 
 @pytest.fixture(scope="module")
-def whole_map(room_walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> MapBuilder:
+def whole_events() -> list[LoopEvent]:
+    """Takes the loops of `whole_map`."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def whole_map(room_walk: Walk, whole_events: list[LoopEvent], tmp_path_factory: pytest.TempPathFactory) -> MapBuilder:
     """Of the whole walk in the room, finished and closed."""
-    builder = _map(room_walk, tmp_path_factory.mktemp("maps") / "whole.map")
+    builder = _map(room_walk, tmp_path_factory.mktemp("maps") / "whole.map", events=whole_events)
     builder.finish()
     builder.close()
     return builder
@@ -95,11 +103,21 @@ def doors_map(doors_walk: Walk, tmp_path_factory: pytest.TempPathFactory) -> Map
     return builder
 
 
-def _map(walk: Walk, path: Path, *, seed: int = 0, rows: slice = slice(None), localise: bool = False) -> MapBuilder:
+def _map(
+    walk: Walk,
+    path: Path,
+    *,
+    seed: int = 0,
+    rows: slice = slice(None),
+    localise: bool = False,
+    events: list[LoopEvent] | None = None,
+) -> MapBuilder:
     store = MapStore(path, create=not localise, read_only=localise)
     builder = MapBuilder(store, "walk", walk.camera, upright=False, localise=localise)
     for keyframe, features in walk.keyframes(seed=seed, rows=rows):
-        builder.add(keyframe, features)
+        found = builder.add(keyframe, features).loops
+        if events is not None:
+            events += found
     return builder
 
 
@@ -118,6 +136,21 @@ def test_a_second_round_closes_loops_and_takes_the_drift_away(room_walk: Walk, w
         assert np.linalg.norm((se3_inverse(truth) @ o.pose.T_i_j)[:3, 3]) < 0.1, "no false loop"
     odometry, optimised = (_errors_m(T.rows, room_walk.T)[25:] for T in (graph.T_odom_cam, graph.T_map_cam))
     assert np.sqrt(np.mean(optimised**2)) < 0.6 * np.sqrt(np.mean(odometry**2))
+
+
+def test_a_loop_names_the_frame_and_the_pixels_that_show_the_place(
+    room_walk: Walk, whole_map: MapBuilder, whole_events: list[LoopEvent]
+) -> None:
+    assert len(whole_events) == len(whole_map.graph.loops)
+    for o in whole_events:
+        assert o.keyframe_frame == o.keyframe, "frames and keyframes of this walk are numbered alike"
+        assert o.matches is not None
+        assert len(o.matches) == o.inliers
+        seen = o.matches.has_right_keyframe & o.matches.has_right_frame
+        p, _ = triangulate(room_walk.camera, o.matches.z_keyframe[seen])
+        T = se3_inverse(room_walk.T[o.frame]) @ room_walk.T[o.keyframe]
+        gap = project(room_walk.camera, transform_points(T, p)) - o.matches.z_frame[seen]
+        assert np.median(np.abs(gap)) < 1.5, "pixels"
 
 
 def test_equal_doors_are_told_apart_by_the_odometry(doors_walk: Walk, doors_map: MapBuilder) -> None:
@@ -143,6 +176,22 @@ def test_a_session_finds_its_place_in_an_earlier_map(room_walk: Walk, first_roun
     errors = np.linalg.norm((room_walk.T[0] @ own - room_walk.T[28:35])[:, :3, 3], axis=1)
     assert np.median(errors) < 0.1
     assert first_round.read_bytes() == before
+
+
+def test_a_jump_of_the_odometry_that_its_motions_do_not_have_leaves_the_place(
+    room_walk: Walk, first_round: Path
+) -> None:
+    """A filter that learns what it was off by moves its newest pose by a metre, but not its window's motions."""
+    store = MapStore(first_round, read_only=True)
+    builder = MapBuilder(store, "walk", room_walk.camera, upright=False, localise=True)
+    jump = se3_exp([1.0, 0.0, 0.0, 0.0, 0.0, 0.3])
+    for keyframe, features in room_walk.keyframes(seed=5, rows=slice(27, 37)):
+        moved = jump @ keyframe.T_odom_cam if keyframe.frame > 31 else keyframe.T_odom_cam
+        builder.add(replace(keyframe, T_odom_cam=moved), features)
+    own = builder.graph.T_map_cam.rows[builder.first :]
+    errors = np.linalg.norm((room_walk.T[0] @ own - room_walk.T[27:37])[:, :3, 3], axis=1)
+    assert errors[5:].max() < 0.1
+    builder.close()
 
 
 def test_a_continued_map_joins_both_sessions(room_walk: Walk, first_round: Path, tmp_path: Path) -> None:

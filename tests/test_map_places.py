@@ -9,7 +9,7 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, transfor
 from vio.geometry.stereo import StereoCamera, project
 from vio.mapping.features import KeyframeFeatures, extract, no_features
 from vio.mapping.loop_geometry import LEAST_INLIERS, match, verify
-from vio.mapping.place_index import PlaceIndex
+from vio.mapping.place_index import PlaceIndex, words_of
 
 CAMERA = StereoCamera(400.0, 400.0, 319.5, 179.5, 0.12, 640, 360)
 T_I_J = se3_exp([0.4, -0.1, 0.3, 0.05, -0.2, 0.03])
@@ -26,7 +26,9 @@ def _flipped(descriptors: np.ndarray, share: float, rng: np.random.Generator) ->
     return descriptors ^ np.packbits(wrong, axis=1)
 
 
-def _views(seed: int, sigma_px: float = 1.0, outliers: float = 0.0) -> tuple[KeyframeFeatures, KeyframeFeatures]:
+def _views(
+    seed: int, sigma_px: float = 1.0, outliers: float = 0.0, stated_px: float | None = None
+) -> tuple[KeyframeFeatures, KeyframeFeatures]:
     """Two views of one place, the second at T_I_J, with pixel noise and wrong positions of some features."""
     rng = np.random.default_rng(seed)
     p = np.stack([rng.uniform(-3, 3, POINTS), rng.uniform(-1.5, 1.5, POINTS), rng.uniform(3, 9, POINTS)], axis=1)
@@ -35,7 +37,7 @@ def _views(seed: int, sigma_px: float = 1.0, outliers: float = 0.0) -> tuple[Key
     for points, names in ((p, bits), (transform_points(se3_inverse(T_I_J), p), _flipped(bits, 0.08, rng))):
         z = project(CAMERA, points) + sigma_px * rng.standard_normal((POINTS, 4))
         z[rng.random(POINTS) < outliers, :2] += 80.0
-        out.append(KeyframeFeatures(z, rng.random(POINTS) < 0.8, np.full(POINTS, sigma_px), names))
+        out.append(KeyframeFeatures(z, rng.random(POINTS) < 0.8, np.full(POINTS, stated_px or sigma_px), names))
     return out[0], out[1]
 
 
@@ -58,6 +60,15 @@ def test_the_motion_between_two_views_is_found_within_its_covariance() -> None:
     squared = [float(r @ np.linalg.solve(C, r)) for r, C, _ in (_error(seed) for seed in range(15))]
     assert 0.5 < np.mean(squared) < 6.0
     assert max(squared) < 16.8  # the 99 % quantile of six degrees of freedom
+
+
+def test_the_covariance_of_a_motion_follows_the_noise_of_its_pixels() -> None:
+    """Key points whose pixels are better than stated, as those of rendered and of compressed images are."""
+    ratios = []
+    for seed in range(8):
+        stated, exact = (_error(seed, sigma_px=0.4, stated_px=px)[1] for px in (1.0, 0.4))
+        ratios.append(np.trace(stated) / np.trace(exact))
+    assert 0.7 < np.mean(ratios) < 1.4
 
 
 def test_a_third_of_wrong_pairs_changes_little() -> None:
@@ -106,6 +117,29 @@ def test_the_index_finds_the_place_that_shares_most_features() -> None:
     assert found[0] == 17
     forbidden = np.arange(40) != 17
     assert 17 not in index.candidates(query, forbidden, 3)
+
+
+def test_scores_do_not_depend_on_what_of_the_index_is_merged() -> None:
+    """The weight of all shared words, counted one by one, for keyframes in the index and in its tail."""
+    rng = np.random.default_rng(8)
+    places = [_bits(int(rng.integers(0, 60)), rng) for _ in range(150)]
+    places[7] = np.concatenate([places[7], places[7][:5]])  # a word twice
+    index, query = PlaceIndex(), _flipped(np.concatenate(places[3:9]), 0.1, rng)
+    for place in places:
+        index.add(place)
+    words, asked = [words_of(place) for place in places], words_of(query)
+    expected = np.zeros(len(places))
+    for table in range(len(asked)):
+        for word in np.unique(asked[table]):
+            shown = np.array([np.count_nonzero(w[table] == word) for w in words])
+            expected += shown * np.log((len(places) + 1) / (np.count_nonzero(shown) + 1))
+    expected /= np.sqrt(np.maximum([len(place) for place in places], 1))
+    np.testing.assert_allclose(index.scores(query), expected, atol=1e-3)
+    few = PlaceIndex()
+    for place in places[:20]:  # all of them in the tail
+        few.add(place)
+    assert len(few.scores(query)) == 20
+    assert index.nbytes < 2 * 8 * sum(len(place) for place in places) + 2 * 8 * 4 * 2**14 + 10_000
 
 
 def test_candidates_are_of_different_places() -> None:

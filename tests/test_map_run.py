@@ -16,10 +16,14 @@ from tests.test_unfinished_runs import Stop
 from vio.cli import main
 from vio.config import Config
 from vio.datasets import open_dataset
-from vio.errors import ConfigError
+from vio.errors import ConfigError, DataError
 from vio.filters.msckf import Msckf
+from vio.finished_run import read_finished_run
+from vio.frame_result import FrameResult
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
+from vio.loop_files import read_loops, write_loops
+from vio.loops import LoopEvent, LoopMatches
 from vio.mapped_run import corrected
 from vio.mapping.map_store import MapStore
 from vio.mapping.session import MapSession
@@ -69,6 +73,32 @@ def test_a_run_with_a_map_writes_its_poses_and_its_metrics(mapped: Path) -> None
     assert len(causal) == len(covariance) == len(odometry)
     assert (np.linalg.eigvalsh(covariance)[1:] > 0).all()
     assert (mapped / "loops.csv").read_text().startswith("frame,time_ns,keyframe")
+    finished = read_finished_run(mapped)
+    assert finished.mapped is not None
+    assert finished.loops == ()
+    keyframes = finished.map_keyframes
+    assert len(keyframes.frame) == metrics["keyframes"]
+    assert keyframes.own.all()
+    place = np.searchsorted(finished.estimates["index"], keyframes.frame)
+    np.testing.assert_allclose(keyframes.T_map_body, finished.mapped.T_world_body[place], atol=1e-9)
+
+
+def test_loops_are_read_as_they_were_written(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    z, has_right = rng.uniform(0, 300, (2, 25, 4)), rng.random((2, 25)) < 0.5
+    loops = (
+        LoopEvent(90, 9 * 10**18 + 1, 3, 10**18, 25, 0.125, False, 12, True, LoopMatches(*z, *has_right)),
+        LoopEvent(95, 9 * 10**18 + 9, 4, 10**17, 0, 1e-3, True, None, False, None),
+    )
+    write_loops(tmp_path, loops)
+    found = read_loops(tmp_path)
+    assert found == loops
+    assert found[0].matches is not None
+    np.testing.assert_array_equal(found[0].matches.z_frame, z[1])
+    np.testing.assert_array_equal(found[0].matches.has_right_keyframe, has_right[0])
+    (tmp_path / "loops.csv").write_text("frame,time_ns\n1,2\n")
+    with pytest.raises(DataError, match="is damaged"):
+        read_loops(tmp_path)
 
 
 def test_a_run_goes_on_to_the_same_map(flight: Path, mapped: Path, tmp_path: Path) -> None:
@@ -143,7 +173,9 @@ def test_live_estimates_have_their_pose_in_the_map(flight: Path, mapped: Path, t
     recording = dataset.recording
     config = replace(Config(), motion="none")
     path = tmp_path / "live.map"
-    with vio.Odometry(recording.camera, config, T_cam0_imu=recording.T_cam0_imu, map=path) as odometry:
+    results: list[FrameResult] = []
+    options = {"T_cam0_imu": recording.T_cam0_imu, "map": path, "on_frame": results.append}
+    with vio.Odometry(recording.camera, config, **options) as odometry:
         for event in dataset.events(0, 6):
             if isinstance(event, StereoFrame):
                 assert event.left is not None
@@ -153,6 +185,7 @@ def test_live_estimates_have_their_pose_in_the_map(flight: Path, mapped: Path, t
                 assert estimate.T_map_body is not None
                 np.testing.assert_allclose(estimate.T_map_body, estimate.T_world_imu, atol=1e-12)
         assert odometry.loops == ()
+        assert [r.is_keyframe for r in results][:2] == [True, False]
         with pytest.raises(ConfigError, match="a map takes one trajectory"):
             odometry.reset()
     assert len(MapStore(path, read_only=True).keyframes()) >= 1
@@ -217,6 +250,54 @@ def test_motions_are_joined_where_the_window_moves_on(tmp_path: Path) -> None:
     assert (first, second) == (0, 1)
     np.testing.assert_allclose(motion.T_i_j, poses[8], atol=1e-12)
     assert np.linalg.eigvalsh(motion.covariance)[0] > 7.0, "of eight steps of unit variance each"
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_what_a_covered_camera_does_to_the_place(alone: bool, tmp_path: Path) -> None:
+    """Ten dark frames of 0.1 s, which the filter's window does not hold: the covariance grows as the filter's own.
+
+    Without a motion sensor the motion is not known after them.
+    """
+
+    def relative(older: int, newer: int) -> RelativePose | None:
+        return None if 12 <= newer < 22 else RelativePose(np.eye(4), 1e-4 * (newer - older) * np.eye(6))
+
+    session = MapSession(
+        tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False, alone=alone
+    )
+    gray, sigmas = np.zeros((64, 64), dtype=np.uint8), []
+    for k in range(24):
+        count = 0 if 12 <= k < 22 else 40
+        ids = np.arange(count) + 1000 * (k == 23)
+        seen = observations(k, 10**8 * k, ids, np.tile([9.0, 9, 5, 9], (count, 1)))
+        estimate = Estimate(k, np.eye(4), (1e-6 + 1e-2 * np.clip(k - 11, 0, 10)) * np.eye(6))
+        session.frame(StereoFrame(k, 10**8 * k, gray, gray), seen, estimate, relative)
+        covariance = session.covariance
+        sigmas.append(np.nan if covariance is None else float(np.sqrt(covariance[0, 0])))
+    session.finish()
+    session.close()
+    np.testing.assert_allclose(sigmas[21] ** 2 - sigmas[11] ** 2, 0.1, rtol=1e-3)
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    assert (np.sqrt(motion.covariance[0, 0]) >= 30.0) is np.bool_(alone)
+
+
+def test_motions_have_errors_that_tracks_do_not_average_out(tmp_path: Path) -> None:
+    """A filter that is sure to a micrometre of a metre: the calibration is not."""
+    steps = [np.eye(4), se3_exp([0.0, 0, 1.0, 0, 0.5, 0])]
+
+    def relative(older: int, newer: int) -> RelativePose | None:
+        return RelativePose(se3_inverse(steps[older]) @ steps[newer], 1e-12 * np.eye(6))
+
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    gray = np.zeros((64, 64), dtype=np.uint8)
+    for k in range(2):
+        seen = observations(k, k, np.arange(40) + 1000 * k, np.tile([9.0, 9, 5, 9], (40, 1)))
+        session.frame(StereoFrame(k, k, gray, gray), seen, Estimate(k, steps[k], np.eye(6)), relative)
+    session.finish()
+    session.close()
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    sigma = np.sqrt(np.diag(motion.covariance))
+    np.testing.assert_allclose(sigma, np.repeat([5e-4, 1e-4], 3), rtol=0.05)
 
 
 def test_where_the_filter_began_anew_the_motion_is_not_known(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from vio.filters.navigation import ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
 from vio.finished_run import read_finished_run, with_distinct_names
 from vio.geometry.lie import se3_from_parts, so3_exp
+from vio.loops import LoopEvent, MapKeyframes
 from vio.report.curves import curves_of
 from vio.report.page import page
 from vio.report.words import figures_of, summary
@@ -69,6 +71,29 @@ def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -
         assert f"<h2>{title}</h2>" in text
     assert "All settings have their defaults" not in text  # --motion is one
     assert "<h2>IMU biases</h2>" not in page([read_finished_run(runs[1])])
+
+
+def test_a_run_with_a_map_is_drawn_in_it_with_its_loops(runs: tuple[Path, Path]) -> None:
+    """The map's own frame does not matter: the picture begins where the run does, or lies on the reference."""
+    plain = read_finished_run(runs[0])
+    moved = se3_from_parts(so3_exp([0.0, 0.0, 1.0]), [5.0, 6.0, 7.0])
+    T_map = moved @ plain.trajectory.T_world_body
+    frames = np.array(plain.estimates["index"])
+    loop = LoopEvent(int(frames[-1]), 1, 0, 0, 50, 0.1, joined=False, keyframe_frame=int(frames[0]))
+    run = replace(
+        plain,
+        mapped=replace(plain.trajectory, T_world_body=T_map),
+        map_keyframes=MapKeyframes(frames[:1], frames[:1], frames[:1], np.array([True]), T_map[:1]),
+        loops=(loop, replace(loop, kept=False), replace(loop, keyframe_frame=None)),
+    )
+    for shown in (run, replace(run, evaluation=None)):
+        (curve,) = curves_of([shown])
+        assert curve.mapped is not None
+        np.testing.assert_allclose(curve.mapped.position, curve.position, atol=1e-9)
+        np.testing.assert_allclose(curve.mapped.keyframes, curve.position[:1], atol=1e-9)
+        np.testing.assert_allclose(curve.mapped.loops, curve.position[None, [-1, 0]], atol=1e-9)
+    assert "<h2>Map</h2>" in page([run])
+    assert "<h2>Map</h2>" not in page([plain])
 
 
 def test_names_of_files_cannot_bring_script_into_a_page(runs: tuple[Path, Path], tmp_path: Path) -> None:

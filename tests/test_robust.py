@@ -5,7 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vio.robust import jackknife, robust_sigma
+from vio.robust import jackknife, median, robust_sigma
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 100, 101])
+def test_the_median_is_numpys_to_the_bit(count: int) -> None:
+    rng = np.random.default_rng(count)
+    for values in (rng.standard_normal(count), np.round(rng.standard_normal(count)), rng.standard_normal((count, 2))):
+        assert median(values) == np.median(values)
+        values.flat[0] = np.nan
+        assert np.isnan(median(values))
+    assert np.isnan(median([]))
+    assert median([3, 1, 2]) == 2.0
 
 
 def test_the_jackknife_of_a_mean_is_its_standard_error() -> None:

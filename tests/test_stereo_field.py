@@ -77,8 +77,18 @@ def test_a_turn_is_named_and_nothing_else() -> None:
     off = np.array([0, TURN, *[0.0] * 10])
     found = calibrated_rig(RECTIFIED, _estimate(_Frame.of(RECTIFIED).coefficients(off)))
     assert len(found.lines()) == 1
-    assert found.lines()[0].startswith("right camera turned by +0.499 ± ")
+    assert found.lines()[0].startswith("right camera turned by +0.500 ± ")
     assert found.lines()[0].endswith(" deg about its vertical axis")
+
+
+def test_a_turn_that_the_principal_point_takes_back_is_none() -> None:
+    """As on KITTI: 1.15 deg of yaw against 14 px of principal point leave the image's centre where it is."""
+    off = np.zeros(12)
+    off[[PARAMETERS.index(name) for name in ("wy", "cu", "p2")]] = 0.02, -0.02, -5e-3
+    found = calibrated_rig(RECTIFIED, _estimate(_Frame.of(RECTIFIED).coefficients(off)))
+    assert abs(found.parameters[PARAMETERS.index("wy")]) > 0.01
+    assert [line for line in found.lines() if "axis" in line or "principal" in line] == []
+    assert any("p2" in line for line in found.lines())
 
 
 def test_what_a_lens_model_cannot_express_is_said() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,16 @@ from hypothesis import strategies as st
 from tests.numerics import numeric_jacobian
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera, left_rays, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import (
+    StereoCamera,
+    depth_of,
+    facing,
+    left_rays,
+    p_cam_D_z,
+    project,
+    triangulate,
+    z_D_p_cam,
+)
 
 properties = settings(max_examples=60, deadline=None)
 
@@ -23,21 +34,28 @@ cameras = st.builds(
     baseline_m=st.floats(0.05, 1.0),
 )
 points = st.tuples(st.floats(-20, 20), st.floats(-20, 20), st.floats(0.5, 80)).map(np.array)
+cylinders = cameras.map(lambda camera: replace(camera, projection="cylinder"))
+around = st.tuples(st.floats(-20, 20), st.floats(0.5, 20), st.floats(-2.8, 2.8)).map(
+    lambda p: np.array([p[0], p[1] * np.sin(p[2]), p[1] * np.cos(p[2])])
+)  # all about the baseline
+both = st.tuples(cameras, points) | st.tuples(cylinders, around)
 
 
 @properties
-@given(cameras, points)
-def test_triangulate_undoes_project(camera: StereoCamera, p: FloatArray) -> None:
+@given(both)
+def test_triangulate_undoes_project(seen: tuple[StereoCamera, FloatArray]) -> None:
+    camera, p = seen
     back, valid = triangulate(camera, project(camera, p)[None], min_disparity_px=1e-3)
     assert valid.all()
     np.testing.assert_allclose(back[0], p, rtol=1e-8, atol=1e-8)
 
 
 @properties
-@given(cameras, points)
-def test_left_rays_lead_to_the_points(camera: StereoCamera, p: FloatArray) -> None:
-    pixels = np.broadcast_to(project(camera, p)[:2], (2, 3, 2))
-    np.testing.assert_allclose(left_rays(camera, pixels) * p[2], np.broadcast_to(p, (2, 3, 3)), rtol=1e-8, atol=1e-8)
+@given(both)
+def test_left_rays_lead_to_the_points(seen: tuple[StereoCamera, FloatArray]) -> None:
+    camera, p = seen
+    pixels, depth = np.broadcast_to(project(camera, p)[:2], (2, 3, 2)), depth_of(camera, p)
+    np.testing.assert_allclose(left_rays(camera, pixels) * depth, np.broadcast_to(p, (2, 3, 3)), rtol=1e-8, atol=1e-8)
 
 
 @properties
@@ -56,16 +74,18 @@ def test_project_is_two_pinholes_a_baseline_apart(camera: StereoCamera, p: Float
 
 
 @properties
-@given(cameras, points)
-def test_z_D_p_cam_equals_central_differences(camera: StereoCamera, p: FloatArray) -> None:
-    numeric = numeric_jacobian(lambda x: project(camera, x), p, eps=1e-5 * p[2])
+@given(both)
+def test_z_D_p_cam_equals_central_differences(seen: tuple[StereoCamera, FloatArray]) -> None:
+    camera, p = seen
+    numeric = numeric_jacobian(lambda x: project(camera, x), p, eps=1e-5 * float(depth_of(camera, p)))
     analytic = z_D_p_cam(camera, p)
     np.testing.assert_allclose(analytic, numeric, rtol=1e-6, atol=1e-6 * np.abs(analytic).max())
 
 
 @properties
-@given(cameras, points)
-def test_p_cam_D_z_equals_central_differences(camera: StereoCamera, p: FloatArray) -> None:
+@given(both)
+def test_p_cam_D_z_equals_central_differences(seen: tuple[StereoCamera, FloatArray]) -> None:
+    camera, p = seen
     z = project(camera, p)
     eps = 1e-5 * (z[0] - z[2])
     numeric = numeric_jacobian(lambda x: triangulate(camera, x[None], min_disparity_px=1e-6)[0][0], z, eps=eps)
@@ -74,10 +94,32 @@ def test_p_cam_D_z_equals_central_differences(camera: StereoCamera, p: FloatArra
 
 
 @properties
-@given(cameras, points)
-def test_the_two_jacobians_are_inverse_on_the_image_of_a_point(camera: StereoCamera, p: FloatArray) -> None:
+@given(both)
+def test_the_two_jacobians_are_inverse_on_the_image_of_a_point(seen: tuple[StereoCamera, FloatArray]) -> None:
+    camera, p = seen
     product = p_cam_D_z(camera, project(camera, p)) @ z_D_p_cam(camera, p)
     np.testing.assert_allclose(product, np.eye(3), atol=1e-7)
+
+
+@properties
+@given(cylinders, around)
+def test_a_cylinder_is_the_pinhole_turned_about_the_baseline_to_each_row(camera: StereoCamera, p: FloatArray) -> None:
+    """Columns are those of the turned pinhole exactly, also beyond 90 degrees; the row is its middle row."""
+    z, pinhole = project(camera, p), replace(camera, projection="pinhole")
+    pixels, turned = facing(camera, z[None, :2], p[None])
+    np.testing.assert_allclose(project(pinhole, turned[0]), [z[0], camera.cv, z[2], camera.cv], rtol=1e-9, atol=1e-6)
+    np.testing.assert_allclose(pixels, [[z[0], camera.cv]], rtol=1e-12)
+    assert turned[0, 2] > 0
+    ahead = np.array([p[0], 0.0, np.hypot(p[1], p[2])])
+    np.testing.assert_allclose(project(camera, ahead), project(pinhole, ahead), rtol=1e-9, atol=1e-6)
+
+
+@properties
+@given(cameras, points)
+def test_a_pinhole_faces_ahead(camera: StereoCamera, p: FloatArray) -> None:
+    pixels, same = facing(camera, project(camera, p)[None, :2], p[None])
+    np.testing.assert_array_equal(same, p[None])
+    np.testing.assert_array_equal(pixels, project(camera, p)[None, :2])
 
 
 @pytest.fixture

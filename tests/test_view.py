@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,9 @@ import pytest
 from vio.cli import main
 from vio.config import load_config
 from vio.datasets import open_dataset
+from vio.loops import LoopEvent
 from vio.pipeline import RunResult, run
-from vio.records import UpdateReport, observations
+from vio.records import Estimate, UpdateReport, observations
 from vio.view.live import RerunViewer, ViewedRig, age_colours, states_of
 
 rr = pytest.importorskip("rerun", reason="needs the extra view")
@@ -76,6 +78,39 @@ def test_every_frame_shows_pose_path_image_features_and_curves(shown: tuple[Reco
     assert scalars == dict.fromkeys(scalars, len(frames) + 1)  # and the names of the curves
     assert stream.flushed == 1
     assert stream.sent["world/run/reference"][0][0] is None  # drawn once
+
+
+def test_marks_lie_on_the_pixels_of_the_shown_image(shown: tuple[Recorder, RunResult, RunResult], flight: Path) -> None:
+    """The centre of our first pixel is (0, 0), of rerun's (0.5, 0.5); so is the principal point."""
+    stream, _, _ = shown
+    camera = open_dataset(flight).recording.camera
+    (pinhole,) = [what for _, what in stream.sent["world/run/camera"] if isinstance(what, rr.Pinhole)]
+    matrix = np.array(pinhole.image_from_camera.as_arrow_array().to_pylist()).reshape(3, 3).T
+    assert matrix[:2, 2] == pytest.approx([camera.cu + 0.5, camera.cv + 0.5], abs=1e-4)
+    seen = RerunViewer._pixels
+    assert seen(_Half(), np.array([10.0, 20.0])) == pytest.approx([5.25, 10.25])  # type: ignore[arg-type]
+
+
+class _Half:
+    _scale = 0.5  # of a viewer that shows images at half their width
+
+
+def test_keyframes_and_loops_of_a_map_are_drawn(flight: Path) -> None:
+    recording, stream = open_dataset(flight).recording, Recorder()
+    viewer = RerunViewer(stream, ViewedRig(recording.camera, np.eye(4), None, None))  # type: ignore[arg-type]
+    again = LoopEvent(frame=20, time_ns=2, keyframe=0, keyframe_time_ns=0, inliers=40, gap_m=0.1, joined=False)
+    for index, loops in ((0, ()), (20, ()), (21, (replace(again, keyframe_frame=0), again))):
+        T = np.eye(4)
+        T[0, 3] = index
+        estimate = Estimate(index, T, np.eye(6))
+        viewer.places(index, estimate, is_keyframe=index < 21, loops=loops)
+    marks = stream.sent["world/run/keyframes"][-1][1].positions.as_arrow_array().to_pylist()
+    assert [p[0] for p in marks] == [0.0, 20.0]
+    (line,) = stream.sent["world/run/loops"][-1][1].strips.as_arrow_array().to_pylist()
+    assert [p[0] for p in line] == [20.0, 0.0]
+    texts = [what.text.as_arrow_array().to_pylist()[0] for _, what in stream.sent["loops"]]
+    assert "the place of frame 0 again" in texts[0]
+    assert "the place of an earlier session again" in texts[1]
 
 
 def test_the_world_is_upright(shown: tuple[Recorder, RunResult, RunResult]) -> None:

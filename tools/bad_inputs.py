@@ -17,13 +17,20 @@ from typing import Any
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rigs import load_rig
 from vio.errors import VioError
+from vio.trajectory_io import read_trajectory
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "bad_inputs.md"
+_MAKERS = {"tests.test_datasets_euroc": "make_euroc", "tests.test_datasets_kitti_raw": "make_kitti_raw"}
 MODULES = {
     "tests.test_rig": "Calibration files (`vio.load_rig`)",
     "tests.test_datasets_plain": "Plain folders",
     "tests.test_datasets_bags": "ROS bags",
     "tests.test_datasets_videos": "Videos",
+    "tests.test_datasets_euroc": "EuRoC folders",
+    "tests.test_datasets_kitti_raw": "KITTI raw drives",
+    "tests.test_datasets_gtsam": "GTSAM's stereo factors",
+    "tests.test_hostile_recordings": "Damaged and hostile files",
+    "tests.test_trajectory_io": "Trajectories",
 }
 _HEAD = """# Bad inputs
 
@@ -47,6 +54,13 @@ def message_of(module: str, case: Any, folder: Path) -> str:
             load_rig(case[0](folder))
         elif module == "tests.test_datasets_videos":
             case[0](folder)
+            list(open_dataset(folder).events())
+        elif module == "tests.test_trajectory_io":
+            (folder / "a.txt").write_text(case[0], encoding="utf-8")
+            read_trajectory(folder / "a.txt", fmt=case[1])
+        elif module in _MAKERS:
+            whole = getattr(importlib.import_module("tests.euroc_maker"), _MAKERS[module])(folder)
+            case[0](whole / "mav0" if (whole / "mav0").is_dir() else whole)
             list(open_dataset(folder).events())
         else:
             settings = DatasetSettings(topics=case[1]) if len(case) == 3 else DatasetSettings()

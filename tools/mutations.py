@@ -66,9 +66,53 @@ _PLACES = ("tests/test_map_places.py",)
 _MAPS = ("tests/test_map_builder.py",)
 _MAP_FILE = ("tests/test_map_store.py",)
 _MAP_RUN = ("tests/test_map_run.py",)
+_ONE_CAMERA = ("tests/test_one_camera.py",)
 _TRACK = ("tests/test_frontend_klt.py", "tests/test_frontend_scene.py", "tests/test_frontend_contract.py")
 
 MUTATIONS = (
+    # --- one camera ---
+    Mutation(
+        "one camera: velocity at standstill as unknown as in motion",
+        "vio/filters/mono_start.py",
+        "P[6:9, 6:9] = np.eye(3) * self._settings.zero_velocity_sigma_mps**2",
+        "P[6:9, 6:9] = np.eye(3) * self._settings.start_velocity_sigma_mps**2",
+        _ONE_CAMERA,
+    ),
+    Mutation(
+        "one camera: begins although the scale is not observable",
+        "vio/filters/mono_start.py",
+        "if sigma > MOST_SCALE_SIGMA:",
+        "if sigma > 1e9 * MOST_SCALE_SIGMA:",
+        _ONE_CAMERA,
+    ),
+    Mutation(
+        "one camera: alignment without the lever arm",
+        "vio/filters/alignment.py",
+        "motion.moves + motion.R_first_body @ bearings.camera_imu",
+        "motion.moves + 0 * motion.R_first_body @ bearings.camera_imu",
+        _ONE_CAMERA,
+    ),
+    Mutation(
+        "one camera: gyro bias of the alignment the wrong way",
+        "vio/filters/alignment.py",
+        "A[:3, :3] - lost @ A[3:, :3], b[:3] - lost @ b[3:]",
+        "A[:3, :3] - lost @ A[3:, :3], lost @ b[3:] - b[:3]",
+        _ONE_CAMERA,
+    ),
+    Mutation(
+        "depth images: virtual baseline without the noise of depths",
+        "vio/camera_rig.py",
+        "_DISPARITY_SIGMAS * _PIXEL_SIGMA_PX / (camera.fu * depth_noise)",
+        "_DISPARITY_SIGMAS * _PIXEL_SIGMA_PX / camera.fu",
+        _ONE_CAMERA,
+    ),
+    Mutation(
+        "depth images: depths across outlines used",
+        "frontend/one_camera.py",
+        "has_depth & (np.ptp(d, axis=0) <= _MOST_SLOPE_PX)",
+        "has_depth & (np.ptp(d, axis=0) <= 1e9)",
+        _ONE_CAMERA,
+    ),
     # --- vio/geometry ---
     Mutation(
         "bags: right images in the place of left ones where the left came first",
@@ -265,6 +309,76 @@ MUTATIONS = (
         "cu, cv = (width - 1) / 2",
         "cu, cv = width / 2",
         _RECTIFY,
+    ),
+    Mutation(
+        "cylinder: taken for every lens",
+        "vio/geometry/rectify.py",
+        "low[1] < -PINHOLE_REACH and",
+        "low[1] < PINHOLE_REACH or",
+        _RECTIFY,
+    ),
+    Mutation(
+        "cylinder: corners that look backwards bound the columns",
+        "vio/geometry/rectify.py",
+        "plane[name][~kept, 0] = bound",
+        "plane[name][~kept, 1] = bound",
+        _RECTIFY,
+    ),
+    Mutation(
+        "cylinder: Jacobian of its rows without the azimuth",
+        "vio/geometry/stereo.py",
+        "camera.fv * c / depth",
+        "camera.fv / depth",
+        _STEREO,
+    ),
+    Mutation(
+        "cylinder: camera turned the wrong way to a feature",
+        "vio/geometry/stereo.py",
+        "c * p[..., 1] - s * p[..., 2], s * p[..., 1] + c * p[..., 2]",
+        "c * p[..., 1] + s * p[..., 2], -s * p[..., 1] + c * p[..., 2]",
+        (*_STEREO, "tests/test_wide.py"),
+    ),
+    Mutation(
+        "cylinder: Jacobian of the tracks turned the wrong way",
+        "vio/filters/track_loops.py",
+        "else c * T[n, 1, j] - s * T[n, 2, j]",
+        "else c * T[n, 1, j] + s * T[n, 2, j]",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "cylinder: coordinates of points not turned to them",
+        "vio/filters/track_loops.py",
+        "row1[i], row2[i] = c * T[k, 1, i] - s * T[k, 2, i],",
+        "row1[i], row2[i] = T[k, 1, i],",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "cylinder: consensus motion not turned back",
+        "frontend/outliers.py",
+        "for i in range(1, 5, 3):",
+        "for i in range(1, 1, 3):",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "cylinder: points by parallax without the cross product's sign",
+        "vio/filters/multiview.py",
+        "rho = -np.sum(parallax * np.cross(rays, m_i), axis=(1, 2))",
+        "rho = np.sum(parallax * np.cross(rays, m_i), axis=(1, 2))",
+        ("tests/test_wide.py",),
+    ),
+    Mutation(
+        "cylinder: columns do not follow a roll of the right camera",
+        "vio/filters/track_loops.py",
+        "out[0, 7] -= (1.0 + x * x) * s",
+        "out[0, 7] += (1.0 + x * x) * s",
+        ("tests/test_wide.py",),
+    ),
+    Mutation(
+        "cylinder: other programs get its pixels as a pinhole's",
+        "vio/saved_run.py",
+        "left, kept = pinhole_pixels(camera, pinhole, z[:, :2])",
+        "left, kept = z[:, :2], pinhole_pixels(camera, pinhole, z[:, :2])[1]",
+        ("tests/test_wide.py",),
     ),
     # --- vio/filters: the sliding window ---
     Mutation(
@@ -1589,5 +1703,61 @@ MUTATIONS = (
         "return RelativePose(se3_inverse(T_i) @ T_j, C)",
         "return RelativePose(se3_inverse(T_j) @ T_i, C)",
         _MAP_RUN,
+    ),
+    Mutation(
+        "loops: bundle adjustment without their matches",
+        "vio/mapping/points.py",
+        "loops = loop_rows(run.loops, run.frames[keyframes])",
+        "loops = loop_rows((), run.frames[keyframes])",
+        ("tests/test_colmap.py",),
+    ),
+    Mutation(
+        "loops: covariance of the pixel noise stated, not found",
+        "vio/mapping/loop_geometry.py",
+        "covariance = noise * _INFLATION**2",
+        "covariance = _INFLATION**2",
+        _PLACES,
+    ),
+    Mutation(
+        "map: moves with the jumps of the odometry",
+        "vio/mapping/builder.py",
+        "if motion is not None and self._last is None:",
+        "if motion is not None:",
+        _MAPS,
+    ),
+    Mutation(
+        "map: covariance stays in the dark",
+        "vio/mapping/session.py",
+        "if self._dark is not None:",
+        "if self._dark is None:",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "map: images alone know their motion in the dark",
+        "vio/mapping/session.py",
+        "return self._alone and self._seen_ns is not None and",
+        "return self._alone and self._seen_ns is None and",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "places: keyframes merged into the index count from its first one",
+        "vio/mapping/place_index.py",
+        "out_owners[t, cursor[w]] = first + k",
+        "out_owners[t, cursor[w]] = k",
+        _PLACES,
+    ),
+    Mutation(
+        "map: motions as certain as the tracks say",
+        "vio/mapping/session.py",
+        "_MOTION_INFLATION**2 * motion.covariance + np.diag(sigma**2)",
+        "_MOTION_INFLATION**2 * motion.covariance",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "map: roll and pitch of the first keyframe held",
+        "vio/mapping/pose_graph.py",
+        "if self.levelled is not None:",
+        "if self.levelled is not None and False:",
+        ("tests/test_pose_graph.py",),
     ),
 )

@@ -434,13 +434,6 @@ def sentences(f: Figures) -> Iterator[tuple[str, str]]:
         f"dead reckoning with OXTS velocities "
         f"({f.tell('drives/kitti_06_head/window/velocity', 'dead_reckoning_ate_m')} m)",
     )
-    dark = [f.value(f"gaps/{flight}/imu/blackout", "ate_m") for flight in FLIGHTS if flight.endswith("real")]
-    yield (
-        readme,
-        f"an error of {100 * min(dark):.0f} to {100 * max(dark):.0f} cm (ATE), and of "
-        f"{100 * f.value('gaps/v102_sim/none/blackout', 'ate_m'):.0f} cm without any IMU",
-    )
-    yield readme, f"are followed to {f.tell('drives/kitti_06_head/window/none', 'ate_m', 2)} m"
 
 
 def differences(figures: Figures, root: Path = ROOT) -> Iterator[str]:

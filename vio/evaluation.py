@@ -75,6 +75,11 @@ class KittiError:
     segments: int
     per_length: tuple[LengthError, ...]
 
+    @property
+    def lengths_m(self) -> tuple[float, ...]:
+        """The path lengths of which the record has segments."""
+        return tuple(row.length_m for row in self.per_length if row.segments)
+
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
@@ -113,7 +118,7 @@ class Evaluation:
     ate_deg: ErrorStatistics
     rpe: RelativeError | None  # over frames
     rpe_distance: RelativeError | None  # over metres, if requested
-    kitti: KittiError | None  # None: the record is shorter than every length
+    kitti: KittiError | None  # None: the record is shorter than every length that was asked for, or than 1 m
     T_ref_est: FloatArray  # (4, 4) alignment of `settle_rotation`; under sim3 the estimate is scaled first
     rows: IntArray  # (M,) matched rows of the estimate
     errors_m: FloatArray  # (M,) distance to the reference after the alignment of `align_poses`, the least squares
@@ -143,6 +148,7 @@ class Evaluation:
             "rpe_distance": _as_plain_dict(self.rpe_distance),
             "t_err_percent": None if self.kitti is None else self.kitti.t_err_percent,
             "r_err_deg_per_100m": None if self.kitti is None else self.kitti.r_err_deg_per_100m,
+            "drift_lengths_m": [] if self.kitti is None else list(self.kitti.lengths_m),
             "kitti_segments": 0 if self.kitti is None else self.kitti.segments,
             "kitti_per_length": [] if self.kitti is None else [_as_plain_dict(row) for row in self.kitti.per_length],
             "notes": list(self.notes),
@@ -154,7 +160,7 @@ def evaluate(
     reference: Trajectory,
     *,
     align: AlignMode = "se3",
-    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    lengths_m: Sequence[float] | None = None,
     max_time_difference_s: float = 0.01,
     T_cam0_imu: npt.ArrayLike | None = None,
     rpe_delta_frames: int = 1,
@@ -168,7 +174,9 @@ def evaluate(
         align: rigid, rigid with scale, the first matched poses made equal, or none (both must then describe the same
             body in the same world). All metrics are those of the aligned estimate, so `sim3` removes the scale error
             from the relative ones too.
-        lengths_m: path lengths of the KITTI metric.
+        lengths_m: path lengths of the KITTI metric; None: KITTI's 100 to 800 m, and where the reference's path is
+            too short for all of them, the first set with a segment of 10 to 80 m and 1 to 8 m. `KittiError.lengths_m`
+            names them: drift over short lengths contains more of the noise of single poses.
         max_time_difference_s: poses further apart in time are not compared.
         T_cam0_imu: extrinsic (4, 4), needed where the two trajectories describe different frames.
         rpe_delta_frames: distance of the pairs of `Evaluation.rpe`, in matched poses.
@@ -211,7 +219,7 @@ def evaluate(
         ate_deg=error_statistics(errors_deg),
         rpe=relative_error_frames(T_aligned, T_ref, rpe_delta_frames),
         rpe_distance=None if rpe_delta_m is None else relative_error_distance(T_aligned, T_ref, rpe_delta_m),
-        kitti=kitti_error(T_aligned, T_ref, lengths_m),
+        kitti=_drift(T_aligned, T_ref) if lengths_m is None else kitti_error(T_aligned, T_ref, lengths_m),
         T_ref_est=se3_from_parts(alignment.R, alignment.t),
         rows=rows,
         errors_m=errors_m,
@@ -431,6 +439,20 @@ def kitti_error(
         return None
     t_err, r_err = np.concatenate(all_trans).mean(), np.concatenate(all_rot).mean()
     return KittiError(float(t_err), float(r_err), segments, tuple(per_length))
+
+
+def lengths_text(lengths_m: Sequence[float]) -> str:
+    """Return path lengths in words: `10 to 50 m`."""
+    first, last = min(lengths_m), max(lengths_m)
+    return f"{first:g} m" if first == last else f"{first:g} to {last:g} m"
+
+
+def _drift(T_est: FloatArray, T_ref: FloatArray) -> KittiError | None:
+    """Compute the drift over KITTI's lengths, or where no segment fits over a tenth or a hundredth of them."""
+    for divisor in (1, 10, 100):
+        if error := kitti_error(T_est, T_ref, [length / divisor for length in KITTI_LENGTHS_M]):
+            return error
+    return None
 
 
 def error_statistics(errors: npt.ArrayLike) -> ErrorStatistics:

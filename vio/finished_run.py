@@ -13,9 +13,11 @@ import numpy as np
 
 from vio.config import Config, describe, load_config
 from vio.errors import ConfigError, DataError, EvaluationError
-from vio.evaluation import KITTI_LENGTHS_M, Evaluation, evaluate
+from vio.evaluation import Evaluation, evaluate
 from vio.geometry.lie import FloatArray
 from vio.input_files import read_input
+from vio.loop_files import read_keyframes, read_loops
+from vio.loops import LoopEvent, MapKeyframes
 from vio.records import Trajectory
 from vio.run_folder import read_metrics
 from vio.run_tables import ESTIMATE
@@ -44,6 +46,9 @@ class FinishedRun:
     dead_reckoning: Trajectory | None
     changed: Mapping[str, tuple[Any, Any]]  # settings that differ from the default: (value, default)
     T_cam0_body: FloatArray  # (4, 4)
+    mapped: Trajectory | None  # poses of all frames in the map; None: the run had no map
+    loops: tuple[LoopEvent, ...]  # places seen again
+    map_keyframes: MapKeyframes  # that share the frame of `mapped`
 
     @property
     def seconds(self) -> FloatArray:
@@ -72,7 +77,7 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         "cam0" if metrics.get("body") == "cam0" else "imu",
         frame_indices=np.array(estimates["index"]),
     )
-    reckoned = folder / "dead_reckoning.tum"
+    reckoned, in_map = folder / "dead_reckoning.tum", folder / "map_trajectory.tum"
     return FinishedRun(
         folder=folder,
         name=folder.resolve().name,
@@ -86,6 +91,9 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         dead_reckoning=read_trajectory(reckoned) if reckoned.is_file() else None,
         changed=_changed_settings(folder / "config.yaml"),
         T_cam0_body=T_cam0_body,
+        mapped=read_trajectory(in_map) if in_map.is_file() else None,
+        loops=read_loops(folder),
+        map_keyframes=read_keyframes(folder),
     )
 
 
@@ -156,7 +164,7 @@ def _evaluation(
     if truth.times_ns is None and truth.frame_indices is None:
         truth = replace(truth, frame_indices=np.arange(len(truth), dtype=np.int64))
     try:
-        return evaluate(trajectory, truth, T_cam0_imu=T_cam0_body, lengths_m=KITTI_LENGTHS_M)
+        return evaluate(trajectory, truth, T_cam0_imu=T_cam0_body)
     except EvaluationError as error:
         log.warning("%s: the reference was not used: %s", path, error)
         return None

@@ -50,3 +50,4 @@ class FrameResult:
     estimate: Estimate
     log: FrameLog
     loops: tuple[LoopEvent, ...] = ()  # places of the map seen again, whose results have come with this frame
+    is_keyframe: bool = False  # whether the frame becomes a keyframe of the map

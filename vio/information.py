@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray, so3_hat, transform_points
-from vio.geometry.stereo import StereoCamera, left_rays, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, triangulate, z_D_p_cam
 from vio.records import BoolArray, IntArray, MotionPrior, Observations
 
 _BATCH = 6  # candidates evaluated exactly at first; doubled until the best is certain
@@ -244,14 +244,15 @@ class MotionInformation:
         valid &= observations.has_right
         left_only = ~observations.has_right & was_used
         if left_only.any():
-            p_cam[left_only] = left_rays(camera, z[left_only, :2]) * predicted[left_only, 2:]
+            depth = depth_of(camera, predicted[left_only])[:, None]
+            p_cam[left_only] = left_rays(camera, z[left_only, :2]) * depth
             valid |= left_only
-        baselines = p_cam[:, 2] / camera.baseline_m
+        baselines = depth_of(camera, p_cam) / camera.baseline_m
         return p_cam, valid & ~observations.stale & (baselines > self._MIN_DEPTH) & (baselines < self._MAX_DEPTH)
 
     def _consistency_weight(self, z: FloatArray, predicted: FloatArray, motion: MotionPrior) -> FloatArray:
         """Weights (N,) from 0 to 1 by the innovation of the pixels under the predicted motion (S4)."""
-        ahead = predicted[:, 2] > self._MIN_DEPTH * self._camera.baseline_m
+        ahead = depth_of(self._camera, predicted) > self._MIN_DEPTH * self._camera.baseline_m
         safe = np.where(ahead[:, None], predicted, [0.0, 0.0, 1.0])
         off = z - project(self._camera, safe)
         r = np.stack([off[:, 0], (off[:, 1] + off[:, 3]) / np.sqrt(2), off[:, 2]], axis=1)
@@ -269,7 +270,7 @@ class MotionInformation:
         weight = row_weights(n, right)
         for k, step in enumerate(self._steps):
             p = transform_points(np.linalg.matrix_power(T_curr_prev, step), now)
-            ahead = p[:, 2] > self._MIN_DEPTH * self._camera.baseline_m
+            ahead = depth_of(self._camera, p) > self._MIN_DEPTH * self._camera.baseline_m
             safe = np.where(ahead[:, None], p, [0.0, 0.0, 1.0])
             if step:
                 z = project(self._camera, safe)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
-from vio.loops import LoopEvent
+from vio.loops import LoopEvent, MapKeyframes
 from vio.records import Estimate, IntArray
 from vio.tables import Records, Rows
 
@@ -25,6 +25,7 @@ class MappedRun:
     joined: bool  # whether `T_map_body` is in the map's frame; else in one of the run's own
     keyframes: int  # of this run
     loops: tuple[LoopEvent, ...]
+    in_map: MapKeyframes  # all keyframes that share the frame of `T_map_body`
 
 
 def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows) -> MappedRun:
@@ -32,7 +33,7 @@ def mapped_run(session: MapSession, estimates: Records[Estimate], causal: Rows) 
     T_odom_body, index = (np.array(estimates.column(name)) for name in ("T_world_imu", "index"))
     frames, T_map, T_odom = session.keyframes()
     T = corrected(T_odom_body, index, frames, T_map, T_odom)
-    return MappedRun(T, causal, session.is_joined, len(frames), tuple(session.loops))
+    return MappedRun(T, causal, session.is_joined, len(frames), session.settled_loops(), session.map_keyframes())
 
 
 def corrected(

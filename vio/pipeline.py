@@ -35,6 +35,7 @@ from vio.records import (
     Recording,
     StereoFrame,
     Trajectory,
+    need_stereo,
 )
 from vio.rig import Rig
 from vio.run_recorder import GrowingFolder, RunRecorder
@@ -74,8 +75,14 @@ class RunResult:
     mapped: MappedRun | None = None  # where a map was built or used
 
     def calibrated_rig(self) -> CalibratedRig | None:
-        """Return the calibration with what the run found it to be off by; None: features without an image size."""
-        return None if self.rig is None else calibrated_rig(self.rig, self.estimates[-1])
+        """Return the calibration with what the run found it to be off by; None: features without an image size.
+
+        On a cylinder left and right stay as given: its stereo field is not expressed as a rig.
+        """
+        if self.rig is None:
+            return None
+        last = self.estimates[-1]
+        return calibrated_rig(self.rig, replace(last, stereo_field=None) if self.recording.camera.is_cylinder else last)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -225,12 +232,20 @@ def _map_session(path: Path, recording: Recording, config: Config, *, localise: 
     """
     from vio.mapping.session import MapSession
 
+    need_stereo(recording, "a map")
     if not recording.has_images:
         raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
     if config.backend != "msckf":
         raise ConfigError(f"a map needs the back end msckf, not {config.backend}; leave --backend out")
-    source, imu = str(recording.path.absolute()), config.motion == "imu"
-    return MapSession(path, recording.camera, recording.T_cam0_body, source=source, imu=imu, localise=localise)
+    return MapSession(
+        path,
+        recording.camera,
+        recording.T_cam0_body,
+        source=str(recording.path.absolute()),
+        imu=config.motion == "imu",
+        localise=localise,
+        alone=config.motion == "none",
+    )
 
 
 def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None) -> NoReturn:
@@ -242,7 +257,7 @@ def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None)
     """
     if stopped is not None:
         raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
-    if odometry.frames_refused:
+    if odometry.frames_refused or odometry.frames_waiting:
         raise DataError(odometry.warnings[-1])
     raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
 

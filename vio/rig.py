@@ -10,7 +10,15 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_inverse
-from vio.geometry.rectify import Interpolation, MapArray, rectified_cameras, rectify
+from vio.geometry.rectify import (
+    PINHOLE_REACH,
+    Interpolation,
+    MapArray,
+    ProjectionMode,
+    field_of_view,
+    rectified_cameras,
+    rectify,
+)
 from vio.geometry.stereo import StereoCamera
 from vio.records import Image, ImuDensities
 
@@ -29,14 +37,30 @@ class Rectifier:
     interpolation: Interpolation
     time_offset_s: float = 0.0  # of the calibration; readers take it out of the IMU's stamps
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What rectifying keeps of a wide lens; nothing for a lens that a planar image can hold."""
+        if self.maps is None:
+            return ()
+        seen, kept = (np.degrees(field_of_view(camera)) for camera in (self.rig.cam0, self.camera))
+        if seen.max() <= 2 * np.degrees(PINHOLE_REACH):
+            return ()
+        form = "a cylinder about the baseline" if self.camera.is_cylinder else "a pinhole's image"
+        return (
+            f"the lens shows {seen[0]:.0f} x {seen[1]:.0f} deg; rectified to {form}, {kept[0]:.0f} x {kept[1]:.0f} deg "
+            f"are kept, at {self.camera.fu:.0f} px per radian in the middle (the lens: {self.rig.cam0.fu:.0f})",
+        )
+
     def __call__(self, left: Image, right: Image) -> tuple[Image, Image]:
         """Rectify one raw pair, each image (H, W) of its camera's size."""
         if self.maps is None:
             return left, right
-        return _remap(left, self.maps[0], self.interpolation), _remap(right, self.maps[1], self.interpolation)
+        return remap(left, self.maps[0], self.interpolation), remap(right, self.maps[1], self.interpolation)
 
 
-def rectifier_of(rig: StereoRig, interpolation: Interpolation = "linear") -> Rectifier:
+def rectifier_of(
+    rig: StereoRig, interpolation: Interpolation = "linear", projection: ProjectionMode = "auto"
+) -> Rectifier:
     """Prepare the rectification of two cameras; a pair that is rectified already passes images through unchanged.
 
     Raises:
@@ -44,11 +68,12 @@ def rectifier_of(rig: StereoRig, interpolation: Interpolation = "linear") -> Rec
     """
     if (pair := rectified_pair(rig)) is not None:
         return Rectifier(rig, pair, se3_inverse(rig.T_imu_cam0), None, interpolation)
-    done = rectify(rig)
+    done = rectify(rig, projection)
     return Rectifier(rig, done.camera, done.T_rect0_imu, (done.map0, done.map1), interpolation)
 
 
-def _remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpolation) -> Image:
+def remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpolation) -> Image:
+    """Return an image (H, W) looked up at the source pixels of a map."""
     import cv2
 
     codes = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos4": cv2.INTER_LANCZOS4}
@@ -178,7 +203,7 @@ class Rig:
             CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
         """
         pair = rectified_pair(self.stereo)
-        return rectified_cameras(self.stereo).camera if pair is None else self._exact(pair)
+        return rectified_cameras(self.stereo, "auto").camera if pair is None else self._exact(pair)
 
     @property
     def T_rect0_imu(self) -> FloatArray | None:
@@ -187,13 +212,15 @@ class Rig:
             return self.T_cam0_imu
         return rectified_cameras(self.stereo).T_rect0_imu
 
-    def rectifier(self, interpolation: Interpolation = "linear") -> Rectifier:
+    def rectifier(self, interpolation: Interpolation = "linear", projection: ProjectionMode = "auto") -> Rectifier:
         """Return the map of raw image pairs (H, W) to rectified ones; the identity for a rectified rig.
+
+        `projection` is that of the rectified images: a cylinder about the baseline for wide lenses by default.
 
         Raises:
             CalibrationError: as `camera`.
         """
-        made = rectifier_of(self.stereo, interpolation)
+        made = rectifier_of(self.stereo, interpolation, projection)
         if made.maps is not None:
             return replace(made, time_offset_s=self.time_offset_s)
         T = made.T_rect0_imu if self.T_cam0_imu is None else self.T_cam0_imu

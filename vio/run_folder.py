@@ -21,9 +21,10 @@ from vio.config import Config, to_yaml
 from vio.datasets.common import checked_transform
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import DataError, EvaluationError
-from vio.evaluation import KITTI_LENGTHS_M, Evaluation, error_statistics, evaluate, path_length_m
+from vio.evaluation import Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.input_files import read_input
+from vio.loop_files import write_keyframes, write_loops
 from vio.mapped_run import MappedRun
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.printable import json_text, printable
@@ -39,7 +40,6 @@ log = logging.getLogger(__name__)
 MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
 CALIBRATION = "camchain-imucam.yaml"  # the corrected calibration, where no other file is named for it
 REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
-LOOP_COLUMNS = ("frame", "time_ns", "keyframe", "keyframe_time_ns", "inliers", "gap_m", "joined")
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 FILES = (
     MARKER,
@@ -51,6 +51,8 @@ FILES = (
     "map_causal.tum",
     "map_covariance.npy",
     "loops.csv",
+    "loop_matches.npz",
+    "map_keyframes.csv",
     "estimates.npy",
     "reference.tum",
     "dead_reckoning.tum",
@@ -68,7 +70,7 @@ def write_run_folder(
     result: RunResult,
     reference: Trajectory | None,
     *,
-    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
 ) -> dict[str, Any]:
     """Write all results of a run atomically, and return the metrics.
@@ -77,7 +79,7 @@ def write_run_folder(
         folder: replaced if it is an earlier run's folder.
         result: the run.
         reference: ground truth; None without one.
-        lengths_m: path lengths of the KITTI metric.
+        lengths_m: path lengths of the drift, see `evaluate`.
         save_observations: also write `observations.npz`; the result must contain them.
 
     Raises:
@@ -93,7 +95,7 @@ def finish_run_folder(
     result: RunResult,
     reference: Trajectory | None,
     *,
-    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
 ) -> dict[str, Any]:
     """Write the results of a run into the folder in which it grew, and return the metrics.
@@ -171,7 +173,7 @@ def _write_files(
     folder: Path,
     result: RunResult,
     reference: Trajectory | None,
-    lengths_m: Sequence[float],
+    lengths_m: Sequence[float] | None,
     *,
     save_observations: bool,
 ) -> dict[str, Any]:
@@ -210,8 +212,8 @@ def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference:
         poses = Trajectory(np.array(causal["T_map_body"]), np.array(causal["time_ns"]), result.body)
         write_tum(target / "map_causal.tum", poses)
     np.save(target / "map_covariance.npy", causal["covariance"])
-    lines = [",".join(LOOP_COLUMNS), *(",".join(str(getattr(o, c)) for c in LOOP_COLUMNS) for o in mapped.loops)]
-    (target / "loops.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_loops(target, mapped.loops)
+    write_keyframes(target, mapped.in_map)
     evaluation, _ = score(replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body)
     return {
         "joined": mapped.joined,
@@ -226,7 +228,7 @@ def score(
     result: RunResult,
     reference: Trajectory | None,
     *,
-    lengths_m: Sequence[float] = KITTI_LENGTHS_M,
+    lengths_m: Sequence[float] | None = None,
     T_world_body: FloatArray | None = None,
 ) -> tuple[Evaluation | None, Evaluation | None]:
     """Evaluate a run's trajectory and its dead reckoning; None without a reference or dead reckoning.
@@ -282,6 +284,7 @@ def metrics_of(
         "landmarks": len(result.landmarks.ids),
         "ate_m": None if scores is None else scores["ate_m"],
         "rpe": None if scores is None else scores["rpe"],
+        "drift_lengths_m": [] if scores is None else scores["drift_lengths_m"],
         "t_err_percent": None if scores is None else scores["t_err_percent"],
         "r_err_deg_per_100m": None if scores is None else scores["r_err_deg_per_100m"],
         "evaluation": scores,
@@ -290,6 +293,7 @@ def metrics_of(
         "warnings": list(result.warnings),
         "stereo_field": stereo_field(result),
         "stereo_scale": stereo_scale(result),
+        "scale_sigma": scale_sigma(result),
         "camera_imu": camera_imu(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
         "camera": asdict(result.recording.camera),
@@ -306,7 +310,7 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
     if field is None:
         return None
     f = result.recording.camera.fu
-    found = result.calibrated_rig()
+    found = None if result.recording.camera.is_cylinder else result.calibrated_rig()
     rig = None
     if found is not None:
         sigmas = found.sigmas.tolist()
@@ -331,6 +335,12 @@ def stereo_scale(result: RunResult) -> dict[str, Any] | None:
     if scale is None:
         return None
     return {name.replace(" ", "_"): {"percent": p, "sigma_percent": s} for name, (p, s) in scale.percent().items()}
+
+
+def scale_sigma(result: RunResult) -> float | None:
+    """Return the median standard deviation of the scale over the frames, over it; None: not of one camera."""
+    known = [sigma for sigma in result.estimates.column("scale_sigma") if sigma is not None and sigma == sigma]
+    return float(np.median(known)) if known else None
 
 
 def camera_imu(result: RunResult) -> dict[str, Any] | None:
@@ -386,6 +396,8 @@ def calibration_text(result: RunResult) -> str:
     lines += found.lines() or ["nothing was found to be off: the calibration as given"]
     if found.left_px:
         lines.append(f"what this calibration cannot express of it: {found.left_px:.2f} px (rms over the images)")
+    if result.recording.camera.is_cylinder and result.estimates[-1].stereo_field is not None:
+        lines.append("left and right are as given, though found to be off; run with dataset.projection=pinhole")
     if not result.recording.has_images:
         lines.append("of the rectified images that the features come from")
     return "".join(f"# {printable(line)}\n" for line in lines) + kalibr_text(found.rig)

@@ -10,17 +10,23 @@ from typing import Any
 import numpy as np
 
 from vio.calibration.stereo_field import PixelField
-from vio.datasets import open_dataset
+from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.common import read_npz
 from vio.datasets.features import FeatureDataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
+from vio.filters.multiview import Views
+from vio.filters.stereo_calibration import FIELD_TERMS, METRIC_TERMS, TERMS, StereoField
+from vio.filters.tracks import measured
 from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
+from vio.geometry.rectify import pinhole_maps, pinhole_pixels, pinhole_within
 from vio.geometry.stereo import StereoCamera
+from vio.loop_files import read_loops
+from vio.loops import LoopEvent
 from vio.mapping.comparison import GroundTruth
 from vio.mapping.keyframes import TrackedPath
-from vio.records import IntArray, StereoFrame
+from vio.records import FeatureTracks, IntArray, StereoFrame, need_stereo
 from vio.rig import Rectifier
 from vio.run_folder import read_metrics
 from vio.trajectory_io import read_trajectory
@@ -50,7 +56,9 @@ def read_saved_run(folder: Path) -> SavedRun:
     """Read the folder of `vio run --save-observations`.
 
     Where the run estimated what its stereo calibration is off by, the tracks are those of a rectified pair without it;
-    `dataset` holds the pixels as the front end saw them.
+    where its images were rectified to a cylinder, those of a pinhole inside it, as other programs know no cylinder.
+    `dataset` holds the pixels as the front end saw them. Where the run had a map and closed loops between its own
+    frames, the poses are those in the map, and the tracks have the loops.
 
     Raises:
         DataError: no such folder, or the observations were not saved.
@@ -60,20 +68,58 @@ def read_saved_run(folder: Path) -> SavedRun:
     if not log.is_file():
         raise DataError(f"{folder} has no {OBSERVATIONS}; repeat its run with --save-observations")
     dataset = read_observation_log(log)
-    trajectory = read_trajectory(folder / "trajectory.tum")
+    need_stereo(replace(dataset.recording, path=folder), "checking, refining or exporting a run")
+    loops = tuple(o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None and o.matches is not None)
+    poses = "map_trajectory.tum" if loops else "trajectory.tum"
+    trajectory = read_trajectory(folder / poses)
     frames = trajectory.frame_indices
     if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
-        raise DataError(f"{folder}: trajectory.tum and {OBSERVATIONS} are not of the same complete run; repeat the run")
+        raise DataError(f"{folder}: {poses} and {OBSERVATIONS} are not of the same complete run; repeat the run")
     camera, tracks = dataset.recording.camera, dataset.tracks
-    field = _pixel_field(folder, camera, metrics)
-    if field is not None:
+    coefficients, field = _field_coefficients(folder, camera, metrics), None
+    if camera.is_cylinder:
+        camera, tracks = _in_pinhole(camera, tracks, coefficients)
+    elif coefficients is not None:
+        field = PixelField(camera, coefficients)
         tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
-    tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks)
+        loops = tuple(_without(field, o) for o in loops)
+    tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks, loops)
     return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics, field)
 
 
-def _pixel_field(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> PixelField | None:
-    """Return the field of pixels that a run's metrics state; None: the run estimated none.
+def _without(field: PixelField, loop: LoopEvent) -> LoopEvent:
+    """Return a loop with the pixels of a rectified pair without the field."""
+    m = loop.matches
+    if m is None:
+        return loop
+    z = field.without(m.z_keyframe, m.has_right_keyframe), field.without(m.z_frame, m.has_right_frame)
+    return replace(loop, matches=replace(m, z_keyframe=z[0], z_frame=z[1]))
+
+
+def _in_pinhole(
+    camera: StereoCamera, tracks: FeatureTracks, coefficients: FloatArray | None
+) -> tuple[StereoCamera, FeatureTracks]:
+    """Return the pinhole inside a cylinder, and those of the tracks' pixels that it shows.
+
+    They are without the stereo field of the coefficients (12,) of (R3) and (R2), where there is one.
+    """
+    z = tracks.z
+    if coefficients is not None:
+        states = np.concatenate([coefficients[:FIELD_TERMS], np.zeros(METRIC_TERMS)])
+        stereo = StereoField(camera, coefficients[FIELD_TERMS:], states, np.arange(TERMS))
+        z = stereo.corrected(Views(z, measured(tracks.has_right))).z
+        z[:, 3] = z[:, 1]
+    pinhole = pinhole_within(camera)
+    left, kept = pinhole_pixels(camera, pinhole, z[:, :2])
+    right, has_right = pinhole_pixels(camera, pinhole, z[:, 2:])
+    has_right &= tracks.has_right
+    offsets = np.concatenate([[0], np.cumsum(kept)])[tracks.offsets]
+    z = np.concatenate([left, right], axis=1)[kept]
+    return pinhole, FeatureTracks(offsets, tracks.ids[kept], z, has_right[kept], tracks.stale[kept])
+
+
+def _field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> FloatArray | None:
+    """Return the coefficients (12,) of (R3) and (R2) in a run's metrics; None: the run estimated none.
 
     Raises:
         DataError: the metrics are damaged.
@@ -87,7 +133,7 @@ def _pixel_field(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) ->
         raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
     if coefficients.shape != (12,) or not np.isfinite(coefficients).all():
         raise DataError(f"{folder}: stereo_field of its metrics holds no 12 finite numbers; repeat the run")
-    return PixelField(camera, coefficients)
+    return coefficients
 
 
 def _original_source(log: Path) -> str:
@@ -127,8 +173,9 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
     Raises:
         DataError: the recording is missing, has no images or another camera, or a frame cannot be read.
     """
+    seen = run.dataset.recording.camera  # by the front end
     try:
-        dataset = open_dataset(source or run.source)
+        dataset = open_dataset(source or run.source, DatasetSettings(projection=seen.projection))
     except DataError as error:
         raise DataError(
             f"the images of {run.tracked.where} are not available: {error}; name the recording with --source"
@@ -138,14 +185,14 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
         raise DataError(
             f"{source or run.source} contains no images; name the recording with --source or use --no-images"
         )
-    ours, theirs = run.tracked.camera, recording.camera
+    ours, theirs = seen if seen.is_cylinder else run.tracked.camera, recording.camera
     if not np.allclose(
         [ours.fu, ours.fv, ours.cu, ours.cv, ours.baseline_m],
         [theirs.fu, theirs.fv, theirs.cu, theirs.cv, theirs.baseline_m],
         rtol=1e-9,
     ):
         raise DataError(f"{recording.path} has another calibration than the run {run.tracked.where}; repeat the run")
-    correct = None if run.field is None else _image_correction(run.field)
+    correct = _image_correction(run)
     for row in rows.tolist():
         index = int(run.tracked.frames[row])
         found = [e for e in dataset.events(index, index + 1) if isinstance(e, StereoFrame)]
@@ -158,7 +205,13 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
             yield replace(found[0], left=left, right=right)
 
 
-def _image_correction(field: PixelField) -> Rectifier:
-    """Return the map of rectified image pairs to those without a field."""
-    rig = rig_from_rectified(field.camera, np.eye(4))
-    return Rectifier(rig, field.camera, np.eye(4), field.maps(), "linear")
+def _image_correction(run: SavedRun) -> Rectifier | None:
+    """Return the map of the front end's image pairs to those of the tracks; None: they are the same."""
+    seen, camera = run.dataset.recording.camera, run.tracked.camera
+    if seen.is_cylinder:
+        maps = (pinhole_maps(seen, camera),) * 2
+    elif run.field is not None:
+        maps = run.field.maps()
+    else:
+        return None
+    return Rectifier(rig_from_rectified(camera, np.eye(4)), camera, np.eye(4), maps, "linear")

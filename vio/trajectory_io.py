@@ -42,6 +42,8 @@ _COLUMNS: dict[TrajectoryFormat, str] = {
     "kitti": "12 columns, the first three rows of a 4x4 pose",
     "euroc": "at least 8 comma-separated columns 'timestamp [ns], px, py, pz, qw, qx, qy, qz'",
 }
+_EUROC_HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
+_HEAD_BYTES = 4096  # that hold the comments and the first row
 _DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
 
 
@@ -148,6 +150,38 @@ def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
         )
     rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12)
     atomic_write_text(path, "".join(f"{exact_text(row)}\n" for row in rows))
+
+
+def write_euroc(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write `timestamp [ns], p x y z, q w x y z` of the IMU, the columns of EuRoC's ground truth up to the velocity.
+
+    Raises:
+        DataError: the poses describe the camera or have no times, or the file cannot be written.
+    """
+    if trajectory.body != "imu" or trajectory.times_ns is None:
+        lacks = "describes the IMU; convert with Trajectory.in_imu" if trajectory.body != "imu" else "needs times"
+        raise DataError(f"cannot write {path}: EuRoC form {lacks} first")
+    T = trajectory.T_world_body
+    q_wxyz = np.roll(quat_xyzw_from_rotation(T[:, :3, :3]), 1, axis=1)
+    values = np.concatenate([T[:, :3, 3], q_wxyz], axis=1)
+    rows = (f"{t},{exact_text(row, ',')}\n" for t, row in zip(trajectory.times_ns.tolist(), values, strict=True))
+    atomic_write_text(path, "".join([_EUROC_HEADER, *rows]))
+
+
+def is_trajectory_file(path: Path) -> bool:
+    """Return whether a text file begins like a trajectory: comments, then a row of 8 or 12 numbers, or a wider csv."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        start = stream.read(_HEAD_BYTES)
+    lines = start.decode("utf-8", errors="replace").splitlines()
+    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    fields = first.split("," if "," in first else None)
+    try:
+        [float(field) for field in fields]
+    except ValueError:
+        return False
+    return len(fields) >= 8 if "," in first else len(fields) in (8, 12)
 
 
 def in_first_cam0(trajectory: Trajectory, T_cam0_imu: FloatArray) -> Trajectory:

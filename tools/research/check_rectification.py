@@ -28,7 +28,7 @@ from vio.datasets.rectified import make_rectifier
 from vio.errors import VioError
 from vio.geometry.distortion import StereoRig, project_point, rig_from_rectified, unproject_pixel
 from vio.geometry.lie import FloatArray
-from vio.geometry.rectify import Interpolation, Rectification, rectify, rectify_pixels
+from vio.geometry.rectify import Interpolation, ProjectionMode, Rectification, rectify, rectify_pixels
 from vio.records import BoolArray, Image, StereoFrame
 from vio.rig import Rectifier
 from vio.sim.effects import SensorEffects, apply_effects
@@ -95,9 +95,9 @@ def _flow(a: Image, b: Image, points: FloatArray, guess: FloatArray, *, levels: 
     return lucas_kanade(a, b, points, guess, window_px=_WINDOW_PX, levels=levels, iterations=40, epsilon_px=1e-3)
 
 
-def row_residuals(source: str, interpolation: Interpolation) -> list[RowResidual]:
+def row_residuals(source: str, interpolation: Interpolation, projection: ProjectionMode) -> list[RowResidual]:
     """Measure a recording, with SIFT points and with refined points."""
-    dataset = open_dataset(source, DatasetSettings(interpolation=interpolation))
+    dataset = open_dataset(source, DatasetSettings(interpolation=interpolation, projection=projection))
     camera = dataset.recording.camera
     matched: dict[str, list[FloatArray]] = {"SIFT": [], "refined": []}
     pairs = 0
@@ -342,6 +342,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("check", choices=("rows", "tracking", "resampling"))
     parser.add_argument("folders", nargs="*", help="recordings (rows)")
     parser.add_argument("--interpolation", choices=get_args(Interpolation), default=DatasetSettings().interpolation)
+    parser.add_argument("--projection", choices=get_args(ProjectionMode), default="pinhole", help="(rows)")
     parser.add_argument("--moments", type=int, default=12, help="rendered times (tracking, resampling; default 12)")
     parser.add_argument("--json", action="store_true", help="print JSON")
     args = parser.parse_intermixed_args(argv)
@@ -351,7 +352,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows: Sequence[RowResidual | TrackingError | ResamplingError]
     try:
         if args.check == "rows":
-            rows = [row for folder in args.folders for row in row_residuals(folder, args.interpolation)]
+            rows = [
+                row for folder in args.folders for row in row_residuals(folder, args.interpolation, args.projection)
+            ]
         elif args.check == "tracking":
             rows = tracking_errors(moments=args.moments)
         else:

@@ -26,7 +26,7 @@ from vio.config import Config, merge
 from vio.datasets import open_dataset
 from vio.datasets.span import frames_between
 from vio.errors import DataError, VioError
-from vio.evaluation import KITTI_LENGTHS_M, Evaluation, evaluate
+from vio.evaluation import Evaluation, evaluate
 from vio.printable import json_text
 from vio.protocols import Dataset
 from vio.records import Trajectory
@@ -204,8 +204,7 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
 
 
 def _evaluate(job: dict[str, Any], trajectory: Trajectory, reference: Trajectory, T_cam0_imu: Any) -> Evaluation:
-    lengths_m = KITTI_LENGTHS_M if job["lengths_m"] is None else job["lengths_m"]
-    return evaluate(trajectory, numbered(reference), T_cam0_imu=T_cam0_imu, lengths_m=lengths_m)
+    return evaluate(trajectory, numbered(reference), T_cam0_imu=T_cam0_imu, lengths_m=job["lengths_m"])
 
 
 def _peak_memory_mib() -> float | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from vio.calibration.findings import NotObservable
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, so3_hat
-from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, depth_of, project, triangulate, z_D_p_cam
 from vio.records import FeatureTracks, IntArray
 
 _MIN_LINKS = 8  # tracks needed between two frames
@@ -54,7 +54,7 @@ def stereo_twists(camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArra
     for width in _WIDTHS_PX:
         T = T_next_prev[group]
         q = np.einsum("nij,nj->ni", T[:, :3, :3], p) + T[:, :3, 3]
-        ahead = q[:, 2] > _MIN_DEPTH_M
+        ahead = depth_of(camera, q) > _MIN_DEPTH_M
         q = np.where(ahead[:, None], q, [0.0, 0.0, 1.0])
         r = tracks.z[later] - project(camera, q)
         weight = ahead / (1 + np.sum(r**2, axis=1) / width**2) ** 2

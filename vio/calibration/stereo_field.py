@@ -40,8 +40,6 @@ _TEXT = {
     "wx": ("right camera turned by {} deg about its horizontal axis", 180 / np.pi, ".3f"),
     "wy": ("right camera turned by {} deg about its vertical axis", 180 / np.pi, ".3f"),
     "wz": ("right camera turned by {} deg about its optical axis", 180 / np.pi, ".3f"),
-    "cu": ("its principal point off by {} px along u", None, ".2f"),
-    "cv": ("its principal point off by {} px along v", None, ".2f"),
     "fu": ("its focal length along u off by {} %", 100.0, ".3f"),
     "fv": ("its focal length along v off by {} %", 100.0, ".3f"),
     "p1": ("its tangential distortion p1 off by {} e-3", 1e3, ".2f"),
@@ -124,13 +122,20 @@ class CalibratedRig:
         return np.sqrt(np.diag(self.covariance))
 
     def lines(self) -> tuple[str, ...]:
-        """Return one line for each parameter that is off by more than three standard deviations."""
+        """Return one line for each parameter that is off by more than three standard deviations.
+
+        A turn about the vertical or horizontal axis and a principal point move the image's centre alike, and only their
+        sum is well determined: it is the turn that is named.
+        """
+        combine = np.eye(len(PARAMETERS))
+        for turn, centre, sign in (("wx", "cv", -1.0), ("wy", "cu", 1.0)):
+            combine[PARAMETERS.index(turn), PARAMETERS.index(centre)] = sign
+        values, covariance = combine @ self.parameters, combine @ self.covariance @ combine.T
         out = []
-        for name, value, sigma in zip(PARAMETERS, self.parameters, self.sigmas, strict=True):
-            if abs(value) > _NAMED_SIGMAS * sigma:
+        for name, value, variance in zip(PARAMETERS, values.tolist(), np.diag(covariance).tolist(), strict=True):
+            if name in _TEXT and value * value > _NAMED_SIGMAS**2 * variance:
                 text, scale, form = _TEXT[name]
-                unit = getattr(self.rig.cam1, "f" + name[1]) if scale is None else scale
-                out.append(text.format(f"{unit * value:+{form}} ± {unit * sigma:{form}}"))
+                out.append(text.format(f"{scale * value:+{form}} ± {scale * variance**0.5:{form}}"))
         return tuple(out)
 
 

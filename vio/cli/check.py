@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vio.colmap.reconstruction import Mapper
-    from vio.offline.check import MapperResult
+    from vio.offline.verdict import MapperResult
 
 MARKER = "check.json"
 KEYFRAMES = 40
+LEAST_SHARED = 15  # points that both images of a loop show, from which the model counts as joined there
 
 
 def add_parser(commands: Any) -> None:
@@ -21,7 +23,8 @@ def add_parser(commands: Any) -> None:
         help="check a run without ground truth",
         description="Reconstruct keyframes of a run (of `vio run --save-observations`) from their images alone with "
         "COLMAP's incremental and global mapper, with a known stereo rig, and compare: ATE after SE(3) alignment, "
-        "scale, and segments that disagree. Writes RUN/check with a report, a plot and both models. Takes minutes.",
+        "scale, and segments that disagree. Loops that the run closed in its map are matched as well. Writes RUN/check "
+        "with a report, a plot and both models. Takes minutes.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
     parser.add_argument(
@@ -51,6 +54,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.colmap import quiet
     from vio.errors import ConfigError
     from vio.offline.check import check_run
+    from vio.offline.verdict import overall_verdict
     from vio.printable import json_text
     from vio.saved_run import read_saved_run
 
@@ -62,16 +66,25 @@ def execute(args: argparse.Namespace) -> int:
     out = args.run / "check"
     with ProgressBar(f"check {args.run.name}") as bar, atomic_folder(out, replace=True, marker=MARKER) as folder:
         results = check_run(
-            run, folder, mappers, most=args.keyframes, source=args.source, threads=args.threads, progress=bar.update
+            run,
+            folder,
+            mappers,
+            most=args.keyframes,
+            source=args.source,
+            threads=args.threads,
+            progress=bar.update,
+            announce=lambda text: print(text, file=sys.stderr),
         )
         report = {
             "out": str(out),
             "of": str(args.run),
+            "verdict": overall_verdict(results),
             "keyframes": results[0].total,
             "mappers": {result.mapper: _facts(result) for result in results},
         }
         (folder / MARKER).write_text(json_text(report, indent=2) + "\n", encoding="utf-8")
-    rows = [(result.mapper, f"{key:<10} {value}") for result in results for key, value in _rows(result)]
+    rows = [("verdict", str(report["verdict"]))]
+    rows += [(result.mapper, f"{key:<10} {value}") for result in results for key, value in _rows(result)]
     return print_result(report, [*rows, ("plot", str(out / "check.png"))], as_json=args.json, name_width=12)
 
 
@@ -87,7 +100,11 @@ def _facts(result: MapperResult) -> dict[str, Any]:
         "registered": len(model.keyframes),
         "points": model.points,
         "mean_reprojection_error_px": model.mean_reprojection_error_px,
+        "loops": len(model.shared),
+        "loops_in_model": int((model.shared >= LEAST_SHARED).sum()),
+        "points_across_loops": model.shared.tolist(),
         **facts,
+        "piece": comparison.frames[comparison.piece].tolist(),
         "frames": comparison.frames.tolist(),
         "difference_m": comparison.difference_m.tolist(),
         "difference_deg": comparison.difference_deg.tolist(),
@@ -96,12 +113,17 @@ def _facts(result: MapperResult) -> dict[str, Any]:
 
 def _rows(result: MapperResult) -> list[tuple[str, str]]:
     if result.found is None:
-        return [("verdict", result.verdict)]
+        return [("result", result.verdict)]
     model, comparison = result.found
+    whole = int(comparison.piece.sum()) == len(comparison.piece)
+    in_one = "" if whole else f", {int(comparison.piece.sum())} of them in one piece, which is compared below"
     rows = [
-        ("keyframes", f"{len(model.keyframes)} of {result.total} connected, {model.points} points"),
+        ("keyframes", f"{len(model.keyframes)} of {result.total} connected{in_one}, {model.points} points"),
         ("ATE", f"{comparison.ate_m:.4f} m to the run after SE(3) alignment, {comparison.ate_deg:.3f} deg"),
     ]
+    if len(model.shared):
+        joined = int((model.shared >= LEAST_SHARED).sum())
+        rows.insert(1, ("loops", f"{joined} of {len(model.shared)} in the model, with {LEAST_SHARED} points or more"))
     if comparison.scale is not None and comparison.scale_sigma is not None:
         percent, sigma = 100 * (comparison.scale - 1), 100 * comparison.scale_sigma
         rows.append(
@@ -123,5 +145,5 @@ def _rows(result: MapperResult) -> list[tuple[str, str]]:
                 f"these keyframes; COLMAP's scale {100 * ((comparison.reference_scale or 1) - 1):+.3f} %",
             )
         )
-    rows.append(("verdict", result.verdict))
+    rows.append(("result", result.verdict))
     return rows

@@ -1,4 +1,4 @@
-"""`vio convert`: write a recording as an EuRoC, KITTI or plain folder."""
+"""`vio convert`: write a recording as a folder or bag of another form, or a trajectory as another file."""
 
 from __future__ import annotations
 
@@ -9,19 +9,24 @@ from typing import Any
 from vio.cli.arguments import add_config_arguments, bound, config_from
 
 MARKER = "conversion.json"
+_FORMS = ("euroc", "kitti", "plain", "rosbag2", "mcap")
+_TRAJECTORIES = ("tum", "kitti", "euroc")
 
 
 def add_parser(commands: Any) -> None:
     """Add the subcommand."""
     parser = commands.add_parser(
         "convert",
-        help="write a recording in another format",
+        help="write a recording or a trajectory in another format",
         description="Write any recording of images, such as a ROS bag or two videos, as an EuRoC, a KITTI or a plain "
-        "folder: frame by frame, rectified as a run sees them, with IMU, velocities and ground truth.",
+        "folder or as a ROS 2 bag: frame by frame, rectified as a run sees them, with IMU, velocities and ground "
+        "truth. Write a trajectory file (TUM, KITTI, EuRoC) in another of these forms; --to tum writes a recording's "
+        "ground truth.",
     )
-    parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
-    parser.add_argument("--to", choices=("euroc", "kitti", "plain"), required=True, help="form of the folder")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder to write (atomically)")
+    parser.add_argument("source", metavar="SOURCE", help="a recording (folder, file or kind:path), or a trajectory")
+    parser.add_argument("--to", choices=(*_FORMS, "tum"), required=True, help="form of the output")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder or file to write (atomically)")
+    parser.add_argument("--times", type=Path, metavar="FILE", help="times of a KITTI trajectory, one a line")
     parser.add_argument("--start", type=bound, default=0, metavar="N", help="first frame, or time such as 12s")
     parser.add_argument("--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time")
     add_config_arguments(parser)
@@ -31,8 +36,41 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
+    from vio.trajectory_io import is_trajectory_file
+
+    if args.to == "tum" or is_trajectory_file(Path(args.source)):
+        return _trajectory(args)
+    return _recording(args)
+
+
+def _trajectory(args: argparse.Namespace) -> int:
+    """Write a trajectory, or the ground truth of a recording."""
+    from vio.cli.output import print_result
+    from vio.datasets import open_dataset
+    from vio.errors import ConfigError
+    from vio.offline.convert_trajectory import convert_trajectory, write_reference
+    from vio.trajectory_io import is_trajectory_file
+
+    source, config = Path(args.source), config_from(args)
+    if args.start or args.stop is not None:
+        raise ConfigError("--start and --end choose frames of a recording to convert, not poses; leave them out")
+    if not is_trajectory_file(source):
+        written = write_reference(open_dataset(args.source, config.dataset), args.out)
+    elif args.to in _TRAJECTORIES:
+        calibration = config.dataset.calibration
+        written = convert_trajectory(source, args.out, args.to, times=args.times, calibration=calibration)
+    else:
+        raise ConfigError(f"{source} is a trajectory: choose --to {', '.join(_TRAJECTORIES)}, not {args.to}")
+    facts = {"out": str(args.out), "form": args.to, "poses": len(written), "body": written.body}
+    rows = [("file", str(args.out)), ("form", args.to), ("poses", f"{len(written)} of {written.body}")]
+    return print_result(facts, rows, as_json=args.json)
+
+
+def _recording(args: argparse.Namespace) -> int:
+    """Write a recording."""
     import json
     import logging
+    from dataclasses import replace
 
     from vio.atomic import atomic_folder
     from vio.cli.output import print_result
@@ -40,11 +78,13 @@ def execute(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
     from vio.datasets.span import frames_between
     from vio.offline.convert import convert
+    from vio.records import need_stereo
     from vio.text_files import write_text
 
     log = logging.getLogger(__name__)
-    dataset = open_dataset(args.source, config_from(args).dataset)
+    dataset = open_dataset(args.source, replace(config_from(args).dataset, projection="pinhole"))
     recording = dataset.recording
+    need_stereo(recording, "vio convert")
     for note in recording.notes:
         log.warning("%s", note)
     start, stop = frames_between(recording, args.start, args.stop)

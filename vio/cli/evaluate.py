@@ -10,10 +10,20 @@ from typing import TYPE_CHECKING, Any
 from vio.cli.arguments import lengths
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from vio.evaluation import Evaluation
     from vio.geometry.lie import FloatArray
     from vio.records import Trajectory
 
 log = logging.getLogger(__name__)
+
+_ALIGNMENTS = {
+    "se3": "rotation and position",
+    "sim3": "rotation, position and scale",
+    "first": "the first poses made equal",
+    "none": "none",
+}
 
 
 def add_parser(commands: Any) -> None:
@@ -39,7 +49,12 @@ def add_parser(commands: Any) -> None:
         help="alignment: se3 (default), sim3 (scale as well), first (at the first matched pose), none (same body and "
         "world frame only)",
     )
-    parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
+    parser.add_argument(
+        "--lengths",
+        type=lengths,
+        metavar="M,M",
+        help="path lengths of the drift (default 100,…,800; a tenth or a hundredth of these where the path is shorter)",
+    )
     parser.add_argument(
         "--max-time-difference",
         type=float,
@@ -55,7 +70,7 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
-    from vio.evaluation import KITTI_LENGTHS_M, evaluate
+    from vio.evaluation import evaluate
 
     estimate, T_cam0_imu = _read(args.estimate)
     reference, other = _read(args.reference)
@@ -72,14 +87,37 @@ def execute(args: argparse.Namespace) -> int:
         align=args.align,
         max_time_difference_s=args.max_time_difference,
         T_cam0_imu=other if T_cam0_imu is None else T_cam0_imu,
-        lengths_m=args.lengths or KITTI_LENGTHS_M,
+        lengths_m=args.lengths,
     )
     for note in result.notes:
         log.warning("%s", note)
-    scores = result.as_dict()
-    figures = ((key, value) for key, value in scores.items() if not isinstance(value, (list, dict)))
-    rows = ((k, "–" if v is None else v if isinstance(v, str) else f"{v:.6g}") for k, v in figures)
-    return print_result(scores, rows, as_json=args.json, name_width=24)
+    return print_result(result.as_dict(), _rows(result), as_json=args.json)
+
+
+def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
+    """Yield the figures as rows of a table, one quantity each."""
+    from vio.evaluation import lengths_text
+
+    share = f"{100 * result.coverage.estimate:.1f} % of the estimate"
+    if result.coverage.reference_span is not None:
+        share += f" and {100 * result.coverage.reference_span:.1f} % of the reference's span"
+    yield "compared", f"{result.matched} poses ({result.body}) by {result.association}: {share}"
+    yield "path", f"{result.matched_path_length_m:.3f} m, the reference's {result.reference_path_length_m:.3f} m"
+    yield "alignment", _ALIGNMENTS[result.align] + (f", scale {result.scale:.6f}" if result.align == "sim3" else "")
+    for name, errors, unit in (("ATE", result.ate_m, "m"), ("attitude", result.ate_deg, "deg")):
+        rest = f"mean {errors.mean:.4g}, median {errors.median:.4g}, largest {errors.max:.4g}"
+        yield name, f"{errors.rmse:.4g} {unit} (rms), {rest}"
+    if result.rpe is not None:
+        yield "RPE", f"{result.rpe.trans_rmse_m:.4g} m, {result.rpe.rot_rmse_deg:.4g} deg (rms) from frame to frame"
+    if result.kitti is None:
+        yield "drift", "the path is shorter than the lengths over which it is measured"
+        return
+    drift = f"{result.kitti.t_err_percent:.3f} %, {result.kitti.r_err_deg_per_100m:.4f} deg/100 m"
+    yield "drift", f"{drift} over {lengths_text(result.kitti.lengths_m)}"
+    for row in result.kitti.per_length:
+        if row.t_err_percent is not None:
+            figures = f"{row.t_err_percent:8.3f} % {row.r_err_deg_per_100m:9.4f} deg/100 m {row.segments:6d} segments"
+            yield f"  {row.length_m:g} m", figures
 
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:

@@ -13,14 +13,14 @@ def add_parser(commands: Any) -> None:
     """Add the subcommand."""
     parser = commands.add_parser(
         "export",
-        help="write a run for COLMAP and nerfstudio",
+        help="write a run for COLMAP and nerfstudio, or for RViz and Foxglove",
         description="Write the keyframes of a run (of `vio run --save-observations`) as a metric COLMAP model: "
         "sparse/0 with cameras, rig, poses, and points with tracks and colours; images/; nerfstudio's transforms.json "
-        "with points.ply.",
+        "with points.ply. Or write any run as a ROS 2 bag: /tf, poses with covariance, path, landmarks, ground truth.",
     )
-    parser.add_argument("form", choices=("colmap",), metavar="FORM", help="colmap (with transforms.json)")
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default RUN/colmap)")
+    parser.add_argument("form", choices=("colmap", "rosbag2", "mcap"), metavar="FORM", help="colmap, rosbag2 or mcap")
+    parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder, for colmap with observations.npz")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to write (default RUN/FORM)")
     parser.add_argument("--refined", action="store_true", help="use the poses of `vio refine`")
     parser.add_argument("--keyframes", type=int, metavar="N", help="largest number of keyframes (default: as needed)")
     parser.add_argument(
@@ -33,6 +33,30 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
+    return _colmap(args) if args.form == "colmap" else _bag(args)
+
+
+def _bag(args: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from vio.atomic import atomic_folder
+    from vio.cli.output import print_result
+    from vio.errors import ConfigError
+    from vio.offline.export_bag import export_bag
+    from vio.printable import json_text
+
+    if args.refined or args.keyframes is not None or args.source is not None or args.no_images:
+        raise ConfigError("--refined, --keyframes, --source and --no-images are for colmap; leave them out")
+    out = args.out or args.run / args.form
+    with atomic_folder(out, replace=True, marker=MARKER) as folder:
+        done = export_bag(args.run, folder, args.form)
+        facts = {"out": str(out), "of": str(args.run), **asdict(done)}
+        (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
+    rows = [("folder", str(out)), ("poses", f"{done.poses}, of the ground truth {done.reference_poses}")]
+    return print_result(facts, [*rows, ("points", f"{done.points}")], as_json=args.json)
+
+
+def _colmap(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from vio.atomic import atomic_folder
@@ -64,14 +88,14 @@ def execute(args: argparse.Namespace) -> int:
             "out": str(out),
             "of": str(args.run),
             "source": run.source,
-            "poses": "refined" if args.refined else "filter",
+            "poses": "refined" if args.refined else "map" if run.tracked.loops else "filter",
             **asdict(done),
         }
         (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
     rows = (
         ("folder", str(out)),
         ("keyframes", f"{done.keyframes} stereo pairs, {done.images} images written"),
-        ("points", f"{done.points}"),
+        ("points", f"{done.points}, {done.loop_points} of them across {done.loops} loops"),
         ("residual", f"{done.mean_reprojection_error_px:.3f} px mean reprojection error, as COLMAP computes it"),
     )
     return print_result(facts, rows, as_json=args.json)

@@ -19,8 +19,8 @@ def add_parser(commands: Any) -> None:
         "refine",
         help="bundle-adjust a run",
         description="Bundle-adjust the keyframes of a run (of `vio run --save-observations`) with the run's own "
-        "tracks and a fixed stereo rig, and write the refined trajectory and map to RUN/refined, which `vio eval` "
-        "and `vio export` read like a run.",
+        "tracks, the matches of its loops and a fixed stereo rig, and write the refined trajectory and map to "
+        "RUN/refined, which `vio eval` and `vio export` read like a run.",
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="a run's folder with observations.npz")
     parser.add_argument("--keyframes", type=int, metavar="N", help="largest number of keyframes (default: as needed)")
@@ -78,6 +78,7 @@ def _facts(run: SavedRun, done: Refinement) -> dict[str, Any]:
         **{key: run.metrics[key] for key in ("source", "kind", "body")},
         "frames": len(done.trajectory),
         "keyframes": len(done.keyframes),
+        "loops": done.loops,
         "frames_aligned_to_points": done.aligned,
         "points": len(done.adjustment.tracks.ids),
         "rows": len(done.adjustment.tracks.point),
@@ -118,6 +119,8 @@ def _rows(m: dict[str, Any]) -> list[tuple[str, str]]:
         ("residual", f"{m['rms_before_px']:.3f} px before, {m['rms_after_px']:.3f} px after"),
         ("moved", f"{1e3 * m['moved_rms_m']:.1f} mm rms after SE(3) alignment"),
     ]
+    if m["loops"]:
+        rows.insert(1, ("loops", f"{m['loops']}, whose matches are points; poses began in the map"))
     if m["ate_m"] is not None:
         rows.append(("ATE", f"{m['ate_before_m']:.4f} m before, {m['ate_m']:.4f} m after"))
     return [*rows, ("time", f"{m['seconds']:.1f} s"), ("results", m["out"])]

@@ -28,7 +28,12 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time such as 60s"
     )
-    parser.add_argument("--lengths", type=lengths, metavar="M,M", help="path lengths of the drift (default 100,…,800)")
+    parser.add_argument(
+        "--lengths",
+        type=lengths,
+        metavar="M,M",
+        help="path lengths of the drift (default 100,…,800; a tenth or a hundredth of these where the path is shorter)",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
     parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map: loops are closed in it")
@@ -69,6 +74,7 @@ _OF_A_NEW_RUN = (
     "backend",
     "frontend",
     "calibration",
+    "camera",
     "topics",
 )
 

@@ -6,6 +6,7 @@ import contextlib
 import logging
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from vio.config import Config, load_config
 from vio.datasets import open_dataset
 from vio.datasets.span import Seconds, frames_between
 from vio.errors import ConfigError, DataError, StoppedError, VioError
-from vio.evaluation import KITTI_LENGTHS_M
+from vio.evaluation import lengths_text
 from vio.frame_result import FrameResult
 from vio.pipeline import given_rig, resolve_motion, run
 from vio.protocols import Dataset, Viewer
@@ -105,7 +106,7 @@ def process(
 
     `save_calibration` names the file for the calibration that the run found; `Path()`, one in the run's folder.
     """
-    dataset = open_dataset(source, config.dataset)
+    dataset = _opened(source, config, mapped=map_file is not None)
     for note in dataset.recording.notes:
         log.warning("%s", note)
     folder = check_out(out if out is not None else free_folder(dataset.recording.path))
@@ -125,6 +126,11 @@ def process(
     return _process(dataset, config, folder, request, progress=progress, resume=False, view=view)
 
 
+def _opened(source: str, config: Config, *, mapped: bool) -> Dataset:
+    """Open a recording; maps know pinholes only."""
+    return open_dataset(source, replace(config.dataset, projection="pinhole") if mapped else config.dataset)
+
+
 def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
     """Go on with an unfinished run and return its metrics.
 
@@ -133,7 +139,7 @@ def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
     """
     request = read_request(folder)
     config = load_config(folder / "config.yaml")
-    dataset = open_dataset(request["source"], config.dataset)
+    dataset = _opened(request["source"], config, mapped=request["map"] is not None)
     saved = (folder / UNFINISHED / CHECKPOINT).is_file()
     if not saved:
         log.warning("%s: the run ended before its first checkpoint; it begins again", folder)
@@ -181,7 +187,7 @@ def _process(
                 folder,
                 result,
                 truth,
-                lengths_m=request["lengths_m"] or KITTI_LENGTHS_M,
+                lengths_m=request["lengths_m"],
                 save_observations=save_observations,
             )
             if calibration is not None and file is not None:
@@ -276,6 +282,11 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         ("time", f"{metrics['ms_per_frame']:.1f} ms a frame ({stages})"),
         ("back end", f"{metrics['backend']}, motion {metrics['motion']}"),
     ]
+    if metrics.get("scale_sigma") is not None:
+        sigma = f"{100 * metrics['scale_sigma']:.2g} %"
+        rows.append(("scale", f"one camera: from the IMU, standard deviation {sigma} (median of the frames)"))
+    elif metrics["camera"].get("kind") == "rgbd":
+        rows.append(("scale", "one camera: from the depth images"))
     if metrics["stereo_field"] is not None:
         field = metrics["stereo_field"]
         off, sigma = field["coefficients_px"][0], field["sigma_px"][0]
@@ -293,7 +304,10 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         beside = "" if against is None else f"   (dead reckoning {against['ate_m']:.3f} m)"
         rows.append(("ATE", f"{metrics['ate_m']:.3f} m after SE(3) alignment{beside}"))
     if metrics["t_err_percent"] is not None:
-        rows.append(("drift", f"{metrics['t_err_percent']:.2f} %, {metrics['r_err_deg_per_100m']:.3f} deg/100 m"))
+        over = lengths_text(metrics["drift_lengths_m"])
+        rows.append(
+            ("drift", f"{metrics['t_err_percent']:.2f} %, {metrics['r_err_deg_per_100m']:.3f} deg/100 m over {over}")
+        )
     if metrics.get("map") is not None:
         rows.append(("map", _map_row(metrics["map"])))
     if metrics["landmark_error"] is not None:

@@ -14,7 +14,10 @@ from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.points import PointTracks, keep_rows, reprojection
+from vio.records import BoolArray
 from vio.robust import robust_sigma
+
+_LEAST_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +29,7 @@ class Adjustment:
     rms_before_px: float  # over all inlier rows, per coordinate
     rms_after_px: float
     rows_dropped: int
-    sigma_px: float  # robust spread of a coordinate's residual after the first round
+    sigma_px: float  # robust spread of a coordinate's residual after the first round, of tracks
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +53,8 @@ def adjust(
     """Bundle-adjust keyframes and points, with fixed intrinsics and stereo extrinsics.
 
     Two rounds: all rows with a robust loss, then from the initial values again without the outliers of the first. The
-    pose of the first keyframe is fixed.
+    pose of the first keyframe is fixed. Rows of points that loops join have a standard deviation of their own in what
+    counts as an outlier: ORB's pixels are less exact than those of tracks.
 
     Args:
         camera: the rectified pair.
@@ -68,9 +72,9 @@ def adjust(
     first_T, first_points = _solve(camera, T_world_cam0, tracks, None, 1.0, threads)
     progress()
     residual, ahead = reprojection(camera, first_T, replace(tracks, p_world=first_points))
-    entries = np.concatenate([residual[:, :2].ravel(), residual[tracks.has_right, 2:].ravel()])
-    sigma_px = max(robust_sigma(entries), 1e-3)
-    good = ahead & (np.abs(residual).max(axis=1) < gate_sigma * sigma_px)
+    sigma_px = _sigma_px(residual, tracks.has_right, ~tracks.by_loop)
+    sigmas = np.where(tracks.by_loop, _sigma_px(residual, tracks.has_right, tracks.by_loop), sigma_px)
+    good = ahead & (np.abs(residual).max(axis=1) < gate_sigma * sigmas)
     start = keep_rows(tracks, good)
     if not len(start.ids):
         raise EstimationError("not observable because no track is consistent over the keyframes; check the run's poses")
@@ -86,6 +90,14 @@ def adjust(
         rows_dropped=len(tracks.point) - len(start.point),
         sigma_px=sigma_px,
     )
+
+
+def _sigma_px(residual: FloatArray, has_right: BoolArray, rows: BoolArray) -> float:
+    """Robust standard deviation of a coordinate's residual (R, 4) over a mask (R,) of rows."""
+    if not rows.any():
+        return _LEAST_SIGMA_PX
+    entries = np.concatenate([residual[rows, :2].ravel(), residual[rows & has_right, 2:].ravel()])
+    return max(robust_sigma(entries), _LEAST_SIGMA_PX)
 
 
 def _rms(residual: FloatArray) -> float:

@@ -18,6 +18,7 @@ from vio.records import IntArray
 Mapper: TypeAlias = Literal["incremental", "global"]
 _NEXT = (1, 2, 3, 5, 8, 16)  # index offsets of later keyframes that left images are matched with
 _CROSS_NEXT = (1,)  # likewise between right images and later left ones
+_AROUND_LOOP = (-1, 0, 1)  # index offsets from both keyframes of a loop, whose left images are matched with one another
 _LEAST_REGISTERED = 3
 
 
@@ -30,9 +31,12 @@ class Reconstructed:
     keyframes: IntArray  # (R,) their indices, increasing
     points: int
     mean_reprojection_error_px: float
+    shared: IntArray  # (L,) points that both left images of each loop show
 
 
-def match_images(database: Path, images: Path, names: ModelImages, camera: StereoCamera, *, threads: int = 1) -> None:
+def match_images(
+    database: Path, images: Path, names: ModelImages, camera: StereoCamera, loops: IntArray, *, threads: int = 1
+) -> None:
     """Find SIFT features in image files and match them within and between keyframes, into a new COLMAP database.
 
     Args:
@@ -40,6 +44,7 @@ def match_images(database: Path, images: Path, names: ModelImages, camera: Stere
         images: folder that the names are relative to; left images must be in one folder, right ones in another.
         names: the keyframes' images.
         camera: the rectified pair, intrinsics and baseline of the rig.
+        loops: (L, 2) keyframes that show one place, which are matched as well, and those next to them.
         threads: for all steps; one makes the result repeatable.
     """
     pycolmap.set_random_seed(SEED)
@@ -68,7 +73,7 @@ def match_images(database: Path, images: Path, names: ModelImages, camera: Stere
     with pycolmap.Database.open(database) as opened:
         pycolmap.apply_rig_config([rig], opened)
     pairs = database.with_name("pairs.txt")
-    pairs.write_text("".join(f"{a} {b}\n" for a, b in _pairs(names)), encoding="utf-8")
+    pairs.write_text("".join(f"{a} {b}\n" for a, b in pairs_to_match(names, loops)), encoding="utf-8")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
     verification.ransac.max_error = 2.0
@@ -82,16 +87,26 @@ def match_images(database: Path, images: Path, names: ModelImages, camera: Stere
     pairs.unlink()
 
 
-def _pairs(names: ModelImages) -> list[tuple[str, str]]:
+def pairs_to_match(names: ModelImages, loops: IntArray) -> list[tuple[str, str]]:
+    """Return the pairs of image files to match, each once."""
     count = len(names.left)
     out = list(zip(names.left, names.right, strict=True))
     out += [(names.left[k], names.left[k + step]) for step in _NEXT for k in range(count - step)]
     out += [(names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)]
-    return out
+    around = {(a + i, b + j) for a, b in loops.tolist() for i in _AROUND_LOOP for j in _AROUND_LOOP}
+    out += [(names.left[a], names.left[b]) for a, b in sorted(around) if 0 <= a < b < count]
+    return list(dict.fromkeys(out))
 
 
 def reconstruct(
-    database: Path, images: Path, names: ModelImages, mapper: Mapper, out: Path, *, threads: int = 1
+    database: Path,
+    images: Path,
+    names: ModelImages,
+    mapper: Mapper,
+    out: Path,
+    loops: IntArray,
+    *,
+    threads: int = 1,
 ) -> Reconstructed | None:
     """Reconstruct keyframes from a database of matches, with fixed rig and intrinsics; None: not successful.
 
@@ -101,6 +116,7 @@ def reconstruct(
         names: the keyframes' images.
         mapper: COLMAP's incremental or global mapper.
         out: folder for the model, created if missing.
+        loops: (L, 2) keyframes that show one place.
         threads: for all steps.
     """
     pycolmap.set_random_seed(SEED)
@@ -126,7 +142,15 @@ def reconstruct(
         np.array([k for k, _ in found], dtype=np.int64),
         int(model.num_points3D()),
         mean_reprojection_error_px(model),
+        np.array([_shared_points(model, names.left[a], names.left[b]) for a, b in loops.tolist()], dtype=np.int64),
     )
+
+
+def _shared_points(model: pycolmap.Reconstruction, one: str, other: str) -> int:
+    """Return how many points of a model two images show; zero where it has not both."""
+    images = [model.find_image_with_name(name) for name in (one, other)]
+    seen = [{p.point3D_id for p in image.points2D if p.has_point3D()} for image in images if image is not None]
+    return len(seen[0] & seen[1]) if len(seen) == 2 else 0
 
 
 def _incremental_options(threads: int) -> pycolmap.IncrementalPipelineOptions:

@@ -36,6 +36,7 @@ from vio.datasets.images import list_images
 from vio.datasets.pairing import PAIRED_NS, pair_stamps
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
 from vio.geometry.distortion import CameraModel, StereoRig, rig_from_rectified
 from vio.geometry.lie import FloatArray, se3_inverse
@@ -55,6 +56,7 @@ class _Camera:
     times_ns: IntArray  # (N,) strictly increasing
     files: tuple[Path, ...]  # N images
     renamed: int  # number of images whose extension differs from their list
+    unlisted: int  # number of images that the list does not name
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +86,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     imu = _read_imu(mav / "imu0")
     T_imu_body = se3_inverse(imu.T_body_imu)
     rig = StereoRig(left.model, right.model, T_imu_body @ left.T_body_cam, T_imu_body @ right.T_body_cam)
-    rectifier = make_rectifier(rig, settings.interpolation, mav)
+    rectifier = make_rectifier(rig, settings.interpolation, mav, settings.projection)
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
     if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
@@ -96,6 +98,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
     pairs = tuple((left.files[a], right.files[b]) for a, b in zip(of_left.tolist(), of_right.tolist(), strict=True))
     white, depth_notes = full_scale(pairs)
+    truth = _reference_file(mav)
     recording = Recording(
         kind="euroc",
         path=path,
@@ -104,8 +107,8 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         frame_times_ns=times_ns,
         has_images=True,
         motion=motion,
-        reference=_read_reference(mav, imu.T_body_imu, rig.T_imu_cam0),
-        notes=(*notes, *imu.notes, *depth_notes),
+        reference=None if truth is None else _read_reference(truth, imu.T_body_imu, rig.T_imu_cam0),
+        notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *_unused(path, mav, truth)),
     )
     return RectifiedDataset(
         recording=recording,
@@ -136,19 +139,21 @@ def _read_camera(folder: Path) -> _Camera:
     model, T_body_cam = read_camera_yaml(folder / "sensor.yaml")
     path = folder / "data.csv"
     times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
-    files, renamed = _find_images(folder / "data", [row[0] for row in rows], path, lines)
-    return _Camera(model, T_body_cam, times_ns, files, renamed)
+    there = list_images(folder / "data")
+    files, renamed = _find_images(there, [row[0] for row in rows], path, lines)
+    return _Camera(model, T_body_cam, times_ns, files, renamed, len(set(there) - set(files)))
 
 
-def _find_images(folder: Path, names: Sequence[str], path: Path, lines: Sequence[int]) -> tuple[tuple[Path, ...], int]:
+def _find_images(
+    there: Sequence[Path], names: Sequence[str], path: Path, lines: Sequence[int]
+) -> tuple[tuple[Path, ...], int]:
     """Return the listed images, and how many have another extension than listed."""
-    there = list_images(folder)
     by_name, by_stem = {file.name: file for file in there}, {file.stem: file for file in there}
     found = [by_name.get(name) or by_stem.get(Path(name).stem) for name in names]
     missing = [k for k, file in enumerate(found) if file is None]
     if missing:
         raise DataError(
-            f"{path}, line {lines[missing[0]]}: {folder / names[missing[0]]} is missing ({len(missing)} of "
+            f"{path}, line {lines[missing[0]]}: {there[0].parent / names[missing[0]]} is missing ({len(missing)} of "
             f"{len(names)} listed images are); copy it again, or remove such lines"
         )
     files = tuple(file for file in found if file is not None)
@@ -171,6 +176,11 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
     notes: list[str] = []
     if renamed := left.renamed + right.renamed:
         notes.append(f"{renamed} images have another extension than listed in their data.csv; matched by their stem")
+    if left.unlisted or right.unlisted:
+        notes.append(
+            f"{left.unlisted} images of cam0 and {right.unlisted} of cam1 are not listed in their data.csv and are "
+            "skipped"
+        )
     unpaired = len(left.times_ns) - len(a), len(right.times_ns) - len(b)
     if any(unpaired):
         notes.append(f"{unpaired[0]} images of cam0 and {unpaired[1]} of cam1 have no partner and are skipped")
@@ -198,17 +208,26 @@ def _read_imu(folder: Path) -> _Imu:
     return _Imu(T_body_imu, noise, imu_samples(read_imu_csv(folder / "data.csv")), notes)
 
 
-def _read_reference(mav: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory | None:
+def _reference_file(mav: Path) -> Path | None:
+    """Return the file of the ground truth; None: there is none."""
+    candidates = (mav / STATE_CSV, mav.absolute().parent / TUM_FILE)
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _read_reference(file: Path, T_body_imu: FloatArray, T_imu_cam0: FloatArray) -> Trajectory:
     """Read the ground truth of the IMU. EuRoC's describes the body; a TUM file may describe the (raw) cam0."""
-    if (path := mav / STATE_CSV).is_file():
-        truth = read_trajectory(path, fmt="euroc", body="imu")
-    elif (path := mav.absolute().parent / TUM_FILE).is_file():
-        truth = read_trajectory(path, fmt="tum")
-    else:
-        return None
+    euroc = file.name == STATE_CSV.name
+    truth = read_trajectory(file, fmt="euroc", body="imu") if euroc else read_trajectory(file, fmt="tum")
     if truth.body == "cam0":
         return truth.in_imu(se3_inverse(T_imu_cam0))
     return replace(truth, T_world_body=truth.T_world_body @ T_body_imu)
+
+
+def _unused(path: Path, mav: Path, truth: Path | None) -> list[str]:
+    """Name what lies in the folder and was not read."""
+    sensors = [mav / name / file for name in ("cam0", "cam1", "imu0") for file in ("sensor.yaml", "data.csv")]
+    layout = Layout(path, mav, mav / "cam0" / "data", mav / "cam1" / "data")
+    return unused_note(layout, sensors if truth is None else [*sensors, truth])
 
 
 # --- writing --------------------------------------------------------------------------------------------------------
@@ -236,15 +255,17 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progre
     for folder in folders:
         (folder / "data").mkdir(parents=True)
 
+    last_ns = int(dataset.recording.frame_times_ns[-1])
+
     def name(frame: StereoFrame, count: int) -> tuple[Path, Path]:
-        file = image_name(frame.time_ns, int(dataset.recording.frame_times_ns[-1]))
+        file = image_name(frame.time_ns, last_ns)
         return folders[0] / "data" / file, folders[1] / "data" / file
 
     times_ns = write_frames(dataset, name, progress)
     for folder, model, T_imu_cam in zip(folders, (rig.cam0, rig.cam1), (rig.T_imu_cam0, rig.T_imu_cam1), strict=True):
         comment, rate_hz = f"rectified {folder.name}", median_rate_hz(times_ns)
         write_text(folder / "sensor.yaml", camera_yaml(model, T_body_imu @ T_imu_cam, comment=comment, rate_hz=rate_hz))
-        write_text(folder / "data.csv", image_list_csv(times_ns))
+        write_text(folder / "data.csv", image_list_csv(times_ns, last_ns))
     for part in (Path("imu0", "sensor.yaml"), Path("imu0", "data.csv"), STATE_CSV):
         _copy(source / part, mav / part)
     _copy(source.absolute().parent / TUM_FILE, out / TUM_FILE)

@@ -155,9 +155,9 @@ def image_name(time_ns: int, last_ns: int) -> str:
     return f"{time_ns:0{len(str(last_ns))}d}.png"
 
 
-def image_list_csv(times_ns: IntArray) -> str:
-    """The text of a camera's `data.csv` for images named by their times (N,), nanoseconds."""
-    last_ns = int(times_ns[-1])
+def image_list_csv(times_ns: IntArray, last_ns: int | None = None) -> str:
+    """The text of a camera's `data.csv` for images named by their times (N,) and the last one, nanoseconds."""
+    last_ns = int(times_ns[-1]) if last_ns is None else last_ns
     return "\n".join([_IMAGES_HEADER, *(f"{t},{image_name(t, last_ns)}" for t in times_ns.tolist())]) + "\n"
 
 

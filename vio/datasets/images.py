@@ -13,7 +13,6 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,6 +22,7 @@ import numpy.typing as npt
 from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
 from vio.datasets.png import decode_gray8
 from vio.errors import DataError
+from vio.geometry.lie import FloatArray
 from vio.input_files import check_regular, read_input
 from vio.records import Image
 
@@ -37,6 +37,12 @@ _WHITE_SHARE = 0.999  # of the pixels are no brighter than the level that tells 
 _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})  # start-of-frame markers, with the image size
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
 
+
+class _End:
+    """What follows the last item of `prefetch`."""
+
+
+_END = _End()
 Item = TypeVar("Item")
 Loaded = TypeVar("Loaded")
 
@@ -121,6 +127,20 @@ def _decoded(data: bytes, path: Path | str) -> npt.NDArray[Any]:
         code = {1: None, 3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}[pixels.shape[2]]
         pixels = pixels[..., 0] if code is None else cv2.cvtColor(pixels, code)
     return np.asarray(pixels)
+
+
+def load_depth(path: Path) -> FloatArray:
+    """Read a depth image (H, W) of 16 bits as the levels that it holds, 0 where the depth is not known.
+
+    Raises:
+        UnreadableImageError: the file cannot be read, or is no gray image of 16 bits.
+    """
+    pixels = _load(path)
+    if pixels.dtype != np.uint16:
+        raise UnreadableImageError(
+            f"{path}: has 8 bits a pixel, too few for depths; give depth images of 16 bits (PNG or TIFF)"
+        )
+    return pixels.astype(np.float64)
 
 
 def write_png(path: Path, image: Image) -> None:
@@ -228,21 +248,29 @@ def natural_key(path: Path) -> tuple[tuple[tuple[int, str], ...], str]:
 
 
 def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) -> Generator[Loaded]:
-    """Yield `load(item)` in order, loading up to `depth` items ahead in one thread; 0 loads in the caller's.
+    """Yield `load(item)` in order, taking and loading up to `depth` items ahead in one thread; 0: in the caller's.
 
-    An exception of `load` is raised at its item. Closing the generator drops pending items and ends the thread.
+    An exception of `load` or of the items is raised at its item. Closing the generator drops pending items, ends the
+    thread, and closes the items where they are a generator.
     """
     if depth <= 0:
         yield from map(load, items)
         return
     source = iter(items)
-    waiting: deque[Future[Loaded]] = deque()
+
+    def step() -> Loaded | _End:
+        """Take and load one item; all of this is the thread's work, as the items may be read from a file, too."""
+        item = next(source, _END)
+        return item if isinstance(item, _End) else load(item)
+
+    waiting: deque[Future[Loaded | _End]] = deque()
     pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="vio-prefetch")
     try:
-        waiting.extend(pool.submit(load, item) for item in islice(source, depth))
-        while waiting:
-            result = waiting.popleft().result()
-            waiting.extend(pool.submit(load, item) for item in islice(source, 1))
+        waiting.extend(pool.submit(step) for _ in range(depth))
+        while not isinstance(result := waiting.popleft().result(), _End):
+            waiting.append(pool.submit(step))
             yield result
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+        if isinstance(source, Generator):
+            source.close()

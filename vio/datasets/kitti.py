@@ -19,6 +19,7 @@ import numpy as np
 from vio.datasets.common import check_intrinsics, checked_transform, clock_ns, naming, numbers_in, velocity_samples
 from vio.datasets.image_pairs import ImageDataset, ImageSize, first_readable, full_scale, pair_images
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
@@ -68,6 +69,10 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
             f"the camera of image_{cameras[1]} is {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of "
             f"image_{cameras[0]}; the pair is treated as rectified anyway"
         )
+    layout = Layout(path, path, *(path / f"image_{k}" for k in cameras))
+    poses = _poses_file(path)
+    used = [path / name for name in ("calib.txt", "times.txt", "velocity.csv", "T_cam0_imu.txt")]
+    notes += unused_note(layout, used if poses is None else [*used, poses])
     recording = Recording(
         kind="kitti",
         path=path,
@@ -76,7 +81,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
         frame_times_ns=times_ns,
         has_images=True,
         motion=frozenset({"velocity"}) if motion else frozenset(),
-        reference=_read_reference(path, times_ns, calibration.T_left_cam0),
+        reference=None if poses is None else _read_reference(poses, times_ns, calibration.T_left_cam0),
         notes=tuple(notes),
     )
     return ImageDataset(recording, pairs, motion, (size, size), settings, white=white)
@@ -184,13 +189,15 @@ def read_extrinsics(path: Path) -> FloatArray | None:
     return checked_transform(read_numbers(path, columns).reshape(-1, 4), str(path))
 
 
-def _read_reference(path: Path, times_ns: IntArray, T_left_cam0: FloatArray) -> Trajectory | None:
-    """Read the ground truth of camera 0 and move it, and the world, to the left camera; identity stays identity."""
+def _poses_file(path: Path) -> Path | None:
+    """Return the ground truth of a folder, or of a sequence of KITTI's own; None: there is none."""
     absolute = path.absolute()
     candidates = [path / "poses.txt", absolute.parent.parent / "poses" / f"{absolute.name}.txt"]
-    file = next((candidate for candidate in candidates if candidate.is_file()), None)
-    if file is None:
-        return None
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _read_reference(file: Path, times_ns: IntArray, T_left_cam0: FloatArray) -> Trajectory:
+    """Read the ground truth of camera 0 and move it, and the world, to the left camera; identity stays identity."""
     poses = read_trajectory(file, fmt="kitti").T_world_body
     if len(poses) > len(times_ns):
         raise DataError(f"{file} holds {len(poses)} poses for {len(times_ns)} images; give one line for each image")

@@ -25,6 +25,7 @@ from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pai
 from vio.datasets.kitti import write_calibration, write_times
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
 from vio.datasets.settings import DatasetSettings
+from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
@@ -85,6 +86,10 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     times_ns, time_notes = _read_times(path / "image_00" / "timestamps.txt", numbers)
     rectifier = _rectifier(calibration, T_cam0_imu, pairs, settings, calibration_path)
     white, depth_notes = full_scale(pairs)
+    layout = Layout(path, path, path / "image_00" / "data", path / "image_01" / "data")
+    twin = path / "image_01" / "timestamps.txt"  # both cameras have one trigger: those of the left one serve
+    used = [calibration_path, path / "image_00" / "timestamps.txt", twin, _find(path, VELO), _find(path, IMU)]
+    unused = unused_note(layout, [file for file in used if file is not None])
     recording = Recording(
         kind="kitti_raw",
         path=path,
@@ -94,7 +99,7 @@ def read_kitti_raw(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         has_images=True,
         motion=frozenset(),
         reference=None,
-        notes=(*time_notes, *imu_notes, *depth_notes),
+        notes=(*time_notes, *imu_notes, *depth_notes, *rectifier.notes, *unused),
     )
     sizes = rig_sizes(rectifier.rig, (calibration_path, calibration_path))
     return RectifiedDataset(recording, pairs, (), sizes, settings, rectifier, white=white)
@@ -129,7 +134,7 @@ def _rectifier(
             f"{pairs[0][0].parent}: images are {size[0]} x {size[1]} pixels but {where} is for {raw[0]} x {raw[1]} "
             f"(raw) or {rectified[0]} x {rectified[1]} (rectified); give the calibration of these images"
         )
-    return make_rectifier(rig, settings.interpolation, where)
+    return make_rectifier(rig, settings.interpolation, where, settings.projection)
 
 
 # --- calibration ----------------------------------------------------------------------------------------------------

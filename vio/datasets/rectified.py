@@ -13,25 +13,28 @@ from vio.datasets.image_pairs import ImageDataset, ImageSize
 from vio.datasets.images import write_png
 from vio.errors import DataError
 from vio.geometry.distortion import StereoRig
-from vio.geometry.rectify import Interpolation
+from vio.geometry.rectify import Interpolation, ProjectionMode
 from vio.protocols import Progress
 from vio.records import Image, ImuDensities, IntArray, StereoFrame
 from vio.rig import Rectifier, rectifier_of
 
 
-def make_rectifier(rig: StereoRig, interpolation: Interpolation, where: Path) -> Rectifier:
+def make_rectifier(
+    rig: StereoRig, interpolation: Interpolation, where: Path, projection: ProjectionMode = "pinhole"
+) -> Rectifier:
     """Prepare the rectification of a rig; a rig that is rectified already passes images through unchanged.
 
     Args:
         rig: both cameras as calibrated.
         interpolation: how gray values between pixels are found.
         where: the calibration file, for messages.
+        projection: of the rectified images.
 
     Raises:
         CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
     """
     with naming(where):
-        return rectifier_of(rig, interpolation)
+        return rectifier_of(rig, interpolation, projection)
 
 
 def rig_sizes(rig: StereoRig, calibrated_in: tuple[Path, Path]) -> tuple[ImageSize, ImageSize]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, TypeAlias
 
-from vio.geometry.rectify import Interpolation
+from vio.geometry.rectify import Interpolation, ProjectionMode
 from vio.setting import Section, setting
 
 ExtrinsicsMode: TypeAlias = Literal["auto", "literal", "corrected"]
@@ -38,6 +38,18 @@ class DatasetSettings(Section):
         None,
         "plain folders, bags and videos: the calibration file, in the place of the recording's own",
     )
+    camera: Literal["both", "left"] = setting(
+        "both", "stereo recordings: use both cameras, or the left one alone, which needs an IMU for the scale"
+    )
+    depth_factor: float | None = setting(
+        None, "depth images: levels per metre; null: the calibration's, or 5000 for TUM RGB-D", above=0
+    )
+    depth_noise: float = setting(
+        1.5e-3,
+        "depth images: k of a depth's standard deviation k depth^2; structured light has 0.0012 to 0.0019",
+        unit="1/m",
+        above=0,
+    )
     topics: str | None = setting(
         None, "bags: topics by name, such as left=/a,right=/b,imu=/c, in the place of those found by type"
     )
@@ -45,6 +57,11 @@ class DatasetSettings(Section):
         "linear",
         "unrectified images: how gray values between pixels are interpolated in rectifying (cubic and lanczos4 cost 5 "
         "and 15 times as much for barely better tracks)",
+    )
+    projection: ProjectionMode = setting(
+        "auto",
+        "unrectified images: rectify to the image of a pinhole, or to a cylinder about the baseline, which keeps what "
+        "a wide lens sees above and below; auto: a cylinder where a pinhole would crop there, beyond 54 degrees",
     )
     max_bad_frames: int | None = setting(
         None,

@@ -52,11 +52,12 @@ def tracks_from_dense(features: FloatArray, path: Path) -> FeatureTracks:
     offsets = np.searchsorted(frames, np.arange(features.shape[2] + 1)).astype(np.int64)
     z = np.ascontiguousarray(features[:, ids, frames].T)
     tracks = FeatureTracks(offsets, ids.astype(np.int64), z, ~right[ids, frames], np.zeros(len(ids), dtype=np.bool_))
-    _refuse_swapped(tracks, path)
+    refuse_swapped(tracks, path)
     return tracks
 
 
-def _refuse_swapped(tracks: FeatureTracks, path: Path) -> None:
+def refuse_swapped(tracks: FeatureTracks, path: Path) -> None:
+    """Raise DataError where most disparities `ul - ur` of a file are negative."""
     z = tracks.z[tracks.has_right]
     negative = int(np.sum(z[:, 0] < z[:, 2]))
     if 2 * negative > len(z):

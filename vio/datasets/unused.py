@@ -10,6 +10,7 @@ from pathlib import Path
 from vio.datasets.images import SUFFIXES
 
 _SILENT = ("readme*", "license*", "*.md", "simulation.json", "rectification.json", "conversion.json")  # no data
+_PHOTOMETRIC = ("pcalib*.txt", "vignette*.png")  # of DSO and TUM-VI
 _NAMED = 12  # unused files listed by name
 
 
@@ -24,7 +25,11 @@ class Layout:
 
 
 def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
-    """Return one note that names what lies in the folder and was not read."""
+    """Return a note that names what lies in the folder and was not read, and one for photometric files.
+
+    Files in `used` need not exist.
+    """
+    used = [file for file in used if file.exists()]
     kept = {layout.left.absolute(), layout.right.absolute(), *(file.absolute() for file in used)}
     kept |= {parent for path in kept for parent in path.parents}
     for path in used:  # the other files of a calibration that lies in several
@@ -41,10 +46,18 @@ def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
             silent = child.name.startswith(".") or any(fnmatch.fnmatch(child.name.lower(), s) for s in _SILENT)
             if not image and not silent and child.absolute() not in kept:
                 found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
-    if not found:
-        return []
-    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
-    return [f"not used: {', '.join(found[:_NAMED])}{more}"]
+    photometric = [name for name in found if any(fnmatch.fnmatch(Path(name).name, p) for p in _PHOTOMETRIC)]
+    others = [name for name in found if name not in photometric]
+    notes = []
+    if photometric:
+        why = "photometric calibration is not applied, as the tracks gain nothing by it"
+        notes.append(f"{why}: {_listed(photometric)}")
+    return [*notes, f"not used: {_listed(others)}"] if others else notes
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
 
 
 def _belongs(other: Path, calibration: Path) -> bool:

@@ -87,7 +87,7 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
         notes.append(f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the shorter counts")
     motion, motion_files, motion_notes = read_motion(layout, rig, times_ns, times_file is not None)
     with naming(calibration):
-        rectifier = rig.rectifier(settings.interpolation)
+        rectifier = rig.rectifier(settings.interpolation, settings.projection)
     reference, reference_file = read_reference(layout, rig, rectifier, times_ns)
     sources = [f for f in (*files, calibration, times_file, *used, *motion_files, reference_file) if f is not None]
     recording = Recording(
@@ -99,7 +99,7 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
         has_images=True,
         motion=sources_of(motion_files),
         reference=reference,
-        notes=(*rig.notes, *notes, *motion_notes, *unused_note(layout, sources)),
+        notes=(*rig.notes, *rectifier.notes, *notes, *motion_notes, *unused_note(layout, sources)),
     )
     sizes = tuple(ImageSize(camera.width, camera.height, calibration) for camera in (rig.cam0, rig.cam1))
     return VideoDataset(recording, files, motion, (sizes[0], sizes[1]), settings, rectifier, rig.imu_noise)

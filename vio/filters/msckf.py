@@ -48,7 +48,7 @@ from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
 from vio.geometry.relative_pose import RelativePose
-from vio.geometry.stereo import StereoCamera, project
+from vio.geometry.stereo import StereoCamera, depth_of, project
 from vio.records import (
     BoolArray,
     Estimate,
@@ -66,10 +66,11 @@ from vio.records import (
     VelocitySample,
     no_landmarks,
 )
+from vio.robust import median
 
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 # Factors on the motion model's densities: at the start, at least, at most.
-_IMU_FACTORS = (1.0, 1.0, 50.0)
+IMU_FACTORS = (1.0, 1.0, 50.0)
 # A start with a large uncertainty of the tilt is linearised far from the truth, which shows as process noise.
 _FACTOR_PER_TILT_SIGMA = 1 / np.radians(8.0)
 _MOST_START_FACTOR = 5.0
@@ -122,6 +123,8 @@ class Msckf:
             raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
         if settings.calibrate not in ("auto", "none") and motion != "imu":
             raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to auto or none")
+        if camera.is_cylinder:  # equation (R4) is a pinhole's
+            settings = replace(settings, stereo_focal_sigma=0.0, stereo_baseline_sigma=0.0)
         self._camera, self._settings = camera, settings
         self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings, motion)
         self._order = InputOrder("msckf")
@@ -137,7 +140,7 @@ class Msckf:
         self._newest: FloatArray = np.zeros((DIM + 6, DIM + 6))  # the same, and the newest camera's after it
         self._frame_pose: FloatArray = np.eye(4)  # (4, 4) of the navigation state after the last frame
         self._expected: FloatArray = np.zeros((6, 6))  # covariance of the camera's motion since, as it was predicted
-        self._noise = MotionNoise(*_IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
+        self._noise = MotionNoise(*IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._rows = RowField(camera)
         self._scale_log: float | None = None  # of the baseline over the calibrated one; None: nothing contradicts it
         self._landmark_gate = LandmarkGate(settings.gate_probability)
@@ -239,7 +242,7 @@ class Msckf:
         rows = rows[table.has_point[rows]]
         ids = np.concatenate([table.ids(rows), window.landmark_ids])
         p_cam = transform_points(T_cam0_world, np.concatenate([table.points[rows], window.landmarks]))
-        ahead = p_cam[:, 2] > MIN_DEPTH * self._camera.baseline_m
+        ahead = depth_of(self._camera, p_cam) > MIN_DEPTH * self._camera.baseline_m
         z, field = project(self._camera, p_cam[ahead]), self._field(window)
         if field is not None:
             z = field.seen(z)
@@ -259,13 +262,12 @@ class Msckf:
     def _update(self, observations: Observations) -> UpdateReport:
         seen = observations.take(~observations.stale)
         if self._window is None:
-            if not self._motion.ready:
+            start = self._start_state(seen)
+            if start is None:
                 return self._wait(observations)
-            nav, P = self._motion.start(observations.time_ns)
+            nav, P = start
             if self._source == "imu":
-                tilt_sigma = float(np.sqrt(P[3:5, 3:5].diagonal().max()))
-                start = min(_IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MOST_START_FACTOR)
-                self._noise = MotionNoise(start, *_IMU_FACTORS[1:])
+                self._noise = self._first_noise(P)
             calibration = self._calibration
             self._window = self._first_window(nav, P, calibration)
             self._time_ns = self._body_ns = self._began_ns = observations.time_ns
@@ -299,6 +301,16 @@ class Msckf:
             )
         return report
 
+    def _start_state(self, seen: Observations) -> tuple[NavState, FloatArray] | None:
+        """The navigation state at the first frame and its covariance (15, 15); None: the frame passes."""
+        return self._motion.start(seen.time_ns) if self._motion.ready else None
+
+    def _first_noise(self, P: FloatArray) -> MotionNoise:
+        """The IMU's noise at a start whose navigation state has the covariance P (15, 15)."""
+        tilt_sigma = float(np.sqrt(P[3:5, 3:5].diagonal().max()))
+        start = min(IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MOST_START_FACTOR)
+        return MotionNoise(start, *IMU_FACTORS[1:])
+
     def restart(self, observations: Observations) -> UpdateReport:
         """Start again at a frame after a divergence, from the state after the last good update.
 
@@ -322,14 +334,18 @@ class Msckf:
             self._window.scale_test = ScaleTest(len(self._window.P), scale_test.estimate()[1])
         self._calibration = good.calibration
         self._time_ns, self._body_ns = observations.time_ns, self._body_time(observations.time_ns)
-        self._tracks = WindowTracks(self._camera, self._settings)
-        self._landmark_gate = LandmarkGate(self._settings.gate_probability)
         self._smoothed, self._gyro, self._blind = None, None, False
         self._since_frame, self._predicted_step = NO_STEP, None
-        self._noise = MotionNoise(*_IMU_FACTORS) if self._source == "imu" else MotionNoise(*_TWIST_FACTORS)
+        self._reset_tracks()
         self._begin_output(self._window)
         self._map = [part for part in self._map if np.isfinite(part.p_world).all()]
         return self._update(observations)
+
+    def _reset_tracks(self) -> None:
+        """Forget all tracks, and what was learned of the motion's noise."""
+        self._tracks = WindowTracks(self._camera, self._settings)
+        self._landmark_gate = LandmarkGate(self._settings.gate_probability)
+        self._noise = MotionNoise(*IMU_FACTORS) if self._source == "imu" else MotionNoise(*_TWIST_FACTORS)
 
     def _begin_output(self, window: Window) -> None:
         """Take over the covariance of a window without clones."""
@@ -581,7 +597,7 @@ class Msckf:
             initialised=created,
             landmarks=len(window.landmarks),
             innovation_median_px=innovation,
-            nis_per_dof=float(np.median(nis / dof)) if len(nis) else None,
+            nis_per_dof=median(nis / dof) if len(nis) else None,
             gated_ids=gated_ids,
             landmark_ids=window.landmark_ids.copy(),
         )

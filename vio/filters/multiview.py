@@ -14,8 +14,9 @@ import numpy as np
 
 from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray, so3_hat
-from vio.geometry.stereo import StereoCamera, left_rays
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 from vio.records import BoolArray, IntArray
+from vio.robust import median
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
@@ -23,6 +24,11 @@ _MEDIAN = 2.37  # of chi-square with 3 degrees of freedom, those of a stereo vie
 LEAST_DISPARITY_PX = 1e-3  # of a point at infinity: ten baselines of motion move it by a hundredth of a pixel
 _PRIOR = 1e-6  # per px^2, information on the disparity: its standard deviation is 1000 px, half of what MIN_DEPTH shows
 _STEREO_VARIANCE = 2.0  # px^2, of the disparity of one stereo view, for one pixel of noise
+# One camera, whose unit of length is arbitrary: standard deviation of an inverse depth over itself, for one pixel of
+# noise, at most. A pair of 0.1 m has 5 to 15 % at usual distances. With a limit in the unit, slow flights have no track
+# (EuRoC MH_01: ATE 20 mm in place of 3); with one for the learned noise, standstills have too many (MH_03: 0.35 m in
+# place of 0.06).
+_MONO_DEPTH_SIGMA = 0.15
 _TINY = 1e-12  # keeps what nothing was seen of invertible
 _PARALLAX_STEPS = 3  # Gauss-Newton steps on a new point without a stereo view, before any pose has moved
 
@@ -152,7 +158,8 @@ def _by_parallax(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -
     """Points (F, 3) on the ray of each track's first left view, at the inverse depth that fits its others best.
 
     With m that ray, and c its camera seen from camera i, view i shows `(m_i + rho c_i)`, up to scale; times its third
-    component this is linear in the inverse depth rho.
+    component this is linear in the inverse depth rho. A cylinder's rays may have no third component: there their cross
+    product with it is zero, which is linear as well.
     """
     seen = views.weight[..., 0] > 0
     first, rows = np.argmax(seen, axis=1), np.arange(len(seen))
@@ -161,9 +168,14 @@ def _by_parallax(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -
     m_i = np.einsum("nij,fj->fni", R, m)
     centre = -np.einsum("nji,nj->ni", R, t)
     c_i = np.einsum("nij,fj->fni", R, centre[first]) + t
-    xy = left_rays(camera, np.where(seen[..., None], views.z[..., :2], 0.0))[..., :2]
-    parallax = (c_i[..., :2] - xy * c_i[..., 2:]) * seen[..., None]
-    rho = np.sum(parallax * (xy * m_i[..., 2:] - m_i[..., :2]), axis=(1, 2))
+    rays = left_rays(camera, np.where(seen[..., None], views.z[..., :2], 0.0))
+    if camera.is_cylinder:
+        parallax = np.cross(rays, c_i) * seen[..., None]
+        rho = -np.sum(parallax * np.cross(rays, m_i), axis=(1, 2))
+    else:
+        xy = rays[..., :2]
+        parallax = (c_i[..., :2] - xy * c_i[..., 2:]) * seen[..., None]
+        rho = np.sum(parallax * (xy * m_i[..., 2:] - m_i[..., :2]), axis=(1, 2))
     rho = rho / (np.sum(parallax**2, axis=(1, 2)) + _TINY)
     return _on_rays(camera, T_cam0_world[first], views.z[rows, first, :2], rho * camera.fu * camera.baseline_m)
 
@@ -190,6 +202,9 @@ def _ahead_of_first(
     """Points (F, 3) with those behind the first camera that saw them put far away on its ray."""
     first = np.argmax(seen, axis=1)
     depth = np.einsum("fi,fi->f", T_cam0_world[first, 2, :3], p_world) + T_cam0_world[first, 2, 3]
+    if camera.is_cylinder:
+        R, t = T_cam0_world[first, :3, :3], T_cam0_world[first, :3, 3]
+        depth = depth_of(camera, np.einsum("fij,fj->fi", R, p_world) + t)
     behind = ~(depth > MIN_DEPTH * camera.baseline_m)
     if not behind.any():
         return p_world
@@ -203,6 +218,8 @@ def _most_disparity(
 ) -> FloatArray:
     """Disparity (F,) beyond which a point would come nearer to one of its cameras than the least depth."""
     least = 1.01 * MIN_DEPTH * camera.baseline_m
+    if camera.is_cylinder:  # a point that comes too near to another camera than its anchor is dropped afterwards
+        return np.full(len(p_world), camera.fu * camera.baseline_m / least)
     ray_z = (p_world - q.centre) @ T_cam0_world[:, 2, :3].T * q.disparity[:, None]
     room = least - (q.centre @ T_cam0_world[:, 2, :3].T + T_cam0_world[:, 2, 3])
     limits = np.divide(ray_z, room, out=np.full(room.shape, np.inf), where=seen & (room > 0) & (ray_z > 0))
@@ -259,7 +276,7 @@ def landmark_residuals(
     at = residuals(camera, T_cam0_world[None], p_world, one)
     r, J = at.r[:, 0], at.z_D_p[:, 0]
     squares, seen = np.sum(r**2, axis=1), at.ahead & (views.weight[:, 1] > 0)
-    scale2 = max(sigma2, float(np.median(squares[seen])) / _MEDIAN) if seen.any() else sigma2
+    scale2 = max(sigma2, median(squares[seen]) / _MEDIAN) if seen.any() else sigma2
     return LandmarkResiduals(r, J, seen / (1 + squares / (4 * scale2 * CAUCHY**2)))
 
 
@@ -347,12 +364,17 @@ def relative_stereo_sigma(at: Residuals, q: InverseDepth) -> FloatArray:
 
 
 def has_parallax(
-    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, at: Residuals
+    camera: StereoCamera,
+    T_cam0_world: FloatArray,
+    p_world: FloatArray,
+    views: Views,
+    at: Residuals,
 ) -> BoolArray:
     """Which tracks (F,) have a right view, or a parallax that fixes the depth as well as one stereo view would.
 
     With less, the estimated depth follows the noise, and its Jacobian by the clones' translations with it: information
-    that is not there, and a scale that shrinks.
+    that is not there, and a scale that shrinks. Of one camera, whose unit of length is arbitrary, the depth must be
+    known relative to itself.
     """
     out: BoolArray = np.any(views.weight[..., 2] > 0, axis=1)
     left_only = ~out
@@ -361,7 +383,11 @@ def has_parallax(
         q = inverse_depth(camera, T_cam0_world, p_world[left_only], seen)
         J = at.z_D_p[left_only].reshape(len(seen), -1, 3) @ q.p_D_q
         C = np.swapaxes(J, 1, 2) @ J + np.diag([_TINY, _TINY, _PRIOR])
-        out[left_only] = np.linalg.inv(C)[:, 2, 2] < _STEREO_VARIANCE
+        variance = np.linalg.inv(C)[:, 2, 2]
+        if camera.kind == "mono":
+            out[left_only] = variance < (_MONO_DEPTH_SIGMA * q.disparity) ** 2
+        else:
+            out[left_only] = variance < _STEREO_VARIANCE
     return out
 
 

@@ -25,6 +25,12 @@ _PARTS = slice(0, 3), slice(3, 6)  # of a twist
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
 _STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
+# Which coefficients are estimated, by whether those of (R3) and of (R4) are.
+_TERMS_OF = {
+    (of_field, metric): np.flatnonzero(np.repeat([of_field, metric], [FIELD_TERMS, TERMS - FIELD_TERMS]))
+    for of_field in (False, True)
+    for metric in (False, True)
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +53,12 @@ class Calibration:
     @property
     def stereo_dim(self) -> int:
         """How many of the error's dimensions, the first, belong to the stereo calibration: 0, 2, 6 or 8."""
-        return len(self.stereo_terms)
+        return FIELD_TERMS * self.stereo_field + (TERMS - FIELD_TERMS) * self.metric
 
     @property
     def stereo_terms(self) -> IntArray:
         """Which coefficients of the stereo calibration are estimated."""
-        return np.flatnonzero(np.repeat([self.stereo_field, self.metric], [FIELD_TERMS, TERMS - FIELD_TERMS]))
+        return _TERMS_OF[self.stereo_field, self.metric]
 
     @property
     def moves_camera(self) -> bool:

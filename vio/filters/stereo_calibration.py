@@ -20,6 +20,7 @@ from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInf
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray, Observations
+from vio.robust import median
 
 FIELD_TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
 METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
@@ -39,10 +40,23 @@ def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
     The row of `vr` is zero: right rows are not measured.
     """
     out = np.empty((*z.shape[:-1], 4, TERMS))
-    loops.stereo_field_jacobian(
-        loops.lens_of(camera), np.ascontiguousarray(z).reshape(-1, 4), out.reshape(-1, 4, TERMS)
-    )
+    jacobian = loops.cylinder_field_jacobian if camera.is_cylinder else loops.stereo_field_jacobian
+    jacobian(loops.lens_of(camera), np.ascontiguousarray(z).reshape(-1, 4), out.reshape(-1, 4, TERMS))
     return out
+
+
+def _row_terms(camera: StereoCamera, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Derivatives (N, 6) of right minus left rows by the coefficients of (R2), and (N, 3) by k, q1, q2 of (R3).
+
+    In focal lengths, of pixels (N, 4).
+    """
+    if camera.is_cylinder:
+        basis, common = np.empty((len(z), _ROW_TERMS)), np.empty((len(z), 3))
+        loops.cylinder_rows(loops.lens_of(camera), np.ascontiguousarray(z), basis, common)
+        return basis, common
+    x, y = (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
+    basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
+    return basis, _common_rows((z[:, 0] - camera.cu) / camera.fu, x, y)
 
 
 class RowField:
@@ -64,16 +78,14 @@ class RowField:
         if len(z) < _MIN_ROWS:
             return
         camera = self._camera
-        x, y = (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
-        basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
+        basis, common = _row_terms(camera, z)
         rows = z[:, 3] - z[:, 1]
         # The median is taken out, as in the first frames the field itself is not yet known.
         residual = _centred(rows - camera.fv * (basis @ self.coefficients))
-        scale = max(1.48 * float(np.median(np.abs(residual))), 1e-3)
+        scale = max(1.48 * median(np.abs(residual)), 1e-3)
         weight: FloatArray = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
         self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
         self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
-        common = _common_rows((z[:, 0] - camera.cu) / camera.fu, x, y)
         self._common = _ROW_MEMORY * self._common + (basis * weight[:, None]).T @ common
         prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
         solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
@@ -117,7 +129,7 @@ def _common_rows(x: FloatArray, xr: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _centred(values: FloatArray) -> FloatArray:
-    return np.asarray(values - np.median(values), dtype=np.float64)
+    return np.asarray(values - median(values), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +150,8 @@ class StereoField:
         z, weight = np.ascontiguousarray(views.z), np.ascontiguousarray(views.weight)
         out = np.empty(z.shape)
         flat = z.reshape(-1, 4), weight.reshape(-1, 4), out.reshape(-1, 4)
-        loops.correct_pixels(loops.lens_of(self.camera), self.coefficients, self.rows, *flat)
+        correct = loops.correct_cylinder_pixels if self.camera.is_cylinder else loops.correct_pixels
+        correct(loops.lens_of(self.camera), self.coefficients, self.rows, *flat)
         return Views(out, views.weight)
 
     def seen(self, z: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """The compiled loops over tracks and their views behind `multiview` and `stereo_calibration`.
 
-Shapes: F tracks, N clones, S coefficients of the stereo field. `lens` is `(fu, fv, cu, cv, baseline)`. Each loop writes
-into the arrays that come last. `tests/numpy_twins.py` holds the same in NumPy.
+Shapes: F tracks, N clones, S coefficients of the stereo field. `lens` is that of `lens_of`. Each loop writes into the
+arrays that come last. `tests/numpy_twins.py` holds the same in NumPy.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray
 
-Lens: TypeAlias = tuple[float, float, float, float, float]
+Lens: TypeAlias = tuple[float, float, float, float, float, bool]
 
 
 def lens_of(camera: StereoCamera) -> Lens:
-    """Return `(fu, fv, cu, cv, baseline)`."""
-    return float(camera.fu), float(camera.fv), float(camera.cu), float(camera.cv), float(camera.baseline_m)
+    """Return `(fu, fv, cu, cv, baseline, whether it is a cylinder)`."""
+    fu, fv, cu, cv = float(camera.fu), float(camera.fv), float(camera.cu), float(camera.cv)
+    return fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder
 
 
 @compiled
@@ -36,13 +37,17 @@ def compare_views(
     ahead: BoolArray,
 ) -> None:
     """Write residuals (F, N, 4), Jacobians (F, N, 4, 3) by the points (F, 3), and which points are ahead (F,): (M1)."""
-    fu, fv, cu, cv, baseline = lens
+    fu, fv, cu, cv, baseline, cylinder = lens
+    azimuth, s, c = 0.0, 0.0, 1.0  # of the point, about the baseline: a cylinder is a pinhole turned to it
     for f in range(len(p)):
         ahead[f] = True
         for n in range(len(T)):
             x = T[n, 0, 0] * p[f, 0] + T[n, 0, 1] * p[f, 1] + T[n, 0, 2] * p[f, 2] + T[n, 0, 3]
             y = T[n, 1, 0] * p[f, 0] + T[n, 1, 1] * p[f, 1] + T[n, 1, 2] * p[f, 2] + T[n, 1, 3]
             depth = T[n, 2, 0] * p[f, 0] + T[n, 2, 1] * p[f, 1] + T[n, 2, 2] * p[f, 2] + T[n, 2, 3]
+            if cylinder:
+                azimuth, depth = np.arctan2(y, depth), np.sqrt(y * y + depth * depth)
+                s, c = np.sin(azimuth), np.cos(azimuth)
             seen = weight[f, n, 0] > 0.0
             usable = depth > least_depth
             if seen and not usable:
@@ -61,7 +66,15 @@ def compare_views(
                     axis, focal, pixel, centre = 1, fv, v, cv
                 elif a == 2:
                     pixel = u - d
+                if cylinder and axis == 1:
+                    pixel = fv * azimuth
                 r[f, n, a] = (z[f, n, a] - pixel - centre) * w if w > 0.0 else 0.0
+                if cylinder:
+                    for j in range(3):
+                        along = pixel * (s * T[n, 1, j] + c * T[n, 2, j]) if axis == 0 else 0.0
+                        across = T[n, 0, j] if axis == 0 else c * T[n, 1, j] - s * T[n, 2, j]
+                        J[f, n, a, j] = w * (focal * across - along) / depth
+                    continue
                 for j in range(3):
                     J[f, n, a, j] = w * (focal * T[n, axis, j] - pixel * T[n, 2, j]) / depth
 
@@ -89,7 +102,8 @@ def anchor_points(
     q_D_p: FloatArray,
 ) -> None:
     """Write the coordinates (M5) of points (F, 3): the columns of `InverseDepth`."""
-    fu, baseline = lens[0], lens[4]
+    fu, baseline, cylinder = lens[0], lens[4], lens[5]
+    row1, row2 = np.empty(3), np.empty(3)  # y and z axes of the camera, for a cylinder turned to the point
     for f in range(len(p)):
         k = 0
         for n in range(len(T) - 1, -1, -1):
@@ -101,15 +115,23 @@ def anchor_points(
         x = T[k, 0, 0] * p[f, 0] + T[k, 0, 1] * p[f, 1] + T[k, 0, 2] * p[f, 2] + T[k, 0, 3]
         y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
         z = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
+        for i in range(3):
+            row1[i], row2[i] = T[k, 1, i], T[k, 2, i]
+        if cylinder:
+            azimuth = np.arctan2(y, z)
+            s, c = np.sin(azimuth), np.cos(azimuth)
+            y, z = 0.0, np.sqrt(y * y + z * z)
+            for i in range(3):
+                row1[i], row2[i] = c * T[k, 1, i] - s * T[k, 2, i], s * T[k, 1, i] + c * T[k, 2, i]
         z = max(z, least_depth)
         disparity[f] = fu * baseline / z
         for i in range(3):
             p_D_q[f, i, 0] = T[k, 0, i] * z / fu
-            p_D_q[f, i, 1] = T[k, 1, i] * z / fu
+            p_D_q[f, i, 1] = row1[i] * z / fu
             p_D_q[f, i, 2] = (centre[f, i] - p[f, i]) / disparity[f]
-            q_D_p[f, 0, i] = (T[k, 0, i] - x / z * T[k, 2, i]) * fu / z
-            q_D_p[f, 1, i] = (T[k, 1, i] - y / z * T[k, 2, i]) * fu / z
-            q_D_p[f, 2, i] = -T[k, 2, i] * disparity[f] / z
+            q_D_p[f, 0, i] = (T[k, 0, i] - x / z * row2[i]) * fu / z
+            q_D_p[f, 1, i] = (row1[i] - y / z * row2[i]) * fu / z
+            q_D_p[f, 2, i] = -row2[i] * disparity[f] / z
 
 
 @compiled
@@ -229,7 +251,7 @@ def eliminate_tracks(
 @compiled
 def stereo_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
     """Write the derivatives (M, 4, 8) of pixels (M, 4) by the coefficients of (R3) and (R4)."""
-    fu, fv, cu, cv, _ = lens
+    fu, fv, cu, cv, _, _ = lens
     for m in range(len(z)):
         x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
         r2, rr2 = x * x + y * y, xr * xr + y * y
@@ -249,7 +271,7 @@ def correct_pixels(
     lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
     """Write pixels (M, 4) without the field of (R3) and (R4), (8,), and what follows from the rows (6,) of (R2)."""
-    fu, fv, cu, cv, _ = lens
+    fu, fv, cu, cv, _, _ = lens
     a0, a1, a2, k, q1, q2, baseline, focal = coefficients
     by_focal, by_both = np.exp(-focal), np.exp(-focal - baseline)
     metric = baseline != 0.0 or focal != 0.0
@@ -269,6 +291,107 @@ def correct_pixels(
             out[m, 0] = cu + (out[m, 0] - cu) * by_focal
             out[m, 1] = cv + (out[m, 1] - cv) * by_focal
             out[m, 2] = out[m, 0] - disparity if weight[m, 2] > 0.0 else z[m, 2]
+
+
+@compiled
+def _lens_plane(x: float, azimuth: float) -> tuple[float, float, float, float, float, float]:
+    """Angles off the axis (along u, along v) of a cylinder's coordinates, and how the coordinates move with them (2x2).
+
+    Errors of a wide lens are low polynomials in these angles, as those of a narrow one are on the plane z = 1.
+    """
+    rho = 1.0 / np.sqrt(1.0 + x * x)
+    a, y, z = x * rho, np.sin(azimuth) * rho, np.cos(azimuth) * rho
+    sine = np.sqrt(a * a + y * y)
+    if sine < 1e-6:
+        return a, y, 1.0, 0.0, 0.0, 1.0
+    ratio = np.arctan2(sine, z) / sine
+    ca, sa = a / sine, y / sine
+    xx, xy = (z * ca * ca + sa * sa / ratio) / rho**3, ca * sa * (z - 1.0 / ratio) / rho**3
+    yx, yy = ca * sa * (1.0 - z / ratio) / rho**2, (sa * sa + ca * ca * z / ratio) / rho**2
+    return ratio * a, ratio * y, xx, xy, yx, yy
+
+
+@compiled
+def cylinder_terms(x: float, azimuth: float, out: FloatArray) -> None:
+    """Write by how much (2, 12) a right camera's coordinates on a cylinder move, for one unit of each coefficient.
+
+    Columns: a0, a1, a2, k, q1, q2 of the states, then the six of the rows, equation (R6).
+    """
+    u, v, xx, xy, yx, yy = _lens_plane(x, azimuth)
+    s, c, r2 = np.sin(azimuth), np.cos(azimuth), u * u + v * v
+    # What moves in the lens, in angles off the axis; then on the cylinder.
+    lens_u = 4.0, u, r2, r2 * u, 2.0 * u * v, r2 + 2.0 * u * u, 0.0, 0.0, 0.0, 0.0, 0.0, r2 * u
+    lens_v = 0.0, 0.0, 0.0, r2 * v, r2 + 2.0 * v * v, 2.0 * u * v, 0.0, 0.0, v, 0.0, 3.0, r2 * v
+    for j in range(12):
+        out[0, j] = xx * lens_u[j] + xy * lens_v[j]
+        out[1, j] = yx * lens_u[j] + yy * lens_v[j]
+    # The turns about y, z and x.
+    out[0, 0] -= 3.0 * (1.0 + x * x) * c
+    out[1, 0] -= 3.0 * x * s
+    out[0, 9] += (1.0 + x * x) * c
+    out[1, 9] += x * s
+    out[0, 7] -= (1.0 + x * x) * s
+    out[1, 7] += x * c
+    out[1, 6] += 1.0
+    out[1, 10] -= 3.0
+
+
+@compiled
+def cylinder_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
+    """Write the derivatives (M, 4, 8) of a cylinder's pixels (M, 4) by the coefficients of (R3); by (R4)'s, zero."""
+    fu, fv, cu, cv, _, _ = lens
+    left, right = np.empty((2, 12)), np.empty((2, 12))
+    for m in range(len(z)):
+        y = (z[m, 1] - cv) / fv
+        cylinder_terms((z[m, 0] - cu) / fu, y, left)
+        cylinder_terms((z[m, 2] - cu) / fu, y, right)
+        for j in range(8):
+            for a in range(4):
+                out[m, a, j] = 0.0
+        for j in range(6):
+            out[m, 2, j] = fu * right[0, j]
+        for j in range(3, 6):
+            out[m, 0, j], out[m, 1, j] = fu * left[0, j], fv * left[1, j]
+
+
+@compiled
+def correct_cylinder_pixels(
+    lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
+) -> None:
+    """Write a cylinder's pixels (M, 4) without the field of (R3), (8,), and what follows from the rows (6,) of (R2)."""
+    fu, fv, cu, cv, _, _ = lens
+    left, right = np.empty((2, 12)), np.empty((2, 12))
+    for m in range(len(z)):
+        y = (z[m, 1] - cv) / fv
+        for a in range(4):
+            out[m, a] = z[m, a]
+        if weight[m, 0] > 0.0:
+            cylinder_terms((z[m, 0] - cu) / fu, y, left)
+            for j in range(3, 6):
+                out[m, 0] -= fu * left[0, j] * coefficients[j]
+                out[m, 1] -= fv * left[1, j] * coefficients[j]
+        if weight[m, 2] > 0.0:
+            cylinder_terms((z[m, 2] - cu) / fu, y, right)
+            for j in range(6):
+                out[m, 2] -= fu * (right[0, j] * coefficients[j] + right[0, 6 + j] * rows[j])
+
+
+@compiled
+def cylinder_rows(lens: Lens, z: FloatArray, rows: FloatArray, common: FloatArray) -> None:
+    """Write the derivatives of right minus left rows, in focal lengths, of a cylinder's pixels (M, 4).
+
+    By the coefficients of (R2), (M, 6), and by k, q1 and q2 of (R3), (M, 3).
+    """
+    fu, fv, cu, cv, _, _ = lens
+    left, right = np.empty((2, 12)), np.empty((2, 12))
+    for m in range(len(z)):
+        y = (z[m, 1] - cv) / fv
+        cylinder_terms((z[m, 0] - cu) / fu, y, left)
+        cylinder_terms((z[m, 2] - cu) / fu, y, right)
+        for j in range(6):
+            rows[m, j] = right[1, 6 + j]
+        for j in range(3):
+            common[m, j] = right[1, 3 + j] - left[1, 3 + j]
 
 
 @compiled

@@ -25,7 +25,8 @@ class TrackTable:
 
     def add_frame(self, column: int, seen: Observations) -> None:
         """Write the observations of one frame into a column; unknown ids become new tracks."""
-        rows = np.array([self._row(i) for i in seen.ids.tolist()], dtype=np.int64)
+        ids, row_of = seen.ids.tolist(), self._row_of
+        rows = np.array([row_of[i] if i in row_of else self._new_row(i) for i in ids], dtype=np.int64)
         if len(rows):
             self._z[rows, column] = seen.z
             self._weight[rows, column] = measured(seen.has_right)
@@ -71,14 +72,12 @@ class TrackTable:
         self._weight[rows] = 0.0
         self.has_point[rows] = False
 
-    def _row(self, track: int) -> int:
-        row = self._row_of.get(track)
-        if row is None:
-            if not self._free:
-                self._grow(2 * len(self._ids))
-            row = self._free.pop()
-            self._row_of[track] = row
-            self._ids[row] = track
+    def _new_row(self, track: int) -> int:
+        if not self._free:
+            self._grow(2 * len(self._ids))
+        row = self._free.pop()
+        self._row_of[track] = row
+        self._ids[row] = track
         return row
 
     def _grow(self, size: int) -> None:

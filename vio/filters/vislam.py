@@ -15,7 +15,7 @@ from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
 from vio.filters.settings import VislamSettings
 from vio.filters.vislam_motion import DriftingTwist, HeldInput
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
-from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, depth_of, p_cam_D_z, project, triangulate, z_D_p_cam
 from vio.records import (
     BoolArray,
     Estimate,
@@ -308,14 +308,15 @@ class Vislam:
         return H_m @ P @ np.swapaxes(H_m, -1, -2) + V
 
     def _in_front(self, m: FloatArray) -> BoolArray:
-        depth = transform_points(self._T_cam0_imu @ self._state.U, m)[:, 2]
+        depth = depth_of(self._camera, transform_points(self._T_cam0_imu @ self._state.U, m))
         return (depth > _MIN_DEPTH_M) & (depth < self._settings.max_landmark_distance_m)
 
     def _initialise(self, ids: IntArray, z: FloatArray) -> int:
         """Create landmarks from their first stereo observation, equation (P3); return how many."""
         s = self._settings
         p_cam, valid = triangulate(self._camera, z)
-        valid &= (p_cam[:, 2] > _MIN_DEPTH_M) & (p_cam[:, 2] < s.max_landmark_distance_m)
+        depth = depth_of(self._camera, p_cam)
+        valid &= (depth > _MIN_DEPTH_M) & (depth < s.max_landmark_distance_m)
         ids, z, p_cam = ids[valid], z[valid], p_cam[valid]
         T_world_cam0 = se3_inverse(self._T_cam0_imu @ self._state.U)
         if s.landmark_prior == "stereo":

@@ -29,6 +29,7 @@ from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray
+from vio.robust import median
 from vio.statistics import chi_square_quantile
 
 MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
@@ -53,7 +54,7 @@ class LinearTracks:
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
         r, used = self.at.r[:, -1], measured_pixels(self.at)[:, -1]
-        return float(np.median(np.abs(r[used]))) if used.any() else None
+        return median(np.abs(r[used])) if used.any() else None
 
 
 class WindowTracks:
@@ -175,7 +176,7 @@ class WindowTracks:
         if len(squares) < MIN_TRACKS_FOR_NOISE:
             return
         s = self._settings
-        ratio = float(np.clip(np.median(squares / chi_square_table(0.5)[dof]), 0.25, 4.0))
+        ratio = float(np.clip(median(squares / chi_square_table(0.5)[dof]), 0.25, 4.0))
         self.variance = float(
             np.clip(self.variance * ratio**_NOISE_GAIN, s.pixel_sigma_min_px**2, s.pixel_sigma_max_px**2)
         )

@@ -16,13 +16,16 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
-from vio.geometry.stereo import StereoCamera, left_rays
+from vio.geometry.stereo import Projection, StereoCamera, left_rays, one_camera, project
 
 MapArray = npt.NDArray[np.float32]
 Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
+ProjectionMode: TypeAlias = Literal["auto", "pinhole", "cylinder"]
 
 _BORDER_SAMPLES = 60  # points along each image border that determine the common field of view
 _MAX_TANGENT = 1.4  # beyond about 54 degrees off axis a planar image only stretches pixels
+PINHOLE_REACH = float(np.arctan(_MAX_TANGENT))  # radians
+_MAX_AZIMUTH = np.pi / 2  # of a cylinder's rows: further round, the rays of a lens of 195 degrees are its dark rim
 _MIN_TANGENT_WIDTH = 0.1
 _MAX_ROTATION_DEG = 30.0  # a camera that needs a larger rotation is not one half of a stereo pair
 
@@ -45,13 +48,17 @@ class Rectification(RectifiedPair):
     map1: tuple[MapArray, MapArray]
 
 
-def rectify(rig: StereoRig) -> Rectification:
+def rectify(rig: StereoRig, projection: ProjectionMode = "pinhole") -> Rectification:
     """Find the rectified pair of a rig and its maps; its images have the size of the left one and no invalid border.
+
+    Args:
+        rig: both cameras as calibrated.
+        projection: of the rectified images; auto: `projection_of`.
 
     Raises:
         CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
     """
-    pair = rectified_cameras(rig)
+    pair = rectified_cameras(rig, projection)
     return Rectification(
         camera=pair.camera,
         R_rect_cam0=pair.R_rect_cam0,
@@ -62,16 +69,29 @@ def rectify(rig: StereoRig) -> Rectification:
     )
 
 
-def rectified_cameras(rig: StereoRig) -> RectifiedPair:
+def projection_of(rig: StereoRig) -> Projection:
+    """Return the projection that keeps most of what a rig sees: a cylinder where a pinhole would crop rows.
+
+    A pinhole ends 54 degrees above and below the axis, a cylinder does not; along the baseline both end there. So only
+    lenses that see further than that above and below, in both images, have anything to gain.
+
+    Raises:
+        CalibrationError: as `rectify`.
+    """
+    R0, R1, _ = rectifying_rotations(rig)
+    low, high = _common_rectangle(rig, R0, R1, "cylinder")
+    return "cylinder" if low[1] < -PINHOLE_REACH and high[1] > PINHOLE_REACH else "pinhole"
+
+
+def rectified_cameras(rig: StereoRig, projection: ProjectionMode = "pinhole") -> RectifiedPair:
     """Find the rectified pair of a rig, without the maps of its images.
 
     Raises:
         CalibrationError: as `rectify`.
     """
     R_rect_cam0, R_rect_cam1, baseline_m = rectifying_rotations(rig)
-    low0, high0 = _inner_rectangle(rig.cam0, R_rect_cam0)
-    low1, high1 = _inner_rectangle(rig.cam1, R_rect_cam1)
-    low, high = np.maximum(low0, low1), np.minimum(high0, high1)
+    chosen = projection_of(rig) if projection == "auto" else projection
+    low, high = _common_rectangle(rig, R_rect_cam0, R_rect_cam1, chosen)
     extent = high - low
     if extent.min() < _MIN_TANGENT_WIDTH:
         raise CalibrationError("the two cameras share no field of view; check the extrinsics T_BS of both cameras")
@@ -80,7 +100,7 @@ def rectified_cameras(rig: StereoRig) -> RectifiedPair:
     f = float(max((width - 1) / extent[0], (height - 1) / extent[1]))
     centre = (low + high) / 2
     cu, cv = (width - 1) / 2 - f * centre[0], (height - 1) / 2 - f * centre[1]
-    camera = StereoCamera(f, f, float(cu), float(cv), baseline_m, width, height)
+    camera = StereoCamera(f, f, float(cu), float(cv), baseline_m, width, height, chosen)
     T_cam0_imu = se3_inverse(rig.T_imu_cam0)
     return RectifiedPair(
         camera=camera,
@@ -127,14 +147,99 @@ def rectify_pixels(
     Both rectified cameras share their intrinsics, so this applies to left and right alike.
     """
     ray, valid = unproject_pixel(camera, uv)
-    ray = ray @ R_rect_cam.T
-    valid = valid & (ray[..., 2] > 1e-6)
-    plane = ray[..., :2] / np.where(valid, ray[..., 2], 1.0)[..., None]
+    plane, ahead = _on_plane(ray @ R_rect_cam.T, rectified.projection, 1e-6)
+    valid = valid & ahead
     return plane * (rectified.fu, rectified.fv) + (rectified.cu, rectified.cv), valid
 
 
-def _inner_rectangle(camera: CameraModel, R_rect_cam: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Corners (2,), (2,) of the largest axis-parallel box on the rectified plane z = 1 inside the image's outline."""
+def field_of_view(camera: CameraModel | StereoCamera) -> tuple[float, float]:
+    """Angles in radians that an image spans along its middle row and its middle column, as far as the lens model goes.
+
+    Raises:
+        CalibrationError: the image size is unknown.
+    """
+    if camera.width is None or camera.height is None:
+        raise CalibrationError("a field of view needs the image size; this camera has none")
+    w, h, s = camera.width - 1.0, camera.height - 1.0, np.linspace(0, 1, 2 * _BORDER_SAMPLES + 1)
+    spans = []
+    for uv in (np.stack([w * s, 0 * s + h / 2], axis=1), np.stack([0 * s + w / 2, h * s], axis=1)):
+        ray, valid = (left_rays(camera, uv), None) if isinstance(camera, StereoCamera) else unproject_pixel(camera, uv)
+        off_axis = np.arctan2(np.hypot(ray[:, 0], ray[:, 1]), ray[:, 2])
+        off_axis = off_axis if valid is None else np.where(valid, off_axis, 0.0)
+        spans.append(float(off_axis[: _BORDER_SAMPLES + 1].max() + off_axis[_BORDER_SAMPLES:].max()))
+    return spans[0], spans[1]
+
+
+def pinhole_within(camera: StereoCamera) -> StereoCamera:
+    """Return a pinhole of a cylinder's size and pose whose image lies inside the cylinder's; a pinhole as it is.
+
+    Raises:
+        CalibrationError: the image size is unknown.
+    """
+    if not camera.is_cylinder:
+        return camera
+    if camera.width is None or camera.height is None:
+        raise CalibrationError("a cylinder needs its image size; this camera has none")
+    size = np.array([camera.width - 1.0, camera.height - 1.0])
+    centre, focal = np.array([camera.cu, camera.cv]), np.array([camera.fu, camera.fv])
+    low, high = np.clip(-centre / focal, -1.2, 1.2), np.clip((size - centre) / focal, -1.2, 1.2)
+    low[1], high[1] = np.tan(low[1]), np.tan(high[1])
+    low, high = np.maximum(low, -_MAX_TANGENT), np.minimum(high, _MAX_TANGENT)
+    f = float(np.max(size / (high - low)))
+    cu, cv = (size / 2 - f * (low + high) / 2).tolist()
+    return StereoCamera(f, f, cu, cv, camera.baseline_m, camera.width, camera.height)
+
+
+def pinhole_pixels(
+    cylinder: StereoCamera, pinhole: StereoCamera, pixels: npt.ArrayLike
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Pixels (N, 2) of a pinhole where a cylinder of the same pose has (N, 2), and a mask (N,) of those in its image.
+
+    Both cameras of a pair share their intrinsics, so this applies to left and right alike.
+    """
+    assert pinhole.width is not None
+    assert pinhole.height is not None
+    plane, ahead = _on_plane(left_rays(cylinder, pixels), "pinhole", 1e-3)
+    uv = plane * (pinhole.fu, pinhole.fv) + (pinhole.cu, pinhole.cv)
+    inside = (uv >= -0.5).all(axis=-1) & (uv <= (pinhole.width - 0.5, pinhole.height - 0.5)).all(axis=-1)
+    return uv, ahead & inside
+
+
+def pinhole_maps(cylinder: StereoCamera, pinhole: StereoCamera) -> tuple[MapArray, MapArray]:
+    """Pixels u and v (H, W) of a cylinder's image for every pixel of a pinhole's of the same pose, for cv2.remap."""
+    assert pinhole.width is not None
+    assert pinhole.height is not None
+    pixels = np.stack(np.meshgrid(np.arange(pinhole.width), np.arange(pinhole.height)), axis=-1)
+    uv = project(cylinder, left_rays(pinhole, pixels))
+    return uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
+
+
+def _on_plane(ray: FloatArray, projection: Projection, least_depth: float) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Coordinates (..., 2) of unit rays (..., 3) in a rectified image of focal length 1, and a mask (...).
+
+    Tangents for a pinhole; tangent and azimuth (radians) for a cylinder.
+    """
+    depth = np.hypot(ray[..., 1], ray[..., 2]) if projection == "cylinder" else ray[..., 2]
+    ahead = np.asarray(depth > least_depth)
+    plane = ray[..., :2] / np.where(ahead, depth, 1.0)[..., None]
+    if projection == "cylinder":
+        plane = np.stack([plane[..., 0], np.arctan2(ray[..., 1], ray[..., 2])], axis=-1)
+    return plane, ahead
+
+
+def _common_rectangle(
+    rig: StereoRig, R_rect_cam0: FloatArray, R_rect_cam1: FloatArray, projection: Projection
+) -> tuple[FloatArray, FloatArray]:
+    """Corners (2,), (2,) of the largest box, in coordinates of `_on_plane`, inside the outlines of both images."""
+    low0, high0 = _inner_rectangle(rig.cam0, R_rect_cam0, projection)
+    low1, high1 = _inner_rectangle(rig.cam1, R_rect_cam1, projection)
+    return np.maximum(low0, low1), np.minimum(high0, high1)
+
+
+def _inner_rectangle(
+    camera: CameraModel, R_rect_cam: FloatArray, projection: Projection
+) -> tuple[FloatArray, FloatArray]:
+    """Corners (2,), (2,) of the largest box, in coordinates of `_on_plane`, inside the image's outline."""
     w, h = camera.width - 1.0, camera.height - 1.0
     s = np.linspace(0, 1, _BORDER_SAMPLES)
     sides = {
@@ -146,15 +251,21 @@ def _inner_rectangle(camera: CameraModel, R_rect_cam: FloatArray) -> tuple[Float
     plane = {}
     for name, uv in sides.items():
         ray, valid = unproject_pixel(camera, uv)
-        ray = ray @ R_rect_cam.T
-        ahead = valid & (ray[:, 2] > 0.1)
+        on_plane, ahead = _on_plane(ray @ R_rect_cam.T, projection, 0.1)
+        ahead = valid & ahead
         # A border point behind the camera, or outside the lens model's range, sets no bound.
         direction = {"left": [-1, 0], "right": [1, 0], "top": [0, -1], "bottom": [0, 1]}[name]
         far = np.array(direction, dtype=np.float64) * 1e9
-        plane[name] = np.where(ahead[:, None], ray[:, :2] / np.where(ahead, ray[:, 2], 1.0)[:, None], far)
-    low = np.array([plane["left"][:, 0].max(), plane["top"][:, 1].max()])
-    high = np.array([plane["right"][:, 0].min(), plane["bottom"][:, 1].min()])
-    return np.maximum(low, -_MAX_TANGENT), np.minimum(high, _MAX_TANGENT)
+        plane[name] = np.where(ahead[:, None], on_plane, far)
+    most = np.array([_MAX_TANGENT, _MAX_AZIMUTH if projection == "cylinder" else _MAX_TANGENT])
+    top, bottom = max(plane["top"][:, 1].max(), -most[1]), min(plane["bottom"][:, 1].min(), most[1])
+    if projection == "cylinder":  # the corners of a wide lens look backwards, beyond the rows that are kept
+        for name, bound in (("left", -np.inf), ("right", np.inf)):
+            kept = (plane[name][:, 1] >= top) & (plane[name][:, 1] <= bottom)
+            plane[name][~kept, 0] = bound
+    low = np.array([plane["left"][:, 0].max(), top])
+    high = np.array([plane["right"][:, 0].min(), bottom])
+    return np.maximum(low, -most), np.minimum(high, most)
 
 
 def _lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray) -> tuple[MapArray, MapArray]:
@@ -165,3 +276,15 @@ def _lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray
     uv, valid = project_point(camera, rays @ R_rect_cam)
     uv = np.where(valid[..., None], uv, -1e4)
     return uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
+
+
+def undistorted(camera: CameraModel) -> tuple[StereoCamera, tuple[MapArray, MapArray]]:
+    """Return one camera without its distortion, looking the same way, and the map of its images.
+
+    The images keep their size and have no invalid border.
+    """
+    low, high = _inner_rectangle(camera, np.eye(3), "pinhole")
+    f = float(max((camera.width - 1) / (high - low)[0], (camera.height - 1) / (high - low)[1]))
+    cu, cv = np.array([camera.width - 1, camera.height - 1]) / 2 - f * (low + high) / 2
+    out = one_camera(f, f, float(cu), float(cv), camera.width, camera.height)
+    return out, _lookup(out, camera, np.eye(3))

@@ -1,12 +1,21 @@
 """The rectified stereo camera: projection, its Jacobian, triangulation and its uncertainty.
 
 Pixels: u right, v down, the centre of the top-left pixel is (0, 0). `z = [ul vl ur vr]`.
+
+Two projections have epipolar planes as rows. With `rho = hypot(y, z)`, the distance from the line of the baseline:
+
+    pinhole    u = cu + fu x / z,    v = cv + fv y / z
+    cylinder   u = cu + fu x / rho,  v = cv + fv atan2(y, z)
+
+The cylinder about the baseline is the pinhole turned about the baseline to each row: it agrees with the pinhole to
+first order in the middle row, disparity is `fu baseline / rho`, and rows reach beyond 90 degrees off the axis.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +23,20 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray
 
+Projection: TypeAlias = Literal["pinhole", "cylinder"]
+CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
+# Of one camera, metres: no distance in the world, but the unit of length of inverse depths. Half of it is the nearest
+# depth, and a track enters the estimate once its inverse depth is known as well as by a stereo pair of this baseline.
+MONO_UNIT_M = 0.1
+
 
 @dataclass(frozen=True, slots=True)
 class StereoCamera:
-    """A rectified stereo pair: one intrinsic matrix, image rows aligned, cam1 at +baseline on cam0's x axis."""
+    """A rectified stereo pair: one intrinsic matrix, image rows aligned, cam1 at +baseline on cam0's x axis.
+
+    One camera with depth images ("rgbd") is a pair with a virtual right camera: `ur = ul - fu baseline / depth`. One
+    camera alone ("mono") has no right pixels; its `baseline_m` is a unit of length, `MONO_UNIT_M`.
+    """
 
     fu: float  # focal length, pixels, along u
     fv: float  # focal length, pixels, along v
@@ -26,6 +45,8 @@ class StereoCamera:
     baseline_m: float  # distance from cam0 to cam1, positive
     width: int | None = None  # image size in pixels; None where only features are given
     height: int | None = None
+    projection: Projection = "pinhole"  # of both images; see above
+    kind: CameraKind = "stereo"  # where right pixels come from: a right camera, depth images, or nowhere
 
     def __post_init__(self) -> None:
         values = (self.fu, self.fv, self.cu, self.cv, self.baseline_m)
@@ -45,8 +66,13 @@ class StereoCamera:
             )
 
     @property
+    def is_cylinder(self) -> bool:
+        """Whether rows are azimuths about the baseline, in the place of a pinhole's."""
+        return self.projection == "cylinder"
+
+    @property
     def M(self) -> FloatArray:
-        """The paper's stereo calibration matrix (4, 4): `z = M pi(q)`."""
+        """The paper's stereo calibration matrix (4, 4) of a pinhole: `z = M pi(q)`."""
         fu, fv, cu, cv = self.fu, self.fv, self.cu, self.cv
         return np.array(
             [[fu, 0, cu, 0], [0, fv, cv, 0], [fu, 0, cu, -fu * self.baseline_m], [0, fv, cv, 0]],
@@ -55,31 +81,90 @@ class StereoCamera:
 
     @property
     def K(self) -> FloatArray:
-        """Intrinsic matrix (3, 3) of both cameras, pixels."""
+        """Intrinsic matrix (3, 3) of both cameras, pixels; of a cylinder, that of the pinhole at its middle row."""
         return np.array([[self.fu, 0, self.cu], [0, self.fv, self.cv], [0, 0, 1]], dtype=np.float64)
 
 
-def project(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
-    """Stereo pixels (..., 4) of points (..., 3) in the cam0 frame, metres; the depth must not be zero."""
+def one_camera(
+    fu: float, fv: float, cu: float, cv: float, width: int | None = None, height: int | None = None
+) -> StereoCamera:
+    """Return an undistorted camera without a right one; the arguments are those of `StereoCamera`, in pixels."""
+    return StereoCamera(fu, fv, cu, cv, MONO_UNIT_M, width, height, kind="mono")
+
+
+def left_alone(camera: StereoCamera) -> StereoCamera:
+    """Return the left camera of a pair as one camera."""
+    return replace(camera, baseline_m=MONO_UNIT_M, kind="mono")
+
+
+def depth_of(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
+    """Depth (...) of points (..., 3) in the cam0 frame, metres, as disparity measures it: `fu baseline / disparity`.
+
+    Along the optical axis of a pinhole; from the line of the baseline, and never negative, for a cylinder.
+    """
     p = np.asarray(p_cam, dtype=np.float64)
-    x, y, depth = p[..., 0], p[..., 1], p[..., 2]
-    v = camera.fv * y / depth + camera.cv
+    return np.hypot(p[..., 1], p[..., 2]) if camera.is_cylinder else p[..., 2]
+
+
+def facing(camera: StereoCamera, pixels: npt.ArrayLike, p_cam: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Turn the camera about its baseline until left pixels lie in its middle row; a pinhole stays as it is.
+
+    About there a cylinder is a pinhole of the same `fu`, `fv`, `cu`, `cv`, to first order along v and exactly along u,
+    so that the geometry of pinholes applies to each feature in its own turned camera.
+
+    Args:
+        camera: rectified pair.
+        pixels: left pixels (N, 2).
+        p_cam: points or directions (..., N, 3) or (..., 1, 3), cam0 frame.
+
+    Returns:
+        The pixels (N, 2), and the points (..., N, 3) in the turned frame of each pixel; a pinhole's as given.
+    """
+    uv, p = np.asarray(pixels, dtype=np.float64), np.asarray(p_cam, dtype=np.float64)
+    if not camera.is_cylinder:
+        return uv, p
+    azimuth = (uv[..., 1] - camera.cv) / camera.fv
+    s, c = np.sin(azimuth), np.cos(azimuth)
+    x, y, z = np.broadcast_arrays(p[..., 0], c * p[..., 1] - s * p[..., 2], s * p[..., 1] + c * p[..., 2])
+    turned = np.stack([x, y, z], axis=-1)
+    return np.stack([uv[..., 0], np.full_like(uv[..., 0], camera.cv)], axis=-1), turned
+
+
+def project(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
+    """Stereo pixels (..., 4) of points (..., 3) in the cam0 frame, metres; their depth must not be zero."""
+    p = np.asarray(p_cam, dtype=np.float64)
+    x, y, depth = p[..., 0], p[..., 1], depth_of(camera, p)
+    if camera.is_cylinder:
+        v = camera.fv * np.arctan2(y, p[..., 2]) + camera.cv
+    else:
+        v = camera.fv * y / depth + camera.cv
     ul = camera.fu * x / depth + camera.cu
     return np.stack([ul, v, ul - camera.fu * camera.baseline_m / depth, v], axis=-1)
 
 
 def left_rays(camera: StereoCamera, pixels: npt.ArrayLike) -> FloatArray:
-    """Rays (..., 3) of unit depth in the cam0 frame through left pixels (..., 2)."""
+    """Rays (..., 3) of unit depth (`depth_of`) in the cam0 frame through left pixels (..., 2)."""
     uv = np.asarray(pixels, dtype=np.float64)
     x, y = (uv[..., 0] - camera.cu) / camera.fu, (uv[..., 1] - camera.cv) / camera.fv
+    if camera.is_cylinder:
+        return np.stack([x, np.sin(y), np.cos(y)], axis=-1)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
 def z_D_p_cam(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
     """Jacobian (..., 4, 3) of `project` with respect to the point in the cam0 frame (pixels per metre)."""
     p = np.asarray(p_cam, dtype=np.float64)
-    x, y, depth = p[..., 0], p[..., 1], p[..., 2]
+    x, y, depth = p[..., 0], p[..., 1], depth_of(camera, p)
     out = np.zeros((*p.shape[:-1], 4, 3))
+    if camera.is_cylinder:
+        s, c = y / depth, p[..., 2] / depth
+        out[..., 0, 0] = out[..., 2, 0] = camera.fu / depth
+        for row, across in ((0, x), (2, x - camera.baseline_m)):
+            u_D_depth = -camera.fu * across / depth**2
+            out[..., row, 1], out[..., row, 2] = u_D_depth * s, u_D_depth * c
+        out[..., 1, 1] = out[..., 3, 1] = camera.fv * c / depth
+        out[..., 1, 2] = out[..., 3, 2] = -camera.fv * s / depth
+        return out
     out[..., 0, 0] = out[..., 2, 0] = camera.fu / depth
     out[..., 1, 1] = out[..., 3, 1] = camera.fv / depth
     out[..., 0, 2] = -camera.fu * x / depth**2
@@ -101,6 +186,9 @@ def triangulate(
     valid = np.isfinite(z).all(axis=-1) & (disparity >= min_disparity_px)
     safe = np.where(valid[..., None], z, 0.0)
     depth = camera.fu * camera.baseline_m / np.where(valid, disparity, 1.0)
+    if camera.is_cylinder:
+        middle = np.stack([safe[..., 0], (safe[..., 1] + safe[..., 3]) / 2], axis=-1)
+        return left_rays(camera, middle) * depth[..., None], valid
     x = (safe[..., 0] - camera.cu) / camera.fu * depth
     y = ((safe[..., 1] + safe[..., 3]) / 2 - camera.cv) / camera.fv * depth
     return np.stack([x, y, depth], axis=-1), valid
@@ -117,6 +205,12 @@ def p_cam_D_z(camera: StereoCamera, z: npt.ArrayLike) -> FloatArray:
     out = np.zeros((*z.shape[:-1], 3, 4))
     out[..., 0, 0] = depth / camera.fu + ray_x * depth_D_ul
     out[..., 0, 2] = -ray_x * depth_D_ul
+    if camera.is_cylinder:
+        s, c = np.sin(ray_y), np.cos(ray_y)
+        for row, along, turned in ((1, s, c), (2, c, -s)):
+            out[..., row, 0], out[..., row, 2] = along * depth_D_ul, -along * depth_D_ul
+            out[..., row, 1] = out[..., row, 3] = turned * depth / (2 * camera.fv)
+        return out
     out[..., 1, 0], out[..., 1, 2] = ray_y * depth_D_ul, -ray_y * depth_D_ul
     out[..., 1, 1] = out[..., 1, 3] = depth / (2 * camera.fv)
     out[..., 2, 0], out[..., 2, 2] = depth_D_ul, -depth_D_ul

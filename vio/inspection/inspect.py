@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from vio.geometry.rectify import field_of_view
 from vio.inspection.finding import Inspection, Part
 from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
 from vio.inspection.pictures import images_part, rows_part
@@ -57,14 +58,17 @@ def camera_part(recording: Recording) -> Part:
     c = recording.camera
     facts = {"fu": c.fu, "fv": c.fv, "cu": c.cu, "cv": c.cv, "baseline_m": c.baseline_m}
     facts |= {"width": c.width or 0, "height": c.height or 0}
-    wide = f", {2 * np.degrees(np.arctan(c.width / 2 / c.fu)):.0f} deg wide" if c.width is not None else ""
+    known = c.width is not None and c.height is not None
+    wide = " x ".join(f"{angle:.0f}" for angle in np.degrees(field_of_view(c))) if known else ""
+    wide = f", {wide} deg" if known else ""
     faults = []
     if not _SHORT_M <= c.baseline_m <= _LONG_M:
         faults.append(f"a baseline of {c.baseline_m:g} m is implausible; translations are metres: check the unit")
     if c.width is not None and c.height is not None and not (0 < c.cu < c.width and 0 < c.cv < c.height):
         faults.append(f"the principal point {c.cu:.0f}, {c.cv:.0f} lies outside the image; check its size")
     one_px_m = c.fu * c.baseline_m  # the depth of one pixel of disparity
-    text = f"rectified: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, 1 px at {one_px_m:.0f} m"
+    form = " to a cylinder" if c.is_cylinder else ""
+    text = f"rectified{form}: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, 1 px at {one_px_m:.0f} m"
     return Part("camera", text, facts, faults)
 
 

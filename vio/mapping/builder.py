@@ -129,8 +129,10 @@ class MapBuilder:
         graph, number, motion = self.graph, len(self.graph), keyframe.motion
         drift, path = graph.gathered(keyframe.T_odom_cam, motion)
         T = keyframe.T_odom_cam
-        if motion is not None:  # until a loop says otherwise, the map moves with the odometry
+        if motion is not None and self._last is None:  # until a loop says otherwise, the map moves with the odometry
             T = graph.T_map_cam[-1] @ (se3_inverse(graph.T_odom_cam[-1]) @ T)
+        elif motion is not None:  # whose poses jump where the filter learns what it was off by; this motion does not
+            T = graph.T_map_cam[-1] @ motion.T_i_j
         up, sigma = keyframe.up_cam, keyframe.up_sigma_rad
         row = KeyframeRow(self._own, keyframe.frame, keyframe.time_ns, T, keyframe.T_odom_cam, drift, path, up, sigma)
         graph.append(row)
@@ -323,7 +325,15 @@ class MapBuilder:
         if joined or _squared(r, pose.covariance) > _SETTLED or self._waiting >= _PATIENCE:
             self._optimise()
         return LoopEvent(
-            graph.frame(k), graph.time_ns(k), i, graph.time_ns(i), row.inliers, float(np.linalg.norm(r[:3])), joined
+            frame=graph.frame(k),
+            time_ns=graph.time_ns(k),
+            keyframe=i,
+            keyframe_time_ns=graph.time_ns(i),
+            inliers=row.inliers,
+            gap_m=float(np.linalg.norm(r[:3])),
+            joined=joined,
+            keyframe_frame=graph.frame(i) if graph.session[i] == self._own else None,
+            matches=loop.seen.matches,
         )
 
     def _join(self, i: int, k: int, T_map_k: FloatArray) -> None:

@@ -15,7 +15,9 @@ from vio.robust import robust_sigma
 
 _SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
 _LEAST_MOTIONS = 8  # keyframes needed to detect outlying motions
+_LEAST_PIECE = 3  # keyframes that an alignment needs
 _OUTLYING = 6.0  # robust standard deviations
+_BROKEN = 1.0  # of the motion between two keyframes: beyond it, one of both trajectories has jumped there
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +44,11 @@ class Comparison:
 
     total: int  # keyframes compared
     frames: IntArray  # (R,) frame numbers
-    aligned: FloatArray  # (R, 4, 4) the other poses in the run's world, after SE(3) alignment
+    piece: BoolArray  # (R,) keyframes of the longest stretch without a jump of either trajectory
+    aligned: FloatArray  # (R, 4, 4) the other poses in the run's world, after SE(3) alignment of this piece
     difference_m: FloatArray  # (R,)
     difference_deg: FloatArray  # (R,)
-    ate_m: float  # after SE(3) alignment
+    ate_m: float  # of the piece
     ate_deg: float
     scale: float | None  # length of the other trajectory over the run's; None: see why_no_scale
     scale_sigma: float | None  # standard error
@@ -70,21 +73,24 @@ def compare_keyframes(
     Reference: Umeyama (1991) for the alignment, as in `vio.evaluation`.
     """
     own = run.trajectory.T_world_body[rows]
-    aligned = apply_alignment(align_poses(T_other_cam0, own, "se3"), T_other_cam0)
+    piece = _longest_piece(own, T_other_cam0)
+    aligned = apply_alignment(align_poses(T_other_cam0[piece], own[piece], "se3"), T_other_cam0)
     difference_m = np.linalg.norm(aligned[:, :3, 3] - own[:, :3, 3], axis=1)
     # Rotations are aligned separately: on a straight path an alignment by positions leaves the roll unobservable.
-    turn = nearest_rotation(np.einsum("nij,nkj->ik", own[:, :3, :3], T_other_cam0[:, :3, :3]))
+    turn = nearest_rotation(np.einsum("nij,nkj->ik", own[piece, :3, :3], T_other_cam0[piece, :3, :3]))
     difference_deg = rotation_angle_deg(np.swapaxes(own[:, :3, :3], 1, 2) @ turn @ T_other_cam0[:, :3, :3])
-    scale, sigma, why = _scale_ratio(T_other_cam0, own, float(np.sqrt(np.mean(difference_m**2))))
+    ate_m, ate_deg = (float(np.sqrt(np.mean(d[piece] ** 2))) for d in (difference_m, difference_deg))
+    scale, sigma, why = _scale_ratio(T_other_cam0[piece], own[piece], ate_m)
     against = (None, None, None) if truth is None else _against(truth, run, rows, T_other_cam0)
     return Comparison(
         total=len(rows),
         frames=run.frames[rows],
+        piece=piece,
         aligned=aligned,
         difference_m=difference_m,
         difference_deg=difference_deg,
-        ate_m=float(np.sqrt(np.mean(difference_m**2))),
-        ate_deg=float(np.sqrt(np.mean(difference_deg**2))),
+        ate_m=ate_m,
+        ate_deg=ate_deg,
         scale=scale,
         scale_sigma=sigma,
         why_no_scale=why,
@@ -116,16 +122,33 @@ def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray) -> 
     """Return segments where motions between neighbouring keyframes differ by outliers."""
     if len(frames) < _LEAST_MOTIONS:
         return ()
-    motion_own = se3_inverse(T_own[:-1]) @ T_own[1:]
-    motion_other = se3_inverse(T_other[:-1]) @ T_other[1:]
-    off_m = np.linalg.norm(motion_own[:, :3, 3] - motion_other[:, :3, 3], axis=1)
-    off_deg = rotation_angle_deg(np.swapaxes(motion_own[:, :3, :3], 1, 2) @ motion_other[:, :3, :3])
+    off_m, off_deg = motion_differences(T_own, T_other)
     bad = _stands_out(off_m) | _stands_out(off_deg)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8)))
     return tuple(
         Segment(int(frames[a]), int(frames[b]), float(off_m[a:b].max()), float(off_deg[a:b].max()))
         for a, b in edges.reshape(-1, 2).tolist()
     )
+
+
+def _longest_piece(T_own: FloatArray, T_other: FloatArray) -> BoolArray:
+    """Return the rows (R,) of the longest stretch in which no motion differs by more than its own length."""
+    if len(T_own) < _LEAST_MOTIONS:
+        return np.ones(len(T_own), dtype=bool)
+    moved_m = np.linalg.norm(np.diff(T_own[:, :3, 3], axis=0), axis=1)
+    off_m, _ = motion_differences(T_own, T_other)
+    broken = _stands_out(off_m) & (off_m > _BROKEN * np.maximum(moved_m, np.median(moved_m)))
+    number = np.concatenate([[0], np.cumsum(broken)])
+    piece: BoolArray = number == np.bincount(number).argmax()
+    return piece if piece.sum() >= _LEAST_PIECE else np.ones_like(piece)
+
+
+def motion_differences(T_own: FloatArray, T_other: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return by how much the motions between neighbouring poses (R, 4, 4) differ: (R - 1,) metres and degrees."""
+    motion_own = se3_inverse(T_own[:-1]) @ T_own[1:]
+    motion_other = se3_inverse(T_other[:-1]) @ T_other[1:]
+    off_m: FloatArray = np.linalg.norm(motion_own[:, :3, 3] - motion_other[:, :3, 3], axis=1)
+    return off_m, rotation_angle_deg(np.swapaxes(motion_own[:, :3, :3], 1, 2) @ motion_other[:, :3, :3])
 
 
 def _stands_out(values: FloatArray) -> BoolArray:

@@ -12,6 +12,8 @@ from vio.errors import DataError, EstimationError
 from vio.evaluation import rotation_angle_deg
 from vio.geometry.lie import se3_exp
 from vio.geometry.stereo import StereoCamera
+from vio.loops import LoopEvent
+from vio.mapping.loop_tracks import loop_pairs
 from vio.records import FeatureTracks, IntArray, Observations, Trajectory
 
 _MIN_DISPARITY_PX = 0.5
@@ -20,6 +22,7 @@ _SCENE_SHARE = 0.08  # of the median depth: translation to a new keyframe …
 _TURN_DEG = 6.0  # … or rotation to it
 _SPARSER = 1.15  # factor on both limits, from one attempt to the next
 _LEAST_STRETCH = 20  # frames
+_LOOP_SHARE = 3  # of the keyframes that may be spent on loops: one in three
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +33,7 @@ class TrackedPath:
     camera: StereoCamera  # rectified pair
     trajectory: Trajectory  # of cam0, one pose a frame, with frame numbers
     tracks: FeatureTracks  # of all frames of the recording, by frame number
+    loops: tuple[LoopEvent, ...] = ()  # between two frames of the trajectory, whose poses agree with them
 
     @property
     def frames(self) -> IntArray:
@@ -47,7 +51,8 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
     """Return the rows (K,) of the trajectory that become keyframes: first, last, and after enough motion.
 
     Enough is a share of the scene's median depth or a few degrees. Both limits are increased until there are at most
-    `most`. Without `most`, all frames of a short run are keyframes.
+    `most`. Without `most`, all frames of a short run are keyframes. Both frames of a loop are keyframes; where that
+    takes more than a third of `most`, only of some loops, spread over the run.
 
     Raises:
         DataError: the run is shorter than two frames.
@@ -58,6 +63,7 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
     step_m = _SCENE_SHARE * _median_depth_m(run)
     if len(T) <= (_ALL_FRAMES if most is None else most):
         return np.arange(len(T))
+    ends = _loop_ends(run, most)
     factor = 1.0
     while True:
         chosen = [0]
@@ -68,9 +74,18 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
                 chosen.append(k)
         if chosen[-1] != len(T) - 1:
             chosen.append(len(T) - 1)
-        if most is None or len(chosen) <= max(most, 2):
-            return np.array(chosen, dtype=np.int64)
+        if most is None or len(chosen) + len(ends) <= max(most, 2):
+            return np.union1d(np.array(chosen, dtype=np.int64), ends)
         factor *= _SPARSER
+
+
+def _loop_ends(run: TrackedPath, most: int | None) -> IntArray:
+    """Return the rows (E,) of the trajectory at which loops begin and end, at most a third of `most`."""
+    pairs = loop_pairs(run.loops, run.frames)
+    if most is not None:
+        count = min(len(pairs), most // (2 * _LOOP_SHARE))
+        pairs = pairs[np.linspace(0, len(pairs) - 1, count).astype(np.int64)] if count else pairs[:0]
+    return np.unique(pairs)
 
 
 def _median_depth_m(run: TrackedPath) -> float:

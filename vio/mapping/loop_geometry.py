@@ -12,11 +12,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.loops import LoopMatches
 from vio.mapping.features import KeyframeFeatures
 from vio.records import BoolArray, IntArray
+from vio.statistics import chi_square_quantile
 
 LEAST_INLIERS = 20
 _LEAST_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random
@@ -32,6 +35,9 @@ _GATE = 3.0  # standard deviations, of a pixel coordinate
 _LEAST_DISPARITY_PX = 1.0
 # Floor of a loop's standard deviations: errors that its points share, such as those of the calibration.
 _FLOOR_DEPTH, _FLOOR_DEG = 0.002, 0.05
+# Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points lie on whole pixels
+# of their level, so that the errors are at least those of rounding.
+_LEAST_VARIANCE = 1 / 12
 _INFLATION = 2.0  # of its standard deviations: key points of neighbouring levels and edges are not independent
 
 
@@ -44,6 +50,7 @@ class Verified:
     pairs: int  # of descriptors
     rows_i: IntArray  # (inliers,) features of i
     rows_j: IntArray  # (inliers,) features of j
+    matches: LoopMatches  # their pixels
 
 
 def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
@@ -59,11 +66,29 @@ def match(i: KeyframeFeatures, j: KeyframeFeatures) -> IntArray:
     return np.stack([good, best[good]], axis=1)
 
 
-def _differing_bits(i: KeyframeFeatures, j: KeyframeFeatures) -> npt.NDArray[np.float32]:
-    """Hamming distances (N, M) of descriptors: with bits as -1 and 1, 256 less their product, halved (exact)."""
-    a, b = (2 * np.unpackbits(f.descriptors, axis=1).astype(np.float32) - 1 for f in (i, j))
-    out: npt.NDArray[np.float32] = (np.float32(a.shape[1]) - a @ b.T) / np.float32(2)
+def _differing_bits(i: KeyframeFeatures, j: KeyframeFeatures) -> npt.NDArray[np.int32]:
+    """Hamming distances (N, M) of descriptors."""
+    out = np.empty((len(i), len(j)), dtype=np.int32)
+    a, b = (np.ascontiguousarray(f.descriptors).view(np.uint64) for f in (i, j))
+    _count_bits(a, b, out)
     return out
+
+
+@compiled
+def _count_bits(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64], out: npt.NDArray[np.int32]) -> None:
+    """Count in which bits the rows of two arrays (N, W) and (M, W) differ, by sums over pairs, fours and bytes."""
+    pairs, fours = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
+    bytes_, ones = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
+    for i in range(len(a)):
+        for j in range(len(b)):
+            total = np.uint64(0)
+            for w in range(a.shape[1]):
+                x = a[i, w] ^ b[j, w]
+                x = x - ((x >> np.uint64(1)) & pairs)
+                x = (x & fours) + ((x >> np.uint64(2)) & fours)
+                x = (x + (x >> np.uint64(4))) & bytes_
+                total += (x * ones) >> np.uint64(56)
+            out[i, j] = total
 
 
 def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, j: KeyframeFeatures) -> Verified | None:
@@ -88,7 +113,8 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
     pose, good = fitted
     if good.sum() < max(LEAST_INLIERS, _LEAST_SHARE * len(pairs)):
         return None
-    return Verified(pose, int(good.sum()), len(pairs), a[good], b[good])
+    a, b = a[good], b[good]
+    return Verified(pose, len(a), len(pairs), a, b, LoopMatches(i.z[a], j.z[b], i.has_right[a], j.has_right[b]))
 
 
 def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -171,8 +197,19 @@ def _fit(
     good[order] = fits
     depth = _median_depth(camera_j, j, b[good])
     floor = np.repeat([(_FLOOR_DEPTH * depth) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
-    covariance = _INFLATION**2 * np.asarray(np.linalg.inv(normal), dtype=np.float64) + np.diag(floor)
+    stereo = np.concatenate([j.has_right[b[forward]], i.has_right[a[~forward]]])
+    noise = _variance_factor(squared[fits], stereo[fits])
+    covariance = noise * _INFLATION**2 * np.asarray(np.linalg.inv(normal), dtype=np.float64) + np.diag(floor)
     return RelativePose(T, covariance), good
+
+
+def _variance_factor(squared: FloatArray, stereo: BoolArray) -> float:
+    """Return the variance of the pixels over the one assumed, by the median of the squared residuals (K,) of a fit.
+
+    Of a left and a right pixel they have three degrees of freedom, of a left one alone two.
+    """
+    expected = np.where(stereo, *chi_square_quantile(0.5, [3, 2]))
+    return max(float(np.median(squared / expected)), _LEAST_VARIANCE)
 
 
 class _Terms:

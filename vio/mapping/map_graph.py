@@ -129,11 +129,14 @@ class MapGraph:
         self.sessions = [replace(s, part=into) if s.part == moved else s for s in self.sessions]
 
     def optimise_part(self, part: int) -> None:
-        """Optimise all keyframes of a part but the first one."""
+        """Optimise all keyframes of a part; of the first one, roll and pitch alone where the vertical is known.
+
+        What the filter took for the vertical at its first frame is less exact than what it knows of it later.
+        """
         rows = self.part == part
         fixed = np.zeros(len(self), dtype=np.bool_)
         fixed[int(np.argmax(rows))] = True
-        self._optimise(rows, fixed)
+        self._optimise(rows, fixed, level=True)
 
     def optimise_end(self, first: int) -> None:
         """Optimise the keyframes from `first` on against those before it that loops join them to, which stay."""
@@ -145,15 +148,27 @@ class MapGraph:
         fixed[linked] = True
         self._optimise(fixed | (np.arange(len(self)) >= first), fixed)
 
-    def _optimise(self, rows: BoolArray, fixed: BoolArray) -> None:
-        """Optimise the keyframes of a mask (K,); mark the loops that contradict the rest."""
+    def _optimise(self, rows: BoolArray, fixed: BoolArray, *, level: bool = False) -> None:
+        """Optimise the keyframes of a mask (K,); mark the loops that contradict the rest.
+
+        Args:
+            rows: keyframes.
+            fixed: (K,) those of them that stay.
+            level: let the roll and pitch of the first one follow the verticals, if there are any.
+        """
         place = np.cumsum(rows) - 1
         odometry = [(int(place[i]), int(place[j]), m) for i, j, m in self.odometry if rows[i] and rows[j]]
         scaled = [(i, j, RelativePose(m.T_i_j, self.odometry_scale * m.covariance)) for i, j, m in odometry]
         inside = [n for n, o in enumerate(self.loops) if rows[o.first] and rows[o.second]]
         loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
+        uprights = self._uprights(rows, place)
         best = optimise(
-            self.T_map_cam.rows[rows], Edges.of(scaled), Edges.of(loops), self._uprights(rows, place), fixed[rows]
+            self.T_map_cam.rows[rows],
+            Edges.of(scaled),
+            Edges.of(loops),
+            uprights,
+            fixed[rows],
+            levelled=0 if level and len(uprights.pose) else None,
         )
         self.T_map_cam.rows[rows] = best.T_map_cam
         for n, kept in zip(inside, best.kept.tolist(), strict=True):

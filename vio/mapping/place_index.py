@@ -9,6 +9,8 @@ Zisserman 2003).
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -18,11 +20,14 @@ from vio.mapping.features import DESCRIPTOR_BYTES, Bits
 from vio.records import BoolArray, IntArray
 
 Words = npt.NDArray[np.uint16]
+Owners = npt.NDArray[np.unsignedinteger[Any]]
 
 _TABLES, _BITS = 4, 14  # 4 x 16384 words; a keyframe of 600 features has 2400 of them in 5 kB
+_WORDS = 1 << _BITS
 _SEED = 20120617  # of the choice of bits: any, but the same in all maps
 _NEIGHBOURS = 2  # keyframes before and after a candidate whose scores are added to its own: they show the same place
-_GROW = 1.5
+_LEAST_TAIL, _TAIL_SHARE = 32, 1 / 16  # keyframes; a merge takes as long as the comparison with ten times as many
+_UNIT = 1 << 16  # of the weights
 
 
 def words_of(descriptors: Bits) -> Words:
@@ -34,45 +39,66 @@ def words_of(descriptors: Bits) -> Words:
 
 
 class PlaceIndex:
-    """The words of all keyframes, in the order in which they were added."""
+    """The words of all keyframes, in the order in which they were added.
+
+    An inverted index: for each word the keyframes that show it. The newest keyframes are a tail whose words are
+    compared one by one, until it is long enough to be merged into the index. Weights are integers, so that a score does
+    not depend on where a keyframe is.
+    """
 
     def __init__(self) -> None:
-        self._words: Words = np.zeros((_TABLES, 0), dtype=np.uint16)
-        self._offsets: list[int] = [0]
-        self._frequency: IntArray = np.zeros((_TABLES, 1 << _BITS), dtype=np.int64)  # keyframes with a word
+        self._begins: IntArray = np.zeros((_TABLES, _WORDS + 1), dtype=np.int64)  # of each word among the owners
+        self._owners: Owners = np.zeros((_TABLES, 0), dtype=np.uint16)  # keyframes, ordered by word
+        self._merged = 0  # keyframes in the index; the others are the tail
+        self._tail: list[Words] = []
+        self._sizes: list[int] = []  # features of each keyframe
+        self._frequency: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)  # keyframes with a word
 
     def __len__(self) -> int:
         """Number of keyframes."""
-        return len(self._offsets) - 1
+        return len(self._sizes)
 
     @property
     def nbytes(self) -> int:
         """Memory of the words, bytes."""
-        return self._words.nbytes + self._frequency.nbytes
+        arrays = (self._begins, self._owners, self._frequency, *self._tail)
+        return sum(array.nbytes for array in arrays)
 
     def add(self, descriptors: Bits) -> None:
         """Add a keyframe with these descriptors (N, 32)."""
         words = words_of(descriptors)
-        end = self._offsets[-1] + words.shape[1]
-        if end > self._words.shape[1]:
-            grown = np.zeros((_TABLES, int(_GROW * end) + 1024), dtype=np.uint16)
-            grown[:, : self._words.shape[1]] = self._words
-            self._words = grown
-        self._words[:, self._offsets[-1] : end] = words
-        self._offsets.append(end)
+        self._tail.append(words)
+        self._sizes.append(words.shape[1])
         for table, row in enumerate(words):
             self._frequency[table, np.unique(row)] += 1
+        if len(self._tail) >= max(_LEAST_TAIL, int(_TAIL_SHARE * len(self))):
+            self._merge()
+
+    def _merge(self) -> None:
+        words, offsets = self._joined_tail()
+        kind = np.min_scalar_type(len(self)) if len(self) > np.iinfo(np.uint16).max else np.dtype(np.uint16)
+        owners: Owners = np.empty((_TABLES, self._owners.shape[1] + words.shape[1]), dtype=kind)
+        begins = np.zeros_like(self._begins)
+        _merge_words(self._begins, self._owners, words, offsets, self._merged, begins, owners)
+        self._begins, self._owners, self._merged, self._tail = begins, owners, len(self), []
+
+    def _joined_tail(self) -> tuple[Words, IntArray]:
+        words = np.concatenate([np.zeros((_TABLES, 0), dtype=np.uint16), *self._tail], axis=1)
+        return words, np.cumsum([0, *(row.shape[1] for row in self._tail)])
 
     def scores(self, descriptors: Bits) -> FloatArray:
         """Return for each keyframe (K,) the weight of the words that it shares with descriptors (N, 32)."""
         count = len(self)
-        weight = np.zeros((_TABLES, 1 << _BITS), dtype=np.float32)
-        for table, row in enumerate(words_of(descriptors)):
-            known = np.unique(row)
-            weight[table, known] = np.log((count + 1.0) / (self._frequency[table, known] + 1.0))
-        out = np.zeros(count)
-        _add_weights(self._words, np.array(self._offsets), weight, out)
-        return out
+        weight = np.zeros((_TABLES, _WORDS), dtype=np.int64)
+        known = [np.unique(row).astype(np.int64) for row in words_of(descriptors)]
+        for table, row in enumerate(known):
+            logs = np.log((count + 1.0) / (self._frequency[table, row] + 1.0))
+            weight[table, row] = np.rint(_UNIT * logs).astype(np.int64)
+        out = np.zeros(count, dtype=np.int64)
+        for table, row in enumerate(known):
+            _add_owners(self._begins[table], self._owners[table], row, weight[table], out)
+        _add_weights(*self._joined_tail(), weight, out[self._merged :])
+        return out / (_UNIT * np.sqrt(np.maximum(self._sizes, 1.0)))
 
     def candidates(self, descriptors: Bits, allowed: BoolArray, most: int) -> IntArray:
         """Return up to `most` keyframes among those `allowed` (K,), the most similar first, each of another place."""
@@ -92,11 +118,49 @@ class PlaceIndex:
 
 
 @compiled
-def _add_weights(words: Words, offsets: IntArray, weight: npt.NDArray[np.float32], out: FloatArray) -> None:
-    """Add the weights of each keyframe's words to `out` (K,), divided by the square root of its number of words."""
+def _merge_words(
+    begins: IntArray,
+    owners: Owners,
+    words: Words,
+    offsets: IntArray,
+    first: int,
+    out_begins: IntArray,
+    out_owners: Owners,
+) -> None:
+    """Merge the words (T, N) of keyframes from `first` on into an index; those of keyframe k begin at `offsets[k]`."""
+    cursor = np.empty(begins.shape[1], dtype=np.int64)
+    for t in range(len(words)):
+        for w in range(begins.shape[1] - 1):
+            out_begins[t, w + 1] = begins[t, w + 1] - begins[t, w]
+        for n in range(words.shape[1]):
+            out_begins[t, words[t, n] + 1] += 1
+        for w in range(begins.shape[1] - 1):
+            out_begins[t, w + 1] += out_begins[t, w]
+            cursor[w] = out_begins[t, w]
+            for e in range(begins[t, w], begins[t, w + 1]):
+                out_owners[t, cursor[w]] = owners[t, e]
+                cursor[w] += 1
+        for k in range(len(offsets) - 1):
+            for n in range(offsets[k], offsets[k + 1]):
+                w = words[t, n]
+                out_owners[t, cursor[w]] = first + k
+                cursor[w] += 1
+
+
+@compiled
+def _add_owners(begins: IntArray, owners: Owners, known: IntArray, weight: IntArray, out: IntArray) -> None:
+    """Add the weight of each word in `known` to its owners in `out` (K,), once for each feature with it."""
+    for w in known:
+        for e in range(begins[w], begins[w + 1]):
+            out[owners[e]] += weight[w]
+
+
+@compiled
+def _add_weights(words: Words, offsets: IntArray, weight: IntArray, out: IntArray) -> None:
+    """Add the weights of the words (T, N) of each keyframe to `out` (K,); those of keyframe k begin at `offsets[k]`."""
     for k in range(len(out)):
-        total = 0.0
+        total = 0
         for n in range(offsets[k], offsets[k + 1]):
             for t in range(len(words)):
                 total += weight[t, words[t, n]]
-        out[k] = total / max(float(offsets[k + 1] - offsets[k]), 1.0) ** 0.5
+        out[k] += total

@@ -10,6 +10,7 @@ from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera, project, triangulate, z_D_p_cam
 from vio.mapping.keyframes import TrackedPath
+from vio.mapping.loop_tracks import loop_rows
 from vio.records import BoolArray, IntArray, Landmarks
 
 _MIN_DISPARITY_PX = 0.5
@@ -27,12 +28,22 @@ class PointTracks:
     keyframe: IntArray  # (R,) index of the keyframe of a row; rows are ordered by keyframe
     z: FloatArray  # (R, 4) rectified pixels
     has_right: BoolArray  # (R,)
+    loops_from: int | None = None  # ids from here on are of points that loops join; None: there are none
+
+    @property
+    def by_loop(self) -> BoolArray:
+        """Mask (R,) of the rows of points that loops join: their pixels are less exact than those of tracks."""
+        if self.loops_from is None:
+            return np.zeros(len(self.point), dtype=np.bool_)
+        return np.asarray(self.ids[self.point] >= self.loops_from)
 
 
 def build_tracks(
     run: TrackedPath, keyframes: IntArray, T_world_cam0: FloatArray, *, gate_px: float = 3.0, least_views: int = 2
 ) -> PointTracks:
     """Turn a run's observations in keyframes into points, each seen in at least `least_views` of them.
+
+    The features that agree with the run's loops are points of their own, with ids after those of the tracks.
 
     Args:
         run: the run.
@@ -45,12 +56,17 @@ def build_tracks(
         EstimationError: no track is consistent.
     """
     fresh = [run.fresh(int(k)) for k in keyframes]
+    loops = loop_rows(run.loops, run.frames[keyframes])
     ids = np.concatenate([o.ids for o in fresh])
-    keyframe = np.repeat(np.arange(len(keyframes)), [len(o) for o in fresh])
-    z = np.concatenate([o.z for o in fresh])
-    has_right = np.concatenate([o.has_right for o in fresh])
+    loops_from = int(ids.max(initial=-1)) + 1
+    ids = np.concatenate([ids, loops.point + loops_from])
+    keyframe = np.concatenate([np.repeat(np.arange(len(keyframes)), [len(o) for o in fresh]), loops.keyframe])
+    order = np.argsort(keyframe, kind="stable")
+    ids, keyframe = ids[order], keyframe[order]
+    z = np.concatenate([*(o.z for o in fresh), loops.z])[order]
+    has_right = np.concatenate([*(o.has_right for o in fresh), loops.has_right])[order]
     names, point = np.unique(ids, return_inverse=True)
-    tracks = PointTracks(names, np.zeros((len(names), 3)), point.astype(np.int64), keyframe, z, has_right)
+    tracks = PointTracks(names, np.zeros((len(names), 3)), point.astype(np.int64), keyframe, z, has_right, loops_from)
     tracks = keep_rows(tracks, np.ones(len(point), dtype=np.bool_), least_views=least_views)
     for _ in range(3):
         if not len(tracks.ids):
@@ -85,6 +101,7 @@ def keep_rows(tracks: PointTracks, rows: BoolArray, *, least_views: int = 2) -> 
         keyframe=tracks.keyframe[rows],
         z=tracks.z[rows],
         has_right=tracks.has_right[rows],
+        loops_from=tracks.loops_from,
     )
 
 

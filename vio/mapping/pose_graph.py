@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import splu
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, se3_left_jacobian, se3_log, so3_hat
@@ -70,7 +70,15 @@ class Optimum:
     weight: FloatArray  # (L,) of each loop, 0 to 1
 
 
-def optimise(T_map_cam: FloatArray, odometry: Edges, loops: Edges, uprights: Uprights, fixed: BoolArray) -> Optimum:
+def optimise(
+    T_map_cam: FloatArray,
+    odometry: Edges,
+    loops: Edges,
+    uprights: Uprights,
+    fixed: BoolArray,
+    *,
+    levelled: int | None = None,
+) -> Optimum:
     """Return the poses (K, 4, 4) that minimise the squared errors of odometry, gravity and truncated loops.
 
     Args:
@@ -79,25 +87,28 @@ def optimise(T_map_cam: FloatArray, odometry: Edges, loops: Edges, uprights: Upr
         loops: edges that may be wrong.
         uprights: directions of the vertical.
         fixed: (K,) poses that stay; at least one of each connected part.
+        levelled: one of the fixed poses whose position and heading alone stay, so that its roll and pitch follow the
+            uprights; None: all of them stay.
     """
+    free = _Free(fixed, levelled)
     limit = float(chi_square_quantile(_TRUNCATION, 6))
     T, weight = T_map_cam.copy(), np.ones(len(loops))
     if not len(loops):
-        return Optimum(_descend(T, odometry, loops, weight, uprights, fixed, _MOST_STEPS), weight > 0.5, weight)
-    T = _descend(T, odometry, loops, weight, uprights, fixed, _MOST_STEPS)
+        return Optimum(_descend(T, odometry, loops, weight, uprights, free, _MOST_STEPS), weight > 0.5, weight)
+    T = _descend(T, odometry, loops, weight, uprights, free, _MOST_STEPS)
     squared = _squared(T, loops)
     worst = float(squared.max())
     if worst > limit:  # else every loop fits with full weight, and there is nothing to decide
         mu = limit / (2 * worst - limit)
         for _ in range(_MOST_GNC_STEPS):
             weight = _gnc_weight(squared, mu, limit)
-            T = _descend(T, odometry, loops, weight, uprights, fixed, 2)
+            T = _descend(T, odometry, loops, weight, uprights, free, 2)
             squared = _squared(T, loops)
             if ((weight == 0) | (weight == 1)).all() and mu > 1:
                 break
             mu *= _MU_GROWTH
         weight = (squared < limit).astype(np.float64)
-        T = _descend(T, odometry, loops, weight, uprights, fixed, _MOST_STEPS)
+        T = _descend(T, odometry, loops, weight, uprights, free, _MOST_STEPS)
     return Optimum(T, weight > 0.5, weight)
 
 
@@ -136,12 +147,31 @@ def up_residual(T: FloatArray, uprights: Uprights) -> tuple[FloatArray, FloatArr
     return up - uprights.up_cam, D
 
 
+@dataclass(frozen=True, slots=True)
+class _Free:
+    """What of the poses may move."""
+
+    fixed: BoolArray  # (K,)
+    levelled: int | None  # a fixed pose that may rotate about the horizontal axes of the map
+
+    def directions(self, T: FloatArray) -> csc_matrix:
+        """Columns (6K, F) of the changes xi of the poses (K, 4, 4) that are free."""
+        rows = np.flatnonzero(np.repeat(~self.fixed, 6))
+        columns, values = np.arange(len(rows)), np.ones(len(rows))
+        if self.levelled is not None:
+            # T exp([0; R^T a]) rotates a pose about its position and the axis a of the map: the first two rows of R.
+            rows = np.concatenate([rows, np.tile(6 * self.levelled + np.arange(3, 6), 2)])
+            columns = np.concatenate([columns, np.repeat(len(columns) + np.arange(2), 3)])
+            values = np.concatenate([values, T[self.levelled, :2, :3].ravel()])
+        return coo_matrix((values, (rows, columns)), shape=(6 * len(T), int(columns.max(initial=-1)) + 1)).tocsc()
+
+
 def _descend(
-    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, uprights: Uprights, fixed: BoolArray, steps: int
+    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, uprights: Uprights, free: _Free, steps: int
 ) -> FloatArray:
     """Gauss-Newton with fixed weights (L,) of the loops."""
     for _ in range(steps):
-        xi = _step(T, odometry, loops, weight, uprights, fixed)
+        xi = _step(T, odometry, loops, weight, uprights, free)
         T = T @ se3_exp(xi)
         if np.abs(xi).max(initial=0.0) < _CONVERGED:
             break
@@ -149,7 +179,7 @@ def _descend(
 
 
 def _step(
-    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, uprights: Uprights, fixed: BoolArray
+    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, uprights: Uprights, free: _Free
 ) -> FloatArray:
     """Solve the normal equations (G4) for xi (K, 6)."""
     count = len(T)
@@ -172,10 +202,9 @@ def _step(
         D, r = D / uprights.sigma_rad[:, None, None], r / uprights.sigma_rad[:, None]
         blocks.append((uprights.pose, uprights.pose, np.swapaxes(D, 1, 2) @ D))
         np.add.at(gradient, uprights.pose, -np.einsum("eji,ej->ei", D, r))
-    free = np.flatnonzero(np.repeat(~fixed, 6))
-    xi = np.zeros(6 * count)
-    xi[free] = splu(_sparse(blocks, count)[free][:, free].tocsc()).solve(gradient.ravel()[free])
-    return xi.reshape(count, 6)
+    P = free.directions(T)
+    xi = P @ splu((P.T @ _sparse(blocks, count) @ P).tocsc()).solve(P.T @ gradient.ravel())
+    return np.asarray(xi).reshape(count, 6)
 
 
 def _sparse(blocks: list[tuple[IntArray, IntArray, FloatArray]], count: int) -> coo_matrix:

@@ -2,49 +2,40 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import Any
 
 import numpy as np
 
 from vio.colmap.model import keyframe_images
-from vio.colmap.reconstruction import Mapper, Reconstructed, match_images, reconstruct
-from vio.mapping.comparison import Comparison, compare_keyframes
+from vio.colmap.reconstruction import Mapper, match_images, reconstruct
+from vio.mapping.comparison import compare_keyframes
 from vio.mapping.keyframes import choose_keyframes
+from vio.mapping.loop_tracks import loop_pairs
 from vio.offline.images import write_images
+from vio.offline.verdict import MapperResult, overall_verdict
 from vio.plotting import write_picture
 from vio.records import Trajectory
 from vio.saved_run import SavedRun
 
+_MATCH_S, _MAP_S = 2.0, 1.0  # for a keyframe, see `expected_minutes`
+_MARGIN = 0.15  # of the path's extent, left free about it
+_LOGARITHMIC = 30.0  # ratio of largest to median distance beyond which a linear axis shows the largest only
+log = logging.getLogger(__name__)
+
 _COLOURS: dict[Mapper, str] = {"incremental": "#d9822b", "global": "#3a9d5d"}
 
 
-@dataclass(frozen=True, slots=True)
-class MapperResult:
-    """The reconstruction of a run's keyframes by one of COLMAP's mappers, and its comparison with the run."""
+def expected_minutes(keyframes: int, mappers: Sequence[Mapper]) -> float:
+    """Return about how long a check of as many keyframes takes on one slow core; images below 0.1 megapixel take less.
 
-    mapper: Mapper
-    total: int  # keyframes given
-    found: tuple[Reconstructed, Comparison] | None  # None: it could not connect them
-
-    @property
-    def verdict(self) -> str:
-        """A short summary."""
-        if self.found is None:
-            return (
-                "not observable because COLMAP could not connect the keyframes; too few images, no overlap between "
-                "them, or too little texture"
-            )
-        model, comparison = self.found
-        missing = self.total - len(model.keyframes)
-        left_out = f"; {missing} of {self.total} keyframes could not be connected" if missing else ""
-        if comparison.scale is None:
-            return f"poses compared, scale not observable because {comparison.why_no_scale}{left_out}"
-        where = f"disagrees in {len(comparison.segments)} segments" if comparison.segments else "agrees throughout"
-        return f"{where}{left_out}"
+    Measured with 30 keyframes of 1226 x 370 pixels: 1.8 s each for features and matches, 1.0 and 0.7 s for the mappers.
+    """
+    return keyframes * (_MATCH_S + _MAP_S * len(mappers)) / 60
 
 
 def check_run(
@@ -56,8 +47,11 @@ def check_run(
     source: str | None,
     threads: int,
     progress: Callable[[int, int], None],
+    announce: Callable[[str], None] = log.info,
 ) -> tuple[MapperResult, ...]:
     """Reconstruct keyframes of a run from their images with a known stereo rig, and compare.
+
+    Of a run that closed loops, keyframes at both ends of loops are matched as well, and its poses are those in the map.
 
     Writes a folder of each mapper's name with its model, and the plot `check.png`.
 
@@ -69,6 +63,7 @@ def check_run(
         source: the recording, if it is not at the path stored in the run.
         threads: for all steps; one makes the result repeatable.
         progress: called with (done, total).
+        announce: called with the number of keyframes and the time that they take.
 
     Raises:
         VioError: the run has too few views, or its images are not available.
@@ -77,49 +72,63 @@ def check_run(
     keyframes = choose_keyframes(path, most=most)
     names = keyframe_images(path.frames[keyframes])
     images, database = folder / "images", folder / "database.db"
+    minutes = expected_minutes(len(keyframes), mappers)
+    announce(f"{len(keyframes)} keyframes: about {minutes:.2g} minutes on one slow core")
     write_images(run, source, keyframes, names, images)
     progress(1, steps)
-    match_images(database, images, names, path.camera, threads=threads)
+    loops = loop_pairs(path.loops, path.frames[keyframes])
+    match_images(database, images, names, path.camera, loops, threads=threads)
     progress(2, steps)
     results: list[MapperResult] = []
     for mapper in mappers:
-        model = reconstruct(database, images, names, mapper, folder / mapper, threads=threads)
+        model = reconstruct(database, images, names, mapper, folder / mapper, loops, threads=threads)
         found = None
         if model is not None:
             rows = keyframes[model.keyframes]
             found = model, compare_keyframes(path, rows, model.T_world_cam0, run.truth)
         results.append(MapperResult(mapper, len(keyframes), found))
         progress(2 + len(results), steps)
-    write_picture(folder / "check.png", lambda: _figure(path.trajectory, results))
+    write_picture(folder / "check.png", lambda: draw_check(path.trajectory, results))
     shutil.rmtree(images)
     database.unlink()
     return tuple(results)
 
 
-def _figure(trajectory: Trajectory, results: Sequence[MapperResult]) -> Any:
-    """Plot the trajectories from above, and their distance along the path."""
+def draw_check(trajectory: Trajectory, results: Sequence[MapperResult]) -> Any:
+    """Plot the trajectories from above, and their distance along the path; a broken model must not shrink the rest."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 5), dpi=110, layout="constrained")
+    figure = Figure(figsize=(11, 5.4), dpi=110, layout="constrained")
     above, along = figure.subplots(1, 2)
     p = trajectory.positions
     axes = np.linalg.svd(p - p.mean(axis=0), full_matrices=False)[2][:2]
-    above.plot(*((p - p[0]) @ axes.T).T, color="#1f5fbf", label="run")
+    path = (p - p[0]) @ axes.T
+    above.plot(*path.T, color="#1f5fbf", label="run")
+    margin = _MARGIN * float(np.ptp(path, axis=0).max())
+    low, high = path.min(axis=0) - margin, path.max(axis=0) + margin
+    differences = [np.zeros(0)]
     for result in results:
         if result.found is None:
             continue
         comparison, colour = result.found[1], _COLOURS[result.mapper]
         q = (comparison.aligned[:, :3, 3] - p[0]) @ axes.T
-        above.plot(*q.T, ".", color=colour, label=f"COLMAP, {result.mapper}")
+        outside = int(((q < low) | (q > high)).any(axis=1).sum())
+        q[((q < low) | (q > high)).any(axis=1)] = np.nan
+        beyond = f" ({outside} of {len(q)} outside the picture)" if outside else ""
+        above.plot(*q.T, ".", color=colour, label=f"COLMAP, {result.mapper}{beyond}")
         along.plot(comparison.frames, 1e3 * comparison.difference_m, ".-", color=colour, label=result.mapper)
+        differences.append(comparison.difference_m)
         for segment in comparison.segments:
             along.axvspan(segment.first_frame, segment.last_frame, color=colour, alpha=0.2)
+    above.set(xlabel="m, plane of largest extent", ylabel="m")
     above.set_aspect("equal", "datalim")
-    above.set_xlabel("m, plane of largest extent")
-    along.set_xlabel("frame")
-    along.set_ylabel("distance to the run, mm")
+    apart = np.concatenate(differences)
+    if len(apart) and apart.max() > _LOGARITHMIC * max(float(np.median(apart)), 1e-9):
+        along.set_yscale("log")
+    along.set(xlabel="frame", ylabel="distance to the run, mm")
     for panel in (above, along):
         if panel.get_legend_handles_labels()[0]:
             panel.legend()
         panel.grid(alpha=0.3)
+    figure.suptitle("\n".join(wrap(overall_verdict(results), 120)), fontsize=10)
     return figure

@@ -1,4 +1,4 @@
-"""Write any recording of images as an EuRoC, KITTI or plain folder: streamed, rectified as a run sees them."""
+"""Write any recording of images as a folder of another form or as a ROS 2 bag: streamed, rectified as a run sees it."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import NOISE_KEYS, kalibr_text
 from vio.errors import DataError
 from vio.geometry.distortion import rig_from_rectified
+from vio.offline.convert_bag import write_bag
 from vio.protocols import Dataset, Progress
 from vio.records import (
     ImuDensities,
@@ -30,13 +31,15 @@ from vio.rig import Rig
 from vio.text_files import exact_text, seconds_text, write_text
 from vio.trajectory_io import in_first_cam0, write_tum
 
-Form: TypeAlias = Literal["euroc", "kitti", "plain"]
+Folder: TypeAlias = Literal["euroc", "kitti", "plain"]
+Form: TypeAlias = Literal["euroc", "kitti", "plain", "rosbag2", "mcap"]
 
 
 @dataclass(slots=True)
 class _Written:
     """What went into the folder."""
 
+    last_ns: int = 0  # of the last frame of the range, by whose digits images are named
     times_ns: list[int] = field(default_factory=list)
     imu: list[ImuSample] = field(default_factory=list)
     velocities: list[VelocitySample] = field(default_factory=list)
@@ -66,38 +69,50 @@ def convert(
     Args:
         dataset: a recording with images.
         out: the folder.
-        form: "euroc" (mav0), "kitti" (image_0 image_1 calib.txt times.txt) or "plain" (left right, Kalibr's file).
+        form: "euroc" (mav0), "kitti" (image_0 image_1 calib.txt times.txt), "plain" (left right, Kalibr's file), or a
+            ROS 2 bag of SQLite ("rosbag2") or MCAP ("mcap") with Kalibr's file beside it.
         start: first frame.
         stop: frame after the last one; None: to the end.
         progress: called after each frame.
 
     Raises:
         DataError: the recording has no images, or too many cannot be read.
+        MissingDependencyError: bags need the package rosbags.
     """
     recording = dataset.recording
     if not recording.has_images or recording.camera.width is None:
         raise DataError(f"{recording.path}: holds no images, so there is nothing to convert")
-    written = _write_images(dataset, out, form, start, stop, progress)
-    if not written.times_ns:
-        raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
     noise: ImuDensities | None = getattr(dataset, "imu_noise", None)
-    writers: dict[Form, Callable[[Path, Recording, _Written, ImuDensities | None], list[str]]] = {
+    if form == "rosbag2" or form == "mcap":  # mypy narrows the type by these
+        counts = write_bag(dataset, out, form, start, stop, progress)
+        _check_frames(counts.frames, recording)
+        _write_kalibr(out, recording, noise if counts.imu_samples else None)
+        notes = tuple(counts.notes(recording))
+        return Converted(counts.frames, counts.imu_samples, counts.velocities, notes)
+    written = _write_images(dataset, out, form, start, stop, progress)
+    _check_frames(len(written.times_ns), recording)
+    writers: dict[Folder, Callable[[Path, Recording, _Written, ImuDensities | None], list[str]]] = {
         "euroc": _finish_euroc,
         "kitti": _finish_kitti,
         "plain": _finish_plain,
     }
-    notes = writers[form](out, recording, written, noise)
-    return Converted(len(written.times_ns), len(written.imu), len(written.velocities), tuple(notes))
+    lacking = writers[form](out, recording, written, noise)
+    return Converted(len(written.times_ns), len(written.imu), len(written.velocities), tuple(lacking))
 
 
-def _folders(out: Path, form: Form) -> tuple[Path, Path]:
+def _check_frames(count: int, recording: Recording) -> None:
+    if not count:
+        raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
+
+
+def _folders(out: Path, form: Folder) -> tuple[Path, Path]:
     names = {"euroc": ("mav0/cam0/data", "mav0/cam1/data"), "kitti": ("image_0", "image_1"), "plain": ("left", "right")}
     left, right = (out / name for name in names[form])
     return left, right
 
 
 def _write_images(
-    dataset: Dataset, out: Path, form: Form, start: int, stop: int | None, progress: Progress
+    dataset: Dataset, out: Path, form: Folder, start: int, stop: int | None, progress: Progress
 ) -> _Written:
     """Write the images of a range, and collect its samples."""
     written = _Written()
@@ -106,7 +121,7 @@ def _write_images(
         folder.mkdir(parents=True)
     count = len(dataset.recording.frame_times_ns)
     total = (count if stop is None else min(stop, count)) - start
-    last_ns = int(dataset.recording.frame_times_ns[total + start - 1])
+    written.last_ns = int(dataset.recording.frame_times_ns[total + start - 1])
     for event in dataset.events(start, stop):
         if isinstance(event, ImuSample):
             written.imu.append(event)
@@ -115,7 +130,7 @@ def _write_images(
         else:
             assert event.left is not None
             assert event.right is not None
-            name = f"{len(written.times_ns):06d}.png" if form == "kitti" else image_name(event.time_ns, last_ns)
+            name = f"{len(written.times_ns):06d}.png" if form == "kitti" else image_name(event.time_ns, written.last_ns)
             for folder, image in zip(folders, (event.left, event.right), strict=True):
                 write_png(folder / name, image)
             written.times_ns.append(event.time_ns)
@@ -130,7 +145,7 @@ def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: Imu
     for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
         text = camera_yaml(camera, T_imu_cam, comment=f"rectified {name}", rate_hz=median_rate_hz(times))
         write_text(mav / name / "sensor.yaml", text)
-        write_text(mav / name / "data.csv", image_list_csv(times))
+        write_text(mav / name / "data.csv", image_list_csv(times, written.last_ns))
     notes = []
     if written.imu:
         record = _record(written.imu)
@@ -174,24 +189,29 @@ def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: Imu
 
 
 def _finish_plain(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
+    _write_kalibr(out, recording, noise if written.imu else None)
+    write_text(out / "times.txt", "".join(f"{seconds_text(t)}\n" for t in written.times_ns))
+    if written.imu:
+        write_text(out / "imu.csv", _imu_text(_record(written.imu)))
+    if written.velocities:
+        write_velocity(out, written.velocities, 0)
+    if recording.reference is not None and recording.reference.times_ns is not None:
+        write_tum(out / "reference.tum", recording.reference)
+    return []
+
+
+def _write_kalibr(out: Path, recording: Recording, noise: ImuDensities | None) -> None:
+    """Write the rectified rig as Kalibr's camchain, and the IMU's noise beside it."""
     c = recording.camera
     assert c.width is not None
     assert c.height is not None
     rig = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, c.width, c.height, recording.T_cam0_imu)
     imu = recording.T_cam0_imu is not None
     write_text(out / ("camchain-imucam.yaml" if imu else "camchain.yaml"), kalibr_text(rig))
-    write_text(out / "times.txt", "".join(f"{seconds_text(t)}\n" for t in written.times_ns))
-    if written.imu:
-        write_text(out / "imu.csv", _imu_text(_record(written.imu)))
-        if noise is not None:
-            values = (noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk)
-            text = "".join(f"{key}: {value!r}\n" for key, value in zip(NOISE_KEYS, values, strict=True))
-            write_text(out / "imu.yaml", text)
-    if written.velocities:
-        write_velocity(out, written.velocities, 0)
-    if recording.reference is not None and recording.reference.times_ns is not None:
-        write_tum(out / "reference.tum", recording.reference)
-    return []
+    if noise is not None:
+        values = (noise.gyro, noise.gyro_walk, noise.accel, noise.accel_walk)
+        text = "".join(f"{key}: {value!r}\n" for key, value in zip(NOISE_KEYS, values, strict=True))
+        write_text(out / "imu.yaml", text)
 
 
 def _record(samples: list[ImuSample]) -> ImuRecord:

@@ -19,6 +19,7 @@ from vio.colmap.model import (
 from vio.colmap.nerfstudio import coloured_ply, nerfstudio_transforms
 from vio.geometry.lie import FloatArray
 from vio.mapping.keyframes import choose_keyframes
+from vio.mapping.loop_tracks import loop_pairs
 from vio.mapping.points import PointTracks, build_tracks
 from vio.offline.images import write_images
 from vio.records import Image, IntArray
@@ -33,6 +34,8 @@ class Exported:
     images: int
     points: int
     mean_reprojection_error_px: float  # as COLMAP computes it
+    loops: int  # whose matches are in the model
+    loop_points: int  # points that loops join
 
 
 def export_colmap(
@@ -76,6 +79,8 @@ def export_colmap(
         images=2 * len(keyframes) if images else 0,
         points=len(tracks.ids),
         mean_reprojection_error_px=mean_reprojection_error_px(model),
+        loops=len(loop_pairs(run.tracked.loops, run.tracked.frames[keyframes])),
+        loop_points=len(np.unique(tracks.point[tracks.by_loop])),
     )
 
 

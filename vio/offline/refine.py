@@ -15,6 +15,7 @@ from vio.errors import ConfigError, EvaluationError
 from vio.evaluation import evaluate
 from vio.input_files import read_input
 from vio.mapping.keyframes import choose_keyframes
+from vio.mapping.loop_tracks import loop_pairs
 from vio.mapping.points import build_tracks, landmarks_of
 from vio.mapping.poses import fill_between, position_covariances, position_difference_m
 from vio.pipeline import run as process
@@ -35,9 +36,10 @@ class Refinement:
     landmarks: Landmarks
     adjustment: Adjustment
     keyframes: IntArray  # (K,) rows of the trajectory
+    loops: int  # whose matches took part
     aligned: int  # frames between keyframes that were aligned to the refined points
     with_priors: bool
-    moved_rms_m: float  # RMS displacement from the run, after SE(3) alignment
+    moved_rms_m: float  # RMS displacement from the run, or from its poses in the map, after SE(3) alignment
     ate_before_m: float | None  # against the reference in the recording; None without one
     ate_m: float | None  # likewise, after refinement
 
@@ -47,6 +49,9 @@ def refine_run(
 ) -> Refinement:
     """Bundle-adjust the keyframes of a run under its stereo rig, and align the other frames to the refined points.
 
+    The features that agree with the loops of a run with a map are points across the loop, and the poses to begin with
+    are those in the map.
+
     Args:
         run: the run.
         most: largest number of keyframes; None: as many as needed.
@@ -55,9 +60,12 @@ def refine_run(
         progress: called with the number of steps done.
 
     Raises:
+        ConfigError: priors were asked for of a run that closed loops.
         VioError: the run has too few views or no consistent track, or the solver failed.
     """
     path = run.tracked
+    if priors and path.loops:
+        raise ConfigError(f"{path.where}: its loops moved the poses away from the filter's; leave --priors out")
     keyframes = choose_keyframes(path, most=most)
     T_world_cam0 = path.trajectory.T_world_body[keyframes]
     tracks = build_tracks(path, keyframes, T_world_cam0)
@@ -76,6 +84,7 @@ def refine_run(
         landmarks=landmarks_of(path.camera, done.T_world_cam0, done.tracks, done.sigma_px),
         adjustment=done,
         keyframes=keyframes,
+        loops=len(loop_pairs(path.loops, path.frames[keyframes])),
         aligned=aligned,
         with_priors=held is not None,
         moved_rms_m=position_difference_m(path.trajectory, refined),

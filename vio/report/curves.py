@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.evaluation import align_poses, settle_rotation
 from vio.finished_run import FinishedRun
-from vio.geometry.lie import FloatArray, se3_from_parts, transform_points
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, transform_points
 from vio.upright import attitude_deg, up_of, upright_axes
 
 _MOST = 3000  # samples of a curve; more are not seen on a screen
@@ -27,6 +28,15 @@ class Truth:
 
 
 @dataclass(frozen=True, slots=True)
+class Mapped:
+    """A run in its map, turned so that both are upright and begin at the same place."""
+
+    position: FloatArray  # (N, 3) right, ahead, up, metres
+    keyframes: FloatArray  # (K, 3)
+    loops: FloatArray  # (L, 2, 3) from a frame to the keyframe of this run that it sees again; those that were kept
+
+
+@dataclass(frozen=True, slots=True)
 class Curves:
     """A run at N of its frames."""
 
@@ -42,6 +52,7 @@ class Curves:
     points: FloatArray  # (M, 3) landmarks
     dead_reckoning: FloatArray | None  # (K, 3)
     truth: Truth | None
+    mapped: Mapped | None  # None: the run had no map
     draws_truth: bool  # whether it is the first of its recording, whose truth is drawn once
 
 
@@ -107,7 +118,30 @@ def _curves(run: FinishedRun, view_ref: FloatArray | None, first: bool) -> Curve
         if reckoned is None
         else transform_points(T_view_world, reckoned.positions[thinned(len(reckoned))]),
         truth=None if run.evaluation is None or view_ref is None else _truth(run, view_ref),
+        mapped=_mapped(run, T_view_world, view_ref),
         draws_truth=first,
+    )
+
+
+def _mapped(run: FinishedRun, T_view_world: FloatArray, view_ref: FloatArray | None) -> Mapped | None:
+    """Return a run in its map: aligned with the reference as the run itself is, else so that the first poses agree."""
+    if run.mapped is None:
+        return None
+    T = run.mapped.T_world_body
+    T_view_map = T_view_world @ run.trajectory.T_world_body[0] @ se3_inverse(T[0])
+    if run.evaluation is not None and view_ref is not None:
+        found = run.evaluation
+        truth = _reference_body(run)
+        alignment = settle_rotation(align_poses(T[found.rows], truth, "se3"), T[found.rows], truth)
+        T_view_map = view_ref @ se3_from_parts(alignment.R, alignment.t)
+    place = {int(index): row for row, index in enumerate(run.estimates["index"])}
+    ends = [(loop.frame, loop.keyframe_frame) for loop in run.loops if loop.kept]
+    rows = [(place[a], place[b]) for a, b in ends if a in place and b is not None and b in place]
+    p: FloatArray = transform_points(T_view_map, T[:, :3, 3])
+    return Mapped(
+        position=p[thinned(len(p))],
+        keyframes=transform_points(T_view_map, run.map_keyframes.T_map_body[:, :3, 3]),
+        loops=p[np.array(rows, dtype=np.int64).reshape(-1, 2)],
     )
 
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
 
 COLOURS = ("#1f5fbf", "#d9822b", "#2e8b57", "#a83279", "#7a5195", "#0f8b8d", "#b5533c", "#6b7280")
-_TRUTH, _POINTS = "#111111", "#9aa5b1"
+_TRUTH, _POINTS, _LOOPS = "#111111", "#9aa5b1", "#c82828"
 _SIGMAS = 3.0  # half width of the bands
 _BULK = (10, 90)  # percentiles of the bands' edges that an axis shows at least
 _AXES = ("right", "ahead", "up")
@@ -34,7 +34,7 @@ class Section:
 
 def sections(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Section]:
     """Return all figures that these runs have the data for."""
-    found = [_maps(runs, curves), _position(runs, curves), _attitude(runs, curves)]
+    found = [_paths(runs, curves), *_mapped(runs, curves), _position(runs, curves), _attitude(runs, curves)]
     found += [f(runs, curves) for f in (_velocity, _errors) if _applies(f, curves)]
     found += [_features(runs), _innovations(runs), *_biases(runs), _timing(runs), *_stereo(runs)]
     return found
@@ -46,7 +46,7 @@ def _applies(section: Any, curves: Sequence[Curves]) -> bool:
     return any(c.truth is not None for c in curves)
 
 
-def _maps(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
     """Draw the path from above and from the side, with the landmarks."""
     figure = _subplots(1, 2, titles=("from above", "from the side"), shared=False)
     for column, (first, second) in enumerate(((0, 1), (1, 2)), start=1):
@@ -66,6 +66,32 @@ def _maps(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
         figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
     figure.update_layout(height=560)
     return Section("Path", figure, "Axes are right, ahead and up at the start.")
+
+
+def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Section]:
+    """Draw the runs that had a map in it, from above, with keyframes and loops."""
+    chosen = [
+        (r, c.mapped, colour) for r, c, colour in zip(runs, curves, COLOURS, strict=False) if c.mapped is not None
+    ]
+    if not chosen:
+        return []
+    figure = _subplots(1, 1, shared=False)
+    for truth in _truths(curves):
+        _line(figure, truth.position[:, :2], "ground truth", _TRUTH, 1, 1, width=3)
+    for run, mapped, colour in chosen:
+        name = "" if len(chosen) == 1 else f"{run.name}, "
+        marks = {"size": 5, "symbol": "circle-open"}
+        _line(figure, mapped.keyframes[:, :2], f"{name}keyframes", _POINTS, 1, 1, mode="markers", marker=marks)
+        # One trace of separate strokes: rows of NaN part them.
+        strokes = np.concatenate([mapped.loops[:, :, :2], np.full((len(mapped.loops), 1, 2), np.nan)], axis=1)
+        if len(strokes):
+            _line(figure, strokes.reshape(-1, 2), f"{name}loops ({len(strokes)})", _LOOPS, 1, 1, width=1.2)
+        _line(figure, mapped.position[:, :2], f"{name}in the map", colour, 1, 1)
+    figure.update_xaxes(title_text=f"{_AXES[0]} (m)", row=1, col=1)
+    figure.update_yaxes(title_text=f"{_AXES[1]} (m)", scaleanchor="x", row=1, col=1)
+    figure.update_layout(height=560)
+    text = "Poses of all frames after the last optimisation; a loop joins a frame with the keyframe that it sees again."
+    return [Section("Map", figure, text)]
 
 
 def _position(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from vio.evaluation import lengths_text
 from vio.finished_run import FinishedRun
 
 _MOTION = {"imu": "an IMU", "velocity": "velocities", "none": "images alone"}
@@ -38,9 +39,8 @@ def summary(run: FinishedRun) -> list[str]:
             f"the path), at most {evaluation.ate_m.max:.3g} m; the attitude error {evaluation.ate_deg.rmse:.2g} deg."
         )
         if evaluation.kitti is not None:
-            lengths = ", ".join(f"{e.length_m:g}" for e in evaluation.kitti.per_length if e.segments)
             lines.append(
-                f"Drift over {lengths} m is {evaluation.kitti.t_err_percent:.2g} % and "
+                f"Drift over {lengths_text(evaluation.kitti.lengths_m)} is {evaluation.kitti.t_err_percent:.2g} % and "
                 f"{evaluation.kitti.r_err_deg_per_100m:.2g} deg per 100 m."
             )
     lines.append(_speed(run))

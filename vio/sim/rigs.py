@@ -1,4 +1,4 @@
-"""Predefined stereo rigs: KITTI-like, EuRoC-like, fisheye, and a small one for demos and tests."""
+"""Predefined stereo rigs: KITTI-like, EuRoC-like, fisheye, wide, and a small one for demos and tests."""
 
 from __future__ import annotations
 
@@ -128,3 +128,23 @@ def fisheye_rig(width: int = 640, height: int = 480) -> StereoRig:
     T_cam0_cam1[:3, :3] = [[np.cos(toe), 0, -np.sin(toe)], [0, 1, 0], [np.sin(toe), 0, np.cos(toe)]]
     T_cam0_cam1[:3, 3] = [0.11, 0.001, -0.002]
     return StereoRig(cam0, cam1, T_imu_cam0, T_imu_cam0 @ T_cam0_cam1)
+
+
+def wide_rig(width: int = 512) -> StereoRig:
+    """Unrectified equidistant pair like TUM-VI's: square images, 154 degrees across and 220 from corner to corner.
+
+    The lenses are those of its 512x512 calibration, with the two cameras pitched against each other by 2.7 degrees as
+    there; IMU axes forward, left, up.
+    Reference: Schubert et al., The TUM VI benchmark for evaluating visual-inertial odometry (2018).
+    """
+    s = width / 512
+    lens0 = (0.003482389, 0.000715035, -0.002053236, 0.000202937)
+    lens1 = (0.003400317, 0.001766278, -0.002663126, 0.000329952)
+    cam0 = CameraModel(190.98 * s, 190.97 * s, 254.93 * s, 256.90 * s, width, width, "equidistant", lens0)
+    cam1 = CameraModel(190.44 * s, 190.43 * s, 252.60 * s, 254.92 * s, width, width, "equidistant", lens1)
+    T_imu_cam0 = se3_inverse(_forward_T_cam0_imu((0.04, 0.0505, 0.01)))
+    pitch = 0.0469
+    T_cam1_cam0 = np.eye(4)
+    T_cam1_cam0[1:3, 1:3] = [[np.cos(pitch), -np.sin(pitch)], [np.sin(pitch), np.cos(pitch)]]
+    T_cam1_cam0[:3, 3] = [-0.10092, -0.00196, -0.00147]
+    return StereoRig(cam0, cam1, T_imu_cam0, T_imu_cam0 @ se3_inverse(T_cam1_cam0))

@@ -44,13 +44,14 @@ from vio.sim.rigs import (
     fisheye_rig,
     kitti_like_rig,
     small_rig,
+    wide_rig,
 )
 from vio.sim.sequence import FrameFaults, SimulatedRecording, Simulation, read_flight, room_around, simulate
 from vio.sim.textures import TextureKind
 from vio.sim.world import MovingBox, SceneName, World, corridor, equal_doors, room, street
 
 ReadyMotion: TypeAlias = Literal["handheld", "car"]
-RigName: TypeAlias = Literal["euroc", "euroc-rectified", "kitti", "fisheye", "small"]
+RigName: TypeAlias = Literal["euroc", "euroc-rectified", "kitti", "fisheye", "wide", "small"]
 VelocityName: TypeAlias = Literal["none", "paper", "exact"]
 
 RIGS: dict[str, Callable[[], StereoRig]] = {
@@ -58,6 +59,7 @@ RIGS: dict[str, Callable[[], StereoRig]] = {
     "euroc-rectified": euroc_rectified_rig,
     "kitti": kitti_like_rig,
     "fisheye": fisheye_rig,
+    "wide": wide_rig,
     "small": small_rig,
 }
 _EUROC_AXES = ("euroc", "euroc-rectified")  # rigs whose IMU axes are up, right, forward

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vio.datasets import open_dataset
+from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError, VioError
 from vio.finished_run import FinishedRun
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import Projection, StereoCamera
 from vio.records import Image, Landmarks, StereoFrame, UpdateReport
 from vio.run_tables import estimate_of
 from vio.saved_run import OBSERVATIONS
@@ -33,15 +33,17 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
     Raises:
         DataError: the folder was written by a version that did not keep the camera.
     """
-    viewer = RerunViewer(stream, _rig_of(run), share=1.0)
+    rig = _rig_of(run)
+    viewer = RerunViewer(stream, rig, share=1.0)
     saved = run.folder / OBSERVATIONS
     log_of_features = read_observation_log(saved) if saved.is_file() else None
-    images = _images_of(run)
+    images = _images_of(run, rig.camera.projection)
     names = {
         "features": ("tracked", "matched", "selected", "used", "gated"),
         "innovation": ("innovation_median_px", "nis_per_dof"),
         "time": [f"{name}_ms" for name in SERIES["time"]],
     }
+    keyframes = set(run.map_keyframes.frame[run.map_keyframes.own].tolist())
     for row, estimate in enumerate(map(estimate_of, run.estimates)):
         index = int(run.estimates["index"][row])
         numbers = {curve: [float(run.frames[name][row]) for name in columns] for curve, columns in names.items()}
@@ -49,6 +51,8 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
         states = None if seen is None else states_of(seen, seen.has_right, _NOTHING_DONE)
         image = next(images, None) if row % _EVERY_IMAGE == 0 else None
         viewer.show(index, estimate, numbers, image, seen, states)
+        loops = [loop for loop in run.loops if loop.frame == index]
+        viewer.places(index, estimate, is_keyframe=index in keyframes, loops=loops)
     ids = np.arange(len(run.points))
     viewer.landmarks(Landmarks(ids, run.points, np.zeros((len(ids), 3, 3))))
     viewer.close()
@@ -68,11 +72,11 @@ def _rig_of(run: FinishedRun) -> ViewedRig:
     return ViewedRig(camera, run.T_cam0_body, run.metrics.get("motion"), reference)
 
 
-def _images_of(run: FinishedRun) -> Iterator[Image]:
+def _images_of(run: FinishedRun, projection: Projection) -> Iterator[Image]:
     """Yield the left images of every fifth frame of a run; none where the recording is not there any more."""
     source = f"{run.metrics.get('kind')}:{run.metrics.get('source')}"
     try:
-        dataset = open_dataset(source)
+        dataset = open_dataset(source, DatasetSettings(projection=projection))
     except VioError as error:
         log.warning("the images are not shown: %s", error)
         return

@@ -15,7 +15,8 @@ import numpy as np
 
 from vio.frame_result import FrameResult
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, left_rays
+from vio.loops import LoopEvent
 from vio.records import BoolArray, Estimate, Image, IntArray, Landmarks, Observations, Trajectory, UpdateReport
 from vio.upright import up_of, upright_axes
 
@@ -82,6 +83,8 @@ class RerunViewer:
         self._scale = min(_WIDEST_PX / (rig.camera.width or _WIDEST_PX), 1.0)  # of the image that is shown
         self._tails: dict[int, list[FloatArray]] = {}
         self._ages: dict[int, int] = {}
+        self._places: dict[int, FloatArray] = {}  # positions of the keyframes of a map, by frame
+        self._loops: list[list[FloatArray]] = []  # from a frame to the keyframe that it sees again
         self._spent_s, self._began_s = 0.0, time.perf_counter()
         self._layout()
 
@@ -96,6 +99,7 @@ class RerunViewer:
         }
         states = states_of(output.observations, chosen, report)
         self.show(result.frame.index, result.estimate, numbers, result.frame.left, output.observations, states)
+        self.places(result.frame.index, result.estimate, is_keyframe=result.is_keyframe, loops=result.loops)
 
     def show(
         self,
@@ -131,6 +135,33 @@ class RerunViewer:
                 self._points(seen, estimate)
             self._spent_s += time.perf_counter() - start
 
+    def places(self, index: int, estimate: Estimate, *, is_keyframe: bool, loops: Sequence[LoopEvent]) -> None:
+        """Show keyframes of a map, and its loops within this run as lines between the odometry's positions.
+
+        Args:
+            index: number of the present frame.
+            estimate: of it.
+            is_keyframe: whether it becomes one.
+            loops: whose results have come with it.
+        """
+        import rerun as rr
+
+        if is_keyframe:
+            self._places[index] = estimate.T_world_imu[:3, 3]
+            marks = rr.Points3D(list(self._places.values()), colors=_STATES["landmark"], radii=rr.Radius.ui_points(3))
+            self._stream.log("world/run/keyframes", marks)
+        for loop in loops:
+            other = "an earlier session" if loop.keyframe_frame is None else f"frame {loop.keyframe_frame}"
+            text = (
+                f"frame {loop.frame} sees the place of {other} again: {loop.inliers} features, {loop.gap_m:.3f} m off"
+            )
+            self._stream.log("loops", rr.TextLog(text))
+            ends = [self._places[k] for k in (loop.frame, loop.keyframe_frame) if k in self._places]
+            self._loops += [ends] if len(ends) == 2 else []
+        if loops and self._loops:
+            lines = rr.LineStrips3D(self._loops, colors=_STATES["gated"], radii=rr.Radius.ui_points(2))
+            self._stream.log("world/run/loops", lines)
+
     def landmarks(self, landmarks: Landmarks) -> None:
         """Show the map at the end of the run."""
         import rerun as rr
@@ -160,7 +191,7 @@ class RerunViewer:
             self._stream.log(f"plots/{name}", rr.SeriesLines(names=list(series)), static=True)
         camera, scale = self._rig.camera, self._scale
         size = scale * np.array([camera.width or 2 * camera.cu, camera.height or 2 * camera.cv])
-        focal, centre = scale * np.array([[camera.fu, camera.fv], [camera.cu, camera.cv]])
+        focal, centre = scale * np.array([camera.fu, camera.fv]), self._pixels(np.array([camera.cu, camera.cv]))
         self._stream.log(_LEFT, rr.Pinhole(focal_length=focal, principal_point=centre, resolution=size), static=True)
 
     def _start(self, T_world_body: FloatArray) -> FloatArray:
@@ -251,13 +282,17 @@ class RerunViewer:
     def _tracks(self, seen: Observations, states: IntArray) -> None:
         import rerun as rr
 
-        pixels = self._scale * seen.z[:, :2]
+        pixels = self._pixels(seen.z[:, :2])
         self._stream.log(f"{_LEFT}/features", rr.Points2D(pixels, class_ids=states, radii=rr.Radius.ui_points(3)))
         tails = [self._tails[name] for name in seen.ids.tolist()]
         long = [k for k, tail in enumerate(tails) if len(tail) > 1]
         ages = np.array([self._ages[name] for name in seen.ids[long].tolist()])
-        strips = rr.LineStrips2D([self._scale * np.array(tails[k]) for k in long], colors=age_colours(ages))
+        strips = rr.LineStrips2D([self._pixels(np.array(tails[k])) for k in long], colors=age_colours(ages))
         self._stream.log(f"{_LEFT}/tracks_by_age", strips)
+
+    def _pixels(self, pixels: FloatArray) -> FloatArray:
+        """Return pixels (..., 2) of the shown image; rerun counts from the first one's corner, we from its centre."""
+        return self._scale * (pixels + 0.5)
 
     def _points(self, seen: Observations, estimate: Estimate) -> None:
         """Draw the features of this frame where their stereo views see them."""
@@ -266,8 +301,7 @@ class RerunViewer:
         camera, z = self._rig.camera, seen.z
         near = seen.has_right & (z[:, 0] - z[:, 2] > _LEAST_DISPARITY_PX)
         depth = camera.fu * camera.baseline_m / (z[near, 0] - z[near, 2])
-        x, y = (z[near, 0] - camera.cu) / camera.fu, (z[near, 1] - camera.cv) / camera.fv
-        p_cam = np.stack([x * depth, y * depth, depth], axis=1)
+        p_cam = left_rays(camera, z[near, :2]) * depth[:, None]
         T_world_cam0 = estimate.T_world_imu @ se3_inverse(self._rig.T_cam0_body)
         points = rr.Points3D(transform_points(T_world_cam0, p_cam), radii=rr.Radius.ui_points(2))
         self._stream.log("world/run/points_of_this_frame", points)

@@ -16,6 +16,7 @@ import numpy as np
 from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_log
 from vio.records import Image, ImuSample, IntArray, MotionPrior, Observations, Prediction, StereoFrame
+from vio.robust import median
 from vio.standstill import STANDSTILL_S, blocks_agree
 from vio.statistics import chi_square_quantile
 
@@ -27,6 +28,7 @@ _ERRORS = 3.0  # … nor one that moves by less than so many times what predicti
 _RECENT, _LEAST_RECENT = 20, 5  # … at most in so many frames
 _UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
 _SHARE = 0.8  # of the corners that must be unmoved
+_FIRST_ROWS = 8  # compared before all others
 _PROBABILITY = 0.9999  # chi-square limit of the predicted motion for no motion to be possible
 _MOST_LINES = 3  # rows of repetitions that are reported one by one
 _GYRO_NOISE, _ACCEL_NOISE = 2e-4, 1.2e-2  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
@@ -64,7 +66,7 @@ class FrozenImages:
             _, a, b = np.intersect1d(seen.ids, self._expected.tracks.ids, assume_unique=True, return_indices=True)
             if len(a):
                 off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
-                self._errors_px.append(float(np.median(np.linalg.norm(off, axis=1))))
+                self._errors_px.append(median(np.linalg.norm(off, axis=1)))
         self._seen = seen
 
     def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
@@ -81,14 +83,13 @@ class FrozenImages:
 
     def _compare(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
         shown = self._shown
-        if shown is None or frame.left is None or frame.right is None:
+        if shown is None or frame.left is None:
             return None
-        assert shown.left is not None
-        assert shown.right is not None
-        if frame.left.shape != shown.left.shape or frame.right.shape != shown.right.shape:
+        images, before = _images(frame), _images(shown)
+        if [image.shape for image in images] != [image.shape for image in before]:
             return None  # the front end refuses it
         again = self._repeating is not None  # what was given again once is, until it changes
-        if np.array_equal(frame.left, shown.left) and np.array_equal(frame.right, shown.right):
+        if all(_equal(new, old) for new, old in zip(images, before, strict=True)):
             return Repeated(shown.index, True) if again or self._moves(expected) else None
         if self._seen is None or expected is None:
             return None
@@ -125,6 +126,11 @@ class FrozenImages:
         return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > chi_square_quantile(_PROBABILITY, 6))
 
 
+def _equal(a: Image, b: Image) -> bool:
+    """Whether two images (H, W) are the same to the bit; most differ in their first rows, and need no more."""
+    return np.array_equal(a[:_FIRST_ROWS], b[:_FIRST_ROWS]) and np.array_equal(a, b)
+
+
 def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float) -> Observations:
     """The features of the last frame that the prediction moves clearly in the left image."""
     _, a, b = np.intersect1d(seen.ids, expected.tracks.ids, assume_unique=True, return_indices=True)
@@ -132,14 +138,15 @@ def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float
     return seen.take(a[moved > least_px])
 
 
+def _images(frame: StereoFrame) -> list[Image]:
+    """The images of a frame: left and right, or that of one camera."""
+    return [image for image in (frame.left, frame.right) if image is not None]
+
+
 def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     """Whether features have not moved since they were seen, in both images."""
-    for old, new, pixels in (
-        (before.left, now.left, seen.z[:_CORNERS, :2]),
-        (before.right, now.right, seen.z[seen.has_right][:_CORNERS, 2:]),
-    ):
-        assert old is not None
-        assert new is not None
+    of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
+    for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
         flow = corner_flow(old, new, pixels)
         if len(flow) < _LEAST_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
             return False

@@ -8,6 +8,7 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.records import Estimate, UpdateReport
+from vio.robust import median
 
 _NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
 _GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many times the usual time
@@ -74,7 +75,7 @@ class RunHealth:
         if last is None:
             return []
         step_s = (estimate.time_ns - last[0]) * 1e-9
-        usual_s = float(np.median(self._steps_s)) if len(self._steps_s) >= _LEAST_STEPS else np.inf
+        usual_s = median(self._steps_s) if len(self._steps_s) >= _LEAST_STEPS else np.inf
         self._steps_s.append(step_s)
         if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
             return []

@@ -17,12 +17,18 @@ def is_bag(path: Path) -> bool:
 
 
 def bag_files(path: Path) -> tuple[Path, ...]:
-    """Return what is opened together: a ROS 2 folder or a file itself, or all bags of a folder by name."""
-    if not path.is_dir():
+    """Return what is opened together: a ROS 2 folder or a file itself, or all bags of one kind of a folder by name."""
+    if not path.is_dir() or _is_ros2_folder(path):
         return (path,)
+    children = sorted(path.iterdir())
+    found = [child for child in children if child.suffix in _SUFFIXES and child.is_file()]
+    if found:
+        return tuple(found) if len({child.suffix for child in found}) == 1 else ()
+    return tuple(child for child in children if child.is_dir() and _is_ros2_folder(child))
+
+
+def _is_ros2_folder(path: Path) -> bool:
     metadata = path / "metadata.yaml"
-    if metadata.is_file() and "rosbag2_bagfile_information" in metadata.read_text(encoding="utf-8", errors="replace"):
-        return (path,)
-    found = sorted(child for child in path.iterdir() if child.suffix in _SUFFIXES and child.is_file())
-    suffixes = {child.suffix for child in found}
-    return tuple(found) if len(suffixes) == 1 else ()
+    return metadata.is_file() and "rosbag2_bagfile_information" in metadata.read_text(
+        encoding="utf-8", errors="replace"
+    )

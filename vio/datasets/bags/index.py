@@ -6,7 +6,7 @@ Nothing of an image is kept but its stamp, so memory does not grow with the imag
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -60,6 +60,7 @@ class BagIndex:
     imu_frame: str = ""
     velocities: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)
     poses: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)  # x y z qx qy qz qw
+    moving: dict[tuple[str, str], list[tuple[int, tuple[float, ...]]]] = field(default_factory=dict)  # likewise, of /tf
     infos: dict[str, CameraInfo] = field(default_factory=dict)  # by topic
     frames: dict[tuple[str, str], FloatArray] = field(default_factory=dict)  # T_parent_child of tf_static
     disordered: dict[str, int] = field(default_factory=dict)  # samples that came late, by topic
@@ -79,15 +80,25 @@ class BagIndex:
         return tuple(VelocitySample(t, row[:3], row[3:]) for t, row in zip(times.tolist(), values, strict=True))
 
     def reference(self, *, imu: bool) -> Trajectory | None:
-        """The poses as those of the IMU, or of the left camera where there is none; None: there are none."""
-        if not self.poses:
-            return None
-        times, values = _sorted(self.poses)
-        q = values[:, 3:]
-        norm = np.linalg.norm(q, axis=1)
-        usable = norm > 0.5
-        R = rotation_from_quat_xyzw(q[usable] / norm[usable, None])
-        return Trajectory(se3_from_parts(R, values[usable, :3]), times[usable], "imu" if imu else "cam0")
+        """The poses as those of the IMU, or of the left camera where there is none; None: there are none.
+
+        Raises:
+            DataError: poses were to come from /tf, where no moving frame carries the body.
+        """
+        if self.moving:
+            of_imu = imu and bool(self.imu_frame)
+            return self._carried((self.imu_frame if of_imu else self.left.frame_id).lstrip("/"), imu=of_imu)
+        return _trajectory(self.poses, imu=imu)
+
+    def _carried(self, body: str, *, imu: bool) -> Trajectory | None:
+        """Return the poses of a frame in the parent of the moving frame that carries it."""
+        carriers = {key: T for key in self.moving if (T := self.transform(key[1], body)) is not None}
+        if not carriers:
+            names = ", ".join(f"{parent} to {child}" for parent, child in self.moving)
+            raise DataError(f"/tf: of its moving frames ({names}) none carries {body}; name another reference=/TOPIC")
+        key = max(carriers, key=lambda name: len(self.moving[name]))
+        found = _trajectory(self.moving[key], imu=imu)
+        return None if found is None else replace(found, T_world_body=found.T_world_body @ carriers[key])
 
     def transform(self, target: str, source: str) -> FloatArray | None:
         """`T_target_source` (4, 4) through the static frames; None: they are not connected."""
@@ -104,6 +115,18 @@ class BagIndex:
                     reached[there] = T @ reached[here]
                     waiting.append(there)
         return reached.get(target)
+
+
+def _trajectory(rows: Sequence[tuple[int, tuple[float, ...]]], *, imu: bool) -> Trajectory | None:
+    """Return poses x y z qx qy qz qw in the order of their stamps; None: there are none."""
+    if not rows:
+        return None
+    times, values = _sorted(rows)
+    q = values[:, 3:]
+    norm = np.linalg.norm(q, axis=1)
+    usable = norm > 0.5
+    R = rotation_from_quat_xyzw(q[usable] / norm[usable, None])
+    return Trajectory(se3_from_parts(R, values[usable, :3]), times[usable], "imu" if imu else "cam0")
 
 
 def _sorted(rows: Sequence[tuple[int, tuple[float, ...]]]) -> tuple[IntArray, FloatArray]:
@@ -203,6 +226,12 @@ def _velocity(index: BagIndex, fields: Any, message: Message) -> None:
 
 
 def _pose(index: BagIndex, fields: Any, message: Message) -> None:
+    if message.kind == TF:
+        for item in fields.transforms:
+            key = (str(item.header.frame_id).lstrip("/"), str(item.child_frame_id).lstrip("/"))
+            p, q = item.transform.translation, item.transform.rotation
+            index.moving.setdefault(key, []).append((stamp_of(item), (p.x, p.y, p.z, q.x, q.y, q.z, q.w)))
+        return
     if hasattr(fields, "transform"):
         p, q = fields.transform.translation, fields.transform.rotation
     else:

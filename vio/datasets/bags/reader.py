@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vio.datasets.bags import bag_files
 from vio.datasets.bags.index import BagIndex, index_bag, info_topic, stamp_of
 from vio.datasets.bags.pictures import gray_of, white_of
 from vio.datasets.bags.store import Bag, Topic
@@ -19,7 +20,7 @@ from vio.datasets.image_pairs import BadFrame, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.datasets.overlap import check_overlap, reference_of_body
 from vio.datasets.pairing import PAIRED_NS, pair_stamps
-from vio.datasets.rigs import load_rig
+from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.rigs.camera_info import rig_from_camera_infos
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import imu_notes
@@ -136,22 +137,23 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         DataError: the bag is damaged, its topics do not make a stereo recording, or no images match.
         CalibrationError: there is no calibration, or it is invalid.
     """
+    beside, notes_on_files = _calibration_beside(path, settings)
     with Bag(path) as bag:
         topics = bag.topics
         roles, notes = choose(topics, settings.topics, str(path))
         infos = [info_topic(topics, topic) for topic in (roles.left, roles.right)]
-        if settings.calibration is None and None in infos:
+        if settings.calibration is None and beside is None and None in infos:
             missing = (roles.left, roles.right)[infos.index(None)].name
             raise CalibrationError(
                 f"{path}: holds no CameraInfo for {missing}; give the cameras' calibration with --calibration FILE"
             )
         index = index_bag(bag, roles, [name for name in infos if name is not None])
         size = index.left.size or _compressed_size(bag, roles.left)
-    rig = _rig(index, infos, roles, settings, size)
+    rig, file, rig_notes = _chosen_rig(index, infos, roles, settings.calibration, beside, size)
     left_ns, right_ns, logged_ns, pair_notes = _paired(index, roles, path)
-    where = settings.calibration or path
+    where = file or path
     with naming(where):
-        rectifier = rig.rectifier(settings.interpolation)
+        rectifier = rig.rectifier(settings.interpolation, settings.projection)
     motion, sources, motion_notes = _motion(index, roles, rig, left_ns, path)
     truth = index.reference(imu=rig.T_cam0_imu is not None)
     white = white_of(max(index.left.white, index.right.white)) if index.left.white else white_of(65535)
@@ -164,7 +166,10 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         has_images=True,
         motion=sources,
         reference=None if truth is None else reference_of_body(truth, rig, rectifier),
-        notes=(*rig.notes, *pair_notes, *motion_notes, *_white_note(white), *notes),
+        notes=(
+            *(*rig.notes, *rectifier.notes, *pair_notes, *motion_notes),
+            *(*_white_note(white), *notes_on_files, *rig_notes, *notes),
+        ),
     )
     sizes = (
         ImageSize(rig.cam0.width, rig.cam0.height, Path(infos[0] or where)),
@@ -187,6 +192,16 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     )
 
 
+def _calibration_beside(path: Path, settings: DatasetSettings) -> tuple[Path | None, list[str]]:
+    """Return the calibration file in a bag's folder where no other is named, and a note on bags that are joined."""
+    parts = bag_files(path)
+    notes = [f"{len(parts)} bags are joined: {', '.join(part.name for part in parts)}"] if len(parts) > 1 else []
+    if settings.calibration is not None:
+        return None, notes
+    folders = [folder for folder in dict.fromkeys((path, *parts)) if folder.is_dir()]
+    return next((found for folder in folders if (found := find_calibration(folder)) is not None), None), notes
+
+
 def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
     """Return width and height of the first compressed image that decodes; None: none of the first few does."""
     for count, message in enumerate(bag.messages([topic.name])):
@@ -200,12 +215,32 @@ def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
     return None
 
 
+def _chosen_rig(
+    index: BagIndex,
+    infos: Sequence[str | None],
+    roles: Roles,
+    named: Path | None,
+    beside: Path | None,
+    size: tuple[int, int] | None,
+) -> tuple[Rig, Path | None, list[str]]:
+    """Return the rig of the named file, else of one beside the bag, else of the CameraInfos; its file; and notes."""
+    if named is not None or beside is None:
+        return _rig(index, infos, roles, named, size), named, []
+    try:
+        rig = _rig(index, infos, roles, beside, size)
+    except CalibrationError as error:
+        if None in infos:
+            raise
+        return _rig(index, infos, roles, None, size), None, [f"the bag's CameraInfo serves, as {error}"]
+    return rig, beside, [f"the calibration is {beside.name}, not the bag's CameraInfo"]
+
+
 def _rig(
-    index: BagIndex, infos: Sequence[str | None], roles: Roles, settings: DatasetSettings, size: tuple[int, int] | None
+    index: BagIndex, infos: Sequence[str | None], roles: Roles, file: Path | None, size: tuple[int, int] | None
 ) -> Rig:
-    """Return the rig of the named calibration, or of the CameraInfos, with the IMU's place from the static frames."""
-    if settings.calibration is not None:
-        rig = load_rig(settings.calibration, image_size=size)
+    """Return the rig of a calibration file, or of the CameraInfos, with the IMU's place from the static frames."""
+    if file is not None:
+        rig = load_rig(file, image_size=size)
     else:
         found = [index.infos[name] for name in infos if name is not None and name in index.infos]
         if len(found) != 2:

@@ -1,4 +1,4 @@
-"""The one place that uses the library rosbags: open bags, list topics, stream messages, and name damage in one line."""
+"""Read bags with the library rosbags: open them, list topics, stream messages, and name damage in one line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vio.errors import DataError, MissingDependencyError
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-_MISSING = "reading ROS bags needs the package rosbags; install it with: pip install 'stereo-vio[bags]'"
+MISSING = "{} ROS bags needs the package rosbags; install it with: pip install 'stereo-vio[bags]'"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Bag:
             from rosbags.highlevel import AnyReader
             from rosbags.typesys import Stores, get_typestore
         except ImportError as error:
-            raise MissingDependencyError(_MISSING) from error
+            raise MissingDependencyError(MISSING.format("reading")) from error
         with named_damage(self.path):
             # ROS 2 bags of before Iron carry no definitions; those of its usual types have not changed since.
             self._reader = AnyReader(bag_files(self.path), default_typestore=get_typestore(Stores.ROS2_HUMBLE))

@@ -23,7 +23,7 @@ _ROLES: dict[str, tuple[str, ...]] = {
     "right": (IMAGE, COMPRESSED),
     "imu": (IMU,),
     "velocity": (ODOMETRY, *TWISTS),
-    "reference": (*POSES, ODOMETRY),
+    "reference": (*POSES, ODOMETRY, TF),
 }
 # What distinguishes the two cameras of a pair in topics' names, left first.
 _SIDES = (

@@ -1,0 +1,86 @@
+"""Export of a run as a ROS 2 bag of poses and points, for RViz and Foxglove."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.bags.writer import Storage, bag_writer
+from vio.finished_run import FinishedRun, read_finished_run
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.records import Trajectory
+from vio.trajectory_io import read_trajectory
+
+POSE, PATH, REFERENCE, POINTS = "/vio/pose", "/vio/path", "/reference/path", "/vio/landmarks"
+_WORLD = "world"
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedBag:
+    """Counts of the written data."""
+
+    poses: int
+    points: int
+    reference_poses: int
+
+
+def export_bag(run: Path, out: Path, storage: Storage) -> ExportedBag:
+    """Write a run as a bag: /tf and /vio/pose with covariance at every frame; path, landmarks and ground truth at once.
+
+    The frames are world, imu and cam0 (without an IMU world and cam0). The ground truth is aligned to the run's world.
+    What is written at once is stamped with the first frame, and kept for subscribers that come late.
+
+    Args:
+        run: folder of `vio run`; an unfinished one's may be given too.
+        out: an existing folder without a bag.
+        storage: "rosbag2" (SQLite) or "mcap".
+
+    Raises:
+        DataError: it is no run's folder, a file in it is damaged, or the bag cannot be written.
+        MissingDependencyError: bags need the package rosbags.
+    """
+    finished = read_finished_run(run)
+    trajectory = finished.trajectory
+    assert trajectory.times_ns is not None
+    times, body = trajectory.times_ns.tolist(), trajectory.body
+    reference = _reference(finished)
+    with bag_writer(out, storage, latched=(PATH, REFERENCE, POINTS)) as bag:
+        if body == "imu":
+            bag.static_transforms(times[0], [("imu", "cam0", se3_inverse(finished.T_cam0_body))])
+        bag.path(PATH, _WORLD, trajectory, times[0])
+        bag.points(POINTS, _WORLD, times[0], finished.points, finished.point_sigmas)
+        if reference is not None:
+            bag.path(REFERENCE, _WORLD, reference, times[0])
+        covariances = finished.estimates["covariance"]
+        for time_ns, T, covariance in zip(times, trajectory.T_world_body, covariances, strict=True):
+            bag.transform(_WORLD, body, time_ns, T)
+            bag.pose(POSE, _WORLD, time_ns, T, ros_covariance(T, covariance))
+    return ExportedBag(len(times), len(finished.points), 0 if reference is None else len(reference))
+
+
+def ros_covariance(T_world_body: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of x y z and of rotations about the world's axes, as PoseWithCovariance has it.
+
+    Args:
+        T_world_body: (4, 4).
+        covariance: (6, 6) of xi in T_body_world = exp(xi) T_body_world_hat, [rho; phi].
+
+    To first order xi moves the position by -R rho and the orientation by -R phi about the world's axes; R is the
+    rotation of T_world_body.
+    """
+    turn = np.kron(np.eye(2), T_world_body[:3, :3])
+    out: FloatArray = turn @ covariance @ turn.T
+    return out
+
+
+def _reference(run: FinishedRun) -> Trajectory | None:
+    """Return the ground truth in the run's world; None: there is none with times, or it was not compared."""
+    path = run.folder / "reference.tum"
+    if run.evaluation is None or not path.is_file():
+        return None
+    truth = read_trajectory(path)
+    T_cam0_body = run.T_cam0_body
+    truth = truth.in_imu(T_cam0_body) if run.trajectory.body == "imu" else truth.in_cam0(T_cam0_body)
+    return replace(truth, T_world_body=se3_inverse(run.evaluation.T_ref_est) @ truth.T_world_body)

@@ -1,0 +1,114 @@
+"""What the comparison of a run with COLMAP's reconstructions says, in one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.colmap.reconstruction import Mapper, Reconstructed
+from vio.mapping.comparison import Comparison, Segment, motion_differences
+from vio.records import IntArray
+
+_SCALE = 0.01  # by which lengths may differ without a word: matches that are off by 0.1 px make as much at far points
+
+
+@dataclass(frozen=True, slots=True)
+class MapperResult:
+    """The reconstruction of a run's keyframes by one of COLMAP's mappers, and its comparison with the run."""
+
+    mapper: Mapper
+    total: int  # keyframes given
+    found: tuple[Reconstructed, Comparison] | None  # None: it could not connect them
+
+    @property
+    def verdict(self) -> str:
+        """A short summary of this mapper alone."""
+        if self.found is None:
+            return (
+                "not observable because COLMAP could not connect the keyframes; too few images, no overlap between "
+                "them, or too little texture"
+            )
+        model, comparison = self.found
+        missing = self.total - len(model.keyframes)
+        left_out = f"; {missing} of {self.total} keyframes could not be connected" if missing else ""
+        if comparison.scale is None:
+            return f"poses compared, scale not observable because {comparison.why_no_scale}{left_out}"
+        where = f"disagrees in {len(comparison.segments)} segments" if comparison.segments else "agrees throughout"
+        return f"{where}{left_out}"
+
+
+def overall_verdict(results: Sequence[MapperResult]) -> str:
+    """Say whether the run and COLMAP agree, and where they do not, which of them is the likelier one to be wrong.
+
+    COLMAP's two mappers share their matches but no poses. Where both differ from the run by the same motion, the run is
+    suspected; where one of them agrees with the run, the other one; where all three differ, nobody.
+    """
+    found = {result.mapper: result.found[1] for result in results if result.found is not None}
+    if not found:
+        return f"none: {results[0].verdict}"
+    agreeing = [name for name, comparison in found.items() if not comparison.segments]
+    if not agreeing:
+        return _disagreement(found)
+    comparison = found[agreeing[0]]
+    length = float(np.linalg.norm(np.diff(comparison.aligned[:, :3, 3], axis=0), axis=1).sum())
+    text = f"the run and COLMAP agree: {_metres(comparison.ate_m)} (rms) apart over {length:.3g} m"
+    if comparison.scale is None:
+        text += f"; lengths could not be compared, {comparison.why_no_scale}"
+    elif abs(comparison.scale - 1) > max(_SCALE, 3 * (comparison.scale_sigma or 0.0)):
+        text += f", but COLMAP's path is {_longer(comparison.scale)}: one of both has disparities that are off"
+    missing = results[0].total - len(comparison.frames)
+    if missing:
+        text += f"; {missing} of {results[0].total} keyframes could not be compared"
+    for name in found.keys() - set(agreeing):
+        text += f"; COLMAP's {name} model breaks at frames {_ranges(found[name].segments)}, the other one does not"
+    return text
+
+
+def _disagreement(found: dict[Mapper, Comparison]) -> str:
+    """Say what differs where no reconstruction agrees with the run throughout."""
+    if len(found) == 1:
+        ((name, only),) = found.items()
+        where = f"the run and COLMAP's {name} model differ at frames {_ranges(only.segments)}"
+        return f"{where}, elsewhere by {_metres(only.ate_m)} (rms); one of both is wrong there"
+    first, second = found.values()
+    shared = _shared(first, second)
+    if shared:
+        return (
+            f"the run is probably wrong at frames {_ranges(shared)}: both of COLMAP's reconstructions differ from it "
+            f"there by up to {_metres(max(s.difference_m for s in shared))}, and agree with one another"
+        )
+    where = " and ".join(f"{_ranges(c.segments)} ({name})" for name, c in found.items())
+    return f"undecided at frames {where}: COLMAP's two reconstructions contradict one another there"
+
+
+def _shared(first: Comparison, second: Comparison) -> list[Segment]:
+    """Return the first one's segments in which the second one differs from the run by the same motion."""
+    _, rows, others = np.intersect1d(first.frames, second.frames, return_indices=True)
+    frames: IntArray = first.frames[rows]
+    if len(frames) < 2:
+        return []
+    apart_m, apart_deg = motion_differences(first.aligned[rows], second.aligned[others])
+    shared = []
+    for segment in first.segments:
+        inside = (frames[:-1] < segment.last_frame) & (frames[1:] > segment.first_frame)
+        met = any(s.first_frame < segment.last_frame and s.last_frame > segment.first_frame for s in second.segments)
+        close = (apart_m[inside] <= 0.5 * segment.difference_m) | (segment.difference_m == 0)
+        turned = apart_deg[inside] <= max(0.5 * segment.difference_deg, 0.05)
+        if met and inside.any() and bool((close & turned).all()):
+            shared.append(segment)
+    return shared
+
+
+def _ranges(segments: Sequence[Segment]) -> str:
+    shown = ", ".join(f"{s.first_frame} to {s.last_frame}" for s in segments[:3])
+    return shown + (f" and {len(segments) - 3} more" if len(segments) > 3 else "")
+
+
+def _metres(value: float) -> str:
+    return f"{1e3 * value:.3g} mm" if value < 0.1 else f"{value:.3g} m"
+
+
+def _longer(scale: float) -> str:
+    return f"{100 * abs(scale - 1):.2f} % {'longer' if scale > 1 else 'shorter'}"
