@@ -55,6 +55,7 @@ BUILDERS: dict[str, Callable[[StereoCamera, FrontendSettings, Dataset | None], F
     "kornia": _build_kornia,
     "precomputed": _build_precomputed,
 }
+_ONE_CAMERA = ("klt", "precomputed")
 
 
 @contextmanager
@@ -90,4 +91,6 @@ def build_frontend(
         name = "klt" if dataset is None or dataset.recording.has_images else "precomputed"
     if name not in BUILDERS:
         raise ConfigError(f"frontend.name: there is no front end {name!r}; choose one of auto, {', '.join(BUILDERS)}")
+    if camera.kind != "stereo" and name not in _ONE_CAMERA:
+        raise ConfigError(f"frontend.name: {name} needs a stereo pair; one camera takes {' or '.join(_ONE_CAMERA)}")
     return BUILDERS[name](camera, settings, dataset)

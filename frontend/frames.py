@@ -56,13 +56,37 @@ class FrameValidator:
                 f"frame {frame.index} has no images, but the {self.name} front end needs them; "
                 "use the precomputed front end, or a recording with images"
             )
+        self._check(frame, {"left": frame.left, "right": frame.right})
+        return frame.left, frame.right
+
+    def validate_one(self, frame: StereoFrame, *, depth: bool) -> Image:
+        """Check a frame of one camera, with depths or without, and return its image, (H, W) uint8.
+
+        Raises:
+            DataError: as `validate`; or depths that are missing, or of another size or type.
+        """
+        if not isinstance(frame, StereoFrame):
+            raise DataError(f"the {self.name} front end takes a StereoFrame, got {type(frame).__name__}")
+        if frame.left is None:
+            raise DataError(f"frame {frame.index} has no image, but the {self.name} front end needs one")
+        self._check(frame, {"left": frame.left})
+        if depth and (frame.depth is None or frame.depth.shape != frame.left.shape):
+            found = "no depths" if frame.depth is None else f"depths of {frame.depth.shape[1]}x{frame.depth.shape[0]}"
+            raise DataError(
+                f"frame {frame.index} has {found}; a camera with depth images needs metres for each pixel of the "
+                f"image, {frame.left.shape[1]}x{frame.left.shape[0]}, 0 where there is none"
+            )
+        return frame.left
+
+    def _check(self, frame: StereoFrame, images: dict[str, Image]) -> None:
+        """Check time and images of a frame, the left one first, and note them."""
         if self._time_ns is not None and frame.time_ns <= self._time_ns:
             raise DataError(
                 f"frame {frame.index} is not later than frame {self._index} ({frame.time_ns} ns after "
                 f"{self._time_ns} ns); sort the frames by time"
             )
         expected = (self.camera.height, self.camera.width)
-        for name, image in (("left", frame.left), ("right", frame.right)):
+        for name, image in images.items():
             if not isinstance(image, np.ndarray) or image.ndim != 2 or image.dtype != np.uint8 or not image.size:
                 found = (
                     f"has shape {image.shape} and type {image.dtype}" if isinstance(image, np.ndarray) else "is none"
@@ -77,13 +101,12 @@ class FrameValidator:
                     f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, but the calibration is for "
                     f"{self.camera.width}x{self.camera.height}; check that calibration and images belong together"
                 )
-            if size != frame.left.shape or (self._shape is not None and size != self._shape):
+            if size != images["left"].shape or (self._shape is not None and size != self._shape):
                 raise DataError(
                     f"frame {frame.index}: the {name} image is {size[1]}x{size[0]}, unlike the previous images; "
                     "all images of a recording must have one size"
                 )
-        self._index, self._time_ns, self._shape = frame.index, frame.time_ns, frame.left.shape
-        return frame.left, frame.right
+        self._index, self._time_ns, self._shape = frame.index, frame.time_ns, images["left"].shape
 
 
 @dataclass(slots=True)

@@ -20,6 +20,7 @@ from .flow import lost_contrast, track_with_retries
 from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
 from .moving_object import ObjectReport, choose_motion
 from .new_features import NewFeatures
+from .one_camera import with_depths, with_prior_depths
 from .outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
 from .patches import View, half_image, inside
 from .prediction import guessed_pixels, prior_rows, usable_prior
@@ -73,11 +74,13 @@ class KltFrontend:
         self._step_ns: int | None = None  # between the last two frames
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
-        """Track, match and detect in one rectified stereo pair; see `vio.protocols.Frontend`.
+        """Track, match and detect in one rectified stereo pair, or in one camera; see `vio.protocols.Frontend`.
 
         Raises:
             ConfigError: the mask is not of the images' size.
         """
+        if self._camera.kind != "stereo":
+            return self._process_one(frame, prior)
         watch = Stopwatch()
         images = self._validator.validate(frame)
         left, right = (self._view(image) for image in self._bands(frame.index, *images))
@@ -109,12 +112,49 @@ class KltFrontend:
         watch.lap("stereo")
         points, matched = tracks.left, int(tracks.has_right.sum())
         self._swap.check(frame, len(points), matched, lambda: stereo.count_mirrored(left, right, points))
+        return self._output(frame, left, right.half, tracks, motion, watch)
+
+    def _process_one(self, frame: StereoFrame, prior: TrackPrior | None) -> FrontendOutput:
+        """Track and detect in the image of one camera; right pixels are those of its depth image, if there is one."""
+        watch, with_depth = Stopwatch(), self._camera.kind == "rgbd"
+        left = self._view(self._validator.validate_one(frame, depth=with_depth))
+        stereo, allowed = self._set_up(left)
+        watch.lap("prepare")
+        if self._contrast_lost(left):
+            return make_output(frame, no_tracks(), 0, watch)
+        tracks, motion = self._track(frame, left, None, usable_prior(prior), stereo, watch)
+        corners = detect_corners(
+            left.half, tracks.left, self._wanted_corners(len(tracks)), self._grid, self._settings, allowed
+        )
+        watch.lap("detect")
+        # No corner is searched along the row; `delayed` takes them without a depth.
+        tracks = self._new_features.add(left, None, tracks, corners, motion, stereo, delayed=True)
+        if with_depth and frame.depth is not None:
+            tracks = with_depths(self._camera, tracks, frame.depth)
+        watch.lap("depth")
+        return self._output(frame, left, None, tracks, motion, watch)
+
+    def _output(
+        self,
+        frame: StereoFrame,
+        left: View,
+        right_half: Image | None,
+        tracks: Tracks,
+        motion: Consensus | None,
+        watch: Stopwatch,
+    ) -> FrontendOutput:
+        """Return the features that are output in a frame, and store what the next one needs."""
         tracks = self._promote(tracks)
         seen = take(tracks, tracks.shown)
         tracked = self._count_tracked(seen)
-        self._store(frame, left, right, tracks, motion)
+        self._store(frame, left, right_half, tracks, motion)
         watch.lap("check")
         return make_output(frame, seen, tracked, watch, self._take_lines())
+
+    @property
+    def _needs_right(self) -> bool:
+        """Whether a feature must be seen in the right image to be trusted."""
+        return self._camera.kind == "stereo" and self._right.usable
 
     def _wanted_corners(self, active: int) -> int:
         """Number of corners to detect beside active features; none in every other frame while few are missing."""
@@ -183,7 +223,9 @@ class KltFrontend:
         old = self._previous.tracks
         return int(np.isin(seen.ids, old.ids[old.shown], assume_unique=True).sum())
 
-    def _store(self, frame: StereoFrame, left: View, right: View, tracks: Tracks, motion: Consensus | None) -> None:
+    def _store(
+        self, frame: StereoFrame, left: View, right_half: Image | None, tracks: Tracks, motion: Consensus | None
+    ) -> None:
         """Store the state that the next frame needs."""
         self._bank.keep_only(tracks.slot)
         before = self._previous
@@ -191,18 +233,21 @@ class KltFrontend:
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
-        self._previous = PreviousFrame(frame.time_ns, left, right.half, tracks, twist, motion is not None)
+        self._previous = PreviousFrame(frame.time_ns, left, right_half, tracks, twist, motion is not None)
 
     def _track(
         self,
         frame: StereoFrame,
         left: View,
-        right: View,
+        right: View | None,
         prior: TrackPrior | None,
         stereo: StereoFit,
         watch: Stopwatch,
     ) -> tuple[Tracks, Consensus | None]:
-        """Track the features of the previous frame into both images; return those kept and the consensus motion."""
+        """Track the features of the previous frame; return those kept and the consensus motion.
+
+        They are matched in the right image, if there is one.
+        """
         previous = self._previous
         if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
             return no_tracks(), None
@@ -219,7 +264,10 @@ class KltFrontend:
         watch.lap("reject")
         tracks = self._anchor_fit.track(old, previous.left, left, found, seen, motion)
         watch.lap("align")
-        tracks = self._matcher.match(frame, previous, tracks, left, right, prior, stereo, motion)
+        if right is None:
+            tracks = with_prior_depths(self._camera, tracks, prior)
+        else:
+            tracks = self._matcher.match(frame, previous, tracks, left, right, prior, stereo, motion)
         watch.lap("stereo")
         return tracks, motion
 
@@ -243,7 +291,7 @@ class KltFrontend:
     ) -> tuple[BoolArray, Consensus | None]:
         """Return the mask (N,) of the found features that are static, and the consensus motion if there is one."""
         camera, rows = self._camera, np.flatnonzero(seen)
-        has_depth = (old.has_point & (old.has_right | (not self._right.usable)))[rows]
+        has_depth = (old.has_point & (old.has_right | (not self._needs_right)))[rows]
         R_prior = T_prior = None
         if prior is not None:
             known, predicted = prior_rows(old, rows[has_depth], prior)
@@ -273,7 +321,7 @@ class KltFrontend:
 
     def _promote(self, tracks: Tracks) -> Tracks:
         """Output features that passed their probation from now on, under new ids; all features if these are few."""
-        proven = tracks.has_right | (not self._right.usable)
+        proven = tracks.has_right | (not self._needs_right)
         proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & proven)
         if proven.sum() < _VERY_FEW * self._grid.target_features:
             proven[:] = True

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera, left_rays
+from vio.geometry.stereo import StereoCamera
 from vio.records import Image, IntArray, StereoFrame, TrackPrior
 
+from .one_camera import with_prior_depths
 from .outliers import Consensus
 from .patches import View
-from .prediction import prior_depths
 from .right_camera import RightCamera
 from .right_delay import PairingCounts, RightDelay, at_exposure, at_present
 from .stereo_fit import StereoFit
@@ -27,7 +27,7 @@ class PreviousFrame:
 
     time_ns: int
     left: View
-    right_half: Image
+    right_half: Image | None  # None: there is no right camera
     tracks: Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
     trusted: bool  # the last motion had a consensus
@@ -55,10 +55,8 @@ class RightMatcher:
 
         While it cannot, depths come from the prior, where it has them.
         """
-        if not self._right.usable and prior is not None:
-            depth, known = prior_depths(self._camera, np.where(tracks.shown, tracks.ids, -1), prior)
-            point = np.where(known[:, None], left_rays(self._camera, tracks.left) * depth[:, None], tracks.point)
-            tracks = replace(tracks, point=point, has_point=tracks.has_point | known)
+        if not self._right.usable:
+            tracks = with_prior_depths(self._camera, tracks, prior)
         has_point, delay = tracks.has_point, self._delay.frames
         flow = tracks.left - previous.tracks.left[_rows_by_slot(previous.tracks, tracks)]
         if delay == 0.0:
@@ -89,6 +87,7 @@ class RightMatcher:
         self, previous: PreviousFrame, left: View, tracks: Tracks, right: View, stereo: StereoFit
     ) -> PairingCounts:
         """Count the features that match if the right image belongs to this frame, the one before, or the next one."""
+        assert previous.right_half is not None
         before = previous.tracks.left[_rows_by_slot(previous.tracks, tracks)][:_PAIRING_POINTS]
         now = tracks.left[:_PAIRING_POINTS]
         return PairingCounts(

@@ -11,20 +11,35 @@ from typing import TYPE_CHECKING
 from vio._version import __version__
 
 if TYPE_CHECKING:
+    from vio.camera_rig import CameraRig
     from vio.config import load_config
     from vio.datasets import open_dataset
     from vio.datasets.rigs import load_rig
+    from vio.datasets.rigs.one_camera import load_camera
     from vio.evaluation import evaluate
     from vio.odometry import Odometry
     from vio.pipeline import run
     from vio.rig import Rig
 
-__all__ = ["Odometry", "Rig", "__version__", "evaluate", "load_config", "load_rig", "open_dataset", "run"]
+__all__ = [
+    "CameraRig",
+    "Odometry",
+    "Rig",
+    "__version__",
+    "evaluate",
+    "load_camera",
+    "load_config",
+    "load_rig",
+    "open_dataset",
+    "run",
+]
 
 _MODULES = {  # loaded when the name is first used
+    "CameraRig": "vio.camera_rig",
     "Odometry": "vio.odometry",
     "Rig": "vio.rig",
     "evaluate": "vio.evaluation",
+    "load_camera": "vio.datasets.rigs.one_camera",
     "load_config": "vio.config",
     "load_rig": "vio.datasets.rigs",
     "open_dataset": "vio.datasets",

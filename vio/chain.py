@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 
 from vio.config import BackendName, Config
-from vio.errors import DataError, DivergedError
+from vio.errors import ConfigError, DataError, DivergedError
 from vio.filters.late_imu import LateImuMsckf
+from vio.filters.mono_msckf import MonoMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.vislam import Vislam
 from vio.frame_result import FrameLog, FrameResult
@@ -93,6 +94,8 @@ class Chain:
         selection = self.selector.select(seen, expected.motion if expected else None)
         timer.end("select")
         report = self._update(seen.take(selection.chosen))
+        if not self._has_started(frame, report):
+            return None
         estimate = self.backend.estimate()
         timer.end("update")
         self.watch.update(frame.index, report, estimate)
@@ -110,19 +113,47 @@ class Chain:
             if not isinstance(self.backend, Msckf):
                 raise
             report = self.backend.restart(seen)
-            self.watch.restarted(seen.frame_index, str(error), self.backend.estimate())
+            if report.started:
+                self.watch.restarted(seen.frame_index, str(error), self.backend.estimate())
+            else:
+                self.watch.lost(seen.frame_index, str(error))
             return report
+
+    def _has_started(self, frame: StereoFrame, report: UpdateReport) -> bool:
+        """Whether the back end has an estimate; the watch says why not, and when it begins."""
+        backend = self.backend
+        if isinstance(backend, MonoMsckf):
+            start = backend.begun
+            if start is None:
+                self.watch.waiting(frame, backend.waits_for)
+            else:
+                self.watch.begun(frame, start.scale_sigma)
+        return report.started
 
 
 def build_backend(
     camera: StereoCamera, T_cam0_body: FloatArray, config: Config, motion: MotionSource | None
 ) -> Backend:
     """Build the configured back end; `T_cam0_body` is (4, 4)."""
+    if camera.kind == "mono":
+        return _mono_backend(camera, T_cam0_body, config, motion)
     if config.backend == "msckf" and motion == "imu":
         return LateImuMsckf(camera, T_cam0_body, config.msckf)
     if config.backend == "msckf":
         return Msckf(camera, T_cam0_body, config.msckf, motion=motion)
     return Vislam(camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
+
+
+def _mono_backend(
+    camera: StereoCamera, T_cam0_body: FloatArray, config: Config, motion: MotionSource | None
+) -> Backend:
+    if config.backend != "msckf":
+        raise ConfigError(f"backend {config.backend} needs a stereo pair, and this is one camera; take msckf")
+    if motion != "imu":
+        raise ConfigError(
+            "one camera alone knows no scale: add an IMU (its samples and T_cam0_imu), depth images or a second camera"
+        )
+    return MonoMsckf(camera, T_cam0_body, config.msckf)
 
 
 class _StageTimer:

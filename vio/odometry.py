@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
+from vio.camera_rig import CameraRig
 from vio.chain import BACKENDS, Chain, build_backend
 from vio.config import Config
 from vio.errors import ConfigError, DataError
@@ -46,6 +47,7 @@ from vio.selectors import build_selector
 from vio.threads import BlasLimit
 
 if TYPE_CHECKING:
+    from vio.camera_rig import Undistorter
     from vio.mapping.session import MapSession
     from vio.rig import Rectifier
 
@@ -55,9 +57,9 @@ log = logging.getLogger(__name__)
 def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig | None:
     """Return a rectified pair with the pose (4, 4) of its IMU as a rig of two pinholes.
 
-    None: the image size is not known, or the pair is a cylinder, which no lens model holds.
+    None: one camera, no known image size, or a cylinder, which no lens model holds.
     """
-    if camera.width is None or camera.height is None or camera.is_cylinder:
+    if camera.width is None or camera.height is None or camera.kind != "stereo" or camera.is_cylinder:
         return None
     c = camera
     return Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height, T_cam0_imu)
@@ -76,7 +78,7 @@ class Odometry:
 
     def __init__(
         self,
-        rig: Rig | StereoCamera,
+        rig: Rig | CameraRig | StereoCamera,
         config: Config | None = None,
         *,
         T_cam0_imu: FloatArray | None = None,
@@ -90,7 +92,8 @@ class Odometry:
         """Prepare; the first frame begins the trajectory.
 
         Args:
-            rig: the calibration, as `vio.load_rig` returns it; or a rectified pair.
+            rig: the calibration, as `vio.load_rig` returns it; or a rectified pair. One camera, as `vio.load_camera`
+                returns it, needs an IMU or, where it has a `depth_factor`, depth images.
             config: every setting; None: the defaults. `motion` auto means the IMU where the rig has one.
             T_cam0_imu: (4, 4) extrinsics, only beside a rectified pair; a `Rig` has its own.
             frontend: used in place of the configured front end.
@@ -109,8 +112,13 @@ class Odometry:
         self._rectifier: Rectifier | None = None
         self._rig: Rig | None = None  # as given; None: a rectified pair
         self._offset_ns = 0
+        self._undistorter: Undistorter | None = None  # of a rig with one camera
         if isinstance(rig, StereoCamera):
             self.camera = rig
+        elif isinstance(rig, CameraRig):
+            self._undistorter = rig.undistorter(depth_noise=None if rig.depth_factor is None else _depth_noise(config))
+            self.camera, T_cam0_imu = self._undistorter.camera, rig.T_cam0_imu
+            self._offset_ns = round(1e9 * rig.time_offset_s)
         else:
             self._rig = rig
             # Maps know pinholes only.
@@ -196,6 +204,8 @@ class Odometry:
             DataError: a wrong type, shape or size, or a time not after the last frame's.
         """
         with self._lock:
+            if self.camera.kind != "stereo":
+                raise DataError("this rig has one camera; give its images to add_images")
             images = [_gray(image, name) for image, name in ((left, "left"), (right, "right"))]
             if images[0].shape != images[1].shape and self._rectifier is None:
                 raise DataError(f"the images differ in size: {images[0].shape} left, {images[1].shape} right")
@@ -207,9 +217,54 @@ class Odometry:
             elif self.camera.width is not None and self.camera.height is not None:
                 _check_size(images[0], (self.camera.height, self.camera.width), "left")
             time_ns = self._new_time("frame", t_ns, kind="images")
+            left_image, right_image = images
             if self._rectifier is not None:
-                images = list(self._rectifier(*images))
-            return self._add_frame(StereoFrame(self._frames, time_ns, *images))
+                left_image, right_image = self._rectifier(left_image, right_image)
+            return self._add_frame(StereoFrame(self._frames, time_ns, left_image, right_image))
+
+    def add_images(
+        self,
+        t_ns: int,
+        left: npt.ArrayLike,
+        right: npt.ArrayLike | None = None,
+        *,
+        depth_m: npt.ArrayLike | None = None,
+    ) -> Estimate | None:
+        """Take the image of one camera, with depths where it has them; with a right image, as `add_stereo`.
+
+        One camera with an IMU has no estimate until the scale is observable: the return value is None until then.
+
+        Args:
+            t_ns: time of the exposure in nanoseconds.
+            left: (H, W) uint8 gray or (H, W, 3) uint8 BGR, distorted or not as the rig says.
+            right: likewise, where the rig has two cameras.
+            depth_m: (H, W) metres along the optical axis of each pixel of the image, 0 where it is not known.
+
+        Raises:
+            DataError: a wrong type, shape or size, a time not after the last frame's, or images of another rig's kind.
+        """
+        if right is not None:
+            return self.add_stereo(t_ns, left, right)
+        with self._lock:
+            if self.camera.kind == "stereo":
+                raise DataError(
+                    "this rig has two cameras, but one image came; give both, or a rig of one camera (vio.load_camera)"
+                )
+            if (depth_m is not None) != (self.camera.kind == "rgbd"):
+                raise DataError(
+                    "depths came, but the rig has no depth_factor; give CameraRig one"
+                    if depth_m is not None
+                    else "this rig has depth images (a depth_factor), but no depths came; give depth_m"
+                )
+            image = _gray(left, "left")
+            made = self._undistorter
+            if self.camera.width is not None and self.camera.height is not None:
+                _check_size(image, (self.camera.height, self.camera.width), "left")
+            depth = None if depth_m is None else _depths(depth_m, image.shape)
+            time_ns = self._new_time("frame", t_ns, kind="images")
+            if made is not None:
+                image, depth = made(image), None if depth is None else made.depth(depth)
+            return self._add_frame(StereoFrame(self._frames, time_ns, image, None, depth))
 
     def add_observations(
         self, t_ns: int, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None = None
@@ -307,6 +362,11 @@ class Odometry:
     def frames_refused(self) -> int:
         """Number of frames that the front end refused."""
         return 0 if self._chain is None else self._chain.watch.frames_refused
+
+    @property
+    def frames_waiting(self) -> int:
+        """Number of frames without a pose, as the scale of one camera was not observable yet."""
+        return 0 if self._chain is None else self._chain.watch.frames_waiting
 
     def predict(self, t_ns: int) -> PredictedPose:
         """Return the pose at a time at or after the newest estimate, from the samples added since.
@@ -567,6 +627,22 @@ def _gray(image: npt.ArrayLike, name: str) -> Image:
 
         array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY)
     return np.array(array, dtype=np.uint8, order="C")  # a copy: the caller may fill its buffer again
+
+
+def _depths(depth_m: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return depths as (H, W) float64.
+
+    Raises:
+        DataError: they are not of the image's shape.
+    """
+    array = np.array(depth_m, dtype=np.float64)
+    if array.shape != shape:
+        raise DataError(f"the depths have shape {array.shape}, but the image {shape}; register them to the image")
+    return array
+
+
+def _depth_noise(config: Config | None) -> float:
+    return (Config() if config is None else config).dataset.depth_noise
 
 
 def _check_size(image: Image, expected: tuple[int, int], name: str) -> None:

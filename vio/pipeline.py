@@ -35,6 +35,7 @@ from vio.records import (
     Recording,
     StereoFrame,
     Trajectory,
+    need_stereo,
 )
 from vio.rig import Rig
 from vio.run_recorder import GrowingFolder, RunRecorder
@@ -231,6 +232,7 @@ def _map_session(path: Path, recording: Recording, config: Config, *, localise: 
     """
     from vio.mapping.session import MapSession
 
+    need_stereo(recording, "a map")
     if not recording.has_images:
         raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
     if config.backend != "msckf":
@@ -255,7 +257,7 @@ def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None)
     """
     if stopped is not None:
         raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
-    if odometry.frames_refused:
+    if odometry.frames_refused or odometry.frames_waiting:
         raise DataError(odometry.warnings[-1])
     raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
 

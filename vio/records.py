@@ -94,12 +94,16 @@ class VelocitySample:
 
 @dataclass(frozen=True, slots=True)
 class StereoFrame:
-    """One stereo exposure. The images are None where the recording holds features only, or none were asked for."""
+    """One exposure of a stereo pair, of one camera, or of one camera with depths.
+
+    The images are None where the recording holds features only, or none were asked for.
+    """
 
     index: int  # frame number in the recording, from 0, whatever --start says
     time_ns: int
     left: Image | None  # (H, W) rectified
-    right: Image | None  # (H, W) rectified
+    right: Image | None  # (H, W) rectified; None for one camera
+    depth: FloatArray | None = None  # (H, W) metres along the optical axis, 0 where unknown; with depth images only
 
 
 MotionSample: TypeAlias = ImuSample | VelocitySample
@@ -344,6 +348,7 @@ class Estimate:
     time_offset_sigma_s: float | None = None
     stereo_field: StereoFieldEstimate | None = None
     stereo_scale: StereoScaleEstimate | None = None
+    scale_sigma: float | None = None  # one camera: standard deviation of the scale of the last frames' motion, over it
     # The pose in a map; None without one, or without a place in it yet.
     T_map_body: FloatArray | None = None  # (4, 4)
     T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi), given the map
@@ -365,6 +370,7 @@ class UpdateReport:
     nis_per_dof: float | None  # normalised innovation squared over its degrees of freedom; about 1 when consistent
     gated_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of those rejected, where the back end says it
     landmark_ids: IntArray = field(default_factory=_no_ids, compare=False)  # of the landmarks in the map, likewise
+    started: bool = True  # False: nothing can be estimated yet, and the frame has no pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -417,3 +423,10 @@ class Recording:
     def T_cam0_body(self) -> FloatArray:
         """Extrinsics (4, 4) of the body that a run estimates: the IMU, or cam0 itself where there is none."""
         return np.eye(4) if self.T_cam0_imu is None else self.T_cam0_imu
+
+
+def need_stereo(recording: Recording, what: str) -> None:
+    """Raise DataError unless a recording has two cameras, which `what` needs."""
+    if recording.camera.kind != "stereo":
+        cameras = "one camera" if recording.camera.kind == "mono" else "one camera with depth images"
+        raise DataError(f"{recording.path}: {what} needs a stereo pair, and this recording has {cameras}")

@@ -55,7 +55,7 @@ class Rectifier:
         """Rectify one raw pair, each image (H, W) of its camera's size."""
         if self.maps is None:
             return left, right
-        return _remap(left, self.maps[0], self.interpolation), _remap(right, self.maps[1], self.interpolation)
+        return remap(left, self.maps[0], self.interpolation), remap(right, self.maps[1], self.interpolation)
 
 
 def rectifier_of(
@@ -72,7 +72,8 @@ def rectifier_of(
     return Rectifier(rig, done.camera, done.T_rect0_imu, (done.map0, done.map1), interpolation)
 
 
-def _remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpolation) -> Image:
+def remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpolation) -> Image:
+    """Return an image (H, W) looked up at the source pixels of a map."""
     import cv2
 
     codes = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos4": cv2.INTER_LANCZOS4}

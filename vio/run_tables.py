@@ -43,6 +43,7 @@ ESTIMATE = np.dtype(
         ("T_cam0_imu_covariance", "<f8", (6, 6)),
         ("time_offset_s", "<f8"),
         ("time_offset_sigma_s", "<f8"),
+        ("scale_sigma", "<f8"),
         ("stereo_field", "<f8", (6,)),
         ("stereo_field_covariance", "<f8", (6, 6)),
         ("stereo_rows_rms_px", "<f8"),
@@ -57,7 +58,7 @@ _OPTIONAL_ARRAYS = (
     *("gyro_bias", "gyro_bias_sigma", "accel_bias", "accel_bias_sigma", "gravity_world"),
     *("T_cam0_imu", "T_cam0_imu_covariance"),
 )
-_OPTIONAL_NUMBERS = ("time_offset_s", "time_offset_sigma_s")
+_OPTIONAL_NUMBERS = ("time_offset_s", "time_offset_sigma_s", "scale_sigma")
 
 _STAGES = 16  # of the front end, at most
 _COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")

@@ -26,7 +26,7 @@ from vio.loop_files import read_loops
 from vio.loops import LoopEvent
 from vio.mapping.comparison import GroundTruth
 from vio.mapping.keyframes import TrackedPath
-from vio.records import FeatureTracks, IntArray, StereoFrame
+from vio.records import FeatureTracks, IntArray, StereoFrame, need_stereo
 from vio.rig import Rectifier
 from vio.run_folder import read_metrics
 from vio.trajectory_io import read_trajectory
@@ -68,6 +68,7 @@ def read_saved_run(folder: Path) -> SavedRun:
     if not log.is_file():
         raise DataError(f"{folder} has no {OBSERVATIONS}; repeat its run with --save-observations")
     dataset = read_observation_log(log)
+    need_stereo(replace(dataset.recording, path=folder), "checking, refining or exporting a run")
     loops = tuple(o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None and o.matches is not None)
     poses = "map_trajectory.tum" if loops else "trajectory.tum"
     trajectory = read_trajectory(folder / poses)

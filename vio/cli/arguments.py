@@ -25,6 +25,7 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--motion", metavar="NAME", help="imu, velocity, none or auto: same as --set motion=NAME")
     parser.add_argument("--backend", metavar="NAME", help="same as --set backend=NAME")
     parser.add_argument("--calibration", metavar="F", help="same as --set dataset.calibration=F")
+    parser.add_argument("--camera", metavar="NAME", help="left: one camera of two: same as --set dataset.camera=left")
     parser.add_argument("--topics", metavar="A=/B,…", help="topics of a bag: same as --set dataset.topics=A=/B,…")
     parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
 
@@ -54,6 +55,7 @@ def config_from(args: argparse.Namespace) -> Config:
         "backend": args.backend,
         "frontend.name": args.frontend,
         "dataset.calibration": args.calibration,
+        "dataset.camera": args.camera,
         "dataset.topics": args.topics,
     }
     for key, value in named.items():

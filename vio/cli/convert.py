@@ -78,11 +78,13 @@ def _recording(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
     from vio.datasets.span import frames_between
     from vio.offline.convert import convert
+    from vio.records import need_stereo
     from vio.text_files import write_text
 
     log = logging.getLogger(__name__)
     dataset = open_dataset(args.source, replace(config_from(args).dataset, projection="pinhole"))
     recording = dataset.recording
+    need_stereo(recording, "vio convert")
     for note in recording.notes:
         log.warning("%s", note)
     start, stop = frames_between(recording, args.start, args.stop)

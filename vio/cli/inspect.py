@@ -36,6 +36,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
     from vio.errors import ConfigError
     from vio.inspection.inspect import inspect_recording
+    from vio.records import need_stereo
     from vio.threads import one_blas_thread
 
     if args.pairs < 1 or args.frames < 0:
@@ -43,6 +44,7 @@ def execute(args: argparse.Namespace) -> int:
     config = config_from(args)
     dataset = open_dataset(args.source, config.dataset)
     recording = dataset.recording
+    need_stereo(recording, "vio inspect")
     with one_blas_thread(), ProgressBar(f"inspect {recording.path.name}") as bar:
         report = inspect_recording(
             dataset,

@@ -43,10 +43,12 @@ def execute(args: argparse.Namespace) -> int:
     from vio.datasets.rectified import RectifiedDataset, check_not_rectified
     from vio.errors import DataError
     from vio.printable import json_text
+    from vio.records import need_stereo
     from vio.text_files import write_text
 
     dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation, projection="pinhole"))
     recording = dataset.recording
+    need_stereo(recording, "vio rectify")
     for note in recording.notes:
         logging.getLogger(__name__).warning("%s", note)
     writers = {"euroc": write_rectified_euroc, "kitti_raw": write_rectified_kitti}

@@ -72,7 +72,9 @@ def add_parser(commands: Any) -> None:
         "lighting), such as effects.blur_exposure_ms=20 or people=0; may be repeated",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers")
-    parser.add_argument("--format", choices=("euroc", "kitti"), help="of the folder (default kitti for that rig)")
+    parser.add_argument(
+        "--format", choices=("euroc", "kitti", "rgbd"), help="of the folder (default kitti for that rig)"
+    )
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default up to 2); the images are the same")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
     parser.set_defaults(execute=execute)
@@ -86,6 +88,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.cli.progress import ProgressBar
     from vio.errors import ConfigError
     from vio.sim.export import export_euroc, export_kitti
+    from vio.sim.export_rgbd import export_rgbd
     from vio.sim.scenarios import ParallelRecording, default_workers, plan
     from vio.sim.sequence import SimulatedRecording
     from vio.threads import one_blas_thread
@@ -102,6 +105,8 @@ def execute(args: argparse.Namespace) -> int:
         with ProgressBar(f"rendering the {scenario.scene}") as bar:
             if form == "kitti":
                 export_kitti(recording, args.out, replace=True, progress=bar.update)
+            elif form == "rgbd":
+                export_rgbd(recording, args.out, replace=True, progress=bar.update)
             else:
                 noise = scenario.conditions.imu_noise.densities
                 export_euroc(recording, args.out, replace=True, noise=noise, progress=bar.update)

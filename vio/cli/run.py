@@ -74,6 +74,7 @@ _OF_A_NEW_RUN = (
     "backend",
     "frontend",
     "calibration",
+    "camera",
     "topics",
 )
 

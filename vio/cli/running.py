@@ -287,6 +287,11 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         ("time", f"{metrics['ms_per_frame']:.1f} ms a frame ({stages})"),
         ("back end", f"{metrics['backend']}, motion {metrics['motion']}"),
     ]
+    if metrics.get("scale_sigma") is not None:
+        sigma = f"{100 * metrics['scale_sigma']:.2g} %"
+        rows.append(("scale", f"one camera: from the IMU, standard deviation {sigma} (median of the frames)"))
+    elif metrics["camera"].get("kind") == "rgbd":
+        rows.append(("scale", "one camera: from the depth images"))
     if metrics["stereo_field"] is not None:
         field = metrics["stereo_field"]
         off, sigma = field["coefficients_px"][0], field["sigma_px"][0]

@@ -40,6 +40,18 @@ def _plain(path: Path, settings: DatasetSettings) -> Dataset:
     return read_plain(path, settings)
 
 
+def _mono(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.one_camera import read_mono
+
+    return read_mono(path, settings)
+
+
+def _rgbd(path: Path, settings: DatasetSettings) -> Dataset:
+    from vio.datasets.one_camera import read_rgbd
+
+    return read_rgbd(path, settings)
+
+
 def _bag(path: Path, settings: DatasetSettings) -> Dataset:
     from vio.datasets.bags.reader import read_bag
 
@@ -81,6 +93,8 @@ READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
     "kitti_raw": _kitti_raw,
     "euroc": _euroc,
     "plain": _plain,
+    "mono": _mono,
+    "rgbd": _rgbd,
     "bag": _bag,
     "video": _video,
     "ece276a": _ece276a,
@@ -90,7 +104,8 @@ READERS: dict[str, Callable[[Path, DatasetSettings], Dataset]] = {
 }
 _LOOKED_FOR = (
     "a KITTI folder (image_0 image_1 calib.txt times.txt), a KITTI raw drive (image_00 image_01), an EuRoC folder "
-    "(mav0), a plain folder (left right and a calibration), a ROS bag (.bag, .db3, .mcap), two videos (left.mp4 "
+    "(mav0), a plain folder (left right and a calibration), one camera (left or cam0, a calibration and an IMU), one "
+    "with depth images (rgb.txt depth.txt, or left depth), a ROS bag (.bag, .db3, .mcap), two videos (left.mp4 "
     "right.mp4), an ECE276A .npz, a UTIAS .mat, GTSAM's stereo factors (*stereo_factors*.txt) or an observation log "
     ".npz"
 )
@@ -113,7 +128,12 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
     if not path.exists():
         raise DataError(f"{path} does not exist; give {_LOOKED_FOR}")
     settings = options or DatasetSettings()
-    return READERS[_for_settings(kind or _detect(path), path, settings)](path, settings)
+    dataset = READERS[_for_settings(kind or _detect(path), path, settings)](path, settings)
+    if settings.camera == "both":
+        return dataset
+    from vio.datasets.left_camera import left_camera
+
+    return left_camera(dataset)
 
 
 def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
@@ -124,7 +144,7 @@ def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
     """
     if settings.topics is not None and kind != "bag":
         raise DataError(f"{path}: --topics names topics of a ROS bag, but this is of kind {kind}; leave it out")
-    if settings.calibration is None or kind in ("plain", "bag", "video"):
+    if settings.calibration is None or kind in ("plain", "mono", "rgbd", "bag", "video"):
         return kind
     if kind in ("kitti", "kitti_raw", "euroc"):
         return "plain"  # which reads these folders, too, with any calibration
@@ -163,7 +183,8 @@ def _folder_kind(path: Path) -> str | None:
     from vio.datasets.gtsam import factor_files
     from vio.datasets.kitti import is_kitti_folder
     from vio.datasets.kitti_raw import is_kitti_raw_folder
-    from vio.datasets.plain import holds_more_than_kitti, is_plain_folder, lacks_sensor_yaml
+    from vio.datasets.one_camera import is_mono_folder, is_rgbd_folder
+    from vio.datasets.plain import holds_more_than_kitti, image_folders, is_plain_folder, lacks_sensor_yaml
     from vio.datasets.videos import video_files
 
     try:
@@ -178,6 +199,8 @@ def _folder_kind(path: Path) -> str | None:
         return "plain" if holds_more_than_kitti(path) else "kitti"
     if is_kitti_raw_folder(path):
         return "kitti_raw"
+    if is_euroc_folder(path) and image_folders(path) is None and is_mono_folder(path):
+        return "mono"
     if is_euroc_folder(path):
         return "plain" if lacks_sensor_yaml(path) else "euroc"
     if is_plain_folder(path):
@@ -186,6 +209,10 @@ def _folder_kind(path: Path) -> str | None:
         return "video"
     if factor_files(path):
         return "gtsam"
+    if is_rgbd_folder(path):
+        return "rgbd"
+    if is_mono_folder(path):
+        return "mono"
     if "sequences" in names:
         raise DataError(f"{path} holds several KITTI sequences; name one of them, such as {path / 'sequences' / '00'}")
     return None

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from vio.camera_rig import CameraRig, Undistorter
 from vio.datasets.common import imu_samples, naming
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.overlap import check_overlap, reference_of_body
@@ -19,6 +21,7 @@ from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource, Trajecto
 from vio.rig import Rectifier, Rig
 from vio.trajectory_io import read_trajectory
 
+AnyRig = TypeVar("AnyRig", Rig, CameraRig)
 IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
 _REFERENCES = (
     "reference.tum",
@@ -58,7 +61,7 @@ def find_calibration_of(layout: Layout) -> Path:
     )
 
 
-def with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:
+def with_extrinsics(rig: AnyRig, layout: Layout, file: Path) -> tuple[AnyRig, list[Path]]:
     """Add `T_cam0_imu.txt` where the calibration itself has none."""
     path = layout.root / "T_cam0_imu.txt"
     if rig.T_cam0_imu is not None or not path.is_file():
@@ -67,7 +70,7 @@ def with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Pat
 
 
 def read_motion(
-    layout: Layout, rig: Rig, times_ns: IntArray, timed: bool
+    layout: Layout, rig: Rig | CameraRig, times_ns: IntArray, timed: bool
 ) -> tuple[tuple[MotionSample, ...], list[Path], list[str]]:
     """Read the IMU and the velocities, on the clock of the images; return the samples, their files and notes."""
     imu = next((f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()), None)
@@ -106,7 +109,7 @@ def sources_of(files: Sequence[Path]) -> frozenset[MotionSource]:
 
 
 def read_reference(
-    layout: Layout, rig: Rig, rectifier: Rectifier, times_ns: IntArray
+    layout: Layout, rig: Rig | CameraRig, rectifier: Rectifier | Undistorter, times_ns: IntArray
 ) -> tuple[Trajectory | None, Path | None]:
     """Read the ground truth as that of the body: the IMU, or the rectified left camera where there is none."""
     bases = (layout.root, layout.base, layout.root / "dso")

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
 from vio.datasets.png import decode_gray8
 from vio.errors import DataError
+from vio.geometry.lie import FloatArray
 from vio.input_files import check_regular, read_input
 from vio.records import Image
 
@@ -126,6 +127,20 @@ def _decoded(data: bytes, path: Path | str) -> npt.NDArray[Any]:
         code = {1: None, 3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}[pixels.shape[2]]
         pixels = pixels[..., 0] if code is None else cv2.cvtColor(pixels, code)
     return np.asarray(pixels)
+
+
+def load_depth(path: Path) -> FloatArray:
+    """Read a depth image (H, W) of 16 bits as the levels that it holds, 0 where the depth is not known.
+
+    Raises:
+        UnreadableImageError: the file cannot be read, or is no gray image of 16 bits.
+    """
+    pixels = _load(path)
+    if pixels.dtype != np.uint16:
+        raise UnreadableImageError(
+            f"{path}: has 8 bits a pixel, too few for depths; give depth images of 16 bits (PNG or TIFF)"
+        )
+    return pixels.astype(np.float64)
 
 
 def write_png(path: Path, image: Image) -> None:

@@ -18,7 +18,7 @@ from vio.datasets.common import checked_transform, read_npz
 from vio.datasets.features import FeatureDataset
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import Projection, StereoCamera
+from vio.geometry.stereo import CameraKind, Projection, StereoCamera
 from vio.records import (
     BodyFrame,
     FeatureTracks,
@@ -57,6 +57,7 @@ _OPTIONAL = (
     "format",
     "projection",
     "run_motion",
+    "camera_kind",
     "T_cam0_imu",
     "reference_T_world_body",
     "reference_body",
@@ -115,6 +116,7 @@ def write_observation_log(
         **_motion_arrays(motion_samples),
         **_optional_arrays(recording),
         **({} if run_motion is None else {"run_motion": np.array(run_motion)}),
+        **({} if camera.kind == "stereo" else {"camera_kind": np.array(camera.kind)}),
     }
     stream = io.BytesIO()
     np.savez(stream, **arrays)  # type: ignore[arg-type] # the stubs take every keyword for allow_pickle
@@ -230,6 +232,8 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
         return f"projection is {str(arrays['projection'])!r}, none of {', '.join(get_args(Projection))}"
     if "run_motion" in arrays and str(arrays["run_motion"]) not in get_args(RunMotion):
         return f"run_motion is {str(arrays['run_motion'])!r}, none of {', '.join(get_args(RunMotion))}"
+    if "camera_kind" in arrays and str(arrays["camera_kind"]) not in get_args(CameraKind):
+        return f"camera_kind is {str(arrays['camera_kind'])!r}, none of {', '.join(get_args(CameraKind))}"
     poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
     stamps = [len(arrays[key]) for key in ("reference_times_ns", "reference_frame_indices") if key in arrays]
     if poses.shape[1:] != (4, 4) or any(count != len(poses) for count in stamps):
@@ -240,8 +244,9 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
 def _camera(arrays: Mapping[str, np.ndarray]) -> StereoCamera:
     fu, fv, cu, cv, b = arrays["intrinsics"].tolist()
     width, height = arrays["image_size"].tolist() or (None, None)
-    projection = str(arrays.get("projection", "pinhole"))
-    return StereoCamera(fu, fv, cu, cv, b, width, height, cast(Projection, projection))
+    projection = cast(Projection, str(arrays.get("projection", "pinhole")))
+    kind = cast(CameraKind, str(arrays.get("camera_kind", "stereo")))
+    return StereoCamera(fu, fv, cu, cv, b, width, height, projection=projection, kind=kind)
 
 
 def _extrinsics(arrays: Mapping[str, np.ndarray], path: Path) -> FloatArray | None:

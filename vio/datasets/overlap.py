@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.camera_rig import CameraRig, Undistorter
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.records import IntArray, Trajectory
@@ -21,7 +22,7 @@ def check_overlap(frame_times_ns: IntArray, times_ns: IntArray, where: Path | st
         raise DataError(f"{where}: no sample is within the time of the images; {finding.message}; or remove it")
 
 
-def reference_of_body(truth: Trajectory, rig: Rig, rectifier: Rectifier) -> Trajectory:
+def reference_of_body(truth: Trajectory, rig: Rig | CameraRig, rectifier: Rectifier | Undistorter) -> Trajectory:
     """Return ground truth of the raw left camera or of the IMU as that of the run's body.
 
     Raises:

@@ -115,7 +115,7 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     file = settings.calibration or find_calibration_of(layout)
     rig = load_rig(file, image_size=(image.shape[1], image.shape[0]))
     rig, used = with_extrinsics(rig, layout, file)
-    times_ns, times_file, time_notes = _frame_times(layout, pairs)
+    times_ns, times_file, time_notes = frame_times(layout, pairs)
     motion, motion_files, motion_notes = read_motion(layout, rig, times_ns, times_file is not None)
     with naming(file):
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
@@ -186,7 +186,7 @@ def _is_stamp(stem: str) -> bool:
     return re.fullmatch(r"\d{13,19}", stem) is not None
 
 
-def _frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | None, tuple[str, ...]]:
+def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | None, tuple[str, ...]]:
     """Return the times (F,) of the pairs, where they come from (None: assumed), and notes.
 
     Raises:

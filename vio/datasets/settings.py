@@ -38,6 +38,18 @@ class DatasetSettings(Section):
         None,
         "plain folders, bags and videos: the calibration file, in the place of the recording's own",
     )
+    camera: Literal["both", "left"] = setting(
+        "both", "stereo recordings: use both cameras, or the left one alone, which needs an IMU for the scale"
+    )
+    depth_factor: float | None = setting(
+        None, "depth images: levels per metre; null: the calibration's, or 5000 for TUM RGB-D", above=0
+    )
+    depth_noise: float = setting(
+        1.5e-3,
+        "depth images: k of a depth's standard deviation k depth^2; structured light has 0.0012 to 0.0019",
+        unit="1/m",
+        above=0,
+    )
     topics: str | None = setting(
         None, "bags: topics by name, such as left=/a,right=/b,imu=/c, in the place of those found by type"
     )

@@ -9,6 +9,7 @@ Contact-aided invariant extended Kalman filtering for robot state estimation (20
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -95,6 +96,7 @@ class Measurement:
     H: FloatArray  # (k, 15)
     residual: FloatArray  # (k,)
     R: FloatArray  # (k, k)
+    metric: bool = False  # whether it is a velocity in m/s; standstill is standstill whatever the scale
 
 
 class ImuMotion:
@@ -115,6 +117,11 @@ class ImuMotion:
             self._history.take(usable)
 
     @property
+    def samples(self) -> Sequence[ImuSample]:
+        """The samples that are kept, in order of time."""
+        return self._samples
+
+    @property
     def ready(self) -> bool:
         """Whether there is a sample to start with."""
         return bool(self._samples)
@@ -131,7 +138,7 @@ class ImuMotion:
         """
         s = self._settings
         begin = imu_start(self._samples, time_ns, s)
-        R = _rotation_to_up(begin.force / np.linalg.norm(begin.force))
+        R = rotation_to_up(begin.force / np.linalg.norm(begin.force))
         T = se3_from_parts(R, np.zeros(3))
         nav = NavState(T, np.zeros(3), begin.rate - begin.gyro_bias, begin.gyro_bias, np.zeros(3))
         known = s.accel_bias_sigma_mps2 / s.gravity_mps2  # tilt that the first second leaves, rad
@@ -396,7 +403,7 @@ class TwistMotion:
         H[3:, 12:15] = np.eye(3)
         residual = np.concatenate([sample.linear - nav.velocity, sample.angular - nav.rate - nav.gyro_bias])
         sigmas = np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3)
-        return Measurement(H, residual, np.diag(sigmas**2))
+        return Measurement(H, residual, np.diag(sigmas**2), metric=True)
 
     def zero_velocity(self, nav: NavState, gyro: FloatArray | None) -> Measurement:
         """Rest as a measurement: no twist."""
@@ -450,7 +457,7 @@ def _yaw_sigma(tilt_sigma: float, known_sigma: float) -> float:
     return float(np.hypot(tilt_sigma**4 / 24, known_sigma**2 / 2))
 
 
-def _rotation_to_up(up_imu: FloatArray) -> FloatArray:
+def rotation_to_up(up_imu: FloatArray) -> FloatArray:
     """A rotation R_world_imu (3, 3) that takes a direction of the IMU to the world's z axis, by the shortest turn."""
     axis = np.cross(up_imu, [0.0, 0.0, 1.0])
     s, c = float(np.linalg.norm(axis)), float(up_imu[2])

@@ -93,9 +93,9 @@ class MotionNoise:
     Reference: Mehra, Approaches to adaptive filtering, IEEE TAC (1972), for matching the innovations' covariance.
     """
 
-    def __init__(self, start: float, smallest: float, largest: float) -> None:
-        """Start both factors at the same value and keep them between two bounds; all on standard deviations."""
-        self.factors: FloatArray = np.array([start, start])  # translation, rotation
+    def __init__(self, start: float | FloatArray, smallest: float, largest: float) -> None:
+        """Start both factors at one value or at two (2,), and keep them between bounds; all on standard deviations."""
+        self.factors: FloatArray = np.ones(2) * start  # translation, rotation
         self._bounds = smallest, largest
         self._variance: FloatArray = np.full(2, _LOG_VARIANCE_SIGMA**2)
         self._sum: StepErrors | None = None

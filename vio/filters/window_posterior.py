@@ -8,11 +8,12 @@ import numpy as np
 
 from vio.filters.navigation import ImuMotion
 from vio.filters.window import Clone, Window
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
 from vio.records import Estimate
 from vio.statistics import chi_square_quantile
 
+_LEAST_MOTION_M = 1e-3  # of all poses from the oldest one: less has no scale
 _STATIONARY_PROBABILITY = 0.95  # chi-square limit of the motion over the window
 
 
@@ -97,6 +98,24 @@ class WindowPosterior:
             return False
         squared = float(xi @ np.linalg.solve(C + 1e-18 * np.eye(6), xi))
         return squared < limit
+
+
+def scale_sigma(posterior: WindowPosterior) -> float | None:
+    """Standard deviation of the scale of the motion over the window, over it; None where there is no motion.
+
+    It is that of the factor by which the poses' positions, from the oldest one on, are longer than the truth.
+    """
+    T = np.array([c.T_world_imu for c in posterior.clones])
+    p = T[:, :3, 3] - T[0, :3, 3]
+    length2 = float(np.sum(p**2))
+    if length2 < _LEAST_MOTION_M**2:
+        return None
+    # p = exp(phi) p_hat + rho, less that of the oldest pose
+    moves = np.concatenate([np.broadcast_to(np.eye(3), (len(T), 3, 3)), -so3_hat(T[:, :3, 3])], axis=2)
+    row = np.einsum("ki,kij->kj", p, moves)
+    row[0] -= p.sum(axis=0) @ moves[0]
+    row = row.ravel() / length2
+    return float(np.sqrt(max(row @ posterior.P @ row, 0.0)))
 
 
 def _with_velocities(clones: tuple[Clone, ...]) -> tuple[Clone, ...]:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
-from vio.geometry.stereo import Projection, StereoCamera, left_rays, project
+from vio.geometry.stereo import Projection, StereoCamera, left_rays, one_camera, project
 
 MapArray = npt.NDArray[np.float32]
 Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
@@ -276,3 +276,15 @@ def _lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray
     uv, valid = project_point(camera, rays @ R_rect_cam)
     uv = np.where(valid[..., None], uv, -1e4)
     return uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
+
+
+def undistorted(camera: CameraModel) -> tuple[StereoCamera, tuple[MapArray, MapArray]]:
+    """Return one camera without its distortion, looking the same way, and the map of its images.
+
+    The images keep their size and have no invalid border.
+    """
+    low, high = _inner_rectangle(camera, np.eye(3), "pinhole")
+    f = float(max((camera.width - 1) / (high - low)[0], (camera.height - 1) / (high - low)[1]))
+    cu, cv = np.array([camera.width - 1, camera.height - 1]) / 2 - f * (low + high) / 2
+    out = one_camera(f, f, float(cu), float(cv), camera.width, camera.height)
+    return out, _lookup(out, camera, np.eye(3))

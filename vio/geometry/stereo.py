@@ -13,7 +13,7 @@ first order in the middle row, disparity is `fu baseline / rho`, and rows reach 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Literal, TypeAlias
 
@@ -24,11 +24,19 @@ from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray
 
 Projection: TypeAlias = Literal["pinhole", "cylinder"]
+CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
+# Of one camera, metres: no distance in the world, but the unit of length of inverse depths. Half of it is the nearest
+# depth, and a track enters the estimate once its inverse depth is known as well as by a stereo pair of this baseline.
+MONO_UNIT_M = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class StereoCamera:
-    """A rectified stereo pair: one intrinsic matrix, image rows aligned, cam1 at +baseline on cam0's x axis."""
+    """A rectified stereo pair: one intrinsic matrix, image rows aligned, cam1 at +baseline on cam0's x axis.
+
+    One camera with depth images ("rgbd") is a pair with a virtual right camera: `ur = ul - fu baseline / depth`. One
+    camera alone ("mono") has no right pixels; its `baseline_m` is a unit of length, `MONO_UNIT_M`.
+    """
 
     fu: float  # focal length, pixels, along u
     fv: float  # focal length, pixels, along v
@@ -38,6 +46,7 @@ class StereoCamera:
     width: int | None = None  # image size in pixels; None where only features are given
     height: int | None = None
     projection: Projection = "pinhole"  # of both images; see above
+    kind: CameraKind = "stereo"  # where right pixels come from: a right camera, depth images, or nowhere
 
     def __post_init__(self) -> None:
         values = (self.fu, self.fv, self.cu, self.cv, self.baseline_m)
@@ -74,6 +83,18 @@ class StereoCamera:
     def K(self) -> FloatArray:
         """Intrinsic matrix (3, 3) of both cameras, pixels; of a cylinder, that of the pinhole at its middle row."""
         return np.array([[self.fu, 0, self.cu], [0, self.fv, self.cv], [0, 0, 1]], dtype=np.float64)
+
+
+def one_camera(
+    fu: float, fv: float, cu: float, cv: float, width: int | None = None, height: int | None = None
+) -> StereoCamera:
+    """Return an undistorted camera without a right one; the arguments are those of `StereoCamera`, in pixels."""
+    return StereoCamera(fu, fv, cu, cv, MONO_UNIT_M, width, height, kind="mono")
+
+
+def left_alone(camera: StereoCamera) -> StereoCamera:
+    """Return the left camera of a pair as one camera."""
+    return replace(camera, baseline_m=MONO_UNIT_M, kind="mono")
 
 
 def depth_of(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:

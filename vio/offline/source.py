@@ -18,7 +18,7 @@ from vio.geometry.distortion import StereoRig, rig_from_rectified
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import rectifying_rotations
 from vio.protocols import Dataset, Frontend
-from vio.records import FeatureTracks, MotionSample, Observations, StereoFrame, feature_tracks
+from vio.records import FeatureTracks, MotionSample, Observations, StereoFrame, feature_tracks, need_stereo
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +70,7 @@ def open_source(text: str) -> CalibrationSource:
             raise
         return found
     recording = dataset.recording
+    need_stereo(recording, "a calibration of cameras")
     if isinstance(dataset, RectifiedDataset):
         return CalibrationSource(recording.path, dataset.rectifier.rig, dataset.pairs, dataset, None)
     known = recording.camera.width is not None

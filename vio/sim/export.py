@@ -82,7 +82,7 @@ def export_euroc(
             write_text(mav / name / "data.csv", text)
         calibration = imu_yaml(np.eye(4), noise, comment=f"{origin} imu0", rate_hz=median_rate_hz(record.times_ns))
         write_text(mav / "imu0" / "sensor.yaml", calibration)
-        write_text(folder / MARKER, _description(recording))
+        write_text(folder / MARKER, description(recording))
         names = [image_name(t, int(stamps[-1])) for t in stamps.tolist()]
         files = [tuple(mav / camera / "data" / name for camera in ("cam0", "cam1")) for name in names]
         _write_images(recording, files, progress)
@@ -117,7 +117,7 @@ def export_kitti(
         write_text(folder / "poses.txt", "".join(f"{exact_text(T[:3])}\n" for T in poses))
         if within:
             write_velocity(folder, within, int(stamps[0]))
-        write_text(folder / MARKER, _description(recording))
+        write_text(folder / MARKER, description(recording))
         files = [tuple(folder / name / f"{i:06d}.png" for name in ("image_0", "image_1")) for i in range(len(stamps))]
         _write_images(recording, files, progress)
 
@@ -150,7 +150,7 @@ def _truth_csv(recording: SimulatedRecording) -> str:
     return state_csv(times, state.T_world_imu, state.velocity_world, biases)
 
 
-def _description(recording: SimulatedRecording) -> str:
+def description(recording: SimulatedRecording) -> str:
     """Describe the simulation as JSON."""
     simulation = recording.simulation
     facts = {

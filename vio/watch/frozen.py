@@ -83,14 +83,13 @@ class FrozenImages:
 
     def _compare(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
         shown = self._shown
-        if shown is None or frame.left is None or frame.right is None:
+        if shown is None or frame.left is None:
             return None
-        assert shown.left is not None
-        assert shown.right is not None
-        if frame.left.shape != shown.left.shape or frame.right.shape != shown.right.shape:
+        images, before = _images(frame), _images(shown)
+        if [image.shape for image in images] != [image.shape for image in before]:
             return None  # the front end refuses it
         again = self._repeating is not None  # what was given again once is, until it changes
-        if _equal(frame.left, shown.left) and _equal(frame.right, shown.right):
+        if all(_equal(new, old) for new, old in zip(images, before, strict=True)):
             return Repeated(shown.index, True) if again or self._moves(expected) else None
         if self._seen is None or expected is None:
             return None
@@ -139,14 +138,15 @@ def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float
     return seen.take(a[moved > least_px])
 
 
+def _images(frame: StereoFrame) -> list[Image]:
+    """The images of a frame: left and right, or that of one camera."""
+    return [image for image in (frame.left, frame.right) if image is not None]
+
+
 def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     """Whether features have not moved since they were seen, in both images."""
-    for old, new, pixels in (
-        (before.left, now.left, seen.z[:_CORNERS, :2]),
-        (before.right, now.right, seen.z[seen.has_right][:_CORNERS, 2:]),
-    ):
-        assert old is not None
-        assert new is not None
+    of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
+    for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
         flow = corner_flow(old, new, pixels)
         if len(flow) < _LEAST_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
             return False

@@ -45,6 +45,9 @@ class RunWatch:
         self._frames = self._features = 0
         self._refused_last = -2
         self.frames_refused = 0
+        self.frames_waiting = 0  # that have no pose, as the back end had not begun
+        self._waiting_since: int | None = None
+        self._waits_for = ""
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
@@ -93,6 +96,34 @@ class RunWatch:
         self._refused_last = index
         self.frames_refused += 1
 
+    def waiting(self, frame: StereoFrame, why: str) -> None:
+        """Add a frame without a pose, as the back end's start is not observable yet; `why` is said at the end."""
+        self._waits_for = why
+        if self._waiting_since is None:
+            self._waiting_since = frame.time_ns
+        self.frames_waiting += 1
+
+    def begun(self, frame: StereoFrame, scale_sigma: float | None) -> None:
+        """Add a frame with a pose of a back end that may have waited: the first one says how it began."""
+        since, self._waiting_since = self._waiting_since, None
+        if since is None:
+            return
+        how = (
+            "at standstill"
+            if scale_sigma is None
+            else f"in motion, its scale known to {100 * scale_sigma:.1f} % by the IMU"
+        )
+        self._report(
+            [
+                f"frame {frame.index}: one camera: the trajectory begins here, {how}; the frames of "
+                f"{(frame.time_ns - since) * 1e-9:.1f} s before have no pose"
+            ]
+        )
+
+    def lost(self, index: int, why: str) -> None:
+        """Report that the back end diverged in a frame and has no estimate until its start is observable again."""
+        self._report([f"frame {index}: {why}; there are no poses until the scale is observable again"])
+
     def restarted(self, index: int, why: str, estimate: Estimate) -> None:
         """Report that the back end diverged in a frame and was started again; repeats within a second are one event."""
         self._report(self._health.restarted(index, why, estimate))
@@ -107,6 +138,8 @@ class RunWatch:
             self._report(
                 [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
             )
+        if self._waiting_since is not None:
+            self._report([f"one camera: {self.frames_waiting} frames have no pose; {self._waits_for}"])
         self._report(self._repeats.finish())
         if self._silence is not None:
             self._report(self._silence.finish())

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from vio.camera_rig import CameraRig
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
 from vio.errors import CalibrationError
@@ -171,18 +172,33 @@ def kalibr_text(rig: Rig) -> str:
             sheet["T_cam_imu"] = poses[name].tolist()
         if name == "cam1":
             sheet["T_cn_cnm1"] = rig.T_cam1_cam0.tolist()
-        kind, bend, leading, coefficients = _kalibr_names(camera)
-        sheet |= {
-            "camera_model": kind,
-            "distortion_model": bend,
-            "distortion_coeffs": [float(c) for c in coefficients],
-            "intrinsics": [*leading, camera.fu, camera.fv, camera.cu, camera.cv],
-            "resolution": [camera.width, camera.height],
-        }
+        sheet |= _camera_sheet(camera)
         if rig.T_cam0_imu is not None:
             sheet["timeshift_cam_imu"] = float(rig.time_offset_s)
         chain[name] = sheet
     return yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
+
+
+def kalibr_camera_text(rig: CameraRig) -> str:
+    """Return the camchain of one camera, with all digits, as `read_one_camera` reads it."""
+    sheet: dict[str, Any] = {}
+    if rig.T_cam0_imu is not None:
+        sheet |= {"T_cam_imu": rig.T_cam0_imu.tolist(), "timeshift_cam_imu": float(rig.time_offset_s)}
+    sheet |= _camera_sheet(rig.cam0)
+    if rig.depth_factor is not None:
+        sheet["depth_factor"] = float(rig.depth_factor)
+    return yaml.safe_dump({"cam0": sheet}, sort_keys=False, default_flow_style=None)
+
+
+def _camera_sheet(camera: CameraModel) -> dict[str, Any]:
+    kind, bend, leading, coefficients = _kalibr_names(camera)
+    return {
+        "camera_model": kind,
+        "distortion_model": bend,
+        "distortion_coeffs": [float(c) for c in coefficients],
+        "intrinsics": [*leading, camera.fu, camera.fv, camera.cu, camera.cv],
+        "resolution": [camera.width, camera.height],
+    }
 
 
 def _kalibr_names(camera: CameraModel) -> tuple[str, str, list[float], tuple[float, ...]]:
@@ -193,3 +209,26 @@ def _kalibr_names(camera: CameraModel) -> tuple[str, str, list[float], tuple[flo
     if camera.model == "unified":
         return "omni", "radtan" if len(c) > 1 else "none", [float(c[0])], c[1:]
     return "pinhole", "none" if camera.model == "pinhole" else camera.model, [], c
+
+
+def is_one_camera(entries: Entries) -> bool:
+    """Return whether entries are those of a camchain with cam0 alone."""
+    cam0 = entries.get("cam0")
+    return isinstance(cam0, dict) and "intrinsics" in cam0 and "cam1" not in entries
+
+
+def read_one_camera(path: Path) -> CameraRig:
+    """Read cam0 of a camchain and, beside it, the IMU's file.
+
+    A depth camera's `depth_factor`, levels per metre, is no entry of Kalibr's and may be added to cam0.
+
+    Raises:
+        CalibrationError: an entry is missing or impossible, or a model is not known; the message names it.
+    """
+    entries = read_yaml(path, "Kalibr's calibration of the camera")
+    block, where = section(entries, "cam0", str(path)), f"{path}, cam0"
+    noise, notes = _imu_beside(path)
+    factor = numbers(block, "depth_factor", where, 1)[0] if "depth_factor" in block else None
+    offset_s = _time_shift(block, {}, path)
+    with naming(path):
+        return CameraRig(_camera(block, where), _pose(block, "T_cam_imu", where), noise, offset_s, notes, factor)
