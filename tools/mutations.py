@@ -1686,8 +1686,8 @@ MUTATIONS = (
     Mutation(
         "map: a filter that began anew knows its motion",
         "vio/mapping/session.py",
-        "np.diag(_BROKEN)",
-        "np.diag(0 * _BROKEN)",
+        "last[2]) @ T_odom_cam, np.diag(_BROKEN))",
+        "last[2]) @ T_odom_cam, np.diag(0 * _BROKEN))",
         _MAP_RUN,
     ),
     Mutation(
