@@ -564,7 +564,7 @@ class Msckf:
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Update with everything that a frame shows."""
         self._calibrate_stereo(window, seen)
-        self._test_scale(window)
+        self._test_scale(window, seen)
         z, weight, found = latest_pixels(seen, window.landmark_ids)
         self._keep_landmarks(window, found)
         pixels = Views(z[found], weight[found])
@@ -649,8 +649,10 @@ class Msckf:
             P, _ = calibration_covariance(calibration, self._settings)
             window.start_stereo_field(calibration, P[:FIELD_TERMS, :FIELD_TERMS])
 
-    def _test_scale(self, window: Window) -> None:
+    def _test_scale(self, window: Window, seen: Observations) -> None:
         """Take the scale of IMU or velocities, from the frame on at which they contradict that of the baseline."""
+        if not seen.has_right.any():  # then the scale is not the baseline's, but the sensor's already
+            window.scale_test = None
         test = window.scale_test
         if test is not None:
             test.frames += 1
