@@ -116,6 +116,8 @@ class MapSession:
             frame.index, estimate, _unknown if shown and self._is_lost(frame.time_ns) else relative
         )
         self._dark = _predicted(self._seen, estimate) if motion is None and self._seen is not None else None
+        if self._dark is not None and self._is_lost(frame.time_ns):
+            self._dark = RelativePose(self._dark.T_i_j, np.diag(_BROKEN))
         if not shown:
             return events
         self._seen_ns, self._seen = frame.time_ns, estimate
@@ -173,7 +175,7 @@ class MapSession:
         """Covariance (6, 6) of xi in T_map_body = T_hat exp(xi), [rho; phi], at the newest frame, given the map.
 
         That of the newest keyframe whose place is known, grown by the odometry since; None without a place. Where
-        images show nothing, it grows as the filter's own.
+        images show nothing, it grows as the filter's own; of images alone, the place is soon not known.
         """
         if self._known is None:
             return None
