@@ -282,6 +282,25 @@ def test_what_a_covered_camera_does_to_the_place(alone: bool, tmp_path: Path) ->
     assert (np.sqrt(motion.covariance[0, 0]) >= 30.0) is np.bool_(alone)
 
 
+def test_few_features_are_no_darkness(tmp_path: Path) -> None:
+    """Ten features for a second are too few for a keyframe, and enough for images alone to follow."""
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False, alone=True)
+    gray = np.zeros((64, 64), dtype=np.uint8)
+    for k in range(24):
+        count = 10 if 12 <= k < 22 else 40
+        seen = observations(k, 10**8 * k, np.arange(count) + 1000 * (k == 23), np.tile([9.0, 9, 5, 9], (count, 1)))
+        session.frame(
+            StereoFrame(k, 10**8 * k, gray, gray),
+            seen,
+            Estimate(k, np.eye(4), np.eye(6)),
+            lambda older, newer: RelativePose(np.eye(4), 1e-4 * (newer - older) * np.eye(6)),
+        )
+    session.finish()
+    session.close()
+    ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
+    assert np.sqrt(motion.covariance[0, 0]) < 1.0
+
+
 def test_motions_have_errors_that_tracks_do_not_average_out(tmp_path: Path) -> None:
     """A filter that is sure to a micrometre of a metre: the calibration is not."""
     steps = [np.eye(4), se3_exp([0.0, 0, 1.0, 0, 0.5, 0])]

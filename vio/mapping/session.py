@@ -27,6 +27,7 @@ Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
 _SHARED = 0.6  # of the last keyframe's features that are still seen: below it, a new keyframe
 _LEAST_FEATURES = 30  # with a right pixel
+_LEAST_TRACKED = 6  # likewise, by which the odometry can still follow
 _LOCALISE_STEP = 5  # frames between keyframes of a session that is localised, where nothing is stored
 _LOST_STEP = 3  # likewise while it has no place
 _LOST_M = 1.0  # standard deviation of the position, likewise
@@ -111,16 +112,16 @@ class MapSession:
         self._frames += 1
         events = self._take(lambda due: due <= self._frames)
         fresh = seen.take(seen.has_right & ~seen.stale)
-        shown = len(fresh) >= _LEAST_FEATURES and frame.left is not None and frame.right is not None
-        motion = self._motion_to(
-            frame.index, estimate, _unknown if shown and self._is_lost(frame.time_ns) else relative
-        )
+        seen_now = len(fresh) >= _LEAST_TRACKED
+        lost = seen_now and self._is_lost(frame.time_ns)
+        motion = self._motion_to(frame.index, estimate, _unknown if lost else relative)
         self._dark = _predicted(self._seen, estimate) if motion is None and self._seen is not None else None
         if self._dark is not None and self._is_lost(frame.time_ns):
             self._dark = RelativePose(self._dark.T_i_j, np.diag(_BROKEN))
-        if not shown:
+        if seen_now:
+            self._seen_ns, self._seen = frame.time_ns, estimate
+        if len(fresh) < _LEAST_FEATURES or frame.left is None or frame.right is None:
             return events
-        self._seen_ns, self._seen = frame.time_ns, estimate
         self._since += 1
         if motion is None and self._newest is not None:
             return events
