@@ -51,6 +51,12 @@ def test_reports_once_a_focal_length_that_differs_beyond_doubt_and_beyond_harm(
     )
 
 
+def test_a_scale_that_is_off_is_laid_on_baseline_or_focal_length_where_nothing_tells_them_apart() -> None:
+    scale = StereoScaleEstimate(np.array([np.log(1.1), 0.0]), np.diag([0.01**2, 0.0]))
+    (line,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_scale=scale))
+    assert "the baseline, or the focal length, is 10.0 % longer than calibrated" in line
+
+
 def test_a_restart_is_one_event_and_its_jump_is_not_reported_as_a_speed() -> None:
     health = RunHealth()
     assert health.frame(0, GOOD, _estimate(0)) == ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import subprocess
 import sys
 import threading
@@ -28,6 +29,7 @@ from vio.sim.motion import hand_held
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate
 from vio.sim.world import room
+from vio.threads import BlasLimit, one_blas_thread
 
 FRAMES = 12
 IMAGES_ALONE = replace(Config(), motion="none")
@@ -299,7 +301,8 @@ def test_what_the_rig_does_not_have_is_refused_at_once() -> None:
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_one_blas_thread_inside_and_the_callers_number_outside(fails: bool) -> None:
+def test_one_blas_thread_inside_and_the_callers_number_outside(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vio.threads._pinned", 0)  # as outside of these tests, which hold one thread throughout
     inside: list[int] = []
 
     def threads() -> list[int]:
@@ -320,6 +323,12 @@ def test_one_blas_thread_inside_and_the_callers_number_outside(fails: bool) -> N
             odometry.add_observations(0, [1], [[1, 2, 0, 2]])
         assert set(threads()) == {2}
     assert set(inside) == {1}
+
+
+def test_within_a_run_the_number_of_blas_threads_is_not_asked_for_again() -> None:
+    """The run holds it at one; each question takes as long as ten IMU samples."""
+    with one_blas_thread():
+        assert isinstance(BlasLimit()(), contextlib.nullcontext)
 
 
 def test_the_public_names_are_there_and_cost_nothing() -> None:

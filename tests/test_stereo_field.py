@@ -248,7 +248,7 @@ def test_check_refine_and_export_take_the_calibration_of_the_run(ran: Path, monk
             image[20] = 255
             return [vio.records.StereoFrame(start, 0, image, image)]
 
-    monkeypatch.setattr("vio.saved_run.open_dataset", lambda source: Images())
+    monkeypatch.setattr("vio.saved_run.open_dataset", lambda source, options: Images())
     (frame,) = stereo_frames(run, None, np.array([3]))
     assert frame.left is not None
     assert frame.right is not None

@@ -79,6 +79,19 @@ def test_saved_observations_of_a_cylinder_replay_to_the_same_bits(wide_run: Path
         assert (out / name).read_bytes() == (wide_run / name).read_bytes()
 
 
+def test_features_on_a_cylinder_have_no_calibration_to_save(
+    wide_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, out = str(wide_run / "observations.npz"), str(tmp_path / "again")
+    assert main(["run", source, "--save-calibration", "--out", out, "--json", "--quiet"]) == 1
+    assert (
+        "holds features of images on a cylinder, which no lens model holds; run on the images"
+        in capsys.readouterr().err
+    )
+    with pytest.raises(DataError, match="before the first frame"):
+        vio.Odometry(CYLINDER).calibrated_rig()
+
+
 def test_the_projection_is_a_setting(flight: Path) -> None:
     def read(**settings: str) -> StereoCamera:
         return open_dataset(str(flight), DatasetSettings(**settings)).recording.camera  # type: ignore[arg-type]

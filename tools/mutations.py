@@ -38,6 +38,7 @@ _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
 _STEREO_FIELD = ("tests/test_stereo_calibration.py",)
+_SCALE = ("tests/test_scale_test.py",)
 _KEPT = ("tests/test_stereo_field.py",)
 _IN_MOTION = ("tests/test_self_calibration.py",)
 _ROWS = ("tests/test_frontend_rows.py",)
@@ -998,6 +999,20 @@ MUTATIONS = (
         _STEREO_FIELD,
     ),
     Mutation(
+        "scale test: motion in metres does not move the scaled world's errors",
+        "vio/filters/window.py",
+        "V[:DIM] += step.Phi @ before - self._scaled_nav(step.nav)",
+        "V[:DIM] += 0 * (step.Phi @ before - self._scaled_nav(step.nav))",
+        _SCALE,
+    ),
+    Mutation(
+        "scale test: what the filter's errors took up is not taken off its information",
+        "vio/filters/scale_test.py",
+        "float(V @ W - W @ P @ W)",
+        "float(V @ W)",
+        _SCALE,
+    ),
+    Mutation(
         "stereo field: rows believe every mismatch",
         "vio/filters/stereo_calibration.py",
         "1 / (1 + (residual / (CAUCHY * scale)) ** 2)",
@@ -1671,8 +1686,8 @@ MUTATIONS = (
     Mutation(
         "map: a filter that began anew knows its motion",
         "vio/mapping/session.py",
-        "np.diag(_BROKEN)",
-        "np.diag(0 * _BROKEN)",
+        "last[2]) @ T_odom_cam, np.diag(_BROKEN))",
+        "last[2]) @ T_odom_cam, np.diag(0 * _BROKEN))",
         _MAP_RUN,
     ),
     Mutation(

@@ -55,8 +55,11 @@ log = logging.getLogger(__name__)
 
 
 def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig | None:
-    """Return a rectified pair with the pose (4, 4) of its IMU as a rig; None: one camera, or no known image size."""
-    if camera.width is None or camera.height is None or camera.kind != "stereo":
+    """Return a rectified pair with the pose (4, 4) of its IMU as a rig of two pinholes.
+
+    None: one camera, no known image size, or a cylinder, which no lens model holds.
+    """
+    if camera.width is None or camera.height is None or camera.kind != "stereo" or camera.is_cylinder:
         return None
     c = camera
     return Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height, T_cam0_imu)
@@ -326,13 +329,16 @@ class Odometry:
         """Return the rig with what the estimate says that its calibration is off by; `rig` of it begins the next run.
 
         Raises:
-            DataError: there is no estimate yet, or the size of the rectified images is not known.
+            DataError: there is no estimate yet, the size of the rectified images is not known, or they are a cylinder's
+                and the rig of the raw cameras was not given.
         """
         estimate = self._estimate
         if estimate is None:
             raise DataError("there is no calibration before the first frame")
         rig = self._rig or rig_of_rectified(self.camera, None if self.motion is None else self.T_cam0_body)
         if rig is None:
+            if self.camera.is_cylinder:
+                raise DataError("no lens model holds a cylinder; give Odometry the rig of the raw cameras")
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
         # A stereo field on a cylinder is not expressed as a rig.
         return calibrated_rig(rig, replace(estimate, stereo_field=None) if self.camera.is_cylinder else estimate)

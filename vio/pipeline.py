@@ -209,7 +209,7 @@ def run(
 
 
 def given_rig(dataset: Dataset) -> Rig | None:
-    """Return the calibration of a recording's images; None: it holds features, and no image size.
+    """Return the calibration of a recording's images; None: it holds features, and no image size or a cylinder.
 
     For features it is that of the rectified images that they come from.
     """

@@ -222,6 +222,11 @@ def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Pat
     if asked is None:
         return None
     if given_rig(dataset) is None:
+        if dataset.recording.camera.is_cylinder:
+            raise DataError(
+                f"{dataset.recording.path}: holds features of images on a cylinder, which no lens model holds; run on "
+                "the images, or leave --save-calibration out"
+            )
         raise DataError(
             f"{dataset.recording.path}: states no image size, which a calibration needs; leave --save-calibration out"
         )

@@ -32,6 +32,7 @@ from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, NavState, Tr
 from vio.filters.noise import MotionNoise, StepErrors
 from vio.filters.online_calibration import Calibration, Twist, body_twist, calibration_covariance, first_calibration
 from vio.filters.restart import GoodState, restarted
+from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
     FIELD_TERMS,
@@ -59,6 +60,7 @@ from vio.records import (
     MotionSource,
     Observations,
     Prediction,
+    StereoScaleEstimate,
     TrackPrior,
     UpdateReport,
     VelocitySample,
@@ -140,6 +142,7 @@ class Msckf:
         self._expected: FloatArray = np.zeros((6, 6))  # covariance of the camera's motion since, as it was predicted
         self._noise = MotionNoise(*IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._rows = RowField(camera)
+        self._scale_log: float | None = None  # of the baseline over the calibrated one; None: nothing contradicts it
         self._landmark_gate = LandmarkGate(settings.gate_probability)
         self._smoothed: WindowPosterior | None = None  # after the last frame
         self._stationary_ns = -(2**62)  # newest frame of the last zero-velocity measurement
@@ -325,7 +328,10 @@ class Msckf:
         if good is None:
             raise EstimationError("msckf has no good state to start again from; check calibration and first frames")
         nav, P = restarted(good, observations.time_ns, self._motion, self._settings)
+        scale_test = None if self._window is None else self._window.scale_test
         self._window = self._first_window(nav, P, good.calibration)
+        if scale_test is not None:
+            self._window.scale_test = ScaleTest(len(self._window.P), scale_test.estimate()[1])
         self._calibration = good.calibration
         self._time_ns, self._body_ns = observations.time_ns, self._body_time(observations.time_ns)
         self._smoothed, self._gyro, self._blind = None, None, False
@@ -352,7 +358,10 @@ class Msckf:
         """A window without clones; P (15, 15) is the covariance of the navigation state."""
         P_calibration, _ = calibration_covariance(calibration, self._settings)
         own = calibration.in_world(P_calibration, nav.T_world_imu)
-        return Window(self._motion, nav, np.asarray(block_diag(P, own)), calibration)
+        window = Window(self._motion, nav, np.asarray(block_diag(P, own)), calibration)
+        if self._source is not None and not calibration.metric:
+            window.scale_test = ScaleTest(len(window.P))
+        return window
 
     def _is_sane(self, window: Window) -> bool:
         """Whether the state is made of numbers, and with an IMU of a possible speed."""
@@ -381,6 +390,9 @@ class Msckf:
             accel_bias_sigma=known.accel_bias_sigma,
         )
         estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:], window.nav.T_world_imu)
+        if self._scale_log is not None and window.scale_test is not None:
+            covariance = np.diag([window.scale_test.estimate()[1] ** 2, 0.0])
+            estimate = replace(estimate, stereo_scale=StereoScaleEstimate(np.array([self._scale_log, 0.0]), covariance))
         if estimate.stereo_field is not None:
             field = estimate.stereo_field
             own, P = self._rows.without_common(field.coefficients), self._rows.covariance
@@ -552,6 +564,7 @@ class Msckf:
     def _use(self, window: Window, seen: Observations) -> UpdateReport:
         """Update with everything that a frame shows."""
         self._calibrate_stereo(window, seen)
+        self._test_scale(window, seen)
         z, weight, found = latest_pixels(seen, window.landmark_ids)
         self._keep_landmarks(window, found)
         pixels = Views(z[found], weight[found])
@@ -635,6 +648,20 @@ class Msckf:
             calibration = replace(window.calibration, stereo_field=True)
             P, _ = calibration_covariance(calibration, self._settings)
             window.start_stereo_field(calibration, P[:FIELD_TERMS, :FIELD_TERMS])
+
+    def _test_scale(self, window: Window, seen: Observations) -> None:
+        """Take the scale of IMU or velocities, from the frame on at which they contradict that of the baseline."""
+        if not seen.has_right.any():  # then the scale is not the baseline's, but the sensor's already
+            window.scale_test = None
+        test = window.scale_test
+        if test is not None:
+            test.frames += 1
+        if test is None or (self._scale_log is None and not test.contradicted):
+            return
+        factor = window.adopt_scale()
+        self._scale_log = (self._scale_log or 0.0) + float(np.log(factor))
+        self._camera = replace(self._camera, baseline_m=self._camera.baseline_m * factor)
+        self._tracks.scale(self._camera, factor)
 
     def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
         """Linearise tracks at the window's present means."""
@@ -754,6 +781,9 @@ class Msckf:
 
         A, b = self._information(window, tracks, good & ~ending, None)
         P = self._move_to_optimum(window, tracks, A, b, window.first_landmark).covariance()  # no landmark is in it
+        if self._scale_log is not None and window.scale_test is not None:
+            size = window.first_landmark
+            P = P + window.scale_covariance(A[:size, :size], P)
         own = slice(0, window.first_clone)
         self._output = P[own, own]
         rows = np.concatenate([np.arange(window.first_clone), np.r_[window.clone_rows(newest)]])

@@ -96,6 +96,7 @@ class Measurement:
     H: FloatArray  # (k, 15)
     residual: FloatArray  # (k,)
     R: FloatArray  # (k, k)
+    metric: bool = False  # whether it is a velocity in m/s; standstill is standstill whatever the scale
 
 
 class ImuMotion:
@@ -402,7 +403,7 @@ class TwistMotion:
         H[3:, 12:15] = np.eye(3)
         residual = np.concatenate([sample.linear - nav.velocity, sample.angular - nav.rate - nav.gyro_bias])
         sigmas = np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3)
-        return Measurement(H, residual, np.diag(sigmas**2))
+        return Measurement(H, residual, np.diag(sigmas**2), metric=True)
 
     def zero_velocity(self, nav: NavState, gyro: FloatArray | None) -> Measurement:
         """Rest as a measurement: no twist."""

@@ -17,6 +17,7 @@ from scipy.linalg import blas, lapack
 from vio.compiled import move_poses
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.filters.online_calibration import Calibration, Twist
+from vio.filters.scale_test import ScaleTest, is_clear
 from vio.filters.stereo_calibration import METRIC_TERMS, StereoInformation
 from vio.geometry.lie import (
     FloatArray,
@@ -64,6 +65,7 @@ class Window:
         self.landmarks: FloatArray = np.zeros((0, 3))
         self.P = P
         self.prior_delta: FloatArray = np.zeros(len(P))
+        self.scale_test: ScaleTest | None = None  # its vector is transformed with the errors
 
     @property
     def P(self) -> FloatArray:
@@ -214,14 +216,24 @@ class Window:
         if self.calibration.extrinsics:
             rows = self.calibration.extrinsic_rows + DIM
             Phi[np.ix_(rows, rows)] = se3_adjoint(step.nav.T_world_imu @ se3_inverse(self.nav.T_world_imu))
+        own = slice(0, len(Phi))
+        if self.scale_test is not None:
+            V, before = self.scale_test.error_D_scale, self._scaled_nav(self.nav)
+            V[own] = Phi @ V[own]
+            V[:DIM] += step.Phi @ before - self._scaled_nav(step.nav)
         self.nav = step.nav
-        P, self._L, own = self.P, None, slice(0, len(Phi))
+        P, self._L = self.P, None
         P[own] = Phi @ P[own]
         P[:, own] = P[:, own] @ Phi.T
         P[:DIM, :DIM] += step.Q
         if walk is not None:
             P[DIM : len(Phi), DIM : len(Phi)] += self.calibration.in_world(walk, self.nav.T_world_imu)
         self.prior_delta[own] = Phi @ self.prior_delta[own]
+
+    def _scaled_nav(self, nav: NavState) -> FloatArray:
+        """How the navigation state's error (15,) moves with the logarithm of the world's scale, equation (S1)."""
+        T_world_cam0 = nav.T_world_imu @ se3_inverse(self.calibration.T_cam0_imu)
+        return np.concatenate([T_world_cam0[:3, 3], np.zeros(3), nav.velocity, np.zeros(6)])
 
     def start_stereo_field(self, calibration: Calibration, covariance: FloatArray) -> None:
         """Add the stereo field's coefficients to the state.
@@ -236,6 +248,45 @@ class Window:
         P[np.ix_(old, old)], prior_delta[old] = self.P, self.prior_delta
         P[DIM : DIM + S, DIM : DIM + S] = covariance
         self.P, self.prior_delta, self.calibration = P, prior_delta, calibration
+        if self.scale_test is not None:
+            V, self.scale_test.error_D_scale = self.scale_test.error_D_scale, np.zeros(D + S)
+            self.scale_test.error_D_scale[old] = V
+
+    def scaled(self) -> FloatArray:
+        """How all errors (D,) move with the logarithm of the world's scale, equation (S1)."""
+        out = np.zeros(len(self.P))
+        out[:DIM] = self._scaled_nav(self.nav)
+        centres = (self.exposures() @ se3_inverse(self.calibration.T_cam0_imu))[:, :3, 3]
+        out[self.first_clone : self.first_landmark].reshape(-1, 6)[:, :3] = centres
+        out[self.first_landmark :] = self.landmarks.reshape(-1)
+        return out
+
+    def adopt_scale(self) -> float:
+        """Scale the world, and move the prior, by what the scale test has found, equation (S4).
+
+        Returns:
+            The factor, by which the caller scales baseline and points.
+        """
+        assert self.scale_test is not None
+        log, _ = self.scale_test.estimate()
+        move = float(np.expm1(log)) * self.scaled()
+        self.relinearise(move)
+        self.prior_delta = self.prior_delta - move - log * self.scale_test.error_D_scale
+        self.scale_test.adopt()
+        return float(np.exp(log))
+
+    def scale_covariance(self, information: FloatArray, P: FloatArray) -> FloatArray:
+        """What the scale's uncertainty adds to the covariance (k, k) of the first errors, equation (S4).
+
+        Args:
+            information: about them (k, k), not yet absorbed.
+            P: their covariance (k, k) with it, the scale known.
+        """
+        assert self.scale_test is not None
+        V = self.scale_test.error_D_scale[: len(P)]
+        V = V - P @ (information @ V) + self.scaled()[: len(P)]
+        out: FloatArray = self.scale_test.estimate()[1] ** 2 * np.outer(V, V)
+        return out
 
     def inflate_process_noise(self, extra: FloatArray) -> None:
         """Add noise (15, 15) to the last step, as if its motion had been known less; the newest clone ends it."""
@@ -263,6 +314,8 @@ class Window:
             to_nav[:6, self.first_clone - 1] = -camera_D_own[:, -1]
             self.P = to_nav @ self.P @ to_nav.T
             self.prior_delta = to_nav @ self.prior_delta
+            if self.scale_test is not None:
+                self.scale_test.error_D_scale = to_nav @ self.scale_test.error_D_scale
         added, beside = camera_D_own @ self.P[own], self.P[:, own] @ camera_D_own.T  # exact copies without calibration
         block = added[:, own] @ camera_D_own.T
         if self.clones:
@@ -276,10 +329,21 @@ class Window:
         P[new, old], P[old, new], P[new, new] = added, beside, block
         delta = self.prior_delta
         self.prior_delta = np.concatenate([delta[:at], camera_D_own @ delta[own], delta[at:]])
+        if self.scale_test is not None:
+            V = self.scale_test.error_D_scale
+            self.scale_test.error_D_scale = np.concatenate([V[:at], self._scale_of_clone(T, camera_D_own), V[at:]])
         self.P = P
         self.clones.append(Clone(frame_index, time_ns, T, self.nav.velocity))
         if len(self.landmarks):
             self._anchor_to_newest(self.clone_rows(len(self.clones) - 2).start + 3)
+
+    def _scale_of_clone(self, T_exposed: FloatArray, camera_D_own: FloatArray) -> FloatArray:
+        """How the error (6,) of a clone of the navigation state depends on the scale, its own pose being scaled too."""
+        assert self.scale_test is not None
+        nav, V = self.nav, self.scale_test.error_D_scale[: self.first_clone].copy()
+        V[:DIM] += self._scaled_nav(nav)
+        out: FloatArray = camera_D_own @ V - self._scaled_nav(replace(nav, T_world_imu=T_exposed))[:6]
+        return out
 
     def camera_D_own(
         self, late_s: float, twist: Twist, nav: NavState | None = None
@@ -318,6 +382,9 @@ class Window:
         P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
         delta[first:] += p_cross @ (delta[turn] - delta[before])
+        if self.scale_test is not None:
+            V = self.scale_test.error_D_scale
+            V[first:] += p_cross @ (V[turn] - V[before])
 
     def drop_oldest_clone(self) -> None:
         """Forget the oldest clone."""
@@ -335,6 +402,8 @@ class Window:
     def _keep_rows(self, rows: IntArray) -> None:
         self.P = self.P[np.ix_(rows, rows)]
         self.prior_delta = self.prior_delta[rows]
+        if self.scale_test is not None:
+            self.scale_test.error_D_scale = self.scale_test.error_D_scale[rows]
 
     def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
         """Add landmarks (K, 3) whose errors are `A xi + noise`, with A (3K, D) and noise covariance (K, 3, 3)."""
@@ -346,6 +415,9 @@ class Window:
         for k, block in enumerate(covariance):
             P[D + 3 * k : D + 3 * k + 3, D + 3 * k : D + 3 * k + 3] += block
         self.prior_delta = np.concatenate([self.prior_delta, A @ self.prior_delta])
+        if self.scale_test is not None:
+            V = self.scale_test.error_D_scale
+            self.scale_test.error_D_scale = np.concatenate([V, A @ V])
         self.P = 0.5 * (P + P.T)
         self.landmark_ids = np.concatenate([self.landmark_ids, ids])
         self.landmarks = np.concatenate([self.landmarks, p_world])
@@ -376,16 +448,19 @@ class Window:
             self._L = factor(self.P)
         return self._L
 
-    def absorb(self, information: FloatArray, vector: FloatArray) -> None:
+    def absorb(self, information: FloatArray, vector: FloatArray, scaled: FloatArray | None = None) -> None:
         """Absorb measurements into the prior.
 
         Args:
             information: `H' R^-1 H` (D, D) of the residuals at the present means.
             vector: `H' R^-1 r` (D,).
+            scaled: for measurements in metres, how the errors (D,) move with the logarithm of the world's scale.
         """
         P = fit(self._factor(), information).covariance()
         self.prior_delta = self.prior_delta - P @ (vector + information @ self.prior_delta)
         self.P = P
+        if self.scale_test is not None:
+            self.scale_test.absorb(information, vector, -self.prior_delta, P, scaled)
 
     def measure(self, measurement: Measurement) -> None:
         """Absorb a measurement of the navigation state and move the means to the new prior."""
@@ -399,7 +474,11 @@ class Window:
         information[:DIM, :DIM] = measurement.H.T @ RiH
         vector = np.zeros(len(self.P))
         vector[:DIM] = RiH.T @ measurement.residual
-        self.absorb(information, vector)
+        scaled = None
+        if measurement.metric and self.scale_test is not None and is_clear(self.nav.velocity, self.P[6:9, 6:9]):
+            scaled = np.zeros(len(self.P))
+            scaled[:DIM] = self._scaled_nav(self.nav)
+        self.absorb(information, vector, scaled)
 
     def relinearise(self, error: FloatArray) -> None:
         """Move the means by an error vector (D,); the prior stays where it is."""
@@ -448,6 +527,8 @@ class Window:
         self.landmarks = self.landmarks @ R.T
         P = M @ self.P @ M.T
         self.P, self.prior_delta = 0.5 * (P + P.T), turn @ self.prior_delta
+        if self.scale_test is not None:
+            self.scale_test.error_D_scale = M @ self.scale_test.error_D_scale
         return R, M
 
     def _corrected_velocities(self, motion: ImuMotion, T_world_imu: FloatArray, error: FloatArray) -> list[FloatArray]:

@@ -65,6 +65,11 @@ class WindowTracks:
         self.table = TrackTable(settings.clones + 1)
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
 
+    def scale(self, camera: StereoCamera, factor: float) -> None:
+        """Go on in a world scaled by a factor about its origin, whose points the given camera sees."""
+        self._camera = camera
+        self.table.points *= factor
+
     def choose(self, clones: int) -> IntArray:
         """Rows of the tracks that say something of the poses: two views or more, the most telling first if too many."""
         rows = self.table.rows()

@@ -105,8 +105,10 @@ class RunHealth:
             if abs(percent) <= max(_SCALE_OFF_PERCENT, _SCALE_SIGMAS * sigma) or name in self._reported:
                 continue
             self._reported.add(name)
+            # One scale does not tell them apart.
+            named = f"{name}, or the focal length," if len(found) == 1 and name == "baseline" else name
             lines.append(
-                f"frame {index}: the {name} is {abs(percent):.1f} % {'longer' if percent > 0 else 'shorter'} than "
+                f"frame {index}: the {named} is {abs(percent):.1f} % {'longer' if percent > 0 else 'shorter'} than "
                 f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor measures, and is taken "
                 "as that; calibrate the cameras anew, or check that images and calibration have one size"
             )
