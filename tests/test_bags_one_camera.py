@@ -19,7 +19,7 @@ from vio.config import Config  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
 from vio.datasets.bags.one_camera import OneCameraBag  # noqa: E402
 from vio.datasets.rigs.kalibr import kalibr_camera_text  # noqa: E402
-from vio.errors import ConfigError, DataError  # noqa: E402
+from vio.errors import CalibrationError, ConfigError, DataError  # noqa: E402
 from vio.geometry.distortion import CameraModel  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402
 from vio.geometry.stereo import one_camera  # noqa: E402
@@ -152,6 +152,13 @@ def test_rectified_images_take_the_projection_matrix_alone(tmp_path: Path) -> No
     assert dataset.recording.camera == one_camera(40.0, 41.0, 31.0, 23.0, 64, 48)
     for frame, (_, image) in zip(frames_of(dataset), FRAMES, strict=True):
         np.testing.assert_array_equal(frame.left, image)
+
+
+def test_camera_info_of_zeros_is_refused(tmp_path: Path) -> None:
+    script = script_of(imu=False)
+    script.notes[-1].fields.k = np.zeros(9)
+    with pytest.raises(CalibrationError, match=r"/left/camera_info: not calibrated \(K is zero\); give a calibration"):
+        open_dataset(script.write(tmp_path / "f"))
 
 
 # --- topics ---------------------------------------------------------------------------------------------------------

@@ -127,6 +127,20 @@ def test_compressed_images_and_empty_topics(tmp_path: Path) -> None:
     assert "topics without a message: /bob/imu, /lidar" in dataset.recording.notes
 
 
+def test_compressed_images_that_ros_rectified_stay_as_they_are(tmp_path: Path) -> None:
+    """The lens of CameraInfo is that of the raw images."""
+    script = plain_script(imu=False, frames=0)
+    for note in script.notes:
+        note.fields.d = np.array([-0.3, 0.1, 0.0, 0.0, 0.0])
+    for time_ns, left, right in noise_frames(4):
+        script.compressed("/left/image_rect/compressed", time_ns, left)
+        script.compressed("/right/image_rect/compressed", time_ns, right)
+    frames = [event for event in open_dataset(script.write(tmp_path / "f")).events() if isinstance(event, StereoFrame)]
+    for frame, (_, left, right) in zip(frames, noise_frames(4), strict=True):
+        np.testing.assert_array_equal(frame.left, left)
+        np.testing.assert_array_equal(frame.right, right)
+
+
 def test_topics_may_be_named(tmp_path: Path) -> None:
     script = plain_script(imu=False)
     for time_ns, left, right in noise_frames(4):
