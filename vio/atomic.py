@@ -123,6 +123,26 @@ def atomic_write_text(path: str | os.PathLike[str], text: str) -> None:
     atomic_write_bytes(path, text.encode("utf-8"))
 
 
+def check_new_file(path: Path, sign: bytes | None = None) -> None:
+    """Refuse a file that would replace one which this program did not write.
+
+    Args:
+        path: to be written.
+        sign: what our own files of this kind hold, which may be replaced; None: none can be told from others.
+
+    Raises:
+        DataError: it exists and is another's.
+    """
+    if not path.exists():
+        return
+    try:
+        ours = sign is not None and path.is_file() and sign in path.read_bytes()
+    except OSError as error:
+        raise _unwritable(path, error) from error
+    if not ours:
+        raise DataError(f"{path} exists and was not made by this command; remove it, or choose another name")
+
+
 @contextlib.contextmanager
 def atomic_folder(
     path: str | os.PathLike[str], *, replace: bool, marker: str | None = None, own: Collection[str] | None = None

@@ -151,7 +151,8 @@ def _mono_backend(
         raise ConfigError(f"backend {config.backend} needs a stereo pair, and this is one camera; take msckf")
     if motion != "imu":
         raise ConfigError(
-            "one camera alone knows no scale: add an IMU (its samples and T_cam0_imu), depth images or a second camera"
+            "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu; --motion none leaves it out), depth "
+            "images or a second camera"
         )
     return MonoMsckf(camera, T_cam0_body, config.msckf)
 

@@ -20,6 +20,7 @@ from vio.loop_files import read_keyframes, read_loops
 from vio.loops import LoopEvent, MapKeyframes
 from vio.records import Trajectory
 from vio.run_folder import read_metrics
+from vio.run_recorder import UNFINISHED
 from vio.run_tables import ESTIMATE
 from vio.tables import Rows
 from vio.trajectory_io import read_trajectory
@@ -68,6 +69,8 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         DataError: it is no run's folder, or a file in it is missing or damaged.
     """
     metrics, T_cam0_body = read_metrics(folder)
+    if not (folder / "estimates.npy").is_file() and (folder / UNFINISHED).is_dir():
+        raise DataError(f"{folder}: this run was ended before its end; `vio run --resume {folder}` goes on with it")
     estimates = _read_estimates(folder / "estimates.npy")
     frames = _read_frames(folder / "frames.csv", len(estimates))
     points = _read_points(folder / "landmarks.ply")

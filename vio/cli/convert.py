@@ -45,6 +45,7 @@ def execute(args: argparse.Namespace) -> int:
 
 def _trajectory(args: argparse.Namespace) -> int:
     """Write a trajectory, or the ground truth of a recording."""
+    from vio.atomic import check_new_file
     from vio.cli.output import print_result
     from vio.datasets import open_dataset
     from vio.errors import ConfigError
@@ -54,6 +55,7 @@ def _trajectory(args: argparse.Namespace) -> int:
     source, config = Path(args.source), config_from(args)
     if args.start or args.stop is not None:
         raise ConfigError("--start and --end choose frames of a recording to convert, not poses; leave them out")
+    check_new_file(args.out)
     if not is_trajectory_file(source):
         written = write_reference(open_dataset(args.source, config.dataset), args.out)
     elif args.to in _TRAJECTORIES:

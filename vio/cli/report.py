@@ -24,6 +24,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
+    from vio.atomic import check_new_file
     from vio.errors import DataError
     from vio.finished_run import read_finished_run, with_distinct_names
 
@@ -33,6 +34,7 @@ def execute(args: argparse.Namespace) -> int:
         raise DataError(f"the report needs plotly ({error}); install it with: pip install plotly") from error
     runs = with_distinct_names([read_finished_run(folder, args.reference) for folder in args.runs])
     out: Path = args.out or args.runs[0] / "report.html"
+    check_new_file(out, b'<p class="remark">stereo-vio')
     write_report(out, runs)
     print(out)
     return 0

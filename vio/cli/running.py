@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.atomic import atomic_write_text, check_replaceable, check_writable, locked_folder
+from vio.atomic import atomic_write_text, check_new_file, check_replaceable, check_writable, locked_folder
 from vio.cli.progress import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
@@ -236,6 +236,7 @@ def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Pat
         raise ConfigError(f"--save-calibration {asked}: writes Kalibr's format; give a file name that ends in .yaml")
     if asked.is_dir() or not asked.absolute().parent.is_dir():
         raise DataError(f"--save-calibration {asked}: its folder does not exist, or it is one; name a file")
+    check_new_file(asked, b"# by vio run")
     check_writable(asked)
     return asked
 

@@ -129,7 +129,8 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
         raise DataError(f"{path} does not exist; give {_LOOKED_FOR}")
     settings = options or DatasetSettings()
     dataset = READERS[_for_settings(kind or _detect(path), path, settings)](path, settings)
-    if settings.camera == "both":
+    # The settings of a run that took the left camera also serve its observations, which are of that camera.
+    if settings.camera == "both" or (not dataset.recording.has_images and dataset.recording.camera.kind == "mono"):
         return dataset
     from vio.datasets.left_camera import left_camera
 
@@ -153,6 +154,8 @@ def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:
 
 def _parse(source: str) -> tuple[str | None, Path]:
     """Split `kind:path`. An existing path is never split, and a drive letter is no kind."""
+    if not source.strip():
+        raise DataError(f"no recording is named; give {_LOOKED_FOR}")
     head, colon, tail = source.partition(":")
     if not colon or len(head) < 2 or not head.replace("_", "").isalnum() or Path(source).exists():
         return None, Path(source)
@@ -193,6 +196,11 @@ def _folder_kind(path: Path) -> str | None:
         raise DataError(f"cannot list {path}: {error.strerror or error}") from error
     if not names:
         raise DataError(f"{path} is empty; give {_LOOKED_FOR}")
+    if "metrics.json" in names and "config.yaml" in names:
+        raise DataError(
+            f"{path} holds the results of a run, not a recording; show it with vio report, compare it by vio eval, or "
+            "give its observations.npz (of --save-observations)"
+        )
     if is_bag(path):
         return "bag"
     if is_kitti_folder(path):

@@ -263,7 +263,7 @@ def _calibration(
 
 
 def _depth_factor(rig: CameraRig, settings: DatasetSettings, where: Path) -> tuple[float, tuple[str, ...]]:
-    """Return the levels per metre of depth images, and a note that says where they are from.
+    """Return the levels per metre of depth images, and a note where setting and calibration differ.
 
     Raises:
         CalibrationError: nothing states them.
@@ -274,5 +274,6 @@ def _depth_factor(rig: CameraRig, settings: DatasetSettings, where: Path) -> tup
             f"{where}: nothing tells the unit of its depth images; add depth_factor (levels per metre, 1000 for "
             "millimetres) to cam0 of the calibration, or --set dataset.depth_factor=1000"
         )
-    source = "dataset.depth_factor" if settings.depth_factor else "the calibration"
-    return factor, (f"depth images have {factor:g} levels a metre ({source})",)
+    if settings.depth_factor is None or rig.depth_factor in (None, factor):
+        return factor, ()
+    return factor, (f"dataset.depth_factor {factor:g} takes the place of the calibration's {rig.depth_factor:g}",)

@@ -24,6 +24,7 @@ from vio.datasets.companions import (
     sources_of,
     with_extrinsics,
 )
+from vio.datasets.euroc_files import stamped_rows
 from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable, full_scale
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.pairing import pair_stamps
@@ -199,11 +200,27 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
     stems = [left.stem for left, _ in pairs]
     if all(_is_stamp(stem) or re.fullmatch(r"\d{9,10}\.\d{1,9}", stem) for stem in stems):
         return parse_stamps(stems, lambda k: str(pairs[k][0])), layout.left, ()
+    if (file := layout.left.parent / "data.csv").is_file():
+        return _listed_times(file, pairs), file, ()
     note = (
         f"{layout.root}: no times.txt; frames are taken to be {1 / _ASSUMED_HZ:g} s apart, so speeds are unknown; "
         "write one time an image (seconds or nanoseconds) into times.txt"
     )
     return np.arange(len(pairs), dtype=np.int64) * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+
+
+def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
+    """Read the times (F,) of images from EuRoC's list of a camera.
+
+    Raises:
+        DataError: it lacks an image, or cannot be read.
+    """
+    times_ns, rows, _ = stamped_rows(file, 2, "timestamp [ns], filename")
+    time_of = {name: t for (name,), t in zip(rows, times_ns.tolist(), strict=True)}
+    missing = next((left.name for left, _ in pairs if left.name not in time_of), None)
+    if missing is not None:
+        raise DataError(f"{file}: does not list {missing}; copy both again, or remove the image")
+    return np.array([time_of[left.name] for left, _ in pairs], dtype=np.int64)
 
 
 def times_of(file: Path, pairs: ImagePairs) -> IntArray:

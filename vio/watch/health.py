@@ -110,7 +110,8 @@ class RunHealth:
             lines.append(
                 f"frame {index}: the {named} is {abs(percent):.1f} % {'longer' if percent > 0 else 'shorter'} than "
                 f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor measures, and is taken "
-                "as that; calibrate the cameras anew, or check that images and calibration have one size"
+                "as that; calibrate the cameras anew, or check that images and calibration have one size; of depth "
+                "images, check dataset.depth_factor"
             )
         return lines
 

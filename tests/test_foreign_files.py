@@ -1,0 +1,79 @@
+"""Nothing that this program did not write is replaced; what is given by mistake is named."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vio.cli import main
+from vio.datasets import open_dataset
+from vio.datasets.settings import DatasetSettings
+from vio.errors import DataError
+
+
+@pytest.fixture(scope="module")
+def run(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("foreign") / "run"
+    assert main(["run", str(flight), "--quiet", "--save-observations", "--out", str(folder)]) == 0
+    return folder
+
+
+def _refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(list(arguments)) == 1
+    return capsys.readouterr().err
+
+
+def test_files_of_others_are_not_replaced(
+    flight: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, arguments in (
+        ("notes.txt", ["convert", str(flight), "--to", "tum", "--out"]),
+        ("page.html", ["report", str(run), "--out"]),
+        ("rig.yaml", ["run", str(flight), "--quiet", "--out", str(tmp_path / "out"), "--save-calibration"]),
+    ):
+        file = tmp_path / name
+        file.write_text("mine\n")
+        assert "was not made by this command; remove it, or choose another name" in _refused(
+            capsys, *arguments, str(file)
+        )
+        assert file.read_text() == "mine\n"
+        file.unlink()
+        assert main([*arguments, str(file)]) == 0
+        capsys.readouterr()
+    assert main(["report", str(run), "--out", str(tmp_path / "page.html")]) == 0, "our own page may be replaced"
+
+
+def test_results_are_no_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "holds the results of a run, not a recording" in _refused(capsys, "run", str(run))
+    assert "no recording is named" in _refused(capsys, "run", "")
+
+
+def test_a_run_that_can_go_on_is_not_said_to_be_lost(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(run, tmp_path / "run")
+    (tmp_path / "run" / "unfinished").mkdir()
+    (tmp_path / "run" / "estimates.npy").rename(tmp_path / "run" / "unfinished" / "estimates.npy")
+    assert f"`vio run --resume {tmp_path / 'run'}` goes on with it" in _refused(capsys, "report", str(tmp_path / "run"))
+
+
+def test_settings_of_a_left_camera_serve_its_observations(run: Path) -> None:
+    """A log of the left camera alone is of one camera already."""
+    pair = open_dataset(run / "observations.npz", DatasetSettings(camera="left"))
+    assert pair.recording.camera.kind == "mono"
+
+
+def test_an_euroc_folder_of_one_camera_takes_its_times_from_its_list(flight: Path, tmp_path: Path) -> None:
+    """Rendered files are named by the nanoseconds since the start, which are no dates."""
+    shutil.copytree(flight, tmp_path / "flight")
+    shutil.rmtree(tmp_path / "flight" / "mav0" / "cam1")
+    one, two = open_dataset(tmp_path / "flight").recording, open_dataset(flight).recording
+    assert one.camera.kind == "mono"
+    np.testing.assert_array_equal(one.frame_times_ns, two.frame_times_ns)
+    listed = tmp_path / "flight" / "mav0" / "cam0" / "data.csv"
+    listed.write_text("\n".join(listed.read_text().splitlines()[:-1]) + "\n")
+    with pytest.raises(DataError, match=r"data\.csv: does not list .*\.png"):
+        open_dataset(tmp_path / "flight")
