@@ -1239,6 +1239,27 @@ MUTATIONS = (
         _MOVING_OBJECT,
     ),
     Mutation(
+        "moving object: wrong depths of a stereo calibration pass for one",
+        "frontend/klt.py",
+        "if stereo.rows_are_off and one_motion_explains(",
+        "if False and one_motion_explains(",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
+        "moving object: none is reported where the rows are off",
+        "frontend/moving_object.py",
+        "float((~static).mean()) < _SEEN_SHARE * smaller",
+        "True",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
+        "moving object: depths are not trusted where the rows agree either",
+        "frontend/klt.py",
+        "if stereo.rows_are_off and one_motion_explains(",
+        "if one_motion_explains(",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
         "moving object: a wrong prediction overrides the consensus",
         "frontend/moving_object.py",
         "second_agrees = large and _agrees(",
