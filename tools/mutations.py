@@ -978,6 +978,13 @@ MUTATIONS = (
         _STEREO_FIELD,
     ),
     Mutation(
+        "stereo field: landmarks enter while it is estimated",
+        "vio/filters/msckf.py",
+        "if window.calibration.stereo_field or window.scale_sigma()",
+        "if window.scale_sigma()",
+        _STEREO_FIELD,
+    ),
+    Mutation(
         "stereo scale: landmarks enter while the scale is open",
         "vio/filters/msckf.py",
         "window.scale_sigma() > _SCALE_SIGMA",
