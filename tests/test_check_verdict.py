@@ -44,7 +44,7 @@ def _result(mapper: Mapper, T_run: FloatArray, T_world_cam0: FloatArray) -> Mapp
         Path("run"), CAMERA, Trajectory(T_run, None, "cam0", frame_indices=10 * np.arange(COUNT)), NOTHING
     )
     rows = np.arange(COUNT)
-    model = Reconstructed(mapper, T_world_cam0, rows, 1000, 0.5)
+    model = Reconstructed(mapper, T_world_cam0, rows, 1000, 0.5, shared=np.zeros(0, dtype=np.int64))
     return MapperResult(mapper, COUNT, (model, compare_keyframes(path, rows, T_world_cam0)))
 
 

@@ -127,6 +127,20 @@ def test_compressed_images_and_empty_topics(tmp_path: Path) -> None:
     assert "topics without a message: /bob/imu, /lidar" in dataset.recording.notes
 
 
+def test_compressed_images_that_ros_rectified_stay_as_they_are(tmp_path: Path) -> None:
+    """The lens of CameraInfo is that of the raw images."""
+    script = plain_script(imu=False, frames=0)
+    for note in script.notes:
+        note.fields.d = np.array([-0.3, 0.1, 0.0, 0.0, 0.0])
+    for time_ns, left, right in noise_frames(4):
+        script.compressed("/left/image_rect/compressed", time_ns, left)
+        script.compressed("/right/image_rect/compressed", time_ns, right)
+    frames = [event for event in open_dataset(script.write(tmp_path / "f")).events() if isinstance(event, StereoFrame)]
+    for frame, (_, left, right) in zip(frames, noise_frames(4), strict=True):
+        np.testing.assert_array_equal(frame.left, left)
+        np.testing.assert_array_equal(frame.right, right)
+
+
 def test_topics_may_be_named(tmp_path: Path) -> None:
     script = plain_script(imu=False)
     for time_ns, left, right in noise_frames(4):
@@ -137,7 +151,7 @@ def test_topics_may_be_named(tmp_path: Path) -> None:
     calibration.write_text(kalibr_text(RIG))
     dataset = open_dataset(path, DatasetSettings(topics="left=/a, right=b", calibration=calibration))
     assert isinstance(dataset, BagDataset)
-    assert (dataset.roles.left.name, dataset.roles.right.name) == ("/a", "/b")
+    assert [topic.name for topic in dataset.roles.cameras] == ["/a", "/b"]
     assert "not used: /left/image_raw, /right/image_raw" in dataset.recording.notes
 
 
@@ -415,7 +429,31 @@ BAD = {
     "truncated db3": (_cut("db3", 0.5), None, "the bag is truncated or damaged"),
     "truncated mcap": (_cut("mcap", 0.6), None, "the bag is truncated or damaged"),
     "empty file": (_cut("bag", 0.0), None, "no known recording"),
-    "one camera": (_bad(_without("/right/image_raw")), None, r"holds 1 image topics with messages \(/left/image_raw\)"),
+    "no images": (
+        _bad(_without("/left/image_raw", "/right/image_raw")),
+        None,
+        r"holds 0 image topics with messages \(none\); one camera needs one, stereo two",
+    ),
+    "one camera named as the right one": (
+        _bad(_without("/right/image_raw")),
+        "right=/left/image_raw",
+        r"holds 1 image topics with messages \(/left/image_raw\); stereo needs two",
+    ),
+    "one camera of several named": (
+        _bad(_more_images),
+        "left=/right/image_raw",
+        "no two topics are named as left and right .*; name them with --topics left=/A,right=/B",
+    ),
+    "one camera without CameraInfo": (
+        _bad(_without("/right/image_raw", "/left/camera_info")),
+        None,
+        "holds no CameraInfo for /left/image_raw; give the camera's calibration with --calibration FILE",
+    ),
+    "one camera with an IMU without its pose": (
+        _bad(_without("/right/image_raw", "/tf_static")),
+        None,
+        "the pose of /imu in the camera is unknown, and one camera needs its IMU; give --calibration FILE with",
+    ),
     "a /tf of other frames": (
         _bad(lambda script: script.moving(START_NS, "map", "door", np.eye(4))),
         "reference=/tf",

@@ -321,7 +321,7 @@ def _shift_clock(name: str, by_ns: int) -> Corruption:
 _T0, _T1 = camera_stamps(4)[:2]
 _NO_YAML_MESSAGE = r"cam1/sensor.yaml is missing; it holds the sensor's calibration"
 BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
-    "no cam1": (
+    "no cam1 in euroc:FOLDER": (
         lambda mav: (mav / "cam1").rename(mav / "camB"),
         DataError,
         r"mav0: holds no cam1; give an EuRoC folder",
@@ -447,7 +447,7 @@ def test_rejects_bad_folders_with_one_line_error(case: str, tmp_path: Path) -> N
     corrupt, kind, message = BAD[case]
     corrupt(make_euroc(tmp_path) / "mav0")
     with pytest.raises(kind, match=message) as caught:
-        open_dataset(tmp_path)
+        open_dataset(f"euroc:{tmp_path}")  # of itself, a folder without cam1 is a recording of one camera
     assert "\n" not in str(caught.value)
 
 

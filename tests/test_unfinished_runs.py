@@ -209,7 +209,7 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     rows, rows_P = rng.normal(size=6), rng.normal(size=(6, 6))
     field = StereoFieldEstimate(rng.normal(size=6), rng.normal(size=(6, 6)), 0.3, rows, rows_P)
     scale = StereoScaleEstimate(rng.normal(size=2), rng.normal(size=(2, 2)))
-    values |= {"time_ns": 2**60 + 1, "time_offset_s": 0.1, "time_offset_sigma_s": 0.2}
+    values |= {"time_ns": 2**60 + 1, "time_offset_s": 0.1, "time_offset_sigma_s": 0.2, "scale_sigma": 0.02}
     values |= {"stereo_field": field, "stereo_scale": scale}
     back = estimate_of(estimate_row(0, Estimate(**values))[0])
     for name, value in values.items():

@@ -122,6 +122,13 @@ MUTATIONS = (
         ("tests/test_datasets_bags.py",),
     ),
     Mutation(
+        "bags of one camera: images in the order in which they were recorded",
+        "vio/datasets/bags/one_camera.py",
+        "while early and early[0][0] == due:",
+        "while early:",
+        ("tests/test_bags_one_camera.py",),
+    ),
+    Mutation(
         "bags: static frames not inverted towards the child",
         "vio/datasets/bags/index.py",
         "append((child, se3_inverse(T)))",

@@ -163,9 +163,9 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
         DataError: the bag is damaged, or an image topic mixes encodings of different depth.
     """
     index = BagIndex()
+    cameras = tuple(zip(roles.cameras, (index.left, index.right), strict=False))  # one has no right images
     takers: dict[str, list[Callable[[Any, Message], None]]] = {
-        roles.left.name: [lambda f, m: _image(bag, index.left, roles.left, f, m)],
-        roles.right.name: [lambda f, m: _image(bag, index.right, roles.right, f, m)],
+        topic.name: [partial(_image, bag, stamps, topic)] for topic, stamps in cameras
     }
     for topic, take in ((roles.imu, _imu), (roles.velocity, _velocity), (roles.reference, _pose)):
         if topic is not None:  # one odometry may be both velocity and reference
@@ -178,7 +178,7 @@ def index_bag(bag: Bag, roles: Roles, infos: Sequence[str]) -> BagIndex:
         fields = bag.decoded(message)
         for taker in takers[message.topic]:
             taker(fields, message)
-    for images, stamps in ((roles.left, index.left), (roles.right, index.right)):
+    for images, stamps in cameras:
         depths = {"16" in name for name in stamps.encodings}
         if len(depths) > 1:
             raise DataError(f"{bag.path}: {images.name} mixes {', '.join(stamps.encodings)}; record one encoding")

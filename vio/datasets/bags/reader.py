@@ -3,39 +3,30 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vio.datasets.bags import bag_files
-from vio.datasets.bags.index import BagIndex, index_bag, info_topic, stamp_of
-from vio.datasets.bags.pictures import gray_of, white_of
-from vio.datasets.bags.store import Bag, Topic
-from vio.datasets.bags.topics import COMPRESSED, Roles, choose
-from vio.datasets.common import frame_range, imu_samples, merge_events, naming
+from vio.datasets.bags.companions import Contents, chosen_rig, contents, is_rectified, motion_of, white_level
+from vio.datasets.bags.index import BagIndex, stamp_of
+from vio.datasets.bags.one_camera import OneCameraBag, read_one_camera
+from vio.datasets.bags.pictures import gray_of
+from vio.datasets.bags.store import Bag
+from vio.datasets.bags.topics import COMPRESSED, Roles
+from vio.datasets.common import frame_range, merge_events, naming
 from vio.datasets.image_pairs import BadFrame, ImageSize, readable_frames
-from vio.datasets.images import UnreadableImageError, decode_gray
-from vio.datasets.overlap import check_overlap, reference_of_body
+from vio.datasets.images import UnreadableImageError
+from vio.datasets.overlap import reference_of_body
 from vio.datasets.pairing import PAIRED_NS, pair_stamps
-from vio.datasets.rigs import find_calibration, load_rig
+from vio.datasets.rigs import load_rig
 from vio.datasets.rigs.camera_info import rig_from_camera_infos
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.tables import imu_notes
 from vio.errors import CalibrationError, DataError
-from vio.records import (
-    NS_PER_S,
-    Event,
-    ImuDensities,
-    IntArray,
-    MotionSample,
-    MotionSource,
-    Observations,
-    Recording,
-    StereoFrame,
-)
+from vio.records import Event, ImuDensities, IntArray, MotionSample, Observations, Recording, StereoFrame
 from vio.rig import Rectifier, Rig
 
 
@@ -90,7 +81,7 @@ class BagDataset:
         frame_of = [
             {int(stamps[k]): k for k in chosen} for stamps in (self.left_ns, self.right_ns)
         ]  # each entry is taken once
-        names = self.roles.left.name, self.roles.right.name
+        names = [topic.name for topic in self.roles.cameras]
         waiting: dict[int, Any] = {}
         complete: list[tuple[int, Any, Any]] = []
         due = chosen.start
@@ -116,8 +107,7 @@ class BagDataset:
     def _load(self, pair: _Pair) -> StereoFrame | BadFrame:
         """Decode and rectify one pair; runs in the prefetch thread."""
         images = []
-        sides = ((self.roles.left, pair.left, self.sizes[0]), (self.roles.right, pair.right, self.sizes[1]))
-        for topic, fields, size in sides:
+        for topic, fields, size in zip(self.roles.cameras, (pair.left, pair.right), self.sizes, strict=True):
             where = f"{self.recording.path}, {topic.name}, frame {pair.index}"
             try:
                 image = gray_of(fields, where, compressed=topic.kind == COMPRESSED, white=self.white)
@@ -129,34 +119,28 @@ class BagDataset:
         return StereoFrame(pair.index, int(self.recording.frame_times_ns[pair.index]), left, right)
 
 
-def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
+def read_bag(path: Path, settings: DatasetSettings) -> BagDataset | OneCameraBag:
     """Read a ROS bag.
 
     Raises:
         MissingDependencyError: the package rosbags is not installed.
-        DataError: the bag is damaged, its topics do not make a stereo recording, or no images match.
+        DataError: the bag is damaged, its topics do not make a recording, or no images match.
         CalibrationError: there is no calibration, or it is invalid.
     """
-    beside, notes_on_files = _calibration_beside(path, settings)
-    with Bag(path) as bag:
-        topics = bag.topics
-        roles, notes = choose(topics, settings.topics, str(path))
-        infos = [info_topic(topics, topic) for topic in (roles.left, roles.right)]
-        if settings.calibration is None and beside is None and None in infos:
-            missing = (roles.left, roles.right)[infos.index(None)].name
-            raise CalibrationError(
-                f"{path}: holds no CameraInfo for {missing}; give the cameras' calibration with --calibration FILE"
-            )
-        index = index_bag(bag, roles, [name for name in infos if name is not None])
-        size = index.left.size or _compressed_size(bag, roles.left)
-    rig, file, rig_notes = _chosen_rig(index, infos, roles, settings.calibration, beside, size)
+    found = contents(path, settings)
+    return read_one_camera(found, settings) if found.roles.right is None else _read_pair(found, settings)
+
+
+def _read_pair(found: Contents, settings: DatasetSettings) -> BagDataset:
+    path, roles, index, infos = found.path, found.roles, found.index, found.infos
+    rig, file, rig_notes = chosen_rig(found, settings, partial(_rig, found))
     left_ns, right_ns, logged_ns, pair_notes = _paired(index, roles, path)
     where = file or path
     with naming(where):
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
-    motion, sources, motion_notes = _motion(index, roles, rig, left_ns, path)
+    motion, sources, motion_notes = motion_of(found, rig, left_ns)
     truth = index.reference(imu=rig.T_cam0_imu is not None)
-    white = white_of(max(index.left.white, index.right.white)) if index.left.white else white_of(65535)
+    white, white_notes = white_level(index)
     recording = Recording(
         kind="bag",
         path=path,
@@ -168,7 +152,7 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         reference=None if truth is None else reference_of_body(truth, rig, rectifier),
         notes=(
             *(*rig.notes, *rectifier.notes, *pair_notes, *motion_notes),
-            *(*_white_note(white), *notes_on_files, *rig_notes, *notes),
+            *(*white_notes, *rig_notes, *found.notes),
         ),
     )
     sizes = (
@@ -192,87 +176,36 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
     )
 
 
-def _calibration_beside(path: Path, settings: DatasetSettings) -> tuple[Path | None, list[str]]:
-    """Return the calibration file in a bag's folder where no other is named, and a note on bags that are joined."""
-    parts = bag_files(path)
-    notes = [f"{len(parts)} bags are joined: {', '.join(part.name for part in parts)}"] if len(parts) > 1 else []
-    if settings.calibration is not None:
-        return None, notes
-    folders = [folder for folder in dict.fromkeys((path, *parts)) if folder.is_dir()]
-    return next((found for folder in folders if (found := find_calibration(folder)) is not None), None), notes
-
-
-def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
-    """Return width and height of the first compressed image that decodes; None: none of the first few does."""
-    for count, message in enumerate(bag.messages([topic.name])):
-        try:
-            image, _ = decode_gray(bytes(bag.decoded(message).data), topic.name)
-        except UnreadableImageError:
-            if count > 4:
-                return None
-            continue
-        return image.shape[1], image.shape[0]
-    return None
-
-
-def _chosen_rig(
-    index: BagIndex,
-    infos: Sequence[str | None],
-    roles: Roles,
-    named: Path | None,
-    beside: Path | None,
-    size: tuple[int, int] | None,
-) -> tuple[Rig, Path | None, list[str]]:
-    """Return the rig of the named file, else of one beside the bag, else of the CameraInfos; its file; and notes."""
-    if named is not None or beside is None:
-        return _rig(index, infos, roles, named, size), named, []
-    try:
-        rig = _rig(index, infos, roles, beside, size)
-    except CalibrationError as error:
-        if None in infos:
-            raise
-        return _rig(index, infos, roles, None, size), None, [f"the bag's CameraInfo serves, as {error}"]
-    return rig, beside, [f"the calibration is {beside.name}, not the bag's CameraInfo"]
-
-
-def _rig(
-    index: BagIndex, infos: Sequence[str | None], roles: Roles, file: Path | None, size: tuple[int, int] | None
-) -> Rig:
-    """Return the rig of a calibration file, or of the CameraInfos, with the IMU's place from the static frames."""
+def _rig(found: Contents, file: Path | None) -> Rig:
+    """Return the rig of a calibration file; of None, that of the CameraInfos."""
     if file is not None:
-        rig = load_rig(file, image_size=size)
-    else:
-        found = [index.infos[name] for name in infos if name is not None and name in index.infos]
-        if len(found) != 2:
-            raise CalibrationError(f"{infos}: no CameraInfo could be read; give --calibration FILE")
-        if infos[0] == infos[1]:
-            raise CalibrationError(f"{infos[0]} belongs to both images; give --calibration FILE")
-        rig = rig_from_camera_infos(*found, rectified="rect" in roles.left.name.rsplit("/", 1)[-1])
-    if rig.T_cam0_imu is not None or roles.imu is None:
-        return rig
-    T = index.transform(index.left.frame_id.lstrip("/"), index.imu_frame.lstrip("/"))
-    if T is None or index.left.frame_id == index.imu_frame:
-        return rig
-    note = f"the IMU's pose is that of /tf_static ({index.imu_frame} in {index.left.frame_id})"
-    return replace(rig, T_cam0_imu=T).noting(note)
+        return load_rig(file, image_size=found.size)
+    infos = found.infos
+    stated = [found.index.infos[name] for name in infos if name is not None and name in found.index.infos]
+    if len(stated) != 2:
+        raise CalibrationError(f"{infos}: no CameraInfo could be read; give --calibration FILE")
+    if infos[0] == infos[1]:
+        raise CalibrationError(f"{infos[0]} belongs to both images; give --calibration FILE")
+    return rig_from_camera_infos(*stated, rectified=is_rectified(found.roles.left))
 
 
 def _paired(index: BagIndex, roles: Roles, path: Path) -> tuple[IntArray, IntArray, IntArray, list[str]]:
     """Return the stamps of the paired left and right images (F,), when they were logged (F,), and notes."""
     (left, left_logged, left_twice), (right, right_logged, right_twice) = index.left.ordered(), index.right.ordered()
+    names = [topic.name for topic in roles.cameras]
     if not (len(left) and len(right)):
-        raise DataError(f"{path}: no image could be read of {roles.left.name} and {roles.right.name}; copy it again")
+        raise DataError(f"{path}: no image could be read of {names[0]} and {names[1]}; copy it again")
     a, b = pair_stamps(left, right)
     if not len(a):
         spans = [f"{t[0]} to {t[-1]} ns" for t in (left, right)]
         raise DataError(
-            f"{path}: no image of {roles.left.name} ({spans[0]}) has one of {roles.right.name} ({spans[1]}) within "
+            f"{path}: no image of {names[0]} ({spans[0]}) has one of {names[1]} ({spans[1]}) within "
             f"{PAIRED_NS / 1e6:g} ms; the cameras must be synchronised"
         )
     notes = []
-    for topic, stamps in ((roles.left, index.left), (roles.right, index.right)):
+    for name, stamps in zip(names, (index.left, index.right), strict=True):
         if stamps.unstamped:
-            notes.append(f"the headers of {topic.name} have no stamps; the times of logging are used, which jitter")
+            notes.append(f"the headers of {name} have no stamps; the times of logging are used, which jitter")
     if left_twice + right_twice:
         notes.append(f"{left_twice} left and {right_twice} right images repeat a stamp and are skipped")
     alone = len(left) - len(a), len(right) - len(b)
@@ -281,44 +214,3 @@ def _paired(index: BagIndex, roles: Roles, path: Path) -> tuple[IntArray, IntArr
     if (offset := float(np.median(right[b] - left[a])) / 1e6) != 0:
         notes.append(f"the right images are stamped {offset:+.3f} ms from the left ones (median)")
     return left[a], right[b], np.minimum(left_logged[a], right_logged[b]), notes
-
-
-def _motion(
-    index: BagIndex, roles: Roles, rig: Rig, times_ns: IntArray, path: Path
-) -> tuple[tuple[MotionSample, ...], frozenset[MotionSource], list[str]]:
-    """Return the samples in time order on the cameras' clock, their kinds, and notes."""
-    notes = [
-        f"{count} messages of {topic} were recorded out of order and are sorted"
-        for topic, count in index.disordered.items()
-    ]
-    samples: list[MotionSample] = []
-    sources: set[MotionSource] = set()
-    record = index.imu_record()
-    if rig.T_cam0_imu is None and (record is not None or index.velocities):
-        which = " and ".join(t.name for t in (roles.imu, roles.velocity) if t is not None)
-        notes.append(
-            f"{which} cannot be used: its pose in the camera is unknown; give --calibration FILE with T_cam_imu, as "
-            "Kalibr's camchain-imucam; images alone"
-        )
-        return (), frozenset(), notes
-    if record is not None and roles.imu is not None:
-        shift_ns = round(rig.time_offset_s * NS_PER_S)
-        record = replace(record, times_ns=record.times_ns - shift_ns)
-        if shift_ns:
-            notes.append(f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states")
-        check_overlap(times_ns, record.times_ns, f"{path}, {roles.imu.name}")
-        notes += imu_notes(record.times_ns, roles.imu.name)
-        samples += imu_samples(record)
-        sources.add("imu")
-    if roles.velocity is not None and (speeds := index.velocity_samples()):
-        check_overlap(times_ns, np.array([s.time_ns for s in speeds], dtype=np.int64), roles.velocity.name)
-        notes.append(f"the twist of {roles.velocity.name} is taken in the frame of T_cam0_imu")
-        samples += speeds
-        sources.add("velocity")
-    return tuple(sorted(samples, key=lambda s: s.time_ns)), frozenset(sources), notes
-
-
-def _white_note(white: int) -> list[str]:
-    if white == white_of(65535):
-        return []
-    return [f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits"]

@@ -48,10 +48,15 @@ class Roles:
     """The topics that a recording is made of."""
 
     left: Topic
-    right: Topic
+    right: Topic | None  # None: the recording is that of one camera
     imu: Topic | None
     velocity: Topic | None
     reference: Topic | None
+
+    @property
+    def cameras(self) -> tuple[Topic, ...]:
+        """The image topics: left and right, or left alone."""
+        return (self.left,) if self.right is None else (self.left, self.right)
 
 
 def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Roles, tuple[str, ...]]:
@@ -63,14 +68,13 @@ def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Role
         where: the bag, for messages.
 
     Raises:
-        DataError: a named topic is missing, empty or of another type, or no stereo pair can be chosen.
+        DataError: a named topic is missing, empty or of another type, or no pair can be chosen of several image topics.
     """
     given = _named(topics, named, where)
     filled = [t for t in topics if t.count]
     if "left" in given and "right" in given:
         left, right = given["left"], given["right"]
         assert left is not None
-        assert right is not None
     else:
         left, right = _pair(filled, given, where)
     notes: list[str] = []
@@ -108,12 +112,17 @@ def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, 
     return given
 
 
-def _pair(filled: Sequence[Topic], given: dict[str, Topic | None], where: str) -> tuple[Topic, Topic]:
-    """Choose the left and right image topic."""
+def _pair(filled: Sequence[Topic], given: dict[str, Topic | None], where: str) -> tuple[Topic, Topic | None]:
+    """Choose the left and right image topic; None in the place of the right one where there is one image topic."""
     images = [t for t in filled if t.kind in (IMAGE, COMPRESSED) and not _NO_GRAY.search(t.name)]
+    left_named = given.get("left")
+    cameras = images if left_named is None or left_named in images else [*images, left_named]
+    if len(cameras) == 1 and "right" not in given:
+        return cameras[0], None
     if len(images) < 2:
         have = _list([t.name for t in images])
-        raise DataError(f"{where}: holds {len(images)} image topics with messages ({have}); stereo needs two")
+        needed = "stereo needs two" if images else "one camera needs one, stereo two"
+        raise DataError(f"{where}: holds {len(images)} image topics with messages ({have}); {needed}")
     by_name = {t.name: t for t in images}
     pairs = []
     for a, b in _SIDES:

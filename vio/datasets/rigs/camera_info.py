@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.camera_rig import CameraRig
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.rigs.opencv import CoefficientsError, trimmed_coefficients
 from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
@@ -125,6 +126,24 @@ def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, *, rectified: boo
         with naming(info.where):
             cameras.append(camera_from_matrix(info.K, info.width, info.height, model, D))
     return Rig(cameras[0], cameras[1], se3_from_parts(R1.T @ R0, R1.T @ shift))
+
+
+def rig_from_camera_info(info: CameraInfo, *, rectified: bool = False) -> CameraRig:
+    """Return the rig of the CameraInfo of one camera.
+
+    Args:
+        info: the camera.
+        rectified: the images are those after ROS's rectification (`image_rect`), so that only P applies.
+
+    Raises:
+        CalibrationError: the camera is not calibrated (K, or P of rectified images, is zero), or its lens is not read.
+    """
+    K, name = (info.P[:, :3], "P") if rectified else (info.K, "K")
+    if not K[0, 0] > 0:
+        raise CalibrationError(f"{info.where}: not calibrated ({name} is zero); give a calibration file")
+    model, D = ("pinhole", ()) if rectified else _lens(info)
+    with naming(info.where):
+        return CameraRig(camera_from_matrix(K, info.width, info.height, model, D, name))
 
 
 def _lens(info: CameraInfo) -> tuple[DistortionModel, tuple[float, ...]]:

@@ -1,0 +1,170 @@
+"""What goes with the images of a bag: topics, calibration, the IMU's pose, motion samples, the level of white."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from vio.camera_rig import CameraRig
+from vio.datasets.bags import bag_files
+from vio.datasets.bags.index import BagIndex, index_bag, info_topic
+from vio.datasets.bags.pictures import white_of
+from vio.datasets.bags.store import Bag, Topic
+from vio.datasets.bags.topics import Roles, choose
+from vio.datasets.common import imu_samples
+from vio.datasets.images import UnreadableImageError, decode_gray
+from vio.datasets.overlap import check_overlap
+from vio.datasets.rigs import find_calibration
+from vio.datasets.settings import DatasetSettings
+from vio.datasets.tables import imu_notes
+from vio.errors import CalibrationError
+from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource
+from vio.rig import Rig
+
+AnyRig = TypeVar("AnyRig", Rig, CameraRig)
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What one pass over a bag found, and where its calibration may come from."""
+
+    path: Path
+    roles: Roles
+    index: BagIndex
+    infos: tuple[str | None, ...]  # CameraInfo topic of each camera
+    size: Size | None  # width and height of the left images, pixels
+    beside: Path | None  # a calibration file in the bag's folder
+    notes: tuple[str, ...]  # about joined files, and about topics
+
+
+def contents(path: Path, settings: DatasetSettings) -> Contents:
+    """Choose the topics of a bag and pass over it once.
+
+    Raises:
+        MissingDependencyError: the package rosbags is not installed.
+        DataError: the bag is damaged, or its topics do not make a recording.
+        CalibrationError: a camera has no CameraInfo, and no file serves.
+    """
+    beside, joined = _calibration_beside(path, settings)
+    with Bag(path) as bag:
+        roles, notes = choose(bag.topics, settings.topics, str(path))
+        infos = tuple(info_topic(bag.topics, topic) for topic in roles.cameras)
+        if settings.calibration is None and beside is None and None in infos:
+            missing, whose = roles.cameras[infos.index(None)].name, "camera's" if roles.right is None else "cameras'"
+            raise CalibrationError(
+                f"{path}: holds no CameraInfo for {missing}; give the {whose} calibration with --calibration FILE"
+            )
+        index = index_bag(bag, roles, [name for name in infos if name is not None])
+        size = index.left.size or _compressed_size(bag, roles.left)
+    return Contents(path, roles, index, infos, size, beside, (*joined, *notes))
+
+
+def _calibration_beside(path: Path, settings: DatasetSettings) -> tuple[Path | None, list[str]]:
+    """Return the calibration file in a bag's folder where no other is named, and a note on bags that are joined."""
+    parts = bag_files(path)
+    notes = [f"{len(parts)} bags are joined: {', '.join(part.name for part in parts)}"] if len(parts) > 1 else []
+    if settings.calibration is not None:
+        return None, notes
+    folders = [folder for folder in dict.fromkeys((path, *parts)) if folder.is_dir()]
+    return next((found for folder in folders if (found := find_calibration(folder)) is not None), None), notes
+
+
+def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
+    """Return width and height of the first compressed image that decodes; None: none of the first few does."""
+    for count, message in enumerate(bag.messages([topic.name])):
+        try:
+            image, _ = decode_gray(bytes(bag.decoded(message).data), topic.name)
+        except UnreadableImageError:
+            if count > 4:
+                return None
+            continue
+        return image.shape[1], image.shape[0]
+    return None
+
+
+def chosen_rig(
+    found: Contents, settings: DatasetSettings, read: Callable[[Path | None], AnyRig]
+) -> tuple[AnyRig, Path | None, list[str]]:
+    """Return the rig of the named file, else of one beside the bag, else of the CameraInfos; its file; and notes.
+
+    `read` reads the rig of a file; of None, that of the CameraInfos. Where the calibration states no pose of the IMU,
+    the static frames do.
+    """
+    named, beside = settings.calibration, found.beside
+    if named is not None or beside is None:
+        return _with_static_pose(read(named), found), named, []
+    try:
+        rig = read(beside)
+    except CalibrationError as error:
+        if None in found.infos:
+            raise
+        return _with_static_pose(read(None), found), None, [f"the bag's CameraInfo serves, as {error}"]
+    return _with_static_pose(rig, found), beside, [f"the calibration is {beside.name}, not the bag's CameraInfo"]
+
+
+def _with_static_pose(rig: AnyRig, found: Contents) -> AnyRig:
+    index = found.index
+    if rig.T_cam0_imu is not None or found.roles.imu is None:
+        return rig
+    T = index.transform(index.left.frame_id.lstrip("/"), index.imu_frame.lstrip("/"))
+    if T is None or index.left.frame_id == index.imu_frame:
+        return rig
+    note = f"the IMU's pose is that of /tf_static ({index.imu_frame} in {index.left.frame_id})"
+    return replace(rig, T_cam0_imu=T, notes=(*rig.notes, note))
+
+
+def is_rectified(topic: Topic) -> bool:
+    """Return whether a topic's name says that its images are those after ROS's rectification."""
+    return "rect" in topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]
+
+
+def motion_of(
+    found: Contents, rig: Rig | CameraRig, times_ns: IntArray
+) -> tuple[tuple[MotionSample, ...], frozenset[MotionSource], list[str]]:
+    """Return the samples in time order on the cameras' clock, their kinds, and notes."""
+    index, roles = found.index, found.roles
+    notes = [
+        f"{count} messages of {topic} were recorded out of order and are sorted"
+        for topic, count in index.disordered.items()
+    ]
+    samples: list[MotionSample] = []
+    sources: set[MotionSource] = set()
+    record = index.imu_record()
+    if rig.T_cam0_imu is None and (record is not None or index.velocities):
+        which = " and ".join(t.name for t in (roles.imu, roles.velocity) if t is not None)
+        notes.append(
+            f"{which} cannot be used: its pose in the camera is unknown; give --calibration FILE with T_cam_imu, as "
+            "Kalibr's camchain-imucam; images alone"
+        )
+        return (), frozenset(), notes
+    if record is not None and roles.imu is not None:
+        shift_ns = round(rig.time_offset_s * NS_PER_S)
+        record = replace(record, times_ns=record.times_ns - shift_ns)
+        if shift_ns:
+            notes.append(f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states")
+        check_overlap(times_ns, record.times_ns, f"{found.path}, {roles.imu.name}")
+        notes += imu_notes(record.times_ns, roles.imu.name)
+        samples += imu_samples(record)
+        sources.add("imu")
+    if roles.velocity is not None and (speeds := index.velocity_samples()):
+        check_overlap(times_ns, np.array([s.time_ns for s in speeds], dtype=np.int64), roles.velocity.name)
+        notes.append(f"the twist of {roles.velocity.name} is taken in the frame of T_cam0_imu")
+        samples += speeds
+        sources.add("velocity")
+    return tuple(sorted(samples, key=lambda s: s.time_ns)), frozenset(sources), notes
+
+
+def white_level(index: BagIndex) -> tuple[int, list[str]]:
+    """Return the level of white of 16-bit images, and a note where it is not that of 16 bits."""
+    full = white_of(65535)
+    white = white_of(max(index.left.white, index.right.white)) if index.left.white else full
+    if white == full:
+        return white, []
+    return white, [
+        f"the images have 16 bits but use {white.bit_length()}: the levels 0 to {white} are scaled to 8 bits"
+    ]
