@@ -18,7 +18,7 @@ from .exchange import ExchangeDetector, MatchCounts
 from .flicker import BandRemoval
 from .flow import lost_contrast, track_with_retries
 from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
-from .moving_object import ObjectReport, choose_motion
+from .moving_object import ObjectReport, choose_motion, one_motion_explains
 from .new_features import NewFeatures
 from .one_camera import with_depths, with_prior_depths
 from .outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
@@ -259,8 +259,7 @@ class KltFrontend:
         watch.lap("track")
         rng = np.random.default_rng((self._consensus.seed, frame.index))
         problem = RansacProblem(self._camera, self._consensus, settings.consensus_px, rng)
-        near_px = stereo.max_disparity_px
-        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, near_px, frame.index)
+        seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, stereo, frame.index)
         watch.lap("reject")
         tracks = self._anchor_fit.track(old, previous.left, left, found, seen, motion)
         watch.lap("align")
@@ -286,7 +285,7 @@ class KltFrontend:
         seen: BoolArray,
         prior: TrackPrior | None,
         expected: FloatArray,
-        max_disparity_px: float,
+        stereo: StereoFit,
         index: int,
     ) -> tuple[BoolArray, Consensus | None]:
         """Return the mask (N,) of the found features that are static, and the consensus motion if there is one."""
@@ -309,10 +308,12 @@ class KltFrontend:
                 expected_motion,
                 in_event=self._objects.active,
             )
+            if stereo.rows_are_off and one_motion_explains(problem, chosen, before[has_depth], after[has_depth]):
+                chosen = replace(chosen, object_share=0.0)
             motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
             self._lines += self._objects.frame(index, chosen)
         if motion is not None and not has_depth.all():
-            near_m = camera.fu * camera.baseline_m / max_disparity_px
+            near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
             distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)
             kept[~has_depth] = distance <= problem.limit_px
         keep = np.zeros(len(old), dtype=np.bool_)

@@ -4,6 +4,9 @@ The larger consensus wins RANSAC, and that may be the object's. The filter's pre
 by chi-square against the predicted one, with the covariance of the prediction and that of the fit. With an IMU the
 prediction is known to millimetres and the test decides nearly always; without one the prediction is that of a body
 that goes on as before, and where both motions are possible the larger consensus is used, and it is said.
+
+A stereo calibration that is off makes two groups of a static scene, too: its depths are wrong by their size. Where the
+rows show such a calibration, an object is reported only if the left images alone, without depths, show it as well.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from vio.geometry.stereo import StereoCamera, z_D_p_cam
 from vio.records import MotionPrior
 from vio.statistics import chi_square_quantile
 
-from .outliers import Consensus, RansacProblem, best_motion, pixel_errors
+from .outliers import Consensus, RansacProblem, bearing_consensus, best_motion, pixel_errors
 
 Decision: TypeAlias = Literal["predicted", "undecided"]
 
@@ -26,6 +29,7 @@ _PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the
 _LEAST_POINTS = 12  # of a second motion
 _LEAST_SUPPORT = 0.1  # points of a second motion that may replace the first, over the first's
 _LARGE_SHARE = 0.25  # share of all points above which a second motion is reported
+_SEEN_SHARE = 0.5  # of the smaller group's points that must be off the epipolar lines of the others to prove an object
 _PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
 _INDEPENDENT_POINTS = 50  # errors of neighbours have much in common: a fit is no better than that of so many points
 _SCALE_SIGMA = 0.01  # of the length of a fitted translation: depths of one frame have errors in common
@@ -82,6 +86,25 @@ def choose_motion(
     inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
     share = float(found.inliers.mean())
     return TwoMotions(Consensus(T, inliers), share if share >= _LARGE_SHARE else 0.0, "predicted")
+
+
+def one_motion_explains(problem: RansacProblem, chosen: TwoMotions, before: FloatArray, after: FloatArray) -> bool:
+    """Return whether one motion of the camera explains the second group of points too, at depths of their own.
+
+    An object that moves along the epipolar lines of the scene passes for static here: this is asked only where the
+    depths are known to be wrong.
+
+    Args:
+        problem: camera, thresholds and random generator.
+        chosen: the motions by the points' depths.
+        before: left pixels (N, 2) of the points in the previous frame.
+        after: left pixels (N, 2) in the current frame.
+    """
+    if chosen.object_share == 0.0:
+        return False
+    static = bearing_consensus(problem, before, after, chosen.motion.T_curr_prev[:3, :3], None)
+    smaller = min(chosen.object_share, float(chosen.motion.inliers.mean()))  # of the groups: the larger one is fitted
+    return static is not None and float((~static).mean()) < _SEEN_SHARE * smaller
 
 
 def _agrees(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: MotionPrior) -> bool:

@@ -28,6 +28,7 @@ _MIN_DEPTH_M = 0.05
 _FEW_MATCHES = 0.2  # share of features with a right match below which other row differences are tried
 _GOOD_MATCH = 0.9  # correlation of patches whose rows agree
 _LEAST_POINTS = 20
+_ROWS_OFF_PX = 0.2  # root mean square over the matches: from here on the run reports the calibration, too
 _ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
 _MAX_ROWS_HALF = 16  # row difference, pixels at half resolution
 
@@ -114,6 +115,11 @@ class StereoFit:
     def has_few_matches(self) -> bool:
         """Whether hardly any feature of the last frame had a right match, so that those matches may be wrong ones."""
         return self._unmatched > 0
+
+    @property
+    def rows_are_off(self) -> bool:
+        """Whether the rows of the matches differ by a smooth field: the calibration is off, and so are the depths."""
+        return self._rows.rms_px >= _ROWS_OFF_PX
 
     def restart_rows(self) -> None:
         """Forget the row differences."""

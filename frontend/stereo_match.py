@@ -36,6 +36,7 @@ class RowField:
         self._normal = _FIELD_PRIOR * np.eye(5)
         self._moment = np.zeros(5)
         self._field: FloatArray = np.zeros(5)
+        self.rms_px = 0.0  # of the field over the matches of the last frame
 
     def _terms(self, pixels: FloatArray) -> FloatArray:
         x, y = ((pixels - self._centre) / self._scale).T
@@ -67,6 +68,8 @@ class RowField:
             self._normal = kept + (terms * weight[:, None]).T @ terms
             self._moment = moment + terms.T @ (weight * off)
             self._field = np.asarray(np.linalg.solve(self._normal, self._moment), dtype=np.float64)
+        if len(terms):
+            self.rms_px = float(np.sqrt(np.mean((terms @ self._field) ** 2)))
 
 
 def shifted_rows(image: Image, rows: int) -> Image:

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from frontend.moving_object import ObjectReport, TwoMotions, choose_motion
+from frontend.klt import KltFrontend
+from frontend.moving_object import ObjectReport, TwoMotions, choose_motion, one_motion_explains
 from frontend.outliers import Consensus, rigid_consensus
+from frontend.patches import View
 from frontend.prediction import usable_prior
-from tests.test_frontend_outliers import T_TRUE, make_problem, pixels, scene
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
+from frontend.settings import FrontendSettings
+from frontend.tracks import new_tracks
+from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.geometry.stereo import project, triangulate
 from vio.records import BoolArray, MotionPrior, TrackPrior
 
 T_OBJECT = se3_exp([0.4, 0.1, -0.6, 0.0, 0.01, 0.0])  # what the camera would have done by the object's points
@@ -105,6 +112,76 @@ def test_an_object_is_reported_once_per_event_with_what_decided() -> None:
     (line,) = [line for k in range(70, 80) for line in report.frame(k, undecided)]
     assert "60 % and 40 % of all" in line
     assert "does not tell which group it is; the larger one is taken for the scene" in line
+
+
+def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:
+    """What six frames say, after a second of matches to learn rows from.
+
+    Features at stereo pixels z (N, 4), taken for points p (N, 3), move to left pixels uv (N, 2).
+    """
+    frontend, blank = KltFrontend(CAMERA, FrontendSettings()), np.zeros((480, 1220))
+    stereo, _ = frontend._set_up(View(blank.astype(np.float32), blank[::2, ::2].astype(np.uint8)))
+    everything = np.ones(len(p), dtype=np.bool_)
+    new = new_tracks(z[:, :2].copy(), np.zeros(len(p), dtype=np.int64))
+    tracks = replace(new, right=z[:, 2:], has_right=everything, point=p, has_point=everything)
+    for _ in range(20):
+        stereo.update_rows(tracks)
+    for k in range(6):
+        frontend._reject_outliers(make_problem(), tracks, uv, everything, None, np.eye(4), stereo, k)
+    return list(frontend._take_lines())
+
+
+def _yawed(z: FloatArray) -> FloatArray:
+    """Stereo pixels (N, 4) of a right camera that is turned by 1 deg about its vertical axis."""
+    rays = np.column_stack([(z[:, 2:] - [CAMERA.cu, CAMERA.cv]) / CAMERA.fu, np.ones(len(z))])
+    turned = rays @ so3_exp([0.0, np.radians(-1.0), 0.0]).T
+    out = z.copy()
+    out[:, 2:] = turned[:, :2] / turned[:, 2:] * CAMERA.fu + [CAMERA.cu, CAMERA.cv]
+    return out
+
+
+def _two_walls() -> FloatArray:
+    """Points (300, 3) on walls 16 m and 6 m ahead, the nearer 120 last."""
+    far, near = scene(180, 12, (16.0, 16.8)), scene(120, 13, (6.0, 6.3))
+    p = np.concatenate([far, near]) * [0.6, 1.5, 1.0]
+    p[:, 1] += 0.1 * p[:, 2]  # within the image's 480 rows
+    return p
+
+
+def test_wrong_depths_of_a_yawed_right_camera_are_no_moving_object() -> None:
+    """With 12.6 px of disparity too much, 16 m become 10 and 6 m become 5: the walls seem to move apart."""
+    p = _two_walls()
+    z, uv = _yawed(project(CAMERA, p)), pixels(T_TRUE, p, 14)
+    wrong, _ = triangulate(CAMERA, z)
+    found = rigid_consensus(make_problem(), wrong, uv, np.eye(4), None, None)
+    assert found is not None
+    assert choose_motion(make_problem(), wrong, uv, found, None).object_share > 0.25  # control
+    assert _lines(wrong, z, uv) == []
+
+
+def test_a_moving_object_is_reported_where_the_rows_are_off() -> None:
+    p = _two_walls()
+    z = _yawed(project(CAMERA, p))
+    uv = np.concatenate([pixels(T_TRUE, p[:180], 14), pixels(T_OBJECT, p[180:], 15)])
+    (line,) = _lines(triangulate(CAMERA, z)[0], z, uv)
+    assert "two groups of points move differently" in line
+
+
+def test_left_images_show_an_object_that_covers_most_of_them() -> None:
+    """Their epipolar geometry is the object's then, and the scene's few points are off it."""
+    p, uv, _ = scenery(60, 240)
+    chosen, _, _ = choose(60, 240, prediction())
+    assert chosen.object_share > 0.7
+    assert not one_motion_explains(make_problem(), chosen, project(CAMERA, p)[:, :2], uv)
+
+
+def test_an_object_that_moves_along_the_road_is_reported_where_the_rows_agree() -> None:
+    """Its points stay on the epipolar lines of the scene: without its depths it would pass for static."""
+    p = np.concatenate([scene(180, 12, (12.0, 40.0)), scene(120, 13, (6.0, 8.0))])
+    T_car = se3_from_parts(T_TRUE[:3, :3], 0.4 * T_TRUE[:3, 3])
+    uv = np.concatenate([pixels(T_TRUE, p[:180], 14), pixels(T_car, p[180:], 15)])
+    (line,) = _lines(p, project(CAMERA, p), uv)
+    assert "two groups of points move differently" in line
 
 
 def test_a_prediction_that_is_no_number_is_not_used() -> None:

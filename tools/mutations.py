@@ -985,6 +985,13 @@ MUTATIONS = (
         _STEREO_FIELD,
     ),
     Mutation(
+        "stereo field: landmarks enter while it is estimated",
+        "vio/filters/msckf.py",
+        "if window.calibration.stereo_field or window.scale_sigma()",
+        "if window.scale_sigma()",
+        _STEREO_FIELD,
+    ),
+    Mutation(
         "stereo scale: landmarks enter while the scale is open",
         "vio/filters/msckf.py",
         "window.scale_sigma() > _SCALE_SIGMA",
@@ -1243,6 +1250,27 @@ MUTATIONS = (
         "frontend/moving_object.py",
         "if first_agrees or not (second_agrees or in_event):",
         "if not in_event:",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
+        "moving object: wrong depths of a stereo calibration pass for one",
+        "frontend/klt.py",
+        "if stereo.rows_are_off and one_motion_explains(",
+        "if False and one_motion_explains(",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
+        "moving object: none is reported where the rows are off",
+        "frontend/moving_object.py",
+        "float((~static).mean()) < _SEEN_SHARE * smaller",
+        "True",
+        _MOVING_OBJECT,
+    ),
+    Mutation(
+        "moving object: depths are not trusted where the rows agree either",
+        "frontend/klt.py",
+        "if stereo.rows_are_off and one_motion_explains(",
+        "if one_motion_explains(",
         _MOVING_OBJECT,
     ),
     Mutation(

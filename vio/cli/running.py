@@ -300,8 +300,7 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
             ("stereo", f"rows off by {field['rows_rms_px']:.2f} px (rms), disparities by {-off:+.2f} ± {sigma:.2f} px")
         )
         found = [] if field["rig"] is None else field["rig"]["lines"]
-        if found:
-            rows.append(("", "; ".join(found[:_LINES])))
+        rows += [("", line) for line in found[:_LINES]]
     rows += _calibration_rows(metrics)
     if metrics["ate_m"] is None:
         rows.append(("ATE", "no reference"))
