@@ -307,7 +307,9 @@ def test_folder_with_depth_images_is_read_in_metres(tmp_path: Path) -> None:
         cv2.imwrite(str(folder / "depth" / f"{k}.png"), _depth_png(k))
     dataset = open_dataset(folder)
     assert (dataset.recording.kind, dataset.recording.camera.kind) == ("rgbd", "rgbd")
-    assert any("1000 levels" in note for note in dataset.recording.notes)
+    assert not any("depth_factor" in note for note in dataset.recording.notes)
+    other = open_dataset(folder, DatasetSettings(depth_factor=2000.0))
+    assert any("depth_factor 2000 takes the place of the calibration's 1000" in n for n in other.recording.notes)
     frame = next(e for e in dataset.events() if isinstance(e, StereoFrame))
     assert frame.depth is not None
     np.testing.assert_allclose(frame.depth, _walls()[0][1], atol=6e-4)
@@ -339,7 +341,6 @@ def test_tum_rgbd_is_associated_by_stamps_and_its_camera_is_known(tmp_path: Path
     notes = " ".join(recording.notes)
     assert "1 images have no depth" in notes
     assert "freiburg3" in notes
-    assert "5000 levels" in notes
     frame = next(e for e in dataset.events() if isinstance(e, StereoFrame))
     assert frame.depth is not None
     np.testing.assert_allclose(frame.depth, _walls()[0][1], atol=6e-4)
