@@ -51,6 +51,14 @@ def test_results_are_no_recording(run: Path, capsys: pytest.CaptureFixture[str])
     assert "no recording is named" in _refused(capsys, "run", "")
 
 
+def test_images_without_a_calibration_are_named(flight: Path, tmp_path: Path) -> None:
+    shutil.copytree(flight / "mav0" / "cam0" / "data", tmp_path / "left")
+    with pytest.raises(
+        DataError, match=r"holds images in left but no right camera's and no calibration; add the right"
+    ):
+        open_dataset(tmp_path)
+
+
 def test_a_run_that_can_go_on_is_not_said_to_be_lost(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -156,3 +156,10 @@ def test_a_truncated_map_is_refused(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(DataError, match="is damaged or no map"):
         MapStore(path, read_only=True).features(3)
+
+
+def test_a_map_that_cannot_be_made_says_why(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is a folder; name a file"):
+        MapStore(tmp_path, create=True)
+    with pytest.raises(DataError, match="its folder .*nowhere does not exist"):
+        MapStore(tmp_path / "nowhere" / "a.map", create=True)

@@ -176,8 +176,21 @@ def _detect(path: Path) -> str:
     """
     kind = _folder_kind(path) if path.is_dir() else _file_kind(path)
     if kind is None:
-        raise DataError(f"{path}: no known recording; looked for {_LOOKED_FOR}")
+        raise DataError(_unknown(path))
     return kind
+
+
+def _unknown(path: Path) -> str:
+    """Say what is missing where a folder holds images, else what was looked for."""
+    from vio.datasets.one_camera import images_of_one_camera
+
+    images = images_of_one_camera(path) if path.is_dir() else None
+    if images is None:
+        return f"{path}: no known recording; looked for {_LOOKED_FOR}"
+    return (
+        f"{path}: holds images in {images.name} but no right camera's and no calibration; add the right images, "
+        "or for one camera a calibration.yaml (Kalibr's camchain with cam0) and imu.csv"
+    )
 
 
 def _folder_kind(path: Path) -> str | None:

@@ -98,6 +98,12 @@ class OneCameraDataset:
         return StereoFrame(index, time_ns, self.undistorter(image), None, depth)
 
 
+def images_of_one_camera(path: Path) -> Path | None:
+    """Return the folder of images that a folder holds, whether or not anything else tells what they are."""
+    layout = _layout(path)
+    return None if layout is None else layout.left
+
+
 def is_mono_folder(path: Path) -> bool:
     """Return whether a folder holds the images of one camera, and a calibration or an IMU tells what they are."""
     layout = _layout(path)

@@ -91,6 +91,9 @@ class MapStore:
         self.path = path
         if not create and not path.is_file():
             raise DataError(f"{path}: there is no such map; vio run --map {path} makes one")
+        if path.is_dir() or not path.absolute().parent.is_dir():
+            fault = "is a folder" if path.is_dir() else f"its folder {path.parent} does not exist"
+            raise DataError(f"{path}: {fault}; name a file in a folder that exists")
         with self._errors():
             if read_only:
                 uri = f"{path.absolute().as_uri()}?mode=ro"
