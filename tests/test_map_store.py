@@ -161,5 +161,5 @@ def test_a_truncated_map_is_refused(tmp_path: Path) -> None:
 def test_a_map_that_cannot_be_made_says_why(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is a folder; name a file"):
         MapStore(tmp_path, create=True)
-    with pytest.raises(DataError, match="its folder .*nowhere does not exist"):
+    with pytest.raises(DataError, match=r"its folder .*nowhere does not exist"):
         MapStore(tmp_path / "nowhere" / "a.map", create=True)
