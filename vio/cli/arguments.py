@@ -37,6 +37,16 @@ def bound(text: str) -> int | Seconds:
     return parse_bound(text)
 
 
+def add_lengths_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the path lengths of the drift."""
+    parser.add_argument(
+        "--lengths",
+        type=lengths,
+        metavar="M,M",
+        help="path lengths of the drift (default 100,…,800; a tenth or a hundredth of these where the path is shorter)",
+    )
+
+
 def lengths(text: str) -> tuple[float, ...]:
     """Parse '25,50' into metres."""
     values = tuple(float(part) for part in text.split(","))

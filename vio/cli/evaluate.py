@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.cli.arguments import lengths
+from vio.cli.arguments import add_lengths_argument
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -49,12 +49,7 @@ def add_parser(commands: Any) -> None:
         help="alignment: se3 (default), sim3 (scale as well), first (at the first matched pose), none (same body and "
         "world frame only)",
     )
-    parser.add_argument(
-        "--lengths",
-        type=lengths,
-        metavar="M,M",
-        help="path lengths of the drift (default 100,…,800; a tenth or a hundredth of these where the path is shorter)",
-    )
+    add_lengths_argument(parser)
     parser.add_argument(
         "--max-time-difference",
         type=float,

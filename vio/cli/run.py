@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_config_arguments, bound, config_from, lengths
+from vio.cli.arguments import add_config_arguments, add_lengths_argument, bound, config_from
 
 
 def add_parser(commands: Any) -> None:
@@ -28,12 +28,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time such as 60s"
     )
-    parser.add_argument(
-        "--lengths",
-        type=lengths,
-        metavar="M,M",
-        help="path lengths of the drift (default 100,…,800; a tenth or a hundredth of these where the path is shorter)",
-    )
+    add_lengths_argument(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")
     parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map: loops are closed in it")

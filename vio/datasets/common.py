@@ -188,6 +188,12 @@ def frame_range(recording: Recording, start: int, stop: int | None) -> range:
     return range(start, end)
 
 
+def blank_frames(recording: Recording, chosen: range) -> Generator[StereoFrame]:
+    """Yield the frames of a range without their images."""
+    for index in chosen:
+        yield StereoFrame(index, int(recording.frame_times_ns[index]), None, None)
+
+
 def merge_events(
     recording: Recording, chosen: range, motion: Sequence[MotionSample], frames: Generator[StereoFrame]
 ) -> Iterator[Event]:

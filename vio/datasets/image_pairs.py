@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from vio.datasets.common import frame_range, merge_events
+from vio.datasets.common import blank_frames, frame_range, merge_events
 from vio.datasets.images import WHITE_16, UnreadableImageError, list_images, load_gray, prefetch, white_level
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
@@ -139,10 +139,7 @@ class ImageDataset:
             DataError: the range holds no frame, or none that can be used, or more are unusable than the settings allow.
         """
         chosen = frame_range(self.recording, start, stop)
-        if images:
-            frames = readable_frames(self._load, chosen, self.settings)
-        else:
-            frames = (self._frame(index, None, None) for index in chosen)
+        frames = readable_frames(self._load, chosen, self.settings) if images else blank_frames(self.recording, chosen)
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def observations(self, index: int) -> Observations | None:

@@ -13,6 +13,7 @@ from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError, VioError
 from vio.finished_run import FinishedRun
 from vio.geometry.stereo import Projection, StereoCamera
+from vio.loops import LoopEvent
 from vio.records import Image, Landmarks, StereoFrame, UpdateReport
 from vio.run_tables import estimate_of
 from vio.saved_run import OBSERVATIONS
@@ -43,6 +44,9 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
         "innovation": ("innovation_median_px", "nis_per_dof"),
         "time": [f"{name}_ms" for name in SERIES["time"]],
     }
+    loops: dict[int, list[LoopEvent]] = {}
+    for loop in run.loops:
+        loops.setdefault(loop.frame, []).append(loop)
     keyframes = set(run.map_keyframes.frame[run.map_keyframes.own].tolist())
     for row, estimate in enumerate(map(estimate_of, run.estimates)):
         index = int(run.estimates["index"][row])
@@ -51,8 +55,7 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
         states = None if seen is None else states_of(seen, seen.has_right, _NOTHING_DONE)
         image = next(images, None) if row % _EVERY_IMAGE == 0 else None
         viewer.show(index, estimate, numbers, image, seen, states)
-        loops = [loop for loop in run.loops if loop.frame == index]
-        viewer.places(index, estimate, is_keyframe=index in keyframes, loops=loops)
+        viewer.places(index, estimate, is_keyframe=index in keyframes, loops=loops.get(index, ()))
     ids = np.arange(len(run.points))
     viewer.landmarks(Landmarks(ids, run.points, np.zeros((len(ids), 3, 3))))
     viewer.close()

@@ -15,7 +15,7 @@ from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.pictures import gray_of
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import COMPRESSED
-from vio.datasets.common import frame_range, merge_events, naming
+from vio.datasets.common import blank_frames, frame_range, merge_events, naming
 from vio.datasets.image_pairs import BadFrame, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError
 from vio.datasets.overlap import reference_of_body
@@ -50,11 +50,11 @@ class OneCameraBag:
             DataError: the range holds no frame, or none that can be used, or the bag is damaged.
         """
         chosen = frame_range(self.recording, start, stop)
-        if images:
-            frames = readable_frames(self._load, self._messages(chosen), self.settings)
-        else:
-            times = self.recording.frame_times_ns
-            frames = (StereoFrame(k, int(times[k]), None, None) for k in chosen)
+        frames = (
+            readable_frames(self._load, self._messages(chosen), self.settings)
+            if images
+            else blank_frames(self.recording, chosen)
+        )
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def observations(self, index: int) -> Observations | None:
