@@ -80,6 +80,20 @@ def compare_views(
 
 
 @compiled
+def _is_measured(J: FloatArray, f: int, n: int) -> bool:
+    """Whether a clone saw a track: the row of vl is measured in every view."""
+    return J[f, n, 1, 0] != 0.0 or J[f, n, 1, 1] != 0.0 or J[f, n, 1, 2] != 0.0
+
+
+@compiled
+def mark_views(J: FloatArray, out: BoolArray) -> None:
+    """Write which views (F, N) of tracks were measured."""
+    for f in range(J.shape[0]):
+        for n in range(J.shape[1]):
+            out[f, n] = _is_measured(J, f, n)
+
+
+@compiled
 def mark_measured(J: FloatArray, out: BoolArray) -> None:
     """Write which pixel coordinates (F, N, 4) have a Jacobian (F, N, 4, 3) other than zero."""
     for f in range(J.shape[0]):
@@ -135,6 +149,106 @@ def anchor_points(
 
 
 @compiled
+def middle(values: FloatArray, n: int) -> float:
+    """Median of the first n >= 1 entries, which are reordered. Reference: Hoare, Algorithm 65: Find, CACM (1961)."""
+    k, low, high = n // 2, 0, n - 1
+    while low < high:
+        pivot, i, j = values[k], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if j < k:
+            low = i
+        if k < i:
+            high = j
+    if n % 2 == 1:
+        return values[k]
+    below = values[0]
+    for i in range(1, k):
+        below = max(below, values[i])
+    return 0.5 * (below + values[k])
+
+
+@compiled
+def _first_view(weight: FloatArray, f: int) -> int:
+    """The first clone that saw a track; 0 where none did."""
+    for n in range(weight.shape[1]):
+        if weight[f, n, 0] > 0.0:
+            return n
+    return 0
+
+
+@compiled
+def _put_on_ray(lens: Lens, T: FloatArray, u: float, v: float, disparity: float, p: FloatArray) -> None:
+    """Write the point (3,) in the world that a camera (4, 4) sees at a left pixel, at a disparity."""
+    fu, fv, cu, cv, baseline, cylinder = lens
+    scale = fu * baseline / disparity
+    angle = (v - cv) / fv
+    y, z = angle, 1.0
+    if cylinder:
+        y, z = np.sin(angle), np.cos(angle)
+    x, y, z = (u - cu) / fu * scale - T[0, 3], y * scale - T[1, 3], z * scale - T[2, 3]
+    for i in range(3):
+        p[i] = T[0, i] * x + T[1, i] * y + T[2, i] * z
+
+
+@compiled
+def start_by_stereo(
+    lens: Lens,
+    disparities: tuple[float, float],
+    T: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
+    p: FloatArray,
+    known: BoolArray,
+) -> None:
+    """Write points (F, 3) at the stereo view of largest disparity, and which tracks (F,) have one.
+
+    The newest clone's view counts only where it is the only one. Disparities are kept between two values.
+    """
+    last = len(T) - 1
+    for f in range(len(p)):
+        best, largest = -1, -np.inf
+        for n in range(last):
+            disparity = z[f, n, 0] - z[f, n, 2]
+            if weight[f, n, 2] > 0.0 and disparity > largest:
+                best, largest = n, disparity
+        if best < 0 and weight[f, last, 2] > 0.0:
+            best, largest = last, z[f, last, 0] - z[f, last, 2]
+        known[f] = best >= 0
+        if best >= 0:
+            disparity = min(max(largest, disparities[0]), disparities[1])
+            _put_on_ray(lens, T[best], z[f, best, 0], z[f, best, 1], disparity, p[f])
+
+
+@compiled
+def put_ahead(
+    lens: Lens,
+    least_depth: float,
+    least_disparity: float,
+    T: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
+    p: FloatArray,
+) -> None:
+    """Put points (F, 3) that are behind the first camera that saw them far away on its ray, in place."""
+    for f in range(len(p)):
+        k = _first_view(weight, f)
+        depth = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
+        if lens[5]:
+            y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
+            depth = np.sqrt(y * y + depth * depth)
+        if depth > least_depth:
+            continue
+        _put_on_ray(lens, T[k], z[f, k, 0], z[f, k, 1], least_disparity, p[f])
+
+
+@compiled
 def step_points(
     r: FloatArray, J: FloatArray, p_D_q: FloatArray, scale2: float, tiny: float, prior: float, dq: FloatArray
 ) -> None:
@@ -147,6 +261,8 @@ def step_points(
                 C[i, j] = 0.0
         C[0, 0], C[1, 1], C[2, 2] = tiny, tiny, prior
         for n in range(r.shape[1]):
+            if not _is_measured(J, f, n):
+                continue
             squares = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
             w = 1.0 / (1.0 + squares / (4.0 * scale2))
             for a in range(4):
@@ -162,14 +278,224 @@ def step_points(
 
 
 @compiled
+def _most_disparity(
+    lens: Lens,
+    least: float,
+    T: FloatArray,
+    weight: FloatArray,
+    f: int,
+    centre: FloatArray,
+    disparity: float,
+    p: FloatArray,
+) -> float:
+    """Disparity beyond which a point (3,) would come nearer to one of its cameras than the least depth."""
+    if lens[5]:  # of a cylinder, a point that comes too near to another camera than its anchor is dropped afterwards
+        return lens[0] * lens[4] / least
+    most = np.inf
+    for n in range(len(T)):
+        if weight[f, n, 0] > 0.0:
+            a, b, c = T[n, 2, 0], T[n, 2, 1], T[n, 2, 2]
+            ray = (a * (p[0] - centre[0]) + b * (p[1] - centre[1]) + c * (p[2] - centre[2])) * disparity
+            room = least - (a * centre[0] + b * centre[1] + c * centre[2] + T[n, 2, 3])
+            if room > 0.0 and ray > 0.0:
+                most = min(most, ray / room)
+    return most
+
+
+@compiled
+def _move(
+    centre: FloatArray, p_D_q: FloatArray, disparity: float, dq: FloatArray, least: float, most: float, p: FloatArray
+) -> None:
+    """Write the point (3,) after a step (3,) in the coordinates (M5); its disparity stays between two values."""
+    moved = max(min(disparity + dq[2], most), least)
+    for i in range(3):
+        ray = p_D_q[i, 0] * dq[0] + p_D_q[i, 1] * dq[1] - p_D_q[i, 2] * disparity
+        p[i] = centre[i] + ray * (disparity / moved)
+
+
+@compiled
+def refine_points(
+    lens: Lens,
+    least_depth: float,
+    least_disparity: float,
+    T: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
+    steps: int,
+    scale2: float,
+    tiny: float,
+    prior: float,
+    p: FloatArray,
+) -> None:
+    """Move points (F, 3) by Gauss-Newton steps with Cauchy weights of a scale, ahead of all cameras that saw them."""
+    F, N = weight.shape[0], weight.shape[1]
+    r, J, ahead = np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_)
+    seen, anchor, centre = np.empty((F, N), dtype=np.bool_), np.empty(F, dtype=np.int64), np.empty((F, 3))
+    disparity, p_D_q, q_D_p, dq = np.empty(F), np.empty((F, 3, 3)), np.empty((F, 3, 3)), np.empty((F, 3))
+    for f in range(F):
+        for n in range(N):
+            seen[f, n] = weight[f, n, 0] > 0.0
+    for _ in range(steps):
+        put_ahead(lens, least_depth, least_disparity, T, z, weight, p)
+        compare_views(lens, least_depth, T, p, z, weight, r, J, ahead)
+        anchor_points(lens, least_depth, T, p, seen, anchor, centre, disparity, p_D_q, q_D_p)
+        step_points(r, J, p_D_q, scale2, tiny, prior, dq)
+        for f in range(F):
+            most = _most_disparity(lens, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f])
+            _move(centre[f], p_D_q[f], disparity[f], dq[f], least_disparity, most, p[f])
+
+
+@compiled
+def keep_usable(
+    J: FloatArray,
+    p: FloatArray,
+    weight: FloatArray,
+    ahead: BoolArray,
+    p_D_q: FloatArray,
+    disparity: FloatArray,
+    tiny: float,
+    prior: float,
+    variance: float,
+    relative: bool,
+    keep: BoolArray,
+) -> None:
+    """Write which tracks (F,) have a finite point ahead, and a right view or enough parallax.
+
+    Enough is a variance of the disparity below `variance`, times the squared disparity where that is `relative`.
+    """
+    row, C = np.empty(3), np.empty((3, 3))
+    for f in range(len(p)):
+        keep[f] = ahead[f] and np.isfinite(p[f, 0]) and np.isfinite(p[f, 1]) and np.isfinite(p[f, 2])
+        right = False
+        for n in range(weight.shape[1]):
+            right = right or weight[f, n, 2] > 0.0
+        if right or not keep[f]:
+            continue
+        for i in range(3):
+            for j in range(3):
+                C[i, j] = 0.0
+        C[0, 0], C[1, 1], C[2, 2] = tiny, tiny, prior
+        for n in range(J.shape[1]):
+            for a in range(4):
+                for i in range(3):
+                    row[i] = (
+                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
+                    )
+                for i in range(3):
+                    for j in range(3):
+                        C[i, j] += row[i] * row[j]
+        # What is left of the third diagonal entry once the other two coordinates are eliminated.
+        minor = C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1]
+        a0 = (C[0, 2] * C[1, 1] - C[1, 2] * C[0, 1]) / minor
+        a1 = (C[1, 2] * C[0, 0] - C[0, 2] * C[0, 1]) / minor
+        left = C[2, 2] - a0 * C[0, 2] - a1 * C[1, 2]
+        keep[f] = 1.0 / left < (variance * disparity[f] * disparity[f] if relative else variance)
+
+
+@compiled
+def weigh_views(r: FloatArray, J: FloatArray, sigma2: float, median: float, cauchy: float, weights: FloatArray) -> None:
+    """Write Cauchy weights (F, N) of views, zero where not measured; the scale is each clone's own.
+
+    It is the median of its squared residuals over `median`, and `sigma2` at least.
+    """
+    F, N = weights.shape
+    squares = np.empty(F)
+    for n in range(N):
+        count = 0
+        for f in range(F):
+            weights[f, n] = -1.0
+            if _is_measured(J, f, n):
+                weights[f, n] = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
+                squares[count] = weights[f, n]
+                count += 1
+        scale2 = max(sigma2, middle(squares, count) / median) if count > 0 else sigma2
+        for f in range(F):
+            weights[f, n] = 0.0 if weights[f, n] < 0.0 else 1.0 / (1.0 + weights[f, n] / (4.0 * scale2 * cauchy**2))
+
+
+@compiled
+def weigh_landmarks(
+    r: FloatArray, weight: FloatArray, ahead: BoolArray, sigma2: float, median: float, cauchy: float, out: FloatArray
+) -> None:
+    """Write Cauchy weights (K,) of landmarks' views (K, 4), zero where not ahead; the scale is as in `weigh_views`."""
+    squares, count = np.empty(len(r)), 0
+    for k in range(len(r)):
+        out[k] = -1.0
+        if ahead[k] and weight[k, 1] > 0.0:
+            out[k] = r[k, 0] ** 2 + r[k, 1] ** 2 + r[k, 2] ** 2 + r[k, 3] ** 2
+            squares[count] = out[k]
+            count += 1
+    scale2 = max(sigma2, middle(squares, count) / median) if count > 0 else sigma2
+    for k in range(len(r)):
+        out[k] = 0.0 if out[k] < 0.0 else 1.0 / (1.0 + out[k] / (4.0 * scale2 * cauchy**2))
+
+
+@compiled
+def add_landmarks(
+    r: FloatArray, J: FloatArray, weight: FloatArray, exposure: int, first: int, A: FloatArray, b: FloatArray
+) -> None:
+    """Add what landmarks' pixels say of `dp = xi_f - xi_rho` to A (D, D) and b (D,).
+
+    Args:
+        r: residuals (K, 4).
+        J: their Jacobians by dp (K, 4, 3).
+        weight: (K,) over the pixels' variance.
+        exposure: first row of xi_rho.
+        first: row of the first landmark.
+        A: information about all errors.
+        b: its vector.
+    """
+    for k in range(len(r)):
+        own = first + 3 * k
+        for i in range(3):
+            for a in range(4):
+                wJ = weight[k] * J[k, a, i]
+                b[own + i] += wJ * r[k, a]
+                b[exposure + i] -= wJ * r[k, a]
+                for j in range(3):
+                    C = wJ * J[k, a, j]
+                    A[own + i, own + j] += C
+                    A[exposure + i, exposure + j] += C
+                    A[own + i, exposure + j] -= C
+                    A[exposure + i, own + j] -= C
+
+
+@compiled
+def substitute_back(
+    G: FloatArray,
+    C: FloatArray,
+    gradient: FloatArray,
+    centre: FloatArray,
+    p_D_q: FloatArray,
+    disparity: FloatArray,
+    least_disparity: float,
+    clone_errors: FloatArray,
+    p: FloatArray,
+) -> None:
+    """Write points (F, 3) that solve their own equations once the clones (6N,) have moved; see `TrackInformation`."""
+    dq, factor = np.empty(3), np.empty((3, 3))
+    for f in range(len(p)):
+        for i in range(3):
+            dq[i] = gradient[f, i]
+            for k in range(len(clone_errors)):
+                dq[i] -= G[f, k, i] * clone_errors[k]
+            for j in range(3):
+                factor[i, j] = C[f, i, j]
+        solve_positive(factor, dq)
+        _move(centre[f], p_D_q[f], disparity[f], dq, least_disparity, np.inf, p[f])
+
+
+@compiled
 def collect_tracks(
     r: FloatArray,
     J: FloatArray,
     weight: FloatArray,
+    p: FloatArray,
     p_D_q: FloatArray,
-    B: FloatArray,
+    q_D_p: FloatArray,
     anchor: IntArray,
     prior: float,
+    B: FloatArray,
     G: FloatArray,
     C: FloatArray,
     gradient: FloatArray,
@@ -178,11 +504,16 @@ def collect_tracks(
     """Write the normal equations of tracks, (M2), (M3), (M5), (M6): the columns of `TrackInformation`."""
     C_i, g_i, row = np.empty((3, 3)), np.empty(3), np.empty(3)
     for f in range(len(r)):
+        _point_D_pose(q_D_p[f], p[f], B[f])
         for i in range(3):
             point_gradient[f, i] = 0.0
             for j in range(3):
                 C[f, i, j] = 0.0
         for n in range(r.shape[1]):
+            if weight[f, n] == 0.0 and n != anchor[f]:
+                for k in range(6 * n, 6 * n + 6):
+                    gradient[f, k] = G[f, k, 0] = G[f, k, 1] = G[f, k, 2] = 0.0
+                continue
             for i in range(3):
                 g_i[i] = 0.0
                 for j in range(3):
@@ -210,6 +541,24 @@ def collect_tracks(
 
 
 @compiled
+def _point_D_pose(q_D_p: FloatArray, p: FloatArray, B: FloatArray) -> None:
+    """Write `S^-1 [-I, p^]` (3, 6) of one point, equation (M2)."""
+    for i in range(3):
+        a, b, c = q_D_p[i, 0], q_D_p[i, 1], q_D_p[i, 2]
+        B[i, 0], B[i, 1], B[i, 2] = -a, -b, -c
+        B[i, 3], B[i, 4], B[i, 5] = b * p[2] - c * p[1], c * p[0] - a * p[2], a * p[1] - b * p[0]
+
+
+@compiled
+def _has_part(G: FloatArray, f: int, n: int) -> bool:
+    """Whether a clone has a part in a track's normal equations: most clones saw most tracks not."""
+    part = False
+    for k in range(6 * n, 6 * n + 6):
+        part = part or G[f, k, 0] != 0.0 or G[f, k, 1] != 0.0 or G[f, k, 2] != 0.0
+    return part
+
+
+@compiled
 def eliminate_tracks(
     chosen: IntArray,
     G: FloatArray,
@@ -226,7 +575,7 @@ def eliminate_tracks(
     The blocks of the clones on the diagonal are added to A (6N, 6N), and the vector to b (6N,).
     """
     L, y = np.empty((3, 3)), np.empty(3)
-    size = G.shape[1]
+    size, takes_part = G.shape[1], True
     for c, f in enumerate(chosen):
         for i in range(3):
             for j in range(i + 1):
@@ -238,6 +587,11 @@ def eliminate_tracks(
         y[1] = (point_gradient[f, 1] - L[1, 0] * y[0]) / L[1, 1]
         y[2] = (point_gradient[f, 2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
         for k in range(size):
+            if k % 6 == 0:
+                takes_part = _has_part(G, f, k // 6)
+            if not takes_part:
+                V[3 * c, k] = V[3 * c + 1, k] = V[3 * c + 2, k] = 0.0
+                continue
             v0 = G[f, k, 0] / L[0, 0]
             v1 = (G[f, k, 1] - L[1, 0] * v0) / L[1, 1]
             v2 = (G[f, k, 2] - L[2, 0] * v0 - L[2, 1] * v1) / L[2, 2]
@@ -406,6 +760,11 @@ def collect_columns(
             for i in range(3):
                 for s in range(terms):
                     by_point[f, n, i, s] = 0.0
+            if not _is_measured(J, f, n):
+                for a in range(4):
+                    for s in range(terms):
+                        H[f, n, a, s] = WH[f, n, a, s] = 0.0
+                continue
             for a in range(4):
                 measured = J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
                 for i in range(3):
@@ -452,12 +811,14 @@ def eliminate_columns(
         for s in range(terms):
             for t in range(terms):
                 A[s, t] -= own[0, s] * X[t, 0] + own[1, s] * X[t, 1] + own[2, s] * X[t, 2]
-        for m in range(H.shape[1]):
-            for s in range(terms):
-                b[s] += WH[f, m, s] * r[f, m]
-                for t in range(terms):
-                    A[s, t] += WH[f, m, s] * H[f, m, t]
         for n in range(clones):
+            if not _has_part(G, f, n):
+                continue
+            for m in range(4 * n, 4 * n + 4):
+                for s in range(terms):
+                    b[s] += WH[f, m, s] * r[f, m]
+                    for t in range(terms):
+                        A[s, t] += WH[f, m, s] * H[f, m, t]
             for k in range(6):
                 row = 6 * n + k
                 for s in range(terms):

@@ -15,6 +15,9 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from vio.compiled import move_poses
+from vio.filters import pose_loops as loops
+from vio.filters import track_loops
+from vio.filters.multiview import LandmarkResiduals
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.filters.online_calibration import Calibration, Twist
 from vio.filters.scale_test import ScaleTest, is_clear
@@ -27,7 +30,6 @@ from vio.geometry.lie import (
     se3_inverse,
     so3_exp,
     so3_hat,
-    so3_left_jacobian,
 )
 from vio.records import BoolArray, IntArray
 
@@ -57,7 +59,7 @@ class Window:
         calibration: Calibration = _NO_CALIBRATION,
     ) -> None:
         self.motion = motion
-        self._L: Factor | None = None  # factor of P; None: not computed since P changed
+        self._factors: dict[tuple[int, int], Factor] = {}  # of parts of P, since it changed
         self.nav = nav
         self.calibration = calibration
         self.clones: list[Clone] = []
@@ -74,7 +76,7 @@ class Window:
 
     @P.setter
     def P(self, P: FloatArray) -> None:
-        self._P, self._L = P, None
+        self._P, self._factors = P, {}
 
     @property
     def first_clone(self) -> int:
@@ -97,7 +99,9 @@ class Window:
 
     def T_cam0_world(self) -> FloatArray:
         """Camera poses (N, 4, 4) at all exposures."""
-        out: FloatArray = self.calibration.T_cam0_imu @ se3_inverse(self.exposures())
+        T = self.exposures()
+        out: FloatArray = np.empty(T.shape)
+        loops.camera_poses(self.calibration.T_cam0_imu, T, out)
         return out
 
     def body_D_error(self) -> FloatArray:
@@ -130,38 +134,32 @@ class Window:
             out[..., self.stereo_rows] = out_D_stereo
         return out
 
-    def add_landmark_information(self, A: FloatArray, b: FloatArray, C: FloatArray, g: FloatArray) -> None:
+    def add_landmarks_information(self, A: FloatArray, b: FloatArray, at: LandmarkResiduals, variance: float) -> None:
         """Add what the landmarks' pixels in their anchor, the newest clone, say: `dp = xi_f - xi_rho`; in place.
 
         Args:
-            A: information about exposures' poses and landmarks (6N + 3M, 6N + 3M).
-            b: its vector (6N + 3M,).
-            C: information about `dp` of each landmark (M, 3, 3).
-            g: its vector (M, 3).
+            A: information about the errors (D, D).
+            b: its vector (D,).
+            at: their residuals.
+            variance: of one pixel coordinate, px^2.
         """
-        first = 6 * len(self.clones)
-        rho, blocks = slice(first - 6, first - 3), C.reshape(-1, 3)
-        A[rho, rho] += C.sum(axis=0)
-        b[rho] -= g.sum(axis=0)
-        own = first + np.arange(len(blocks)).reshape(-1, 3)
-        A[own[:, :, None], own[:, None]] += C
-        A[first:, rho] -= blocks
-        A[rho, first:] -= blocks.T
-        b[first:] += g.reshape(-1)
+        exposure = self.clone_rows(len(self.clones) - 1).start
+        track_loops.add_landmarks(at.r, at.J, at.weight / variance, exposure, self.first_landmark, A, b)
 
     def lift_information(
         self, A: FloatArray, b: FloatArray, stereo: StereoInformation | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Turn information about exposures' poses and landmarks (6N + 3M) into that about the error vector (D).
+        """Turn information about exposures' poses (6N) into that about the error vector (D).
 
         Args:
-            A: information matrix (6N + 3M, 6N + 3M).
-            b: information vector (6N + 3M,).
-            stereo: the part that concerns the stereo field, where it is estimated.
+            A: information matrix (6N, 6N).
+            b: information vector (6N,).
+            stereo: the part that concerns the stereo field, where it is estimated, beside poses and landmarks.
         """
-        out, vector = np.zeros_like(self.P), np.zeros(len(self.P))
-        first = self.first_clone
-        out[first:, first:], vector[first:] = A, b
+        D, first = len(self.P), self.first_clone
+        out, vector = np.zeros((D, D)), np.zeros(D)
+        poses = slice(first, first + len(b))
+        out[poses, poses], vector[poses] = A, b
         if stereo is not None:
             rows = self.stereo_rows
             out[rows, first:], out[first:, rows] = stereo.cross, stereo.cross.T
@@ -184,10 +182,8 @@ class Window:
 
     def move_covariance(self, index: int, fitted: Fit) -> FloatArray:
         """Covariance (6, 6) of `xi_newest - xi_clone` after a fit of all errors."""
-        J = np.zeros((6, len(self.P)))
-        J[:, self.clone_rows(len(self.clones) - 1)] = np.eye(6)
-        J[:, self.clone_rows(index)] -= np.eye(6)
-        S = fitted.spread(J)
+        newest, clone = self.clone_rows(len(self.clones) - 1), self.clone_rows(index)
+        S = fitted.whitened(fitted.rows(newest.start, newest.stop) - fitted.rows(clone.start, clone.stop))
         return S @ S.T
 
     def landmark_covariance(self, fitted: Fit) -> FloatArray:
@@ -196,11 +192,14 @@ class Window:
         That is `xi_f - xi_rho`, the landmark relative to the newest exposure, and the coefficients of the stereo
         calibration.
         """
-        M, D, S = len(self.landmarks), len(self.P), self.calibration.stereo_dim
-        exposure = self.chain(np.eye(6 * len(self.clones))[-6:-3])  # (3, D)
-        J = np.eye(3 * M, D, self.first_landmark).reshape(-1, 3, D) - exposure
-        stereo = np.broadcast_to(fitted.spread(np.eye(S, D, DIM)), (M, S, D)) if S else np.zeros((M, 0, D))
-        root = np.concatenate([fitted.spread(J), stereo], axis=1)
+        M, S = len(self.landmarks), self.calibration.stereo_dim
+        exposure = self.clone_rows(len(self.clones) - 1).start
+        first, n = self.first_landmark, len(fitted.L)
+        moved = fitted.rows(first, first + 3 * M).reshape(M, 3, n) - fitted.rows(exposure, exposure + 3)
+        root = fitted.whitened(moved)
+        if S:
+            stereo = fitted.whitened(fitted.rows(self.stereo_rows.start, self.stereo_rows.stop))
+            root = np.concatenate([root, np.broadcast_to(stereo, (M, S, n))], axis=1)
         out: FloatArray = root @ np.swapaxes(root, 1, 2)
         return out
 
@@ -222,7 +221,7 @@ class Window:
             V[own] = Phi @ V[own]
             V[:DIM] += step.Phi @ before - self._scaled_nav(step.nav)
         self.nav = step.nav
-        P, self._L = self.P, None
+        P, self._factors = self.P, {}
         P[own] = Phi @ P[own]
         P[:, own] = P[:, own] @ Phi.T
         P[:DIM, :DIM] += step.Q
@@ -377,7 +376,7 @@ class Window:
         first, newest = self.first_landmark, self.clone_rows(len(self.clones) - 1).start + 3
         turn, before = slice(newest, newest + 3), slice(previous_rotation, previous_rotation + 3)
         p_cross = so3_hat(self.landmarks).reshape(-1, 3)
-        P, delta, self._L = self.P, self.prior_delta, None
+        P, delta, self._factors = self.P, self.prior_delta, {}
         P[first:] += p_cross @ (P[turn] - P[before])
         P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
@@ -400,7 +399,9 @@ class Window:
         self.landmark_ids, self.landmarks = self.landmark_ids[chosen], self.landmarks[chosen]
 
     def _keep_rows(self, rows: IntArray) -> None:
-        self.P = self.P[np.ix_(rows, rows)]
+        P = np.empty((len(rows), len(rows)))
+        loops.take_rows(self.P, rows, P)
+        self.P = P
         self.prior_delta = self.prior_delta[rows]
         if self.scale_test is not None:
             self.scale_test.error_D_scale = self.scale_test.error_D_scale[rows]
@@ -434,19 +435,46 @@ class Window:
             The fit, with the covariance (k, k) of the first errors there, and the error vector (D,) that moves the
             means there.
         """
-        own = slice(0, size)
+        prior = self._prior_of(information, size)
+        own = slice(prior.first, size)
         A, b = information[own, own], vector[own] + information[own, own] @ self.prior_delta[own]
-        fitted = fit(self._factor().leading(size), A)
-        shift = fitted.move(b)
-        if size < len(self.P):  # P (b - A shift) is the shift; the others follow by their correlation
-            shift = np.concatenate([shift, self.P[size:, own] @ (b - A @ shift)])
+        fitted = fit(prior, A)
+        moved = fitted.move(b)
+        shift: FloatArray = self.P[:, own] @ (b - A @ moved)  # the others follow by their correlation
+        shift[own] = moved
         return fitted, shift - self.prior_delta
 
-    def _factor(self) -> Factor:
-        """The factor of the present covariance, computed once for all fits to it."""
-        if self._L is None:
-            self._L = factor(self.P)
-        return self._L
+    def _prior_of(self, information: FloatArray, size: int) -> Factor:
+        """The factor of the present covariance, up to row `size`, of the errors that information (D, D) is about.
+
+        Pixels depend on no error of navigation state and extrinsics: then it is that of the errors after them, unless
+        these are singular beyond rounding. It is computed once for all fits to one covariance.
+        """
+        first = DIM if self.calibration.stereo_dim else self.first_clone
+        if information[:first].any():
+            first = 0
+        if (first, size) not in self._factors:
+            prior = factor(self.P[first:size, first:size], first)
+            self._factors[first, size] = prior if prior.triangular else factor(self.P[:size, :size])
+        return self._factors[first, size]
+
+    def covariance_after(self, fitted: Fit) -> FloatArray:
+        """Covariance (k, k) of the first errors after a fit, up to those that it is about.
+
+        With `W' W` that of the fitted ones, and N the others' covariance with them before, times `L'^-1 K'^-1`: the
+        others' covariance with them is then `N W`, and their own `N N'` and what it is given the fitted ones.
+        """
+        first, size = fitted.first, fitted.first + len(fitted.L)
+        others, own = slice(0, first), slice(first, size)
+        W, P = fitted.root(), np.empty((size, size))
+        P[own, own] = W.T @ W
+        if first:
+            G: FloatArray = blas.dtrsm(1.0, fitted.L.T, self.P[others, own].T, lower=0, trans_a=1).T
+            N = fitted.whitened(G)
+            P[others, own] = N @ W
+            P[own, others] = P[others, own].T
+            P[others, others] = self.P[others, others] - G @ G.T + N @ N.T
+        return P
 
     def absorb(self, information: FloatArray, vector: FloatArray, scaled: FloatArray | None = None) -> None:
         """Absorb measurements into the prior.
@@ -456,7 +484,9 @@ class Window:
             vector: `H' R^-1 r` (D,).
             scaled: for measurements in metres, how the errors (D,) move with the logarithm of the world's scale.
         """
-        P = fit(self._factor(), information).covariance()
+        prior = self._prior_of(information, len(self.P))
+        own = slice(prior.first, None)
+        P = self.covariance_after(fit(prior, information[own, own]))
         self.prior_delta = self.prior_delta - P @ (vector + information @ self.prior_delta)
         self.P = P
         if self.scale_test is not None:
@@ -482,12 +512,15 @@ class Window:
 
     def relinearise(self, error: FloatArray) -> None:
         """Move the means by an error vector (D,); the prior stays where it is."""
-        T, moves = self.exposures(), self.body_D_error() @ error[: self.first_landmark]
-        move_poses(moves.reshape(-1, 6), T)
+        T, moves = self.exposures(), self.exposure_errors(error).reshape(-1, 6).copy()
+        if self.calibration.extrinsics:
+            eta = error[self.calibration.extrinsic_rows + DIM]
+            loops.add_extrinsic_moves(T, self.nav.T_world_imu, eta, moves)
+        move_poses(moves, T)
         if len(self.landmarks):
-            phi = self.exposure_errors(error)[-3:]
+            self.landmarks = self.landmarks.copy()
             xi_f = error[self.first_landmark :].reshape(-1, 3)
-            self.landmarks = self.landmarks @ so3_exp(phi).T + xi_f @ so3_left_jacobian(phi).T
+            loops.move_points(self.exposure_errors(error)[-3:], xi_f, self.landmarks)
         velocities = [c.velocity for c in self.clones]
         if isinstance(self.motion, ImuMotion):
             velocities = self._corrected_velocities(self.motion, T, error[:DIM])
@@ -544,14 +577,7 @@ class Factor:
 
     L: FloatArray  # (D, D)
     triangular: bool  # by Cholesky; False: by the eigenvectors of a P that is singular beyond rounding
-
-    def leading(self, size: int) -> Factor:
-        """The factor of the covariance of the first errors alone."""
-        if size == len(self.L):
-            return self
-        if self.triangular:
-            return Factor(np.ascontiguousarray(self.L[:size, :size]), True)
-        return factor(self.L[:size] @ self.L[:size].T)
+    first: int = 0  # row of the first of its errors in the window's
 
 
 @dataclass(frozen=True, slots=True)
@@ -560,6 +586,7 @@ class Fit:
 
     L: FloatArray  # (D, D) of the prior
     K_transposed: FloatArray  # (D, D) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
+    first: int = 0  # as in Factor
 
     def move(self, vector: FloatArray) -> FloatArray:
         """Return `P_new v` (D,), for the information vector v (D,) the shift of the mean."""
@@ -567,28 +594,39 @@ class Fit:
         out: FloatArray = self.L @ inner
         return out
 
-    def spread(self, J: FloatArray) -> FloatArray:
-        """Return S (..., k, D) with `S S'` the covariance of `J error`, for a Jacobian J (..., k, D)."""
-        rows = np.ascontiguousarray((J @ self.L).reshape(-1, J.shape[-1]))
+    def rows(self, start: int, stop: int) -> FloatArray:
+        """Return rows (stop - start, D) of L, which are `J L` for a choice J of the window's errors."""
+        return self.L[start - self.first : stop - self.first]
+
+    def whitened(self, J_L: FloatArray) -> FloatArray:
+        """Return S (..., k, D) with `S S'` the covariance of `J error`, from `J L` (..., k, D)."""
+        rows = np.ascontiguousarray(J_L).reshape(-1, J_L.shape[-1])
         S: FloatArray = blas.dtrsm(1.0, self.K_transposed, rows.T, lower=0, trans_a=1).T
-        return S.reshape(J.shape)
+        return S.reshape(J_L.shape)
+
+    def root(self) -> FloatArray:
+        """Return W (D, D) with `W' W` the covariance."""
+        out: FloatArray = blas.dtrsm(1.0, self.K_transposed, self.L.T, lower=0, trans_a=1)
+        return out
 
     def covariance(self) -> FloatArray:
         """Return the covariance (D, D): symmetric and positive by construction."""
-        W = blas.dtrsm(1.0, self.K_transposed, self.L.T, lower=0, trans_a=1)
+        W = self.root()
         P_new: FloatArray = W.T @ W
         return P_new
 
 
-def factor(P: FloatArray) -> Factor:
-    """Factor a covariance (D, D)."""
-    try:
-        L = np.asarray(np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24)), dtype=np.float64)
-        return Factor(L, True)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(P)
-        root: FloatArray = np.array(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C")
-        return Factor(root, False)
+def factor(P: FloatArray, first: int = 0) -> Factor:
+    """Factor a covariance (D, D); `first` is the row of its first error in the window's."""
+    A = np.array(P, order="C")
+    A.ravel()[:: len(A) + 1] *= 1.0 + 1e-14
+    A.ravel()[:: len(A) + 1] += 1e-24
+    upper, failed = lapack.dpotrf(A.T, lower=0, overwrite_a=1)
+    if not failed:
+        return Factor(upper.T, True, first)
+    values, vectors = np.linalg.eigh(P)
+    root: FloatArray = np.array(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C")
+    return Factor(root, False, first)
 
 
 def fit(prior: Factor, information: FloatArray) -> Fit:
@@ -609,7 +647,7 @@ def fit(prior: Factor, information: FloatArray) -> Fit:
     K_transposed, failed = lapack.dpotrf(inner, lower=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("the information is not positive")
-    return Fit(L, K_transposed)
+    return Fit(L, K_transposed, prior.first)
 
 
 def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
