@@ -298,10 +298,8 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
     WH = H * weight[..., None, None]
     by_point = np.asarray(sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3)))
     by_q = np.swapaxes(p_D_q, 1, 2) @ np.swapaxes(by_point, 1, 2).reshape(F, 3, N * S)
-    flat = (F, 4 * N, S)
-    return StereoColumns(
-        np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2), H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N)
-    )
+    A, b = np.einsum("fnas,fnat->fst", WH, H), np.einsum("fnas,fna->fs", WH, at.r)
+    return StereoColumns(np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2), A, b)
 
 
 def eliminate_points_from_columns(
@@ -310,16 +308,15 @@ def eliminate_points_from_columns(
     """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does."""
     by_point = columns.by_point[chosen]
     F, N, _, S = by_point.shape
-    H, WH, r = (a[chosen] for a in (columns.H, columns.WH, columns.r))
     G = by_point.sum(axis=1)  # (F, 3, S)
     CG = np.linalg.solve(info.C[chosen], G)  # (F, 3, S)
     flat_G, flat_CG = G.reshape(3 * F, S), CG.reshape(3 * F, S)
-    A = WH.reshape(-1, S).T @ H.reshape(-1, S) - flat_G.T @ flat_CG
+    A = columns.A[chosen].sum(axis=0) - flat_G.T @ flat_CG
     B = info.q_D_clone[chosen].reshape(3 * F, 6)
     per_view = np.swapaxes(by_point, 1, 2).reshape(3 * F, N * S)
     cross = (B.T @ per_view).reshape(6, N, S).transpose(1, 0, 2).reshape(6 * N, S)
     cross = cross - np.swapaxes(info.G[chosen], 1, 2).reshape(3 * F, 6 * N).T @ flat_CG
-    b = WH.reshape(-1, S).T @ r.reshape(-1) - flat_CG.T @ info.point_gradient[chosen].reshape(-1)
+    b = columns.b[chosen].sum(axis=0) - flat_CG.T @ info.point_gradient[chosen].reshape(-1)
     return StereoInformation(A, cross.T, b)
 
 

@@ -916,8 +916,8 @@ MUTATIONS = (
     Mutation(
         "smoothed estimates: velocity of the newest clone",
         "vio/filters/window_posterior.py",
-        "replace(c, velocity=v[k])",
-        "replace(c, velocity=v[-1])",
+        "Clone(c.frame_index, c.time_ns, c.T_world_imu, v[k])",
+        "Clone(c.frame_index, c.time_ns, c.T_world_imu, v[-1])",
         _TRUTH,
     ),
     Mutation(
@@ -980,8 +980,8 @@ MUTATIONS = (
     Mutation(
         "stereo scale: sign of the baseline's lever",
         "vio/filters/track_loops.py",
-        "out[m, 2, 6] = z[m, 2] - z[m, 0]",
-        "out[m, 2, 6] = z[m, 0] - z[m, 2]",
+        "fu * rr2, z[m, 2] - z[m, 0], fu * xr",
+        "fu * rr2, z[m, 0] - z[m, 2], fu * xr",
         _STEREO_FIELD,
     ),
     Mutation(
@@ -1008,8 +1008,8 @@ MUTATIONS = (
     Mutation(
         "stereo field: eliminated points still count",
         "vio/filters/track_loops.py",
-        "A[s, t] -= own[0, s] * X[t, 0]",
-        "A[s, t] -= 0 * own[0, s] * X[t, 0]",
+        "own_A[f, s, t] - own[0, s] * CG[0, t]",
+        "own_A[f, s, t] - 0.0 * own[0, s] * CG[0, t]",
         _STEREO_FIELD,
     ),
     Mutation(

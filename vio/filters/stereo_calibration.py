@@ -34,14 +34,14 @@ _ROW_SIGNIFICANCE = 25.0  # squared standard deviations of the field by noise al
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
 
 
-def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the coefficients of (R3) and (R4), (..., 4, 8), pixels.
+def field_jacobian(camera: StereoCamera, z: FloatArray, first: int = 0, terms: int = TERMS) -> FloatArray:
+    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by coefficients of (R3) and (R4), (..., 4, terms), pixels.
 
     The row of `vr` is zero: right rows are not measured.
     """
-    out = np.empty((*z.shape[:-1], 4, TERMS))
+    out = np.empty((*z.shape[:-1], 4, terms))
     jacobian = loops.cylinder_field_jacobian if camera.is_cylinder else loops.stereo_field_jacobian
-    jacobian(loops.lens_of(camera), np.ascontiguousarray(z).reshape(-1, 4), out.reshape(-1, 4, TERMS))
+    jacobian(loops.lens_of(camera), np.ascontiguousarray(z).reshape(-1, 4), first, out.reshape(-1, 4, terms))
     return out
 
 
@@ -143,7 +143,7 @@ class StereoField:
 
     def jacobian(self, z: FloatArray) -> FloatArray:
         """Derivatives of pixels (..., 4) by the coefficients that are estimated (..., 4, S)."""
-        return field_jacobian(self.camera, z)[..., self.terms]
+        return field_jacobian(self.camera, z, int(self.terms[0]), len(self.terms))
 
     def corrected(self, views: Views) -> Views:
         """Return views (..., 4) without the field."""
@@ -169,9 +169,8 @@ class StereoColumns:
     """The part of the tracks' normal equations that concerns the field's S coefficients; pixel noise is one pixel."""
 
     by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view, the point in the coordinates (M5)
-    H: FloatArray  # (F, 4N, S) derivatives of the pixels by the coefficients, zero where not measured
-    WH: FloatArray  # (F, 4N, S) the same times the robust weights
-    r: FloatArray  # (F, 4N) residuals
+    A: FloatArray  # (F, S, S) information about the coefficients before the points are eliminated
+    b: FloatArray  # (F, S) its vector
 
     @property
     def G(self) -> FloatArray:
@@ -195,10 +194,9 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
         weight: robust weights (F, N).
     """
     F, N, _, S = H.shape
-    H, WH, by_point = H.copy(), np.empty(H.shape), np.empty((F, N, 3, S))
-    loops.collect_columns(at.z_D_p, H, weight, p_D_q, by_point, WH)
-    flat = (F, 4 * N, S)
-    return StereoColumns(by_point, H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N))
+    columns = StereoColumns(np.empty((F, N, 3, S)), np.empty((F, S, S)), np.empty((F, S)))
+    loops.collect_columns(at.r, at.z_D_p, H, weight, p_D_q, columns.by_point, columns.A, columns.b)
+    return columns
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,12 +227,12 @@ def eliminate_points_from_columns(
     columns: StereoColumns, info: TrackInformation, chosen: BoolArray
 ) -> StereoInformation:
     """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does."""
-    size, S = info.G.shape[1], columns.H.shape[2]
-    out = StereoInformation(np.zeros((S, S)), np.zeros((S, size)), np.zeros(S))
+    size, S = info.G.shape[1], columns.A.shape[2]
+    A, cross, b = np.zeros((S, S)), np.zeros((size, S)), np.zeros(S)
     points = info.G, info.C, info.q_D_clone, info.point_gradient
-    own = columns.by_point, columns.H, columns.WH, columns.r
-    loops.eliminate_columns(np.flatnonzero(chosen), *own, *points, out.A, out.cross, out.b)
-    return out
+    own = columns.by_point, columns.A, columns.b
+    loops.eliminate_columns(np.flatnonzero(chosen), *own, *points, A, cross, b)
+    return StereoInformation(A, cross.T, b)
 
 
 def landmark_columns(at: LandmarkResiduals, H: FloatArray, clones: int) -> StereoInformation:

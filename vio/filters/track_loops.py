@@ -266,6 +266,8 @@ def step_points(
             squares = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
             w = 1.0 / (1.0 + squares / (4.0 * scale2))
             for a in range(4):
+                if J[f, n, a, 0] == 0.0 and J[f, n, a, 1] == 0.0 and J[f, n, a, 2] == 0.0:
+                    continue
                 for i in range(3):
                     row[i] = (
                         J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
@@ -519,6 +521,8 @@ def collect_tracks(
                 for j in range(3):
                     C_i[i, j] = 0.0
             for a in range(4):
+                if J[f, n, a, 0] == 0.0 and J[f, n, a, 1] == 0.0 and J[f, n, a, 2] == 0.0:
+                    continue
                 for i in range(3):
                     row[i] = (
                         J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
@@ -603,21 +607,20 @@ def eliminate_tracks(
 
 
 @compiled
-def stereo_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
-    """Write the derivatives (M, 4, 8) of pixels (M, 4) by the coefficients of (R3) and (R4)."""
+def stereo_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray) -> None:
+    """Write the derivatives (M, 4, S) of pixels (M, 4) by S coefficients of (R3) and (R4), from the `first` one on."""
     fu, fv, cu, cv, _, _ = lens
+    H = np.zeros((4, 8))
     for m in range(len(z)):
         x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
         r2, rr2 = x * x + y * y, xr * xr + y * y
+        H[0, 3], H[0, 4], H[0, 5], H[0, 7] = fu * x * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x), fu * x
+        H[1, 3], H[1, 4], H[1, 5], H[1, 7] = fv * y * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y, fv * y
+        H[2, 0], H[2, 1], H[2, 2], H[2, 6], H[2, 7] = fu, fu * xr, fu * rr2, z[m, 2] - z[m, 0], fu * xr
+        H[2, 3], H[2, 4], H[2, 5] = fu * xr * rr2, fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
         for a in range(4):
-            for s in range(8):
-                out[m, a, s] = 0.0
-        out[m, 0, 3], out[m, 0, 4], out[m, 0, 5] = fu * x * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
-        out[m, 1, 3], out[m, 1, 4], out[m, 1, 5] = fv * y * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y
-        out[m, 2, 0], out[m, 2, 1], out[m, 2, 2] = fu, fu * xr, fu * rr2
-        out[m, 2, 3], out[m, 2, 4], out[m, 2, 5] = fu * xr * rr2, fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
-        out[m, 2, 6] = z[m, 2] - z[m, 0]
-        out[m, 0, 7], out[m, 1, 7], out[m, 2, 7] = fu * x, fv * y, fu * xr
+            for s in range(out.shape[2]):
+                out[m, a, s] = H[a, first + s]
 
 
 @compiled
@@ -691,21 +694,20 @@ def cylinder_terms(x: float, azimuth: float, out: FloatArray) -> None:
 
 
 @compiled
-def cylinder_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
-    """Write the derivatives (M, 4, 8) of a cylinder's pixels (M, 4) by the coefficients of (R3); by (R4)'s, zero."""
+def cylinder_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray) -> None:
+    """Write the same for a cylinder's pixels; by the coefficients of (R4), zero."""
     fu, fv, cu, cv, _, _ = lens
     left, right = np.empty((2, 12)), np.empty((2, 12))
     for m in range(len(z)):
         y = (z[m, 1] - cv) / fv
         cylinder_terms((z[m, 0] - cu) / fu, y, left)
         cylinder_terms((z[m, 2] - cu) / fu, y, right)
-        for j in range(8):
-            for a in range(4):
-                out[m, a, j] = 0.0
-        for j in range(6):
-            out[m, 2, j] = fu * right[0, j]
-        for j in range(3, 6):
-            out[m, 0, j], out[m, 1, j] = fu * left[0, j], fv * left[1, j]
+        for s in range(out.shape[2]):
+            k = first + s
+            out[m, 0, s] = fu * left[0, k] if 3 <= k < 6 else 0.0
+            out[m, 1, s] = fv * left[1, k] if 3 <= k < 6 else 0.0
+            out[m, 2, s] = fu * right[0, k] if k < 6 else 0.0
+            out[m, 3, s] = 0.0
 
 
 @compiled
@@ -750,42 +752,56 @@ def cylinder_rows(lens: Lens, z: FloatArray, rows: FloatArray, common: FloatArra
 
 @compiled
 def collect_columns(
-    J: FloatArray, H: FloatArray, weight: FloatArray, p_D_q: FloatArray, by_point: FloatArray, WH: FloatArray
+    r: FloatArray,
+    J: FloatArray,
+    H: FloatArray,
+    weight: FloatArray,
+    p_D_q: FloatArray,
+    by_point: FloatArray,
+    A: FloatArray,
+    b: FloatArray,
 ) -> None:
-    """Write `J' W H` (F, N, 3, S) and `W H` (F, N, 4, S); H (F, N, 4, S) becomes zero where nothing was measured."""
-    row = np.empty(3)
-    terms = H.shape[3]
+    """Write `J' W H` (F, N, 3, S) of each view, and `H' W H` (F, S, S) and `H' W r` (F, S) of each track.
+
+    H (F, N, 4, S) are the derivatives of the pixels, of which those count that were measured.
+    """
+    terms, wH = H.shape[3], np.empty(H.shape[3])
     for f in range(len(J)):
+        for s in range(terms):
+            b[f, s] = 0.0
+            for t in range(terms):
+                A[f, s, t] = 0.0
         for n in range(J.shape[1]):
             for i in range(3):
                 for s in range(terms):
                     by_point[f, n, i, s] = 0.0
-            if not _is_measured(J, f, n):
-                for a in range(4):
-                    for s in range(terms):
-                        H[f, n, a, s] = WH[f, n, a, s] = 0.0
+            if weight[f, n] == 0.0:
                 continue
             for a in range(4):
-                measured = J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
-                for i in range(3):
-                    row[i] = (
-                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
-                    )
+                row = J[f, n, a]
+                if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
+                    continue
                 for s in range(terms):
-                    if not measured:
-                        H[f, n, a, s] = 0.0
-                    WH[f, n, a, s] = weight[f, n] * H[f, n, a, s]
-                    for i in range(3):
-                        by_point[f, n, i, s] += row[i] * WH[f, n, a, s]
+                    wH[s] = weight[f, n] * H[f, n, a, s]
+                    b[f, s] += wH[s] * r[f, n, a]
+                for s in range(terms):
+                    for t in range(s + 1):
+                        A[f, s, t] += wH[s] * H[f, n, a, t]
+                for i in range(3):
+                    by_q = row[0] * p_D_q[f, 0, i] + row[1] * p_D_q[f, 1, i] + row[2] * p_D_q[f, 2, i]
+                    for s in range(terms):
+                        by_point[f, n, i, s] += by_q * wH[s]
+        for s in range(terms):
+            for t in range(s):
+                A[f, t, s] = A[f, s, t]
 
 
 @compiled
 def eliminate_columns(
     chosen: IntArray,
     by_point: FloatArray,
-    H: FloatArray,
-    WH: FloatArray,
-    r: FloatArray,
+    own_A: FloatArray,
+    own_b: FloatArray,
     G: FloatArray,
     C: FloatArray,
     B: FloatArray,
@@ -794,33 +810,32 @@ def eliminate_columns(
     cross: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Add to A (S, S), cross (S, 6N) and b (S,) what is left of the chosen tracks once their points are eliminated."""
+    """Add to A (S, S), cross (6N, S) and b (S,) what is left of the chosen tracks once their points are eliminated."""
     clones, terms = by_point.shape[1], by_point.shape[3]
-    own, X, factor = np.empty((3, terms)), np.empty((terms, 3)), np.empty((3, 3))
+    own, X, CG, factor = np.empty((3, terms)), np.empty(3), np.empty((3, terms)), np.empty((3, 3))
     for f in chosen:
         for s in range(terms):
             for i in range(3):
                 own[i, s] = 0.0
                 for n in range(clones):
                     own[i, s] += by_point[f, n, i, s]
-                X[s, i] = own[i, s]
+                X[i] = own[i, s]
                 for j in range(3):
                     factor[i, j] = C[f, i, j]
-            solve_positive(factor, X[s])
-            b[s] -= X[s, 0] * point_gradient[f, 0] + X[s, 1] * point_gradient[f, 1] + X[s, 2] * point_gradient[f, 2]
+            solve_positive(factor, X)
+            b[s] += own_b[f, s]
+            for i in range(3):
+                CG[i, s] = X[i]
+                b[s] -= X[i] * point_gradient[f, i]
         for s in range(terms):
             for t in range(terms):
-                A[s, t] -= own[0, s] * X[t, 0] + own[1, s] * X[t, 1] + own[2, s] * X[t, 2]
+                A[s, t] += own_A[f, s, t] - own[0, s] * CG[0, t] - own[1, s] * CG[1, t] - own[2, s] * CG[2, t]
         for n in range(clones):
             if not _has_part(G, f, n):
                 continue
-            for m in range(4 * n, 4 * n + 4):
-                for s in range(terms):
-                    b[s] += WH[f, m, s] * r[f, m]
-                    for t in range(terms):
-                        A[s, t] += WH[f, m, s] * H[f, m, t]
             for k in range(6):
-                row = 6 * n + k
-                for s in range(terms):
-                    for i in range(3):
-                        cross[s, row] += B[f, i, k] * by_point[f, n, i, s] - G[f, row, i] * X[s, i]
+                g, add = G[f, 6 * n + k], cross[6 * n + k]
+                for i in range(3):
+                    by_pose = B[f, i, k]
+                    for s in range(terms):
+                        add[s] += by_pose * by_point[f, n, i, s] - g[i] * CG[i, s]

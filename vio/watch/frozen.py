@@ -29,7 +29,7 @@ _RECENT, _LEAST_RECENT = 20, 5  # … at most in so many frames
 _UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
 _SHARE = 0.8  # of the corners that must be unmoved
 _FIRST_ROWS = 8  # compared before all others
-_PROBABILITY = 0.9999  # chi-square limit of the predicted motion for no motion to be possible
+_LIMIT = float(chi_square_quantile(0.9999, 6))  # of the predicted motion for no motion to be possible
 _MOST_LINES = 3  # rows of repetitions that are reported one by one
 _GYRO_NOISE, _ACCEL_NOISE = 2e-4, 1.2e-2  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
 _NS = 1e-9
@@ -123,7 +123,7 @@ class FrozenImages:
         xi = se3_log(motion.T_curr_prev)
         C = motion.covariance
         scale = float(np.trace(C)) + 1e-18
-        return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > chi_square_quantile(_PROBABILITY, 6))
+        return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > _LIMIT)
 
 
 def _equal(a: Image, b: Image) -> bool:

@@ -42,6 +42,7 @@ class RunWatch:
             from vio.watch.inertial import InertialCheck  # it loads scipy.optimize
 
             self._inertial = InertialCheck(camera, T_cam0_body)
+        self._new: list[ImuSample] = []  # since the last frame
         self._frames = self._features = 0
         self._refused_last = -2
         self.frames_refused = 0
@@ -51,16 +52,33 @@ class RunWatch:
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
-        """Add one motion sample."""
-        if isinstance(sample, ImuSample):
-            if self._silence is not None:
-                self._report(self._silence.sample(sample.time_ns))
-            if self._faults is not None and self._inertial is not None:
-                usable, lines = self._faults.sample(sample)
-                self._report(lines)
-                for x in usable:
-                    self._inertial.imu(x)
-                    self._frozen.sample(x)
+        """Add one motion sample; it is judged with all others before the next frame."""
+        if self._silence is not None and isinstance(sample, ImuSample):
+            self._new.append(sample)
+
+    def _take_new(self) -> None:
+        """Judge the samples since the last frame."""
+        new, self._new = self._new, []
+        if self._silence is None or not new:
+            return
+        taken = 0
+        for k, sample in enumerate(new):
+            gap = self._silence.sample(sample.time_ns)
+            if gap:  # what is to be said of earlier samples comes first
+                self._check(new[taken:k])
+                self._report(gap)
+                taken = k
+        self._check(new[taken:])
+
+    def _check(self, samples: list[ImuSample]) -> None:
+        """Report faulty samples, and hand the others on."""
+        if self._faults is None or self._inertial is None:
+            return
+        usable, lines = self._faults.samples(samples)
+        self._report(lines)
+        for x in usable:
+            self._inertial.imu(x)
+            self._frozen.sample(x)
 
     def repeats(self, frame: StereoFrame, expected: Prediction | None) -> bool:
         """Return whether a frame shows an earlier exposure again and must not be used; called before `observations`.
@@ -69,6 +87,7 @@ class RunWatch:
             frame: in time order.
             expected: the back end's prediction of it.
         """
+        self._take_new()
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
         self._report(self._repeats.frame(frame, repeated))
@@ -76,6 +95,7 @@ class RunWatch:
 
     def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
         """Add the front end's observations, before feature selection, and what it says of the images."""
+        self._take_new()
         self._report(warnings)
         self._frames += 1
         self._features += len(seen)
@@ -134,6 +154,7 @@ class RunWatch:
 
     def close(self) -> None:
         """Finish at the end of the run, also of a failed one."""
+        self._take_new()
         if self._frames and not self._features:
             self._report(
                 [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
