@@ -273,9 +273,9 @@ def test_the_imu_is_integrated_as_in_numpy() -> None:
 def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     T, p, views = _scene()
     rng = np.random.default_rng(13)
-    rows, states = rng.normal(0, 0.01, 6), rng.normal(0, 0.01, 8)
+    rows, states = rng.normal(0, 0.01, 7), rng.normal(0, 0.01, 10)
     expected = numpy_twins.corrected(CAMERA, rows, states, views.z, views.weight)
-    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(8)).corrected(views)
+    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(10)).corrected(views)
     np.testing.assert_allclose(views.z, expected, rtol=1e-12)
     at = multiview.residuals(CAMERA, T, p, views)
     at, p = at.take(at.ahead), p[at.ahead]
