@@ -72,7 +72,9 @@ def test_field_jacobian_equals_central_differences_of_distorted_projections() ->
     z = _grid()
 
     def seen(s: FloatArray) -> FloatArray:
-        left, right = (_distorted(_rays(CAMERA, z[:, c]), (s[4], s[5]), (s[6], s[7])) for c in (slice(0, 2), slice(2, 4)))
+        left, right = (
+            _distorted(_rays(CAMERA, z[:, c]), (s[4], s[5]), (s[6], s[7])) for c in (slice(0, 2), slice(2, 4))
+        )
         x, y = _rays(CAMERA, z[:, 2:])[:, :2].T
         r2 = x * x + y * y
         right[:, 0] += CAMERA.fu * (s[0] + s[1] * x + s[2] * r2 + s[3] * r2 * r2)

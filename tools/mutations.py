@@ -376,8 +376,8 @@ MUTATIONS = (
     Mutation(
         "cylinder: columns do not follow a roll of the right camera",
         "vio/filters/track_loops.py",
-        "out[0, 7] -= (1.0 + x * x) * s",
-        "out[0, 7] += (1.0 + x * x) * s",
+        "out[0, 9] -= (1.0 + x * x) * s",
+        "out[0, 9] += (1.0 + x * x) * s",
         ("tests/test_wide.py",),
     ),
     Mutation(
@@ -980,8 +980,8 @@ MUTATIONS = (
     Mutation(
         "stereo scale: sign of the baseline's lever",
         "vio/filters/track_loops.py",
-        "fu * rr2, z[m, 2] - z[m, 0], fu * xr",
-        "fu * rr2, z[m, 0] - z[m, 2], fu * xr",
+        "= z[m, 2] - z[m, 0], fu * x, fv * y",
+        "= z[m, 0] - z[m, 2], fu * x, fv * y",
         _STEREO_FIELD,
     ),
     Mutation(
@@ -1614,10 +1614,24 @@ MUTATIONS = (
         _KEPT,
     ),
     Mutation(
+        "stereo field: no term of the fourth order",
+        "vio/filters/track_loops.py",
+        "right = a0 + a1 * xr + rr2 * (a2 + rr2 * a3)",
+        "right = a0 + a1 * xr + rr2 * a2",
+        (*_STEREO_FIELD, "tests/test_compiled.py"),
+    ),
+    Mutation(
+        "rows take a right camera below the left one's row for a turn",
+        "vio/filters/stereo_calibration.py",
+        "basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y, left - x], axis=1)",
+        "basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y, 0 * x], axis=1)",
+        _STEREO_FIELD,
+    ),
+    Mutation(
         "rows keep what both lenses do to near points",
         "vio/filters/stereo_calibration.py",
-        "return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[3:]))",
-        "return np.asarray(self.coefficients - 0 * np.linalg.solve(self._A + prior, self._common @ stereo[3:]))",
+        "return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[RIGHT_TERMS:]))",
+        "return np.asarray(self.coefficients - 0 * np.linalg.solve(self._A + prior, self._common @ stereo[RIGHT_TERMS:]))",
         _STEREO_FIELD,
     ),
     Mutation(

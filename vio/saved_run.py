@@ -132,7 +132,9 @@ def _field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, A
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
     if coefficients.shape != (FIELD_TERMS + ROW_TERMS,) or not np.isfinite(coefficients).all():
-        raise DataError(f"{folder}: stereo_field of its metrics holds no {FIELD_TERMS + ROW_TERMS} finite numbers; repeat the run")
+        raise DataError(
+            f"{folder}: stereo_field of its metrics holds no {FIELD_TERMS + ROW_TERMS} finite numbers; repeat the run"
+        )
     return coefficients
 
 

@@ -2,9 +2,9 @@
 
 A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field.
 Its rows show in `vl - vr` at once. Its columns look like depth: only motion, which gives the same points a second
-depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three terms of the columns; four others are states,
-and so are four terms of distortion that both lenses have in common. With a metric sensor, so are the length of the
-baseline and the focal length, equation (R4).
+depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three terms of the columns; four others are
+states, and so are four terms of distortion that both lenses have in common. With a metric sensor, so are the length of
+the baseline and the focal length, equation (R4).
 References: Dang, Hoffmann & Stiller, Continuous stereo self-calibration by camera parameter tracking, IEEE TIP (2009);
 Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for improved odometry accuracy, ECMR (2021).
 """

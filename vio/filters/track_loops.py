@@ -719,7 +719,7 @@ def cylinder_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArr
 def correct_cylinder_pixels(
     lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
-    """Write a cylinder's pixels (M, 4) without the field of (R3), (10,), and what follows from the rows (7,) of (R2)."""
+    """Write a cylinder's pixels (M, 4) without the field of (R3), (10,), and what the rows (7,) of (R2) tell."""
     fu, fv, cu, cv, _, _ = lens
     left, right = np.empty((2, 14)), np.empty((2, 14))
     for m in range(len(z)):
