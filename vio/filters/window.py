@@ -79,9 +79,14 @@ class Window:
         self._P, self._factors = P, {}
 
     @property
-    def first_clone(self) -> int:
-        """Row of the first clone, the one after the calibration's."""
-        return DIM + self.calibration.dim
+    def calibration(self) -> Calibration:
+        """The estimate of the rig's calibration."""
+        return self._calibration
+
+    @calibration.setter
+    def calibration(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+        self.first_clone = DIM + calibration.dim  # row of the first clone, the one after the calibration's
 
     @property
     def first_landmark(self) -> int:
@@ -322,10 +327,11 @@ class Window:
         else:
             self.P[:6, :6] += noise
         P = np.empty((D + 6, D + 6))
-        old = np.concatenate([np.arange(at), np.arange(at + 6, D + 6)])
-        new = slice(at, at + 6)
-        P[np.ix_(old, old)] = self.P
-        P[new, old], P[old, new], P[new, new] = added, beside, block
+        new, end = slice(at, at + 6), slice(at + 6, D + 6)
+        P[:at, :at], P[:at, end] = self.P[:at, :at], self.P[:at, at:]
+        P[end, :at], P[end, end] = self.P[at:, :at], self.P[at:, at:]
+        P[new, :at], P[new, end] = added[:, :at], added[:, at:]
+        P[:at, new], P[end, new], P[new, new] = beside[:at], beside[at:], block
         delta = self.prior_delta
         self.prior_delta = np.concatenate([delta[:at], camera_D_own @ delta[own], delta[at:]])
         if self.scale_test is not None:
