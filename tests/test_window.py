@@ -155,7 +155,7 @@ def test_fit_by_factors_equals_the_dense_covariance() -> None:
         P_new, shift = posterior(prior, H.T @ H, b)
         np.testing.assert_allclose(fitted.covariance(), P_new, atol=1e-12)
         np.testing.assert_allclose(fitted.move(b), shift, atol=1e-9)
-        S = fitted.whitened(J @ fitted.L)
+        S = fitted.whitened(J @ fitted.prior.L)
         np.testing.assert_allclose(S @ np.swapaxes(S, 1, 2), J @ P_new @ np.swapaxes(J, 1, 2), atol=1e-9)
 
 
@@ -174,9 +174,9 @@ def test_a_fit_of_some_errors_equals_the_one_of_all(about_all: bool) -> None:
         A[:size, :size], b[:size] = H[:, :size].T @ H[:, :size], H[:, :size].T @ r
         P, shift = posterior(window.P, A, b + A @ window.prior_delta)
         fitted, error = window.optimum(A, b, size)
-        assert fitted.first == (0 if about_all else window.first_clone)
+        assert fitted.prior.first == (0 if about_all else window.first_clone)
         np.testing.assert_allclose(error, shift - window.prior_delta, atol=1e-8)
-        np.testing.assert_allclose(window.covariance_after(fitted), P[:size, :size], atol=1e-8)
+        np.testing.assert_allclose(fitted.covariance(), P[:size, :size], atol=1e-8)
     delta = window.prior_delta
     window.absorb(A, b)
     np.testing.assert_allclose(window.P, P, atol=1e-8)
@@ -193,4 +193,4 @@ def test_changes_in_place_are_seen_by_the_next_fit() -> None:
         change()
         nothing = np.zeros_like(window.P)
         fitted, _ = window.optimum(nothing, np.zeros(len(nothing)), len(nothing))
-        np.testing.assert_allclose(window.covariance_after(fitted), window.P, atol=1e-11)
+        np.testing.assert_allclose(fitted.covariance(), window.P, atol=1e-11)

@@ -461,8 +461,8 @@ MUTATIONS = (
     Mutation(
         "many views: any parallax is enough",
         "vio/filters/multiview.py",
-        "_MONO_DEPTH_SIGMA**2 if mono else _STEREO_VARIANCE",
-        "_MONO_DEPTH_SIGMA**2 if mono else np.inf",
+        "if relative else _STEREO_VARIANCE",
+        "if relative else np.inf",
         _WINDOW,
     ),
     Mutation(
@@ -489,8 +489,8 @@ MUTATIONS = (
     Mutation(
         "IMU: sign of a lever of the gyro's noise",
         "vio/filters/pose_loops.py",
-        "out[i, j] = -_cross(p, axis, i)",
-        "out[i, j] = _cross(p, axis, i)",
+        "lever[i] = p[i] + left",
+        "lever[i] = -p[i] + left",
         _WINDOW,
     ),
     Mutation(
@@ -1560,8 +1560,8 @@ MUTATIONS = (
     Mutation(
         "fit of some errors: the others keep their covariance",
         "vio/filters/window.py",
-        "self.P[others, others] - G @ G.T + N @ N.T",
-        "self.P[others, others]",
+        "P[:first, :first] - G @ G.T + N @ N.T",
+        "P[:first, :first]",
         ("tests/test_window.py",),
     ),
     Mutation(

@@ -208,7 +208,7 @@ class MonoStarter:
         if tracks.variance >= self._settings.pixel_sigma_max_px**2:
             self.why = f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
             return None
-        P = window.covariance_after(fitted)
+        P = fitted.covariance()
         sigma = scale_sigma(WindowPosterior.of(window, P))
         return *_at_origin(window.nav, P[:DIM, :DIM]), float("inf") if sigma is None else sigma
 

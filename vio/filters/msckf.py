@@ -781,7 +781,7 @@ class Msckf:
         promoted = self._promote(window, tracks, leaving & good & seen[:, newest], depth_sigma)
 
         A, b = self._information(window, tracks, good & ~ending, None)
-        P = window.covariance_after(self._move_to_optimum(window, tracks, A, b, window.first_landmark))  # no landmark
+        P = self._move_to_optimum(window, tracks, A, b, window.first_landmark).covariance()  # no landmark is in it
         if self._scale_log is not None and window.scale_test is not None:
             size = window.first_landmark
             P = P + window.scale_covariance(A[:size, :size], P)

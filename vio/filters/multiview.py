@@ -177,11 +177,14 @@ def refine_points(
 
     Steps are taken in the coordinates (M5), damped by their prior, and end ahead of all cameras that saw the point.
     """
-    p, least = p_world.copy(), MIN_DEPTH * camera.baseline_m
-    if steps:
-        limits = least, LEAST_DISPARITY_PX
-        numbers = scale_px**2, _TINY, _PRIOR
-        loops.refine_points(loops.lens_of(camera), *limits, T_cam0_world, views.z, views.weight, steps, *numbers, p)
+    lens, least, T = loops.lens_of(camera), MIN_DEPTH * camera.baseline_m, T_cam0_world
+    p, seen, dq = p_world.copy(), views.weight[..., 0] > 0, np.empty((len(p_world), 3))
+    for _ in range(steps):
+        loops.put_ahead(lens, least, LEAST_DISPARITY_PX, T, views.z, views.weight, p)
+        at, q = residuals(camera, T, p, views), inverse_depth(camera, T, p, seen)
+        loops.step_points(at.r, at.z_D_p, q.p_D_q, scale_px**2, _TINY, _PRIOR, dq)
+        point = q.centre, q.p_D_q, q.disparity
+        loops.move_points(lens, least, LEAST_DISPARITY_PX, T, views.weight, *point, dq, p)
     return p
 
 
@@ -221,9 +224,7 @@ def landmark_residuals(
     one = Views(views.z[:, None], views.weight[:, None])
     at = residuals(camera, T_cam0_world[None], p_world, one)
     r, J = at.r.reshape(-1, 4), at.z_D_p.reshape(-1, 4, 3)
-    weight = np.empty(len(r))
-    loops.weigh_landmarks(r, views.weight, at.ahead, sigma2, _MEDIAN, CAUCHY, weight)
-    return LandmarkResiduals(r, J, weight)
+    return LandmarkResiduals(r, J, robust_weights(at, sigma2)[:, 0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,10 +323,15 @@ def usable_points(
     depth follows the noise, and its Jacobian by the clones' translations with it: information that is not there, and a
     scale that shrinks. Of one camera, whose unit of length is arbitrary, the depth must be known relative to itself.
     """
-    q = inverse_depth(camera, T_cam0_world, p_world, views.weight[..., 0] > 0)
-    mono, keep = camera.kind == "mono", np.empty(len(p_world), dtype=np.bool_)
-    limits = _TINY, _PRIOR, _MONO_DEPTH_SIGMA**2 if mono else _STEREO_VARIANCE, mono
-    loops.keep_usable(at.z_D_p, p_world, views.weight, at.ahead, q.p_D_q, q.disparity, *limits, keep)
+    keep = at.ahead & np.isfinite(p_world).all(axis=1)
+    left_only = np.flatnonzero(keep & ~np.any(views.weight[..., 2] > 0, axis=1))
+    if len(left_only):
+        q = inverse_depth(camera, T_cam0_world, p_world[left_only], views.weight[left_only, :, 0] > 0)
+        J = at.z_D_p[left_only].reshape(len(left_only), -1, 3) @ q.p_D_q
+        C = np.swapaxes(J, 1, 2) @ J + np.diag([_TINY, _TINY, _PRIOR])
+        relative = camera.kind == "mono"
+        limit = (_MONO_DEPTH_SIGMA * q.disparity) ** 2 if relative else _STEREO_VARIANCE
+        keep[left_only] = np.linalg.inv(C)[:, 2, 2] < limit
     return keep
 
 

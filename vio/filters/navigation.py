@@ -289,9 +289,8 @@ class ImuMotion:
         hidden = self._history.hidden(cuts, t)
         if hidden is not None:
             cuts = hidden.cuts_ns
-        at = np.empty((len(cuts), 6))
-        loops.interpolate(t, readings_of(samples), cuts, at)
-        return cuts, at, hidden
+        readings = np.stack([np.interp(cuts, t, column) for column in readings_of(samples).T], axis=1)
+        return cuts, readings, hidden
 
 
 class TwistMotion:

@@ -109,19 +109,6 @@ def take_rows(P: FloatArray, rows: IntArray, out: FloatArray) -> None:
 
 
 @compiled
-def interpolate(t: FloatArray, values: FloatArray, at: FloatArray, out: FloatArray) -> None:
-    """Write values (K, 6) at increasing times (K,) by those (S, 6) at times (S,); beyond the ends they are held."""
-    s = 0
-    for k in range(len(at)):
-        while s < len(t) and t[s] <= at[k]:
-            s += 1
-        before, after = max(s - 1, 0), min(s, len(t) - 1)
-        share = (at[k] - t[before]) / (t[after] - t[before]) if after > before and s > 0 else 0.0
-        for j in range(values.shape[1]):
-            out[k, j] = values[before, j] + share * (values[after, j] - values[before, j])
-
-
-@compiled
 def _add_noise(
     R: FloatArray,
     p: FloatArray,
@@ -139,14 +126,17 @@ def _add_noise(
     `gyro2` and `accel2` are the variances of the integrals of gyro and accelerometer over it.
     """
     # How noise and bias errors of gyro and accelerometer enter [rho phi xi_v] (9, 6) there, carried to the end.
-    out = np.zeros((9, 6))
-    for j in range(3):
-        axis = R[:, j]
-        for i in range(3):
-            out[3 + i, j] = -axis[i]
-            out[6 + i, j] = -_cross(v, axis, i) - left * _cross(gravity, axis, i)
-            out[i, j] = -_cross(p, axis, i) - left * _cross(v, axis, i) - 0.5 * left * left * _cross(gravity, axis, i)
-            out[i, 3 + j], out[6 + i, 3 + j] = -left * axis[i], -axis[i]
+    out, lever, swing = np.zeros((9, 6)), np.empty(3), np.empty(3)
+    for i in range(3):
+        swing[i] = v[i] + left * gravity[i]
+        lever[i] = p[i] + left * (v[i] + 0.5 * left * gravity[i])
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            out[i, c] = lever[k] * R[j, c] - lever[j] * R[k, c]
+            out[3 + i, c] = -R[i, c]
+            out[6 + i, c] = swing[k] * R[j, c] - swing[j] * R[k, c]
+            out[i, 3 + c], out[6 + i, 3 + c] = -left * R[i, c], -R[i, c]
     for i in range(9):
         for j in range(6):
             Phi[i, 9 + j] += out[i, j] * dt

@@ -149,9 +149,9 @@ def anchor_points(
 
 
 @compiled
-def middle(values: FloatArray, n: int) -> float:
-    """Median of the first n >= 1 entries, which are reordered. Reference: Hoare, Algorithm 65: Find, CACM (1961)."""
-    k, low, high = n // 2, 0, n - 1
+def middle(values: FloatArray) -> float:
+    """Median of one or more values (n,), which are reordered. Reference: Hoare, Algorithm 65: Find, CACM (1961)."""
+    k, low, high = len(values) // 2, 0, len(values) - 1
     while low < high:
         pivot, i, j = values[k], low, high
         while i <= j:
@@ -166,7 +166,7 @@ def middle(values: FloatArray, n: int) -> float:
             low = i
         if k < i:
             high = j
-    if n % 2 == 1:
+    if len(values) % 2 == 1:
         return values[k]
     below = values[0]
     for i in range(1, k):
@@ -316,82 +316,22 @@ def _move(
 
 
 @compiled
-def refine_points(
+def move_points(
     lens: Lens,
     least_depth: float,
     least_disparity: float,
     T: FloatArray,
-    z: FloatArray,
     weight: FloatArray,
-    steps: int,
-    scale2: float,
-    tiny: float,
-    prior: float,
-    p: FloatArray,
-) -> None:
-    """Move points (F, 3) by Gauss-Newton steps with Cauchy weights of a scale, ahead of all cameras that saw them."""
-    F, N = weight.shape[0], weight.shape[1]
-    r, J, ahead = np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_)
-    seen, anchor, centre = np.empty((F, N), dtype=np.bool_), np.empty(F, dtype=np.int64), np.empty((F, 3))
-    disparity, p_D_q, q_D_p, dq = np.empty(F), np.empty((F, 3, 3)), np.empty((F, 3, 3)), np.empty((F, 3))
-    for f in range(F):
-        for n in range(N):
-            seen[f, n] = weight[f, n, 0] > 0.0
-    for _ in range(steps):
-        put_ahead(lens, least_depth, least_disparity, T, z, weight, p)
-        compare_views(lens, least_depth, T, p, z, weight, r, J, ahead)
-        anchor_points(lens, least_depth, T, p, seen, anchor, centre, disparity, p_D_q, q_D_p)
-        step_points(r, J, p_D_q, scale2, tiny, prior, dq)
-        for f in range(F):
-            most = _most_disparity(lens, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f])
-            _move(centre[f], p_D_q[f], disparity[f], dq[f], least_disparity, most, p[f])
-
-
-@compiled
-def keep_usable(
-    J: FloatArray,
-    p: FloatArray,
-    weight: FloatArray,
-    ahead: BoolArray,
+    centre: FloatArray,
     p_D_q: FloatArray,
     disparity: FloatArray,
-    tiny: float,
-    prior: float,
-    variance: float,
-    relative: bool,
-    keep: BoolArray,
+    dq: FloatArray,
+    p: FloatArray,
 ) -> None:
-    """Write which tracks (F,) have a finite point ahead, and a right view or enough parallax.
-
-    Enough is a variance of the disparity below `variance`, times the squared disparity where that is `relative`.
-    """
-    row, C = np.empty(3), np.empty((3, 3))
+    """Move points (F, 3) by steps (F, 3) in the coordinates (M5), to what is ahead of all cameras that saw them."""
     for f in range(len(p)):
-        keep[f] = ahead[f] and np.isfinite(p[f, 0]) and np.isfinite(p[f, 1]) and np.isfinite(p[f, 2])
-        right = False
-        for n in range(weight.shape[1]):
-            right = right or weight[f, n, 2] > 0.0
-        if right or not keep[f]:
-            continue
-        for i in range(3):
-            for j in range(3):
-                C[i, j] = 0.0
-        C[0, 0], C[1, 1], C[2, 2] = tiny, tiny, prior
-        for n in range(J.shape[1]):
-            for a in range(4):
-                for i in range(3):
-                    row[i] = (
-                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
-                    )
-                for i in range(3):
-                    for j in range(3):
-                        C[i, j] += row[i] * row[j]
-        # What is left of the third diagonal entry once the other two coordinates are eliminated.
-        minor = C[0, 0] * C[1, 1] - C[0, 1] * C[0, 1]
-        a0 = (C[0, 2] * C[1, 1] - C[1, 2] * C[0, 1]) / minor
-        a1 = (C[1, 2] * C[0, 0] - C[0, 2] * C[0, 1]) / minor
-        left = C[2, 2] - a0 * C[0, 2] - a1 * C[1, 2]
-        keep[f] = 1.0 / left < (variance * disparity[f] * disparity[f] if relative else variance)
+        most = _most_disparity(lens, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f])
+        _move(centre[f], p_D_q[f], disparity[f], dq[f], least_disparity, most, p[f])
 
 
 @compiled
@@ -410,26 +350,9 @@ def weigh_views(r: FloatArray, J: FloatArray, sigma2: float, median: float, cauc
                 weights[f, n] = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
                 squares[count] = weights[f, n]
                 count += 1
-        scale2 = max(sigma2, middle(squares, count) / median) if count > 0 else sigma2
+        scale2 = max(sigma2, middle(squares[:count]) / median) if count > 0 else sigma2
         for f in range(F):
             weights[f, n] = 0.0 if weights[f, n] < 0.0 else 1.0 / (1.0 + weights[f, n] / (4.0 * scale2 * cauchy**2))
-
-
-@compiled
-def weigh_landmarks(
-    r: FloatArray, weight: FloatArray, ahead: BoolArray, sigma2: float, median: float, cauchy: float, out: FloatArray
-) -> None:
-    """Write Cauchy weights (K,) of landmarks' views (K, 4), zero where not ahead; the scale is as in `weigh_views`."""
-    squares, count = np.empty(len(r)), 0
-    for k in range(len(r)):
-        out[k] = -1.0
-        if ahead[k] and weight[k, 1] > 0.0:
-            out[k] = r[k, 0] ** 2 + r[k, 1] ** 2 + r[k, 2] ** 2 + r[k, 3] ** 2
-            squares[count] = out[k]
-            count += 1
-    scale2 = max(sigma2, middle(squares, count) / median) if count > 0 else sigma2
-    for k in range(len(r)):
-        out[k] = 0.0 if out[k] < 0.0 else 1.0 / (1.0 + out[k] / (4.0 * scale2 * cauchy**2))
 
 
 @compiled

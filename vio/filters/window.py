@@ -79,9 +79,14 @@ class Window:
         self._P, self._factors = P, {}
 
     @property
-    def first_clone(self) -> int:
-        """Row of the first clone, the one after the calibration's."""
-        return DIM + self.calibration.dim
+    def calibration(self) -> Calibration:
+        """The estimate of the rig's calibration."""
+        return self._calibration
+
+    @calibration.setter
+    def calibration(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+        self.first_clone = DIM + calibration.dim  # row of the first clone, the one after the calibration's
 
     @property
     def first_landmark(self) -> int:
@@ -194,7 +199,7 @@ class Window:
         """
         M, S = len(self.landmarks), self.calibration.stereo_dim
         exposure = self.clone_rows(len(self.clones) - 1).start
-        first, n = self.first_landmark, len(fitted.L)
+        first, n = self.first_landmark, len(fitted.prior.L)
         moved = fitted.rows(first, first + 3 * M).reshape(M, 3, n) - fitted.rows(exposure, exposure + 3)
         root = fitted.whitened(moved)
         if S:
@@ -322,10 +327,11 @@ class Window:
         else:
             self.P[:6, :6] += noise
         P = np.empty((D + 6, D + 6))
-        old = np.concatenate([np.arange(at), np.arange(at + 6, D + 6)])
-        new = slice(at, at + 6)
-        P[np.ix_(old, old)] = self.P
-        P[new, old], P[old, new], P[new, new] = added, beside, block
+        new, end = slice(at, at + 6), slice(at + 6, D + 6)
+        P[:at, :at], P[:at, end] = self.P[:at, :at], self.P[:at, at:]
+        P[end, :at], P[end, end] = self.P[at:, :at], self.P[at:, at:]
+        P[new, :at], P[new, end] = added[:, :at], added[:, at:]
+        P[:at, new], P[end, new], P[new, new] = beside[:at], beside[at:], block
         delta = self.prior_delta
         self.prior_delta = np.concatenate([delta[:at], camera_D_own @ delta[own], delta[at:]])
         if self.scale_test is not None:
@@ -454,27 +460,8 @@ class Window:
         if information[:first].any():
             first = 0
         if (first, size) not in self._factors:
-            prior = factor(self.P[first:size, first:size], first)
-            self._factors[first, size] = prior if prior.triangular else factor(self.P[:size, :size])
+            self._factors[first, size] = factor(self.P[:size, :size], first)
         return self._factors[first, size]
-
-    def covariance_after(self, fitted: Fit) -> FloatArray:
-        """Covariance (k, k) of the first errors after a fit, up to those that it is about.
-
-        With `W' W` that of the fitted ones, and N the others' covariance with them before, times `L'^-1 K'^-1`: the
-        others' covariance with them is then `N W`, and their own `N N'` and what it is given the fitted ones.
-        """
-        first, size = fitted.first, fitted.first + len(fitted.L)
-        others, own = slice(0, first), slice(first, size)
-        W, P = fitted.root(), np.empty((size, size))
-        P[own, own] = W.T @ W
-        if first:
-            G: FloatArray = blas.dtrsm(1.0, fitted.L.T, self.P[others, own].T, lower=0, trans_a=1).T
-            N = fitted.whitened(G)
-            P[others, own] = N @ W
-            P[own, others] = P[others, own].T
-            P[others, others] = self.P[others, others] - G @ G.T + N @ N.T
-        return P
 
     def absorb(self, information: FloatArray, vector: FloatArray, scaled: FloatArray | None = None) -> None:
         """Absorb measurements into the prior.
@@ -486,7 +473,7 @@ class Window:
         """
         prior = self._prior_of(information, len(self.P))
         own = slice(prior.first, None)
-        P = self.covariance_after(fit(prior, information[own, own]))
+        P = fit(prior, information[own, own]).covariance()
         self.prior_delta = self.prior_delta - P @ (vector + information @ self.prior_delta)
         self.P = P
         if self.scale_test is not None:
@@ -573,60 +560,77 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Factor:
-    """A covariance `P = L L'`."""
+    """A covariance, and a factor of that of its last n errors: `P_n = L L'`."""
 
-    L: FloatArray  # (D, D)
+    P: FloatArray  # (D, D)
+    L: FloatArray  # (n, n)
     triangular: bool  # by Cholesky; False: by the eigenvectors of a P that is singular beyond rounding
-    first: int = 0  # row of the first of its errors in the window's
+
+    @property
+    def first(self) -> int:
+        """Row of the first error that is factored."""
+        return len(self.P) - len(self.L)
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The covariance after a measurement in information form, as factors: `P_new = L (K K')^-1 L'`."""
+    """The covariance after a measurement of the last n errors in information form: `P_n_new = L (K K')^-1 L'`."""
 
-    L: FloatArray  # (D, D) of the prior
-    K_transposed: FloatArray  # (D, D) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
-    first: int = 0  # as in Factor
+    prior: Factor
+    K_transposed: FloatArray  # (n, n) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
 
     def move(self, vector: FloatArray) -> FloatArray:
-        """Return `P_new v` (D,), for the information vector v (D,) the shift of the mean."""
-        inner = lapack.dpotrs(self.K_transposed, self.L.T @ vector, lower=0)[0]
-        out: FloatArray = self.L @ inner
+        """Return `P_n_new v` (n,), for the information vector v (n,) the shift of their mean."""
+        L = self.prior.L
+        out: FloatArray = L @ lapack.dpotrs(self.K_transposed, L.T @ vector, lower=0)[0]
         return out
 
     def rows(self, start: int, stop: int) -> FloatArray:
-        """Return rows (stop - start, D) of L, which are `J L` for a choice J of the window's errors."""
-        return self.L[start - self.first : stop - self.first]
+        """Return the rows (stop - start, n) of L that belong to rows of P: `J L` for a choice J of the errors."""
+        first = self.prior.first
+        return self.prior.L[start - first : stop - first]
 
     def whitened(self, J_L: FloatArray) -> FloatArray:
-        """Return S (..., k, D) with `S S'` the covariance of `J error`, from `J L` (..., k, D)."""
+        """Return S (..., k, n) with `S S'` the covariance of `J error`, from `J L` (..., k, n)."""
         rows = np.ascontiguousarray(J_L).reshape(-1, J_L.shape[-1])
         S: FloatArray = blas.dtrsm(1.0, self.K_transposed, rows.T, lower=0, trans_a=1).T
         return S.reshape(J_L.shape)
 
-    def root(self) -> FloatArray:
-        """Return W (D, D) with `W' W` the covariance."""
-        out: FloatArray = blas.dtrsm(1.0, self.K_transposed, self.L.T, lower=0, trans_a=1)
+    def covariance(self) -> FloatArray:
+        """Return the covariance (D, D) of all errors: symmetric and positive by construction.
+
+        That of the last n is `W' W`. With N the others' covariance with them before, times `L'^-1 K'^-1`, the others'
+        covariance with them is `N W`, and their own is `N N'` and what it is given the last n.
+        """
+        P, L, first = self.prior.P, self.prior.L, self.prior.first
+        W = blas.dtrsm(1.0, self.K_transposed, L.T, lower=0, trans_a=1)
+        out: FloatArray = np.empty(P.shape)
+        out[first:, first:] = W.T @ W
+        if first:
+            G: FloatArray = blas.dtrsm(1.0, L.T, P[:first, first:].T, lower=0, trans_a=1).T
+            N = self.whitened(G)
+            out[:first, first:] = N @ W
+            out[first:, :first] = out[:first, first:].T
+            out[:first, :first] = P[:first, :first] - G @ G.T + N @ N.T
+            _keep_positive(out, P, first)
         return out
 
-    def covariance(self) -> FloatArray:
-        """Return the covariance (D, D): symmetric and positive by construction."""
-        W = self.root()
-        P_new: FloatArray = W.T @ W
-        return P_new
+
+def _keep_positive(out: FloatArray, P: FloatArray, count: int) -> None:
+    """Add to the first variances of a covariance what keeps it positive to rounding, also where P knows one exactly."""
+    np.einsum("ii->i", out)[:count] += 1e-14 * P.diagonal()[:count] + 1e-24
 
 
 def factor(P: FloatArray, first: int = 0) -> Factor:
-    """Factor a covariance (D, D); `first` is the row of its first error in the window's."""
-    A = np.array(P, order="C")
-    A.ravel()[:: len(A) + 1] *= 1.0 + 1e-14
-    A.ravel()[:: len(A) + 1] += 1e-24
+    """Factor a covariance (D, D) from the row `first` on; the whole where that part is singular beyond rounding."""
+    A = np.array(P[first:, first:], order="C")
+    _keep_positive(A, A, len(A))
     upper, failed = lapack.dpotrf(A.T, lower=0, overwrite_a=1)
     if not failed:
-        return Factor(upper.T, True, first)
+        return Factor(P, upper.T, True)
     values, vectors = np.linalg.eigh(P)
     root: FloatArray = np.array(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C")
-    return Factor(root, False, first)
+    return Factor(P, root, False)
 
 
 def fit(prior: Factor, information: FloatArray) -> Fit:
@@ -647,7 +651,7 @@ def fit(prior: Factor, information: FloatArray) -> Fit:
     K_transposed, failed = lapack.dpotrf(inner, lower=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("the information is not positive")
-    return Fit(L, K_transposed, prior.first)
+    return Fit(prior, K_transposed)
 
 
 def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
