@@ -1795,4 +1795,11 @@ MUTATIONS = (
         "if self.levelled is not None and False:",
         ("tests/test_pose_graph.py",),
     ),
+    Mutation(
+        "calibrate: a baseline as certain as if lenses had no residual distortion",
+        "vio/calibration/stereo.py",
+        "size = np.radians(_LENS_DEG)",
+        "size = 1e-6 * np.radians(_LENS_DEG)",
+        ("tests/test_calibration.py",),
+    ),
 )
