@@ -407,6 +407,38 @@ def test_commands_for_pairs_say_so_in_one_line(
     assert "needs a stereo pair" in lines[0]
 
 
+def test_a_start_that_fails_is_explained_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    from vio.cli import main
+
+    assert main(["run", str(_mono_folder(tmp_path / "r")), "--out", str(tmp_path / "out")]) == 1
+    lines = [*caplog.messages, *capsys.readouterr().err.splitlines()]
+    assert sum("frames have no pose" in line for line in lines) == 1
+    assert sum("4 frames has a pose; see the warnings above" in line for line in lines) == 1
+
+
+def test_an_accelerometer_in_g_is_named_before_the_start_that_it_prevents(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    from vio.cli import main
+
+    folder = _mono_folder(tmp_path / "r")
+    (folder / "times.txt").write_text("\n".join(f"{0.5 * k:.2f}" for k in range(4)))
+    rng = np.random.default_rng(0)
+    rows = [f"{int(k * 5e6)},{a[0]},{a[1]},{a[2]},{a[3]},{a[4]},{1 + a[5]}" for k in range(320) for a in [_shake(rng)]]
+    (folder / "imu.csv").write_text("\n".join(["#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z", *rows]))
+    assert main(["run", str(folder), "--out", str(tmp_path / "out")]) == 1
+    lines = [m for m in caplog.messages if "accelerometer" in m or "no pose" in m]
+    assert "in g: multiply by 9.81" in lines[0]
+    assert "have no pose; mend the fault of the IMU" in lines[1]
+
+
+def _shake(rng: np.random.Generator) -> FloatArray:
+    """Readings of a hand that moves: gyro in rad/s and accelerometer in g, without gravity."""
+    return rng.normal(0, [0.2, 0.2, 0.2, 0.02, 0.02, 0.02])
+
+
 # --- live -----------------------------------------------------------------------------------------------------------
 
 

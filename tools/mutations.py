@@ -1802,4 +1802,18 @@ MUTATIONS = (
         "size = 1e-6 * np.radians(_LENS_DEG)",
         ("tests/test_calibration.py",),
     ),
+    Mutation(
+        "frozen: repeated depth images pass",
+        "vio/watch/run.py",
+        "return frame if repeated is None else",
+        "return frame if repeated is None or True else",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen: equal depth images at standstill left out",
+        "vio/watch/frozen.py",
+        "self._same_depth = self._same_depth or self._moves(self._expected)",
+        "self._same_depth = True",
+        _FROZEN,
+    ),
 )
