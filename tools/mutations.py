@@ -1816,4 +1816,11 @@ MUTATIONS = (
         "self._same_depth = True",
         _FROZEN,
     ),
+    Mutation(
+        "evaluation: attitudes about a straight path called another convention",
+        "vio/reference_axes.py",
+        "max(_LARGE_DEG, _SIGMAS * float(np.degrees(sigma_rad)))",
+        "_LARGE_DEG",
+        ("tests/test_evaluation.py",),
+    ),
 )
