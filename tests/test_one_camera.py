@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -393,7 +395,7 @@ def test_left_camera_of_a_pair_has_no_right_side(tmp_path: Path) -> None:
     assert all(e.right is None for e in dataset.events() if isinstance(e, StereoFrame))
 
 
-@pytest.mark.parametrize("command", [["inspect"], ["calibrate"], ["convert", "--to", "euroc", "--out", "x"]])
+@pytest.mark.parametrize("command", [["calibrate"], ["convert", "--to", "euroc", "--out", "x"]])
 def test_commands_for_pairs_say_so_in_one_line(
     tmp_path: Path, command: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -437,6 +439,48 @@ def test_an_accelerometer_in_g_is_named_before_the_start_that_it_prevents(
 def _shake(rng: np.random.Generator) -> FloatArray:
     """Readings of a hand that moves: gyro in rad/s and accelerometer in g, without gravity."""
     return rng.normal(0, [0.2, 0.2, 0.2, 0.02, 0.02, 0.02])
+
+
+def _inspected(folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, Any]]:
+    from vio.cli import main
+
+    status = main(["inspect", str(folder), "--frames", "3", "--json"])
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_inspect_shows_one_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = _mono_folder(tmp_path / "r")
+    status, report = _inspected(folder, capsys)
+    assert (status, report["kind"], report["faults"]) == (0, "mono", [])
+    parts = report["parts"]
+    assert parts["camera"]["kind"] == "mono"
+    assert "baseline_m" not in parts["camera"]
+    assert len(parts["images"]["mean"]) == 1
+    assert "stereo" not in parts
+    assert parts["tracking"]["tracked_median"] > 40
+    (folder / "imu.csv").unlink()
+    status, report = _inspected(folder, capsys)
+    assert status == 1
+    assert report["faults"] == [
+        "missing: one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu), depth images or a second camera"
+    ]
+
+
+def test_inspect_shows_depth_images_and_a_wrong_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = _mono_folder(tmp_path / "r")
+    (folder / "depth").mkdir()
+    for k in range(4):
+        cv2.imwrite(str(folder / "depth" / f"{k}.png"), _depth_png(k))
+    (folder / "imu.csv").unlink()
+    status, report = _inspected(folder, capsys)
+    assert (status, report["kind"], report["faults"]) == (0, "rgbd", [])
+    true = np.median(_walls()[0][1])
+    assert report["parts"]["depth"]["median_m"] == pytest.approx(true, rel=0.1)
+    assert report["parts"]["tracking"]["matched_median"] > 40
+    (folder / "calibration.yaml").write_text(kalibr_camera_text(replace(RIG, depth_factor=1.0)))
+    status, report = _inspected(folder, capsys)
+    assert status == 1
+    assert "check depth_factor" in report["faults"][0]
 
 
 # --- live -----------------------------------------------------------------------------------------------------------
