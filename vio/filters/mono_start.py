@@ -4,6 +4,7 @@ Nothing is estimated before. At standstill (the IMU shows noise alone, and the t
 In motion, a linear solution (`vio.filters.alignment`) starts Gauss-Newton over some views of the last seconds, with the
 same motion model, errors and elimination of points as the filter has; its covariance is that of the start. The frames
 that were used have no pose of their own: the filter begins with the newest one and never sees their pixels again.
+Equations (V1) to (V6) of docs/math.md.
 """
 
 from __future__ import annotations
