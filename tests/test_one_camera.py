@@ -374,9 +374,11 @@ def test_euroc_folder_with_cam0_alone_is_one_camera(tmp_path: Path) -> None:
         "distortion_model: radial-tangential\ndistortion_coefficients: [-0.1, 0.01, 0, 0]\n"
         "T_BS:\n  cols: 4\n  rows: 4\n  data: [1,0,0,0.1, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n"
     )
+    (cam / "data.csv").write_text("#timestamp [ns],filename\n")
     dataset = open_dataset(tmp_path)
     assert dataset.recording.camera.kind == "mono"
     assert len(list(dataset.events())) == 3
+    assert not any("data.csv" in note for note in dataset.recording.notes), "the names of the images say the same"
 
 
 def test_left_camera_of_a_pair_has_no_right_side(tmp_path: Path) -> None:
@@ -416,7 +418,7 @@ def test_a_start_that_fails_is_explained_once(
 
     assert main(["run", str(_mono_folder(tmp_path / "r")), "--out", str(tmp_path / "out")]) == 1
     lines = [*caplog.messages, *capsys.readouterr().err.splitlines()]
-    assert sum("frames have no pose" in line for line in lines) == 1
+    assert sum("frames have no pose; there are 0.15 s of frames" in line for line in lines) == 1
     assert sum("4 frames has a pose; see the warnings above" in line for line in lines) == 1
 
 
