@@ -55,7 +55,7 @@ def test_a_conversion_never_removes_its_source_nor_what_others_put_beside_it(
     assert main(["convert", str(flight), "--to", "plain", "--out", str(first), "--stop", "3"]) == 0
     for source, out in ((first, first), (first, tmp_path)):
         assert main(["convert", str(source), "--to", "kitti", "--out", str(out)]) == 1
-        assert "itself, which would be replaced; choose another path" in capsys.readouterr().err
+        assert "itself and will not be replaced; choose another path" in capsys.readouterr().err
     assert main(["convert", str(flight), "--to", "kitti", "--out", str(first), "--stop", "2"]) == 0, "an earlier result"
     (first / "run").mkdir()
     (first / "run" / "notes.txt").write_text("mine")

@@ -216,7 +216,7 @@ def check_spares(source: Path, target: Path) -> None:
     """Raise VioError if replacing a folder would remove the recording that it is made from."""
     own, there = source.resolve(), target.resolve()
     if there == own or there in own.parents:
-        raise VioError(f"{target}: holds the recording {source} itself, which would be replaced; choose another path")
+        raise VioError(f"{target}: holds the recording {source} itself and will not be replaced; choose another path")
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
