@@ -708,6 +708,14 @@ def test_reference_of_another_path_length_is_noted() -> None:
     assert evaluate(kitti_form(large), kitti_form(T), align="sim3").notes == ()  # the scale is known to be open
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1000, "millimetres"), (100, "centimetres")])
+def test_a_reference_in_another_unit_is_named(factor: float, unit: str) -> None:
+    T = wander(100)
+    large = se3_from_parts(T[:, :3, :3], factor * T[:, :3, 3])
+    assert evaluate(timed(drift(T)), timed(large)).notes[0].endswith(f"; the reference seems to be in {unit}")
+    assert evaluate(timed(large), timed(T)).notes[0].endswith(f"; the estimate seems to be in {unit}")
+
+
 def test_reference_that_hardly_matches_is_noted() -> None:
     T = wander(100)
     found = evaluate(timed(T), timed(T, start_ns=7_000_000_000))

@@ -32,6 +32,8 @@ _LOOSE_RAD = 0.05  # positions determine the rotation about the path if its stan
 _ORIENTATION_GAIN = 10.0  # ratio of standard deviations above which the orientations replace the positions in it
 _CONTRADICTION = 5.0  # standard deviations by which they may differ; more: they do not describe the same body
 _PATH_RATIO = 1.5  # ratio of path lengths above which the reference may be another recording's
+_UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
+_UNIT_SHARE = 0.1  # a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
 _PATH_LEAST_M = 1.0  # paths below this may consist of noise
 _MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
 _STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points coincide, to rounding
@@ -622,9 +624,11 @@ def _notes(
     notes = []
     short, long = sorted((estimate_m, reference_m))
     if long > _PATH_LEAST_M and long > _PATH_RATIO * short:
+        units = {name: size for name, size in _UNITS.items() if abs(long / max(short, 1e-12) / size - 1) < _UNIT_SHARE}
+        which = "the reference" if reference_m > estimate_m else "the estimate"
+        what = f"{which} seems to be in {next(iter(units))}" if units else "is it the reference of this recording?"
         notes.append(
-            f"over the same poses the estimate travels {estimate_m:.1f} m and the reference {reference_m:.1f} m; is it "
-            "the reference of this recording?"
+            f"over the same poses the estimate travels {estimate_m:.1f} m and the reference {reference_m:.1f} m; {what}"
         )
     shorter = min(len(estimate), len(reference))
     if len(rows) < _MATCHED_SHARE * shorter:
