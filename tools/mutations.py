@@ -1823,4 +1823,32 @@ MUTATIONS = (
         "if self.levelled is not None and False:",
         ("tests/test_pose_graph.py",),
     ),
+    Mutation(
+        "calibrate: a baseline as certain as if lenses had no residual distortion",
+        "vio/calibration/stereo.py",
+        "size = np.radians(_LENS_DEG)",
+        "size = 1e-6 * np.radians(_LENS_DEG)",
+        ("tests/test_calibration.py",),
+    ),
+    Mutation(
+        "frozen: repeated depth images pass",
+        "vio/watch/run.py",
+        "return frame if repeated is None else",
+        "return frame if repeated is None or True else",
+        _FROZEN,
+    ),
+    Mutation(
+        "frozen: equal depth images at standstill left out",
+        "vio/watch/frozen.py",
+        "self._same_depth = self._same_depth or self._moves(self._expected)",
+        "self._same_depth = True",
+        _FROZEN,
+    ),
+    Mutation(
+        "evaluation: attitudes about a straight path called another convention",
+        "vio/reference_axes.py",
+        "max(_LARGE_DEG, _SIGMAS * float(np.degrees(sigma_rad)))",
+        "_LARGE_DEG",
+        ("tests/test_evaluation.py",),
+    ),
 )
