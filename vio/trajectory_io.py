@@ -43,6 +43,7 @@ _COLUMNS: dict[TrajectoryFormat, str] = {
     "euroc": "at least 8 comma-separated columns 'timestamp [ns], px, py, pz, qw, qx, qy, qz'",
 }
 _EUROC_HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
+_STAMP = re.compile(r"[+-]?\d{1,19}")
 _HEAD_BYTES = 4096  # that hold the comments and the first row
 _DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
 
@@ -53,7 +54,7 @@ class _Table:
 
     path: Path
     comments: list[str]  # without the leading '#'
-    rows: list[list[str]]
+    rows: list[list[str]]  # between commas, with the spaces around the fields
     line_numbers: list[int]  # from 1, one per row
     commas: bool  # what separates the fields of the first row; else white space
 
@@ -197,7 +198,7 @@ def _read_table(path: Path) -> _Table:
     return _Table(
         path,
         comments=[line[1:].strip() for _, line in lines if line.startswith("#")],
-        rows=[[field.strip() for field in line.split(",")] if commas else line.split() for _, line in data],
+        rows=[line.split("," if commas else None) for _, line in data],
         line_numbers=[number for number, _ in data],
         commas=commas,
     )
@@ -225,12 +226,13 @@ def _check_columns(table: _Table, kind: TrajectoryFormat) -> None:
 
 def _floats(table: _Table, first: int, last: int) -> FloatArray:
     """Columns `first <= column < last` as finite numbers (N, last - first)."""
-    out = np.empty((len(table.rows), last - first))
-    for row, fields in enumerate(table.rows):
-        try:
-            out[row] = [float(field) for field in fields[first:last]]
-        except ValueError as error:
-            table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
+    values, row = [], 0
+    try:
+        for row, fields in enumerate(table.rows):  # noqa: B007  # the row that is at fault
+            values.append(list(map(float, fields[first:last])))
+    except ValueError as error:
+        table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
+    out = np.array(values).reshape(-1, last - first)
     bad = ~(np.abs(out) < _LARGEST).all(axis=1)
     if bad.any():
         table.fail(
@@ -247,9 +249,9 @@ def _times_ns(table: _Table, kind: TrajectoryFormat) -> IntArray:
 
 
 def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
-    text = table.rows[row][0]
+    text = table.rows[row][0].strip()
     if kind == "euroc":
-        if not re.fullmatch(r"[+-]?\d{1,19}", text) or abs(int(text)) > INT64_MAX:
+        if not _STAMP.fullmatch(text) or abs(int(text)) > INT64_MAX:
             table.fail(row, f"the time {text!r} is not in whole nanoseconds; EuRoC form has {_COLUMNS[kind]}")
         return int(text)
     try:

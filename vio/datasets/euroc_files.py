@@ -37,6 +37,7 @@ _NOISE = {  # entries of the IMU's sensor.yaml, and their units
     "accelerometer_random_walk": "m / s^3 / sqrt(Hz)",
 }
 _IMAGES_HEADER = "#timestamp [ns],filename"
+_STAMP = re.compile(r"\d{1,19}")
 _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -220,7 +221,7 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[li
         fields = [field.strip() for field in line.split(",")]
         if len(fields) != columns:
             raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})")
-        if not re.fullmatch(r"\d{1,19}", fields[0]) or int(fields[0]) > INT64_MAX:
+        if not _STAMP.fullmatch(fields[0]) or int(fields[0]) > INT64_MAX:
             raise DataError(f"{path}, line {number}: {fields[0]!r} is no time in whole nanoseconds ({form})")
         times.append(int(fields[0]))
         rows.append(fields[1:])
