@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable
+from dataclasses import fields
+from functools import lru_cache
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,16 +17,22 @@ Record = TypeVar("Record")
 
 def take(record: Record, index: BoolArray | IntArray) -> Record:
     """Select rows of a record by a mask (N,) or indices (K,); the record itself where the mask selects all."""
-    if index.dtype == np.bool_ and index.all():
-        return record
-    return type(record)(*(take(c, index) if is_dataclass(c) else c[index] for c in _columns(record)))
+    if index.dtype == np.bool_:
+        if index.all():
+            return record
+        index = np.flatnonzero(index)
+    columns = _getter(type(record))(record)
+    return type(record)(*[c.take(index, axis=0) if isinstance(c, np.ndarray) else take(c, index) for c in columns])
 
 
 def joined(first: Record, second: Record) -> Record:
     """Concatenate the rows of two records."""
-    pairs = zip(_columns(first), _columns(second), strict=True)
-    return type(first)(*(joined(a, b) if is_dataclass(a) else np.concatenate([a, b]) for a, b in pairs))
+    columns = _getter(type(first))
+    pairs = zip(columns(first), columns(second), strict=True)
+    return type(first)(*[np.concatenate([a, b]) if isinstance(a, np.ndarray) else joined(a, b) for a, b in pairs])
 
 
-def _columns(record: Any) -> list[Any]:
-    return [getattr(record, column.name) for column in fields(record)]
+@lru_cache(maxsize=16)
+def _getter(kind: type) -> Callable[[Any], tuple[Any, ...]]:
+    """Return what gives the columns of a record of a kind; looking the fields up each time takes as long as indexing."""
+    return attrgetter(*(column.name for column in fields(kind)))

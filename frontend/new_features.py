@@ -52,6 +52,8 @@ class NewFeatures:
             delayed: whether the right image is of another time: a corner is matched once two frames have seen it.
         """
         tracks, disparity_new, unique = self._search_right(left, right, tracks, corners, motion, stereo, delayed)
+        if not len(corners):
+            return tracks
         stays = self._stay_visible(corners, disparity_new, motion, left.full)
         chosen, with_depth = self._select_corners(tracks, unique, stays, delayed)
         centres = rounded(corners[chosen])
@@ -89,6 +91,8 @@ class NewFeatures:
             # A feature with a known point that was not matched near it must not be matched elsewhere.
             unmatched &= ~tracks.has_point
         rows = np.flatnonzero(unmatched)
+        if not len(rows) + len(corners):
+            return self._without_old_left_only(tracks), *nothing
         disparity, unique = stereo.search(left, right, np.concatenate([tracks.left[rows], corners]))
         disparity_old, disparity_new = np.split(disparity, [len(rows)])
         known, unique = np.split(unique, [len(rows)])

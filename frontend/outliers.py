@@ -188,14 +188,39 @@ def _refine(
     converged: float = _CONVERGED,
 ) -> FloatArray:
     """Refine one motion (4, 4) on all points, with Geman-McClure weights."""
+    T = np.array(T[None], order="C")
+    points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
+    _refine_on_all(_lens(camera), T, points, seen, scale_px, free.stop, converged)
+    return T[0]
+
+
+@compiled
+def _refine_on_all(
+    lens: _Lens,
+    T: FloatArray,
+    points: FloatArray,
+    pixels: FloatArray,
+    scale_px: float,
+    free: int,
+    converged: float,
+) -> None:
+    """Refine one motion (1, 4, 4) in place on points (N, 3) and pixels (N, 2); see `_refine`."""
+    weight, before = np.empty((1, len(points))), np.empty((4, 4))
     for _ in range(_REFINE_ITERATIONS):
-        error = pixel_errors(camera, T, p_prev, pixels)
-        weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
-        before = T
-        T = _gauss_newton(camera, T[None], p_prev[None], pixels[None], weight[None], iterations=1, free=free)[0]
-        if np.abs(T - before).max() < converged:
+        _distances(lens, T, points, pixels, weight)
+        for n in range(len(points)):
+            error = weight[0, n]
+            weight[0, n] = 1.0 / (1.0 + (error / scale_px) ** 2) if error < 3.0 * scale_px else 0.0
+        for i in range(4):
+            for j in range(4):
+                before[i, j] = T[0, i, j]
+        _iterate(lens, T, points.reshape(1, -1, 3), pixels.reshape(1, -1, 2), weight, 1, free)
+        change = 0.0
+        for i in range(4):
+            for j in range(4):
+                change = max(change, abs(T[0, i, j] - before[i, j]))
+        if change < converged:
             break
-    return T
 
 
 def _ransac(
@@ -231,8 +256,8 @@ def best_motion(
 
 def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:
     """Return the index of the start with the smallest median error; errors far beyond the limit are clipped."""
-    error = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)
-    return int(np.argmin(np.median(error, axis=1)))
+    errors = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)
+    return int(np.argmin([median(error) for error in errors]))
 
 
 def static_tracks(

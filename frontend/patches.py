@@ -38,12 +38,13 @@ def inside(image: Image | FloatImage, points: npt.NDArray[np.float64], margin: f
 
 def mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:
     """Mean and standard deviation of an image's gray levels, from every `stride`-th pixel of every `stride`-th row."""
-    mean, contrast = _mean_and_contrast(image, stride)
+    mean, contrast = statistics(image, stride)
     return float(mean), float(contrast)
 
 
 @compiled
-def _mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:
+def statistics(image: Image, stride: int) -> tuple[float, float]:
+    """Return what `mean_and_contrast` does, to compiled functions."""
     height, width = image.shape
     total, squares, count = np.int64(0), np.int64(0), 0
     for y in range(0, height, stride):

@@ -36,8 +36,18 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
 
 def prior_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
     """Rows (K,) of the ids (N,) that a usable prior contains, and the left pixels (K, 2) that it predicts."""
-    _, rows, given = np.intersect1d(ids, prior.ids, assume_unique=True, return_indices=True)
+    rows, given = _common_rows(ids, prior)
     return rows, prior.z[given, :2]
+
+
+def _common_rows(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, IntArray]:
+    """Rows (K,) of the ids (N,) that a usable prior contains, and its rows (K,) for them."""
+    if not len(prior.ids):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    order = np.argsort(prior.ids)
+    at = order[np.minimum(np.searchsorted(prior.ids, ids, sorter=order), len(order) - 1)]
+    rows = np.flatnonzero(prior.ids[at] == ids)
+    return rows, at[rows]
 
 
 def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tuple[FloatArray, BoolArray]:
@@ -47,7 +57,7 @@ def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tupl
     """
     depth, known = np.ones(len(ids)), np.zeros(len(ids), dtype=np.bool_)
     named = np.flatnonzero(ids >= 0)
-    _, rows, given = np.intersect1d(ids[named], prior.ids, assume_unique=True, return_indices=True)
+    rows, given = _common_rows(ids[named], prior)
     disparity = prior.z[given, 0] - prior.z[given, 2]
     ahead = np.isfinite(disparity) & (disparity > 0)
     rows = named[rows[ahead]]

@@ -6,14 +6,17 @@ half resolution, left to right and back; `frontend.align` then finds the sub-pix
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled
+from vio.compiled import compiled, solve_positive
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
 from .align import FLAT_RMS
+from .weighted_fit import add_equations
 
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
@@ -39,8 +42,11 @@ class RowField:
         self.rms_px = 0.0  # of the field over the matches of the last frame
 
     def _terms(self, pixels: FloatArray) -> FloatArray:
-        x, y = ((pixels - self._centre) / self._scale).T
-        return np.stack([np.ones_like(x), x, y, x * y, y * y], axis=1)
+        terms = np.empty((len(pixels), 5))
+        terms[:, 0] = 1.0
+        terms[:, 1:3] = (pixels - self._centre) / self._scale
+        terms[:, 3:] = terms[:, 1:3] * terms[:, 2:3]  # x y, y y
+        return terms
 
     @property
     def offset_px(self) -> float:
@@ -64,12 +70,13 @@ class RowField:
         prior = (1 - _FIELD_MEMORY) * _FIELD_PRIOR * np.eye(5)
         kept, moment = _FIELD_MEMORY * self._normal + prior, _FIELD_MEMORY * self._moment
         for _ in range(_FIELD_ITERATIONS):
-            weight = 1.0 / (1.0 + ((off - terms @ self._field) / _FIELD_SIGMA_PX) ** 2)
-            self._normal = kept + (terms * weight[:, None]).T @ terms
-            self._moment = moment + terms.T @ (weight * off)
-            self._field = np.asarray(np.linalg.solve(self._normal, self._moment), dtype=np.float64)
+            self._normal, self._moment = kept.copy(), moment.copy()
+            add_equations(terms, off, self._field, _FIELD_SIGMA_PX, self._normal, self._moment)
+            self._field = self._moment.copy()
+            solve_positive(self._normal.copy(), self._field)
         if len(terms):
-            self.rms_px = float(np.sqrt(np.mean((terms @ self._field) ** 2)))
+            fitted = terms @ self._field
+            self.rms_px = math.sqrt(float(fitted @ fitted) / len(fitted))
 
 
 def shifted_rows(image: Image, rows: int) -> Image:

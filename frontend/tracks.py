@@ -13,6 +13,8 @@ from .align import Templates, cut_patches, empty_templates, shift_warps, templat
 from .columns import joined
 from .patches import FloatImage
 
+_TEMPLATE_COLUMNS = tuple(column.name for column in fields(Templates))
+
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
@@ -80,8 +82,8 @@ class AnchorBank:
     def replace(self, slots: IntArray, image: FloatImage, centres: FloatArray) -> None:
         """Replace the anchors in slots (N,) by the patches around pixels (N, 2) of an image."""
         new = templates(cut_patches(image, centres, self._radius_px))
-        for column in fields(Templates):
-            getattr(self.store, column.name)[slots] = getattr(new, column.name)
+        for name in _TEMPLATE_COLUMNS:
+            getattr(self.store, name)[slots] = getattr(new, name)
 
     def keep_only(self, slots: IntArray) -> None:
         """Free all slots but these."""
