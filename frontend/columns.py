@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
-from functools import lru_cache
-from operator import attrgetter
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,6 +11,8 @@ from vio.records import BoolArray, IntArray
 
 Record = TypeVar("Record")
 
+_names: dict[type, tuple[str, ...]] = {}  # of the columns of each kind: to find them takes as long as to index them
+
 
 def take(record: Record, index: BoolArray | IntArray) -> Record:
     """Select rows of a record by a mask (N,) or indices (K,); the record itself where the mask selects all."""
@@ -21,18 +20,18 @@ def take(record: Record, index: BoolArray | IntArray) -> Record:
         if index.all():
             return record
         index = np.flatnonzero(index)
-    columns = _getter(type(record))(record)
+    columns = _columns(record)
     return type(record)(*[c.take(index, axis=0) if isinstance(c, np.ndarray) else take(c, index) for c in columns])
 
 
 def joined(first: Record, second: Record) -> Record:
     """Concatenate the rows of two records."""
-    columns = _getter(type(first))
-    pairs = zip(columns(first), columns(second), strict=True)
+    pairs = zip(_columns(first), _columns(second), strict=True)
     return type(first)(*[np.concatenate([a, b]) if isinstance(a, np.ndarray) else joined(a, b) for a, b in pairs])
 
 
-@lru_cache(maxsize=16)
-def _getter(kind: type) -> Callable[[Any], tuple[Any, ...]]:
-    """Return what gives the columns of a record of a kind; looking the fields up each time takes as long as indexing."""
-    return attrgetter(*(column.name for column in fields(kind)))
+def _columns(record: Any) -> list[Any]:
+    kind = type(record)
+    if kind not in _names:
+        _names[kind] = tuple(column.name for column in fields(kind))
+    return [getattr(record, name) for name in _names[kind]]

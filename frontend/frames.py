@@ -186,9 +186,7 @@ def make_output(
     z[:, :2], z[:, 2:] = features.left[rows], features.right[rows]
     has_right = features.has_right[rows]
     return FrontendOutput(
-        Observations(
-            frame.index, frame.time_ns, features.ids[rows], z, has_right, np.zeros(len(rows), dtype=np.bool_)
-        ),
+        Observations(frame.index, frame.time_ns, features.ids[rows], z, has_right, np.zeros(len(rows), dtype=np.bool_)),
         tracked=tracked,
         matched=int(has_right.sum()),
         detected=len(rows) - tracked,

@@ -179,7 +179,7 @@ class KltFrontend:
         """Equalise and convert an image; the result does not share memory with it."""
         if self._clahe is not None:
             image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
-        return View(image.astype(np.float32), half_image(image))
+        return View(image.copy(), half_image(image))
 
     def _set_up(self, left: View) -> tuple[StereoFit, BoolArray | None]:
         """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame."""

@@ -8,12 +8,12 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
-from vio.records import BoolArray, IntArray
+from vio.records import BoolArray, Image, IntArray
 
 from .align import rounded
 from .columns import joined, take
 from .outliers import Consensus
-from .patches import FloatImage, View, inside
+from .patches import View, inside
 from .settings import GridSettings, KltSettings
 from .stereo_fit import StereoFit
 from .tracks import AnchorBank, Tracks, new_tracks
@@ -124,7 +124,7 @@ class NewFeatures:
         return np.concatenate([staying, leaving, no_depth]), len(staying) + len(leaving)
 
     def _stay_visible(
-        self, corners: FloatArray, disparity: FloatArray, motion: Consensus | None, image: FloatImage
+        self, corners: FloatArray, disparity: FloatArray, motion: Consensus | None, image: Image
     ) -> BoolArray:
         """Mask (K,) of corners that stay in the image for a while if the camera motion continues."""
         if motion is None or self._settings.wanted_life_frames == 0:

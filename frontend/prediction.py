@@ -6,9 +6,9 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_from_parts, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
-from vio.records import BoolArray, IntArray, TrackPrior
+from vio.records import BoolArray, Image, IntArray, TrackPrior
 
-from .patches import FloatImage, inside
+from .patches import inside
 from .tracks import Tracks
 
 _ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
@@ -74,7 +74,7 @@ def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArr
 
 
 def guessed_pixels(
-    camera: StereoCamera, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage
+    camera: StereoCamera, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: Image
 ) -> FloatArray:
     """Predict the left pixels (N, 2) of features in the current frame: from the prior, else by the last motion.
 

@@ -1,4 +1,4 @@
-"""Robustly weighted normal equations of a linear model, as the estimates that learn from the rows of matches add them."""
+"""Robustly weighted normal equations of a linear model, for what is learned from the rows of matches."""
 
 from __future__ import annotations
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
-from frontend.outliers import _gauss_newton, pixel_errors
+from frontend.outliers import _gauss_newton, _refine, pixel_errors
+from frontend.weighted_fit import add_equations
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.compiled import invert_positive, move_by_twist, solve_positive
@@ -34,25 +35,25 @@ def test_patches_are_sampled_exactly_inside_the_image_and_at_its_border() -> Non
     outside = [[0.0, 0.0], [298.6, 198.9], [-9.0, 50.0], [150.0, 1e9], [7.0, 7.0]]
     warp = shift_warps(np.concatenate([POINTS, across, down, outside]))
     warp[:, :, :2] += np.random.default_rng(3).normal(0, 0.2, (len(warp), 2, 2))
-    image = PLAIN.astype(np.float32)
+    image = PLAIN
     np.testing.assert_allclose(warped_patches(image, warp, 7), numpy_twins.sampled(PLAIN, warp, 7), atol=2e-3)
 
 
 def test_warp_that_is_not_finite_samples_the_border() -> None:
     warp = shift_warps(POINTS[:3])
     warp[0, 0, 0], warp[1, 1, 2], warp[2, 0, 2] = np.nan, np.inf, -np.inf
-    assert np.isfinite(warped_patches(PLAIN.astype(np.float32), warp, 7)).all()
+    assert np.isfinite(warped_patches(PLAIN, warp, 7)).all()
 
 
 @pytest.mark.parametrize("on_rows", [False, True])
 def test_alignment_equals_numpy(on_rows: bool) -> None:
     other = picture(np.array([[1.04, 0.03, -4.0], [-0.02 * (not on_rows), 1 - 0.03 * (not on_rows), 0.3], [0, 0, 1.0]]))
-    image, centres = PLAIN.astype(np.float32), rounded(POINTS)
+    image, centres = PLAIN, rounded(POINTS)
     rows = POINTS[:, 1] - 0.2 if on_rows else None
     start = shift_warps(POINTS + np.array([3.0, -0.3]))
     wide = cut_patches(image, centres, 7)
     twin, expected = numpy_twins.aligned(numpy_twins.prepared(wide.astype(np.float64)), other, start, 5, rows)
-    warp, score = align(templates(wide), np.arange(len(POINTS)), other.astype(np.float32), start, 5, rows)
+    warp, score = align(templates(wide), np.arange(len(POINTS)), other, start, 5, rows)
     inside = score > -1.0  # elsewhere the patch has left the image
     assert inside.mean() > 0.8
     np.testing.assert_allclose(score[inside], expected[inside], atol=1e-4)
@@ -76,6 +77,34 @@ def test_gauss_newton_on_motions_equals_numpy(free: slice, camera: StereoCamera)
     ours = _gauss_newton(camera, T, points, pixels, weight, iterations=2, free=free)
     twin = numpy_twins.gauss_newton(camera, T, points, pixels, weight, iterations=2, free=free)
     np.testing.assert_allclose(ours, twin, rtol=1e-6, atol=1e-6)
+
+
+@both_cameras
+def test_refinement_of_a_motion_equals_numpy(camera: StereoCamera) -> None:
+    rng = np.random.default_rng(12)
+    true, points = se3_exp([0.1, 0.05, -0.2, 0.01, 0.02, -0.01]), rng.uniform([-2, -1, 3], [2, 1, 9], (60, 3))
+    pixels = project(camera, transform_points(true, points))[:, :2] + rng.normal(0, 0.3, (60, 2))
+    pixels[::5] += 40.0  # on something that moves
+    ours = _refine(camera, np.eye(4), points, pixels, 60.0, slice(0, 6))
+    twin = numpy_twins.refined(camera, np.eye(4), points, pixels, 60.0, 3e-6)
+    np.testing.assert_allclose(ours, twin, atol=1e-9)
+    close = _refine(camera, ours, points, pixels, 0.5, slice(0, 6))
+    np.testing.assert_allclose(close, numpy_twins.refined(camera, ours, points, pixels, 0.5, 3e-6), atol=1e-9)
+    assert np.abs(ours - np.eye(4)).max() > 0.05  # from both starts it moves
+    assert np.abs(close - ours).max() > 0.01
+
+
+@pytest.mark.parametrize("sigma", [0.5, np.inf])
+def test_weighted_equations_equal_numpy(sigma: float) -> None:
+    rng = np.random.default_rng(13)
+    terms, model, start = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=(5, 5))
+    values = terms @ model + rng.normal(0, 1.0, 40)
+    normal, moment = start.copy(), start[0].copy()
+    count, squares = add_equations(terms, values, model, sigma, normal, moment)
+    expected = numpy_twins.equations(terms, values, model, sigma)
+    np.testing.assert_allclose(normal, start + expected[0], rtol=1e-10)
+    np.testing.assert_allclose(moment, start[0] + expected[1], rtol=1e-10)
+    np.testing.assert_allclose((count, squares), expected[2:], rtol=1e-10)
 
 
 @both_cameras
