@@ -13,7 +13,6 @@ exact rotation between two images independently of the translation, ECCV (2012),
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -24,6 +23,7 @@ from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, proje
 from vio.records import BoolArray, IntArray
 from vio.robust import median
 
+from .lens import Lens, lens_of, moved_pixel
 from .settings import ConsensusSettings
 
 _MIN_DEPTH_M = 0.05
@@ -41,8 +41,6 @@ _SURE_BEARING_SHARE = 0.9  # share of inliers of a predicted rotation above whic
 _FIVE_POINT_CONFIDENCE = 0.999
 _EPSILON = 1e-9  # added to denominators
 _LEAST_FORWARD = 0.5  # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as large
-
-_Lens: TypeAlias = tuple[float, float, float, float, bool]  # fu, fv, cu, cv, whether the projection is a cylinder
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,30 +69,18 @@ def pixel_errors(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArr
     T = np.ascontiguousarray(T_curr_prev).reshape(-1, 4, 4)
     out = np.empty((len(T), len(p_prev)))
     points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
-    _distances(_lens(camera), T, points, seen, out)
+    _distances(lens_of(camera), T, points, seen, out)
     return out.reshape(*T_curr_prev.shape[:-2], len(p_prev))
 
 
-def _lens(camera: StereoCamera) -> _Lens:
-    return camera.fu, camera.fv, camera.cu, camera.cv, camera.is_cylinder
-
-
 @compiled
-def _distances(lens: _Lens, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
+def _distances(lens: Lens, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
     """Write the distances (H, N) of points (N, 3) moved by motions (H, 4, 4) from pixels (N, 2)."""
-    fu, fv, cu, cv, cylinder = lens
     for h in range(len(T)):
+        motion = T[h]
         for n in range(len(points)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            depth = T[h, 2, 0] * x + T[h, 2, 1] * y + T[h, 2, 2] * z + T[h, 2, 3]
-            across = T[h, 0, 0] * x + T[h, 0, 1] * y + T[h, 0, 2] * z + T[h, 0, 3]
-            down = T[h, 1, 0] * x + T[h, 1, 1] * y + T[h, 1, 2] * z + T[h, 1, 3]
-            if cylinder:
-                dv = fv * np.arctan2(down, depth) + cv - pixels[n, 1]
-                depth = np.sqrt(down * down + depth * depth)
-            else:
-                dv = fv * down / depth + cv - pixels[n, 1]
-            du = fu * across / depth + cu - pixels[n, 0]
+            u, v, depth = moved_pixel(lens, motion, points[n, 0], points[n, 1], points[n, 2])
+            du, dv = u - pixels[n, 0], v - pixels[n, 1]
             out[h, n] = np.sqrt(du * du + dv * dv) if depth > _MIN_DEPTH_M else np.inf
 
 
@@ -114,13 +100,13 @@ def _gauss_newton(
     """
     T = np.array(T, order="C")  # of one layout, so that one version is compiled
     points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
-    _iterate(_lens(camera), T, points, seen, w, iterations, free.stop)
+    _iterate(lens_of(camera), T, points, seen, w, iterations, free.stop)
     return T
 
 
 @compiled
 def _iterate(
-    lens: _Lens,
+    lens: Lens,
     T: FloatArray,
     points: FloatArray,
     pixels: FloatArray,
@@ -190,13 +176,13 @@ def _refine(
     """Refine one motion (4, 4) on all points, with Geman-McClure weights."""
     T = np.array(T[None], order="C")
     points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
-    _refine_on_all(_lens(camera), T, points, seen, scale_px, free.stop, converged)
+    _refine_on_all(lens_of(camera), T, points, seen, scale_px, free.stop, converged)
     return T[0]
 
 
 @compiled
 def _refine_on_all(
-    lens: _Lens,
+    lens: Lens,
     T: FloatArray,
     points: FloatArray,
     pixels: FloatArray,

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, se3_from_parts, transform_points
-from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
+from vio.compiled import compiled
+from vio.geometry.lie import FloatArray, se3_from_parts
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 from vio.records import BoolArray, Image, IntArray, TrackPrior
 
+from .lens import Lens, lens_of, moved_pixel
 from .patches import inside
 from .tracks import Tracks
 
@@ -67,10 +69,18 @@ def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tupl
 
 def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, left: FloatArray) -> FloatArray:
     """Left pixels (N, 2) of points (N, 3) after a camera motion; points behind the camera keep their pixels `left`."""
-    moved = transform_points(T_curr_prev, p_prev)
-    ahead = depth_of(camera, moved) > _MIN_DEPTH_M
-    pixels = project(camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
-    return np.where(ahead[:, None], pixels, left)
+    out = left.copy()
+    _move(lens_of(camera), np.ascontiguousarray(T_curr_prev), np.ascontiguousarray(p_prev), out)
+    return out
+
+
+@compiled
+def _move(lens: Lens, T: FloatArray, points: FloatArray, pixels: FloatArray) -> None:
+    """Replace the pixels (N, 2) of points (N, 3) that are ahead after a motion (4, 4) by those after it."""
+    for n in range(len(points)):
+        u, v, depth = moved_pixel(lens, T, points[n, 0], points[n, 1], points[n, 2])
+        if depth > _MIN_DEPTH_M:
+            pixels[n, 0], pixels[n, 1] = u, v
 
 
 def guessed_pixels(

@@ -90,7 +90,8 @@ class RightDelay:
 
     def _decide(self, index: int, frame_s: float) -> None:
         """Take a delay out where it is significant, and say so once."""
-        if self._frames < _LEAST_FRAMES:
+        small = abs(self._solution[_TERMS]) <= _LEAST_DELAY
+        if self._frames < _LEAST_FRAMES or (self.frames == 0.0 and small):
             return
         delay, sigma, explained = self._significance()
         if _SIGMAS * sigma > _LEAST_DELAY:

@@ -14,7 +14,10 @@ import numpy as np
 import pytest
 
 from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
+from frontend.lens import lens_of
 from frontend.outliers import _gauss_newton, _refine, pixel_errors
+from frontend.prediction import moved_pixels
+from frontend.stereo_fit import _triangulate
 from frontend.weighted_fit import add_equations
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
@@ -22,7 +25,7 @@ from vio.compiled import invert_positive, move_by_twist, solve_positive
 from vio.filters import multiview, stereo_calibration
 from vio.filters.multiview import Views
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
-from vio.geometry.stereo import StereoCamera, project
+from vio.geometry.stereo import StereoCamera, project, triangulate
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 CAMERAS = {"pinhole": CAMERA, "cylinder": replace(CAMERA, projection="cylinder")}
@@ -117,6 +120,27 @@ def test_reprojection_errors_equal_numpy(camera: StereoCamera) -> None:
     assert 0 < np.isinf(expected).sum() < 100
     np.testing.assert_allclose(pixel_errors(camera, T, points, pixels), expected, rtol=1e-10)
     np.testing.assert_allclose(pixel_errors(camera, T[0, 1], points, pixels), expected[0, 1], rtol=1e-10)
+
+
+@both_cameras
+def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(camera: StereoCamera) -> None:
+    rng = np.random.default_rng(14)
+    T, points = se3_exp([0.1, -0.2, 0.3, 0.05, 0.1, -0.1]), rng.uniform([-2, -1, 2], [2, 1, 9], (40, 3))
+    moved = transform_points(T, points)
+    pixels = moved_pixels(camera, T, points, np.zeros((40, 2)))
+    np.testing.assert_allclose(pixels, project(camera, moved)[:, :2], rtol=1e-10)
+
+    z = project(camera, moved) + rng.normal(0, 0.3, (40, 4))
+    z[3, 2], z[5, 2] = z[3, 0] - 0.05, z[5, 0] + 4.0  # too far away, and behind the cameras
+    rows, point, has_point = np.arange(0, 40, 2), np.zeros((40, 3)), np.zeros(40, dtype=np.bool_)
+    rows[1], rows[2] = 3, 5
+    f_baseline = camera.fu * camera.baseline_m
+    _triangulate(lens_of(camera), f_baseline, z[:, :2].copy(), rows, z[rows, 2:], point, has_point)
+    expected, valid = triangulate(camera, z[rows])
+    assert not valid[1:3].any()
+    np.testing.assert_array_equal(has_point[rows], valid)
+    np.testing.assert_allclose(point[rows[valid]], expected[valid], rtol=1e-10)
+    assert not point[~has_point].any()
 
 
 @pytest.mark.parametrize("size", [1e-9, 5e-3, 0.3, 3.0])

@@ -1239,6 +1239,13 @@ MUTATIONS = (
         ("tests/test_compiled.py",),
     ),
     Mutation(
+        "stereo: a feature's row is that of the left image alone",
+        "frontend/stereo_fit.py",
+        "v = (left[n, 1] + right[k, 1]) / 2.0",
+        "v = left[n, 1]",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
         "outliers: a motion is refined without weights",
         "frontend/outliers.py",
         "weight[0, n] = 1.0 / (1.0 + (error / scale_px) ** 2) if error < 3.0 * scale_px else 0.0",
