@@ -165,20 +165,17 @@ def _prepare(
     basis, normal = np.empty((_PARAMETERS, size)), np.empty((_PARAMETERS, _PARAMETERS))
     on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
     for n in range(len(wide)):
-        total = 0.0
-        for k in range(size):
-            total += wide[n, k // side + 1, k % side + 1]
-        mean = np.float32(total / size)
-        for k in range(size):
-            y, x = k // side, k % side
-            centred = wide[n, y + 1, x + 1] - mean
-            gu = (wide[n, y + 1, x + 2] - wide[n, y + 1, x]) / np.float32(2.0)
-            gv = (wide[n, y + 2, x + 1] - wide[n, y, x + 1]) / np.float32(2.0)
-            patch[n, k], gradient[n, 0, k], gradient[n, 1, k] = centred, gu, gv
-            energy[n] += centred * centred
-            basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, centred, 1.0
-            basis[4, k], basis[5, k] = gu * (x - radius), gu * (y - radius)
-            basis[6, k], basis[7, k] = gv * (x - radius), gv * (y - radius)
+        mean = _mean_inside(wide[n])
+        for y in range(side):
+            above, here, below = wide[n, y], wide[n, y + 1], wide[n, y + 2]
+            for x in range(side):
+                k, centred = y * side + x, here[x + 1] - mean
+                gu, gv = (here[x + 2] - here[x]) / np.float32(2.0), (below[x + 1] - above[x + 1]) / np.float32(2.0)
+                patch[n, k], gradient[n, 0, k], gradient[n, 1, k] = centred, gu, gv
+                energy[n] += centred * centred
+                basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, centred, 1.0
+                basis[4, k], basis[5, k] = gu * (x - radius), gu * (y - radius)
+                basis[6, k], basis[7, k] = gv * (x - radius), gv * (y - radius)
         for i in range(_PARAMETERS):
             for j in range(i + 1):
                 normal[i, j] = _product(basis[i], basis[j])
@@ -189,6 +186,17 @@ def _prepare(
                 on_row[i, j] = normal[i, j]
         on_row[1, 1] += _ROW_WEIGHT
         invert_positive(on_row, row_inverse[n])
+
+
+@compiled
+def _mean_inside(wide: Pixels) -> np.float32:
+    """Mean of a patch (h, w) without its outermost pixels."""
+    height, width = wide.shape
+    total = 0.0
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            total += wide[y, x]
+    return np.float32(total / ((height - 2) * (width - 2)))
 
 
 @compiled_sums

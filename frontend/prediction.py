@@ -112,12 +112,31 @@ def _points_with_borrowed_depth(camera: StereoCamera, old: Tracks) -> FloatArray
     known, unknown = np.flatnonzero(old.has_point), np.flatnonzero(~old.has_point)
     if len(unknown) == 0 or len(known) < _NEIGHBOURS:
         return np.where(old.has_point[:, None], old.point, left_rays(camera, old.left) * _FAR_M)
-    gap = np.abs(old.left[unknown, None] - old.left[known]).sum(axis=2)
-    nearest = known[np.argpartition(gap, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]]
+    depth = depth_of(camera, old.point)[known]
+    borrowed = np.empty(len(unknown))
+    _borrow(old.left[known], depth, old.left[unknown], borrowed)
     point = old.point.copy()
-    depth = np.median(depth_of(camera, old.point)[nearest], axis=1)
-    point[unknown] = left_rays(camera, old.left[unknown]) * depth[:, None]
+    point[unknown] = left_rays(camera, old.left[unknown]) * borrowed[:, None]
     return point
+
+
+@compiled
+def _borrow(known: FloatArray, depth: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
+    """Write the median depth of the three nearest of known pixels (K, 2), K >= 3, for each of some pixels (N, 2)."""
+    gap, near = np.empty(_NEIGHBOURS), np.empty(_NEIGHBOURS)
+    for n in range(len(pixels)):
+        for i in range(_NEIGHBOURS):
+            gap[i] = np.inf
+        for k in range(len(known)):
+            distance = abs(pixels[n, 0] - known[k, 0]) + abs(pixels[n, 1] - known[k, 1])
+            if not distance < gap[2]:
+                continue
+            i = 2
+            while i > 0 and distance < gap[i - 1]:  # kept in order
+                gap[i], near[i] = gap[i - 1], near[i - 1]
+                i -= 1
+            gap[i], near[i] = distance, depth[k]
+        out[n] = max(min(near[0], near[1]), min(max(near[0], near[1]), near[2]))
 
 
 def prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:

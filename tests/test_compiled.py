@@ -16,7 +16,7 @@ import pytest
 from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
 from frontend.lens import lens_of
 from frontend.outliers import _gauss_newton, _refine, pixel_errors
-from frontend.prediction import moved_pixels
+from frontend.prediction import _borrow, moved_pixels
 from frontend.stereo_fit import _triangulate
 from frontend.weighted_fit import add_equations
 from tests import numpy_twins
@@ -141,6 +141,15 @@ def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(camer
     np.testing.assert_array_equal(has_point[rows], valid)
     np.testing.assert_allclose(point[rows[valid]], expected[valid], rtol=1e-10)
     assert not point[~has_point].any()
+
+
+def test_unknown_depths_are_the_median_of_the_three_nearest_known_ones() -> None:
+    rng = np.random.default_rng(15)
+    known, depth, pixels = rng.uniform(0, 300, (50, 2)), rng.uniform(1, 9, 50), rng.uniform(0, 300, (20, 2))
+    found = np.zeros(20)
+    _borrow(known, depth, pixels, found)
+    nearest = np.argsort(np.abs(pixels[:, None] - known).sum(axis=2), axis=1)[:, :3]
+    np.testing.assert_array_equal(found, np.median(depth[nearest], axis=1))
 
 
 @pytest.mark.parametrize("size", [1e-9, 5e-3, 0.3, 3.0])
