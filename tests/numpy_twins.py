@@ -125,6 +125,29 @@ def gauss_newton(
     return T
 
 
+def refined_motion(
+    camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray, scale_px: float, converged: float
+) -> FloatArray:
+    """A motion (4, 4) refined on all points (N, 3) and pixels (N, 2), with Geman-McClure weights."""
+    for _ in range(6):
+        error = moved_errors(camera, T, p_prev, pixels)
+        weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
+        before = T
+        one = (T[None], p_prev[None], pixels[None], weight[None])
+        T = gauss_newton(camera, *one, iterations=1, free=slice(0, 6))[0]
+        if np.abs(T - before).max() < converged:
+            break
+    return T
+
+
+def equations(
+    terms: FloatArray, values: FloatArray, model: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Cauchy-weighted normal equations (K, K) and (K,), the sum of the weights, and that of the squared values."""
+    weight = 1 / (1 + ((values - terms @ model) / sigma) ** 2)
+    return (terms * weight[:, None]).T @ terms, terms.T @ (weight * values), weight.sum(), weight @ values**2
+
+
 # --- tracks and their views --------------------------------------------------------------------------------------
 
 

@@ -306,8 +306,8 @@ MUTATIONS = (
     Mutation(
         "rectification: lookup map rotated the wrong way",
         "vio/geometry/rectify.py",
-        "rays @ R_rect_cam)",
-        "rays @ R_rect_cam.T)",
+        "left_rays(rectified, pixels) @ R_rect_cam)",
+        "left_rays(rectified, pixels) @ R_rect_cam.T)",
         _RECTIFY,
     ),
     Mutation(
@@ -1227,9 +1227,30 @@ MUTATIONS = (
     Mutation(
         "right delay: a wrong rectification counts as a delay",
         "frontend/right_delay.py",
-        "weight * rows)",
-        "weight * (rows + 0.5 * flow[:, 1]))",
+        "add_equations(terms, rows, self._solution",
+        "add_equations(terms, rows + 0.5 * flow[:, 1], self._solution",
         _DELAY,
+    ),
+    Mutation(
+        "weighted fit: outliers weigh as much as matches",
+        "frontend/weighted_fit.py",
+        "weight = 1.0 / (1.0 + ((values[n] - fitted) / sigma) ** 2)",
+        "weight = 1.0 / (1.0 + 0.0 * ((values[n] - fitted) / sigma) ** 2)",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "stereo: a feature's row is that of the left image alone",
+        "frontend/stereo_fit.py",
+        "v = (left[n, 1] + right[k, 1]) / 2.0",
+        "v = left[n, 1]",
+        ("tests/test_compiled.py",),
+    ),
+    Mutation(
+        "outliers: a motion is refined without weights",
+        "frontend/outliers.py",
+        "weight[0, n] = 1.0 / (1.0 + (error / scale_px) ** 2) if error < 3.0 * scale_px else 0.0",
+        "weight[0, n] = 1.0",
+        ("tests/test_compiled.py",),
     ),
     Mutation(
         "flicker: bands are seen and left in the images",
@@ -1630,8 +1651,8 @@ MUTATIONS = (
     Mutation(
         "rows keep what both lenses do to near points",
         "vio/filters/stereo_calibration.py",
-        "return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[RIGHT_TERMS:]))",
-        "return np.asarray(self.coefficients - 0 * np.linalg.solve(self._A + prior, self._common @ stereo[RIGHT_TERMS:]))",
+        "self.coefficients - np.linalg.solve(self._A + prior,",
+        "self.coefficients - 0 * np.linalg.solve(self._A + prior,",
         _STEREO_FIELD,
     ),
     Mutation(

@@ -27,6 +27,8 @@ _STAGE_COLOURS = ("#c9d1d9", "#6aa2d8", "#b7a2d8", "#e8b04b", "#1f5fbf")
 _MOVED_SIGMAS = 3.0  # a stereo calibration that ends within so many standard deviations of zero is not drawn
 _STANDS_M = 2.0  # extent of a path below which the landmarks set the limits of the map
 _SIGMAS = 3.0  # half width of the bands
+# Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself draws all twice.
+_MARGINS = {"left": 0.06, "right": 0.985, "bottom": 0.06, "top": 0.925, "wspace": 0.18, "hspace": 0.26}
 
 
 def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
@@ -61,9 +63,9 @@ def write_picture(path: Path, draw: Callable[[], Any]) -> None:
 def _figure(result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> Any:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 9), dpi=110, layout="constrained")
+    figure = Figure(figsize=(13, 9), dpi=110)
     calibrated = has_calibration_panel(result)
-    grid = figure.add_gridspec(6 if calibrated else 5, 2, width_ratios=(1.25, 1))
+    grid = figure.add_gridspec(6 if calibrated else 5, 2, width_ratios=(1.25, 1), **_MARGINS)
     R_view_world = _axes(result)
     _draw_map(figure.add_subplot(grid[:, 0]), R_view_world, result, evaluation, dead_reckoning)
     seconds = np.array(result.frames.column("time_ns") - result.frames[0].time_ns) * 1e-9
@@ -74,6 +76,9 @@ def _figure(result: RunResult, evaluation: Evaluation | None, dead_reckoning: Ev
     _draw_time(figure.add_subplot(grid[4, 1]), seconds, result)
     if calibrated:
         _draw_calibration(figure.add_subplot(grid[5, 1]), seconds, result)
+    for axes in figure.axes[1:-1]:  # all of them have the time axis of the last one
+        axes.tick_params(labelbottom=False)
+        axes.set_xlabel("")
     figure.suptitle(_title(result, evaluation), fontsize=12, parse_math=False)  # a $ in a file name is no formula
     return figure
 

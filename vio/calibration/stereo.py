@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from vio.calibration.findings import NotObservable
 from vio.geometry.lie import FloatArray, so3_exp, so3_log
@@ -194,6 +193,8 @@ def too_few(matches: RayMatches) -> NotObservable | None:
 
 
 def _fit_stereo(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float) -> _Pose:
+    from scipy.optimize import least_squares  # every run imports this module, and few fit
+
     basis = _tangents(d)
 
     def moved(x: FloatArray) -> _Pose:

@@ -141,7 +141,7 @@ def _read_camera(folder: Path) -> _Camera:
     path = folder / "data.csv"
     times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
     there = list_images(folder / "data")
-    files, renamed = _find_images(there, [row[0] for row in rows], path, lines)
+    files, renamed = _find_images(there, rows, path, lines)
     return _Camera(model, T_body_cam, times_ns, files, renamed, len(set(there) - set(files)))
 
 

@@ -41,6 +41,7 @@ _NOISE = {  # entries of the IMU's sensor.yaml, and their units
     "accelerometer_random_walk": "m / s^3 / sqrt(Hz)",
 }
 _IMAGES_HEADER = "#timestamp [ns],filename"
+_STAMP = re.compile(r"\d{1,19}")
 _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -211,14 +212,14 @@ def read_imu_csv(path: Path) -> ImuRecord:
     """
     times_ns, rows, lines = stamped_rows(path, 7, "timestamp [ns], gyro x y z, accel x y z")
     try:
-        values = np.array(rows, dtype=np.float64)
+        values = np.array([list(map(float, row.split(","))) for row in rows])
     except ValueError:
-        values = np.array([[as_number(text) for text in row] for row in rows])
+        values = np.array([[as_number(text.strip()) for text in row.split(",")] for row in rows])
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         k = int(np.argmax(bad))
         raise DataError(
-            f"{path}, line {lines[k]}: a reading is not a finite number ({','.join(rows[k])}; {int(bad.sum())} lines "
+            f"{path}, line {lines[k]}: a reading is not a finite number ({rows[k]}; {int(bad.sum())} lines "
             "in all); remove such lines"
         )
     return ImuRecord(times_ns, values[:, :3], values[:, 3:])
@@ -247,25 +248,28 @@ def _stamped_csv(header: str, times_ns: IntArray, values: FloatArray) -> str:
     return "\n".join([header, *rows]) + "\n"
 
 
-def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[list[str]], list[int]]:
-    """Return the times (N,) of a csv, its other fields, and their line numbers; '#' comment lines are skipped.
+def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[str], list[int]]:
+    """Return the times (N,) of a csv, the text of each line behind its time, and their line numbers.
+
+    Comment lines, which begin with '#', are skipped. The text holds `columns - 1` fields between commas.
 
     Raises:
         DataError: the file is missing or empty, a line has a wrong number of fields, or the clock does not increase.
     """
     times: list[int] = []
-    rows: list[list[str]] = []
+    rows: list[str] = []
     lines: list[int] = []
     for number, line in text_lines(path):
         if line.startswith("#"):
             continue
-        fields = [field.strip() for field in line.split(",")]
-        if len(fields) != columns:
-            raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})")
-        if not re.fullmatch(r"\d{1,19}", fields[0]) or int(fields[0]) > INT64_MAX:
-            raise DataError(f"{path}, line {number}: {fields[0]!r} is no time in whole nanoseconds ({form})")
-        times.append(int(fields[0]))
-        rows.append(fields[1:])
+        if (count := line.count(",") + 1) != columns:
+            raise DataError(f"{path}, line {number}: {count} values instead of {columns} ({form})")
+        stamp, _, rest = line.partition(",")
+        stamp = stamp.strip()
+        if not _STAMP.fullmatch(stamp) or int(stamp) > INT64_MAX:
+            raise DataError(f"{path}, line {number}: {stamp!r} is no time in whole nanoseconds ({form})")
+        times.append(int(stamp))
+        rows.append(rest.strip())
         lines.append(number)
     if not times:
         raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove its folder")
