@@ -63,6 +63,7 @@ _FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _GRAPH = ("tests/test_pose_graph.py",)
 _PLACES = ("tests/test_map_places.py",)
+_GUIDED = ("tests/test_guided_search.py",)
 _MAPS = ("tests/test_map_builder.py",)
 _MAP_FILE = ("tests/test_map_store.py",)
 _MAP_RUN = ("tests/test_map_run.py",)
@@ -1794,5 +1795,33 @@ MUTATIONS = (
         "if self.levelled is not None:",
         "if self.levelled is not None and False:",
         ("tests/test_pose_graph.py",),
+    ),
+    Mutation(
+        "guided search: what agrees by chance not counted",
+        "vio/mapping/guided_search.py",
+        "if inliers < _OVER_CHANCE * chance:",
+        "if inliers < 0 * chance:",
+        _GUIDED,
+    ),
+    Mutation(
+        "guided search: windows as if the pose were known",
+        "vio/mapping/guided_search.py",
+        "radius = radius + _SIGMAS *",
+        "radius = radius + 0 * _SIGMAS *",
+        _GUIDED,
+    ),
+    Mutation(
+        "guided search: the prior pulls the wrong way",
+        "vio/mapping/loop_geometry.py",
+        "P @ se3_log(se3_inverse(T) @ prior.T_i_j)",
+        "-P @ se3_log(se3_inverse(T) @ prior.T_i_j)",
+        _GUIDED,
+    ),
+    Mutation(
+        "map: right pixels refined in unequal images",
+        "vio/mapping/features.py",
+        "_equal_contrast(right),",
+        "right,",
+        _PLACES,
     ),
 )
