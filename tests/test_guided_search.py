@@ -12,8 +12,8 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.guided_search import View, place_points, search
-from vio.mapping.loop_geometry import verify
+from vio.mapping.guided_search import View, _pairs, _Target, place_points, search
+from vio.mapping.loop_geometry import Terms, points_of, verify
 from vio.mapping.map_store import MapStore
 from vio.mapping.overlap import Overlaps
 
@@ -137,3 +137,43 @@ def test_a_walk_back_along_a_wallpaper_closes_loops(tmp_path: Path) -> None:
     for o in loops:
         gap = se3_log(se3_inverse(o.pose.T_i_j) @ se3_inverse(T[o.first]) @ T[o.second])
         assert np.linalg.norm(gap[:3]) < 0.03
+
+
+def test_the_step_of_a_fit_is_that_of_finite_differences() -> None:
+    """Normal equations of whitened residuals at a pose, in both directions, with wide weights."""
+    paper = Wallpaper(5, points=60)
+    i, k = paper.seen_from(np.eye(4)), paper.seen_from(np.eye(4))
+    rows, T = np.arange(min(len(i), len(k))), se3_exp([0.01, -0.02, 0.01, 0.002, 0.001, -0.002])
+    for inverse in (True, False):
+        terms = Terms(points_of(CAMERA, i, rows), CAMERA, k, rows, inverse=inverse)
+
+        def cost(xi: FloatArray, terms: Terms = terms) -> float:
+            squared = terms.add(T @ se3_exp(xi), 1e6, np.zeros((6, 6)), np.zeros(6))
+            return 0.5 * float(squared[np.isfinite(squared)].sum())
+
+        normal, pull = np.zeros((6, 6)), np.zeros(6)
+        terms.add(T, 1e6, normal, pull)
+        step = 1e-5 * np.eye(6)
+        slope = np.array([(cost(e) - cost(-e)) / 2e-5 for e in step])
+        bend = np.array([(cost(e) - 2 * cost(0 * e) + cost(-e)) / 1e-10 for e in step])
+        np.testing.assert_allclose(-pull, slope, atol=0.02 * np.abs(slope).max())
+        np.testing.assert_allclose(np.diag(normal), bend, rtol=0.25, err_msg="but for the curvature of the residuals")
+
+
+def test_windows_are_as_wide_as_the_covariance_of_the_pose_makes_them() -> None:
+    """Against central differences of the predicted pixels."""
+    p = np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 8], (6, 3))
+    T, C = se3_exp([0.1, 0.0, 0.05, 0.02, -0.03, 0.01]), np.diag(np.array([0.02, 0.03, 0.05, 0.01, 0.006, 0.02]) ** 2)
+    view = View(
+        0, CAMERA, KeyframeFeatures(project(CAMERA, p), np.ones(6, bool), np.ones(6), np.zeros((6, 32), np.uint8)), OFF
+    )
+    place = place_points([view._replace(place=RelativePose(np.eye(4), np.zeros((6, 6))))])
+    pairs = _pairs(place, _Target.of(CAMERA, view.features), T, C)
+    step = 1e-6 * np.eye(6)
+    ahead, back = (
+        np.array([project(CAMERA, transform_points(se3_inverse(T @ se3_exp(s * e)), p))[:, :2] for e in step])
+        for s in (1, -1)
+    )
+    D = (ahead - back) / 2e-6
+    sigma = np.sqrt(np.einsum("inc,ij,jnc->nc", D, C, D).max(axis=1))
+    np.testing.assert_allclose(pairs.radius, 3.0 * np.maximum(pairs.size_px, 1.0) + 3.0 * sigma, rtol=1e-6)

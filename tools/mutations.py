@@ -1694,8 +1694,8 @@ MUTATIONS = (
     Mutation(
         "loops: uncertainty of the points ignored",
         "vio/mapping/loop_geometry.py",
-        "C = J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2)",
-        "C = 0 * J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2)",
+        "C[i, j] += M[i, a] * P[k, a, b] * M[j, b]",
+        "C[i, j] += 0 * M[i, a] * P[k, a, b] * M[j, b]",
         _PLACES,
     ),
     Mutation(

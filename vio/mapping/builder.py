@@ -19,7 +19,7 @@ from vio.geometry.stereo import StereoCamera, triangulate
 from vio.loops import LoopEvent, LoopMatches
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.guided_search import LEAST_CORNERS, Guided, View, place_points, search
-from vio.mapping.loop_geometry import Verified, points_of, verify
+from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.overlap import Overlaps
@@ -195,8 +195,8 @@ class MapBuilder:
     def _remember(self, camera: StereoCamera, features: KeyframeFeatures) -> None:
         """Let the next keyframe be found again."""
         self._index.add(features.descriptors)
-        seen = points_of(camera, features, np.flatnonzero(features.has_right))
-        self._overlaps.add(seen.p[seen.valid])
+        p, valid = triangulate(camera, features.z, min_disparity_px=LEAST_DISPARITY_PX)
+        self._overlaps.add(p[valid & features.has_right])
 
     def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
         if not self.is_joined:
@@ -233,6 +233,9 @@ class MapBuilder:
             return None
         drift = self._drift_since(np.arange(known), number)
         allowed = self._may_be_seen(number, depth, drift[:, :3, :3])
+        expected = self._search(number, features, allowed)
+        if expected is not None:
+            return expected
         found: list[FoundPlace] = []
         for i in self._index.candidates(features.descriptors, allowed, _CANDIDATES).tolist():
             camera = self.graph.sessions[int(self.graph.session[i])].camera
@@ -241,7 +244,7 @@ class MapBuilder:
                 lost = drift[i, :3, :3].trace() > _LOST_M**2 and seen.inliers < _SURE_INLIERS
                 found.append(FoundPlace(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS))
         if not found:
-            return self._search(number, features, allowed)
+            return None
         best = max(found, key=lambda loop: loop.seen.inliers)
         if any(self._is_rival(other, best, depth) for other in found):
             return None
@@ -307,12 +310,14 @@ class MapBuilder:
         """Return keyframe i and its neighbours in its session, with their motion from another keyframe."""
         graph, session = self.graph, self.graph.session
         rows = range(max(i - _GUIDED_NEIGHBOURS, 0), min(i + _GUIDED_NEIGHBOURS + 1, len(self._index)))
-        views = []
-        for m in sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)):
-            covariance = graph.drift(np.array([origin]), np.array([m]), systematic=0.0)[0]
-            motion = RelativePose(se3_inverse(graph.T_map_cam[origin]) @ graph.T_map_cam[m], covariance)
-            views.append(View(m, graph.sessions[int(session[m])].camera, self._store.features(m), motion))
-        return views
+        near = np.array(sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)), dtype=np.int64)
+        covariance = graph.drift(np.full(len(near), origin), near, systematic=0.0)
+        motion = se3_inverse(graph.T_map_cam[origin]) @ graph.T_map_cam[near]
+        camera = graph.sessions[int(session[i])].camera
+        return [
+            View(m, camera, self._store.features(m), RelativePose(motion[n], covariance[n]))
+            for n, m in enumerate(near.tolist())
+        ]
 
     def _is_rival(self, other: FoundPlace, best: FoundPlace, depth: float) -> bool:
         """Whether another place of the same part of the map fits nearly as well as the best one."""

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.compiled import compiled
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_hat, transform_points
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp
 from vio.geometry.relative_pose import RelativePose
-from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate
 from vio.loops import LoopMatches
 from vio.mapping.features import KeyframeFeatures
 from vio.records import BoolArray, IntArray
@@ -33,7 +33,7 @@ _SAME_M, _SAME_DEG = 0.1, 3.0  # by which both directions may differ; metres, be
 _SAME_DEPTH = 0.05
 _STEPS, _CONVERGED = 10, 1e-5  # largest change, m and rad
 _GATE = 3.0  # standard deviations, of a pixel coordinate
-_LEAST_DISPARITY_PX = 1.0
+LEAST_DISPARITY_PX = 1.0
 # Floor of a loop's standard deviations: errors that its points share, such as those of the calibration.
 _FLOOR_DEPTH, _FLOOR_DEG = 0.002, 0.05
 # Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points lie on whole pixels
@@ -119,7 +119,7 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
 
 
 def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:
-    p, valid = triangulate(camera, f.z[rows], min_disparity_px=_LEAST_DISPARITY_PX)
+    p, valid = triangulate(camera, f.z[rows], min_disparity_px=LEAST_DISPARITY_PX)
     return p, valid & f.has_right[rows]
 
 
@@ -219,18 +219,19 @@ def fit_terms(
     """
     T, normal = T_i_j, np.eye(6)
     P = 1e-9 * np.eye(6) if prior is None else np.asarray(np.linalg.inv(prior.covariance))
+    squared = np.zeros(sum(len(part.stereo) for part in parts))
     for step in range(_STEPS):
         width = _GATE * 2.0 ** max(2 - step, 0)
-        r, W, H, on = (np.concatenate(one) for one in zip(*(part.at(T) for part in parts), strict=True))
-        squared = np.einsum("ki,kij,kj->k", r, W, r)
-        weight = on / (1 + squared / (3 * width**2)) ** 2
-        fits = on & (squared < 3 * _GATE**2)
+        normal, pull, begin = np.zeros((6, 6)), np.zeros(6), 0
+        for part in parts:
+            squared[begin : begin + len(part.stereo)] = part.add(T, width, normal, pull)
+            begin += len(part.stereo)
+        fits: BoolArray = squared < 3 * _GATE**2
         if fits.sum() < least:
             return None
-        HW = np.swapaxes(H, 1, 2) @ (W * weight[:, None, None])
-        normal = np.sum(HW @ H, axis=0)
-        pull = np.zeros(6) if prior is None else P @ se3_log(se3_inverse(T) @ prior.T_i_j)
-        xi = np.linalg.solve(normal + P, np.sum(HW @ r[..., None], axis=0)[:, 0] + pull)
+        if prior is not None:
+            pull += P @ se3_log(se3_inverse(T) @ prior.T_i_j)
+        xi = np.linalg.solve(normal + P, pull)
         T = T @ se3_exp(xi)
         if step > 2 and np.abs(xi).max() < _CONVERGED:
             break
@@ -279,29 +280,113 @@ class Terms:
             rows_t: (K,) features that show the points.
             inverse: whether the pixels are those of keyframe j, so that the inverse of T_i_j predicts them.
         """
-        self._camera, self._inverse = camera_t, inverse
+        self._inverse = inverse
+        self._camera = np.array([camera_t.fu, camera_t.fv, camera_t.cu, camera_t.cv, camera_t.baseline_m])
         self._p, self._P, self._used = source.p, source.covariance, source.valid
         self._z, self.stereo = t.z[rows_t], t.has_right[rows_t]
         self._variance = t.sigma_px[rows_t] ** 2
 
-    def at(self, T_i_j: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return residuals (K, 3), weights (K, 3, 3), Jacobians (K, 3, 6) for T_i_j <- T_i_j exp(xi), a mask (K,)."""
+    def add(self, T_i_j: FloatArray, width: float, normal: FloatArray, pull: FloatArray) -> FloatArray:
+        """Add the normal equations of xi in T_i_j <- T_i_j exp(xi); return squared residuals (K,), infinite where none.
+
+        Args:
+            T_i_j: (4, 4).
+            width: normalised residual at which a pair counts a quarter.
+            normal: (6, 6), added to.
+            pull: (6,) right-hand side, added to.
+        """
         T_t_s = se3_inverse(T_i_j) if self._inverse else T_i_j
-        q = transform_points(T_t_s, self._p)
-        on = self._used & (q[:, 2] > 0.05)
-        q = np.where(on[:, None], q, [0.0, 0.0, 1.0])
-        J = z_D_p_cam(self._camera, q)[:, :3]
-        r = (self._z - project(self._camera, q))[:, :3]
-        R = T_t_s[:3, :3]
-        C = J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2) + self._variance[:, None, None] * np.eye(3)
-        W = np.asarray(np.linalg.inv(C), dtype=np.float64)
-        left = ~self.stereo
-        if left.any():  # of a left pixel alone
-            W[left] = 0.0
-            W[left, :2, :2] = np.linalg.inv(C[left, :2, :2])
-        if self._inverse:  # q = exp(-xi) T_hat^-1 p
-            q_D_xi = np.concatenate([-np.broadcast_to(np.eye(3), (len(q), 3, 3)), so3_hat(q)], axis=2)
-        else:  # q = T_hat exp(xi) p
-            q_D_xi = np.concatenate([np.broadcast_to(R, (len(q), 3, 3)), -R @ so3_hat(self._p)], axis=2)
-        W = W * on[:, None, None]
-        return r * on[:, None], W, J @ q_D_xi * on[:, None, None], on
+        squared = np.full(len(self._p), np.inf)
+        pairs = self._p, self._P, self._used, self._z, self.stereo, self._variance
+        _add_pairs(*pairs, T_t_s, self._inverse, self._camera, 3 * width**2, normal, pull, squared)
+        return squared
+
+
+@compiled
+def _add_pairs(
+    p: FloatArray,
+    P: FloatArray,
+    used: BoolArray,
+    z: FloatArray,
+    stereo: BoolArray,
+    variance: FloatArray,
+    T: FloatArray,
+    inverse: bool,
+    camera: FloatArray,
+    scale: float,
+    normal: FloatArray,
+    pull: FloatArray,
+    squared: FloatArray,
+) -> None:
+    """Whiten the residuals of pairs (K,) by Cholesky, and add their normal equations; arguments as `Terms` has them."""
+    A, M, C, q = np.zeros((3, 7)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)  # A: rows [J | r]; M: z_D_p
+    for k in range(len(p)):
+        for i in range(3):
+            q[i] = T[i, 0] * p[k, 0] + T[i, 1] * p[k, 1] + T[i, 2] * p[k, 2] + T[i, 3]
+        if not used[k] or q[2] <= 0.05:
+            continue
+        rows = 3 if stereo[k] else 2  # of a left pixel alone, two
+        _linearise(p[k], q, z[k], T, inverse, camera, A, M)
+        for i in range(rows):
+            for j in range(i + 1):
+                C[i, j] = variance[k] if i == j else 0.0
+                for a in range(3):
+                    for b in range(3):
+                        C[i, j] += M[i, a] * P[k, a, b] * M[j, b]
+        for i in range(rows):  # Cholesky factor of C, and A by forward substitution
+            for j in range(i):
+                for n in range(j):
+                    C[i, j] -= C[i, n] * C[j, n]
+                C[i, j] /= C[j, j]
+                C[i, i] -= C[i, j] ** 2
+                for c in range(7):
+                    A[i, c] -= C[i, j] * A[j, c]
+            C[i, i] = np.sqrt(C[i, i])
+            for c in range(7):
+                A[i, c] /= C[i, i]
+        total = 0.0
+        for i in range(rows):
+            total += A[i, 6] ** 2
+        squared[k] = total
+        weight = 1.0 / (1.0 + total / scale) ** 2
+        for i in range(rows):
+            for a in range(6):
+                pull[a] += weight * A[i, a] * A[i, 6]
+                for b in range(6):
+                    normal[a, b] += weight * A[i, a] * A[i, b]
+
+
+@compiled
+def _linearise(
+    p: FloatArray,
+    q: FloatArray,
+    z: FloatArray,
+    T: FloatArray,
+    inverse: bool,
+    camera: FloatArray,
+    A: FloatArray,
+    M: FloatArray,
+) -> None:
+    """Write Jacobian and residual [ul vl ur] of a point p (3,), at q in the target (3,), into A (3, 7), z_D_p into M.
+
+    `q = exp(-xi) T_hat^-1 p` if `inverse`, else `q = T_hat exp(xi) p`: its derivative is [-I, q^] or R [I, -p^].
+    """
+    fu, fv, cu, cv, baseline = camera
+    z_D_q = np.zeros((3, 3))
+    for i in range(3):
+        f = fv if i == 1 else fu
+        across = q[1] if i == 1 else q[0] - (baseline if i == 2 else 0.0)
+        z_D_q[i, 1 if i == 1 else 0] = f / q[2]
+        z_D_q[i, 2] = -f * across / q[2] ** 2
+        A[i, 6] = z[i] - (cv if i == 1 else cu) - f * across / q[2]
+    for i in range(3):
+        for c in range(3):
+            M[i, c] = z_D_q[i, 0] * T[0, c] + z_D_q[i, 1] * T[1, c] + z_D_q[i, 2] * T[2, c]
+        for c in range(3):
+            a, b = (c + 1) % 3, (c + 2) % 3
+            if inverse:
+                A[i, c] = -z_D_q[i, c]
+                A[i, 3 + c] = z_D_q[i, a] * q[b] - z_D_q[i, b] * q[a]
+            else:
+                A[i, c] = M[i, c]
+                A[i, 3 + c] = M[i, b] * p[a] - M[i, a] * p[b]
