@@ -143,6 +143,8 @@ def test_maps_are_shown_and_merged(mapped: Path, tmp_path: Path, capsys: pytest.
     assert "session 1" in capsys.readouterr().out
     assert main(["map", "merge", str(path), str(path), "--out", str(out)]) == 1
     assert "exists; give another name" in capsys.readouterr().err
+    assert main(["map", "merge", str(path), str(path), "--out", str(tmp_path / "twice.map")]) == 1
+    assert "is the same map as" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

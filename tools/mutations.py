@@ -1824,4 +1824,11 @@ MUTATIONS = (
         "right,",
         _PLACES,
     ),
+    Mutation(
+        "map: another rig taken for the same",
+        "vio/mapping/builder.py",
+        "if others and not any(_is_alike(other, camera) for other in others):",
+        "if others and any(_is_alike(other, camera) for other in others):",
+        _MAP_FILE,
+    ),
 )

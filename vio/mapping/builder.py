@@ -7,12 +7,14 @@ same. All follows from the keyframes alone, so that equal keyframes give equal m
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, triangulate
@@ -26,6 +28,8 @@ from vio.mapping.overlap import Overlaps
 from vio.mapping.place_index import PlaceIndex
 from vio.records import BoolArray, IntArray
 from vio.statistics import chi_square_quantile
+
+log = logging.getLogger(__name__)
 
 _CANDIDATES = 3  # keyframes that are compared by geometry
 _RECENT = 10  # newest keyframes, which the filter's own tracks join
@@ -48,7 +52,46 @@ _GUIDED_PLACES, _GUIDED_NEIGHBOURS = 3, 3  # places that are searched, and keyfr
 # odometry is right to 0.25 % and 0.12 deg/100 m, which is a quarter of what a place found without it is held against.
 _GUIDED_SHARE = 0.25
 _GUIDED_M = 0.5  # standard deviation of the position up to which places are searched
+_ONLY = ("pinhole", "stereo")  # projection and kind of the cameras that maps know
+_SAME_RIG = 0.03  # by which two calibrations of one rig may differ in focal length and baseline
 _LOCAL = 20  # keyframes of a localised session that are optimised together
+
+
+def check_camera(path: Path, camera: StereoCamera) -> None:
+    """Raise ConfigError unless a map can be made of a camera's images."""
+    if (camera.projection, camera.kind) != _ONLY:
+        raise ConfigError(
+            f"{path}: a map is made of the rectified images of a pinhole stereo pair, not of {_text(camera)}; "
+            "set dataset.projection to pinhole, and give a recording of two cameras"
+        )
+
+
+def _check_sessions(store: MapStore, camera: StereoCamera) -> None:
+    """Warn where a map was made with another rig; raise DataError where with another kind of camera."""
+    others = [s.camera for s in store.sessions()]
+    for other in others:
+        if (other.projection, other.kind) != _ONLY:
+            raise DataError(f"{store.path}: is a map of {_text(other)}; use another map for {_text(camera)}")
+    if others and not any(_is_alike(other, camera) for other in others):
+        log.warning(
+            "%s: was made with another rig, %s; this recording is of %s: places are looked for all the same, and if "
+            "this is the same rig, one of the calibrations is wrong",
+            store.path,
+            _text(others[-1]),
+            _text(camera),
+        )
+
+
+def _is_alike(a: StereoCamera, b: StereoCamera) -> bool:
+    """Whether two cameras may be one rig with two calibrations."""
+    lengths, others = ((c.fu, c.fv, c.baseline_m) for c in (a, b))
+    return (a.width, a.height) == (b.width, b.height) and np.allclose(lengths, others, rtol=_SAME_RIG, atol=0)
+
+
+def _text(camera: StereoCamera) -> str:
+    size = "" if camera.width is None else f"{camera.width}x{camera.height} pixels, "
+    kind = "a stereo pair" if camera.kind == "stereo" else "one camera"
+    return f"{kind} ({camera.projection}, {size}focal length {camera.fu:.1f} px, baseline {camera.baseline_m:.4f} m)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +137,13 @@ class MapBuilder:
             camera: rectified pair.
             upright: whether z of the odometry's world is up.
             localise: find poses in the map, and leave it as it is.
+
+        Raises:
+            ConfigError: the images are not those of a pinhole stereo pair.
+            DataError: those of the map are not.
         """
+        check_camera(store.path, camera)
+        _check_sessions(store, camera)
         self._store, self._camera, self._localise = store, camera, localise
         self.graph = MapGraph(store)
         self._index, self._overlaps = PlaceIndex(), Overlaps()

@@ -18,7 +18,7 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.loops import LoopEvent, MapKeyframes
-from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate
+from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate, check_camera
 from vio.mapping.features import extract
 from vio.mapping.map_store import MapStore
 from vio.records import Estimate, Image, IntArray, Observations, StereoFrame
@@ -71,8 +71,10 @@ class MapSession:
             alone: whether the odometry has images alone, so that it is lost where they show nothing.
 
         Raises:
+            ConfigError: the images are not those of a pinhole stereo pair.
             DataError: the map cannot be used.
         """
+        check_camera(path, camera)
         self._path, self._localise, self._imu, self._alone = str(path), localise, imu, alone
         self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
         store = MapStore(path, create=not localise, read_only=localise)
