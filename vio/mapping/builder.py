@@ -111,6 +111,7 @@ class MapUpdate:
     """What a keyframe made of the map."""
 
     T_map_odom: FloatArray | None  # (4, 4); None: the session has not found its place in the map
+    T_map_cam: FloatArray | None  # (4, 4) of the keyframe, once a loop holds it; None: it moves with the odometry
     covariance: FloatArray | None  # (6, 6) of xi in T_map_cam = T_hat exp(xi), given the map; None likewise
     loops: tuple[LoopEvent, ...]
 
@@ -170,6 +171,11 @@ class MapBuilder:
     def index_bytes(self) -> int:
         """Memory of the words of all keyframes."""
         return self._index.nbytes
+
+    @property
+    def overlap_bytes(self) -> int:
+        """Memory of the points by which places are expected."""
+        return self._overlaps.nbytes
 
     @property
     def is_joined(self) -> bool:
@@ -249,11 +255,12 @@ class MapBuilder:
 
     def _update(self, events: tuple[LoopEvent, ...]) -> MapUpdate:
         if not self.is_joined:
-            return MapUpdate(None, None, events)
+            return MapUpdate(None, None, None, events)
         graph, k = self.graph, len(self.graph) - 1
         T_map_odom = graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k])
         since = self._drift_since(np.array([self.first if self._last is None else self._last.first]), k)
-        return MapUpdate(T_map_odom, since[0], events)
+        T_map_cam = None if self._last is None else graph.T_map_cam[k].copy()
+        return MapUpdate(T_map_odom, T_map_cam, since[0], events)
 
     # Loops
 
