@@ -29,10 +29,9 @@ from vio.errors import VioError
 from vio.evaluation import nees, nees_bounds
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import RIGHT_TERMS
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import left_rays
-from vio.records import Estimate, ImuSample, Observations
+from vio.records import RIGHT_TERMS, Estimate, ImuSample, Observations
 from vio.threads import one_blas_thread
 
 Rig = Literal["camera-IMU", "right camera turned", "baseline"]
