@@ -14,14 +14,27 @@ import numpy as np
 import pytest
 
 from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
-from frontend.outliers import _gauss_newton, pixel_errors
+from frontend.lens import lens_of
+from frontend.outliers import _gauss_newton, _refine, pixel_errors
+from frontend.prediction import _borrow, moved_pixels
+from frontend.stereo_fit import _triangulate
+from frontend.weighted_fit import add_equations
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.compiled import invert_positive, move_by_twist, solve_positive
-from vio.filters import multiview, stereo_calibration
+from vio.filters import multiview, pose_loops, stereo_calibration, track_loops
 from vio.filters.multiview import Views
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
-from vio.geometry.stereo import StereoCamera, project
+from vio.geometry.lie import (
+    FloatArray,
+    se3_adjoint,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    so3_left_jacobian,
+    transform_points,
+)
+from vio.geometry.stereo import StereoCamera, project, triangulate
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 CAMERAS = {"pinhole": CAMERA, "cylinder": replace(CAMERA, projection="cylinder")}
@@ -34,25 +47,25 @@ def test_patches_are_sampled_exactly_inside_the_image_and_at_its_border() -> Non
     outside = [[0.0, 0.0], [298.6, 198.9], [-9.0, 50.0], [150.0, 1e9], [7.0, 7.0]]
     warp = shift_warps(np.concatenate([POINTS, across, down, outside]))
     warp[:, :, :2] += np.random.default_rng(3).normal(0, 0.2, (len(warp), 2, 2))
-    image = PLAIN.astype(np.float32)
+    image = PLAIN
     np.testing.assert_allclose(warped_patches(image, warp, 7), numpy_twins.sampled(PLAIN, warp, 7), atol=2e-3)
 
 
 def test_warp_that_is_not_finite_samples_the_border() -> None:
     warp = shift_warps(POINTS[:3])
     warp[0, 0, 0], warp[1, 1, 2], warp[2, 0, 2] = np.nan, np.inf, -np.inf
-    assert np.isfinite(warped_patches(PLAIN.astype(np.float32), warp, 7)).all()
+    assert np.isfinite(warped_patches(PLAIN, warp, 7)).all()
 
 
 @pytest.mark.parametrize("on_rows", [False, True])
 def test_alignment_equals_numpy(on_rows: bool) -> None:
     other = picture(np.array([[1.04, 0.03, -4.0], [-0.02 * (not on_rows), 1 - 0.03 * (not on_rows), 0.3], [0, 0, 1.0]]))
-    image, centres = PLAIN.astype(np.float32), rounded(POINTS)
+    image, centres = PLAIN, rounded(POINTS)
     rows = POINTS[:, 1] - 0.2 if on_rows else None
     start = shift_warps(POINTS + np.array([3.0, -0.3]))
     wide = cut_patches(image, centres, 7)
     twin, expected = numpy_twins.aligned(numpy_twins.prepared(wide.astype(np.float64)), other, start, 5, rows)
-    warp, score = align(templates(wide), np.arange(len(POINTS)), other.astype(np.float32), start, 5, rows)
+    warp, score = align(templates(wide), np.arange(len(POINTS)), other, start, 5, rows)
     inside = score > -1.0  # elsewhere the patch has left the image
     assert inside.mean() > 0.8
     np.testing.assert_allclose(score[inside], expected[inside], atol=1e-4)
@@ -79,6 +92,34 @@ def test_gauss_newton_on_motions_equals_numpy(free: slice, camera: StereoCamera)
 
 
 @both_cameras
+def test_refinement_of_a_motion_equals_numpy(camera: StereoCamera) -> None:
+    rng = np.random.default_rng(12)
+    true, points = se3_exp([0.1, 0.05, -0.2, 0.01, 0.02, -0.01]), rng.uniform([-2, -1, 3], [2, 1, 9], (60, 3))
+    pixels = project(camera, transform_points(true, points))[:, :2] + rng.normal(0, 0.3, (60, 2))
+    pixels[::5] += 40.0  # on something that moves
+    ours = _refine(camera, np.eye(4), points, pixels, 60.0, slice(0, 6))
+    twin = numpy_twins.refined_motion(camera, np.eye(4), points, pixels, 60.0, 3e-6)
+    np.testing.assert_allclose(ours, twin, atol=1e-9)
+    close = _refine(camera, ours, points, pixels, 5.0, slice(0, 6))
+    np.testing.assert_allclose(close, numpy_twins.refined_motion(camera, ours, points, pixels, 5.0, 3e-6), atol=1e-9)
+    assert np.abs(ours - np.eye(4)).max() > 0.05  # from both starts it moves
+    assert np.abs(close - ours).max() > 0.01
+
+
+@pytest.mark.parametrize("sigma", [0.5, np.inf])
+def test_weighted_equations_equal_numpy(sigma: float) -> None:
+    rng = np.random.default_rng(13)
+    terms, model, start = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=(5, 5))
+    values = terms @ model + rng.normal(0, 1.0, 40)
+    normal, moment = start.copy(), start[0].copy()
+    count, squares = add_equations(terms, values, model, sigma, normal, moment)
+    expected = numpy_twins.equations(terms, values, model, sigma)
+    np.testing.assert_allclose(normal, start + expected[0], rtol=1e-10)
+    np.testing.assert_allclose(moment, start[0] + expected[1], rtol=1e-10)
+    np.testing.assert_allclose((count, squares), expected[2:], rtol=1e-10)
+
+
+@both_cameras
 def test_reprojection_errors_equal_numpy(camera: StereoCamera) -> None:
     rng = np.random.default_rng(8)
     T, points = se3_exp(rng.normal(0, 0.3, (2, 5, 6))), rng.uniform([-2, -2, -1], [2, 2, 8], (30, 3))
@@ -88,6 +129,36 @@ def test_reprojection_errors_equal_numpy(camera: StereoCamera) -> None:
     assert 0 < np.isinf(expected).sum() < 100
     np.testing.assert_allclose(pixel_errors(camera, T, points, pixels), expected, rtol=1e-10)
     np.testing.assert_allclose(pixel_errors(camera, T[0, 1], points, pixels), expected[0, 1], rtol=1e-10)
+
+
+@both_cameras
+def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(camera: StereoCamera) -> None:
+    rng = np.random.default_rng(14)
+    T, points = se3_exp([0.1, -0.2, 0.3, 0.05, 0.1, -0.1]), rng.uniform([-2, -1, 2], [2, 1, 9], (40, 3))
+    moved = transform_points(T, points)
+    pixels = moved_pixels(camera, T, points, np.zeros((40, 2)))
+    np.testing.assert_allclose(pixels, project(camera, moved)[:, :2], rtol=1e-10)
+
+    z = project(camera, moved) + rng.normal(0, 0.3, (40, 4))
+    z[3, 2], z[5, 2] = z[3, 0] - 0.05, z[5, 0] + 4.0  # too far away, and behind the cameras
+    rows, point, has_point = np.arange(0, 40, 2), np.zeros((40, 3)), np.zeros(40, dtype=np.bool_)
+    rows[1], rows[2] = 3, 5
+    f_baseline = camera.fu * camera.baseline_m
+    _triangulate(lens_of(camera), f_baseline, z[:, :2].copy(), rows, z[rows, 2:], point, has_point)
+    expected, valid = triangulate(camera, z[rows])
+    assert not valid[1:3].any()
+    np.testing.assert_array_equal(has_point[rows], valid)
+    np.testing.assert_allclose(point[rows[valid]], expected[valid], rtol=1e-10)
+    assert not point[~has_point].any()
+
+
+def test_unknown_depths_are_the_median_of_the_three_nearest_known_ones() -> None:
+    rng = np.random.default_rng(15)
+    known, depth, pixels = rng.uniform(0, 300, (50, 2)), rng.uniform(1, 9, 50), rng.uniform(0, 300, (20, 2))
+    found = np.zeros(20)
+    _borrow(known, depth, pixels, found)
+    nearest = np.argsort(np.abs(pixels[:, None] - known).sum(axis=2), axis=1)[:, :3]
+    np.testing.assert_array_equal(found, np.median(depth[nearest], axis=1))
 
 
 @pytest.mark.parametrize("size", [1e-9, 5e-3, 0.3, 3.0])
@@ -152,12 +223,113 @@ def test_tracks_are_linearised_and_eliminated_as_in_numpy(camera: StereoCamera) 
         np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
 
 
+@both_cameras
+def test_points_are_refined_chosen_and_weighed_as_in_numpy(camera: StereoCamera) -> None:
+    T, p, views = _scene(camera)
+    views.weight[5:15, :, 2] = 0.0
+    views.weight[5:8, 2:, :2] = 0.0  # two views at most: little parallax
+    start = p + np.random.default_rng(14).normal(0, 0.2, p.shape)
+    start[3] = transform_points(se3_inverse(T[1]), [0.0, 0.0, 1e-3])
+    ours = multiview.refine_points(camera, T, start, views, 3, 1.0)
+    np.testing.assert_allclose(ours, numpy_twins.refined(camera, T, start, views, 3, 1.0), rtol=1e-6)
+    ours[20] = np.nan
+    for lens in (camera, replace(camera, kind="mono")):
+        at = multiview.residuals(lens, T, ours, views)
+        keep = multiview.usable_points(lens, T, ours, views, at)
+        assert keep.tolist() == numpy_twins.usable_points(lens, T, ours, views, at).tolist()
+        assert 0 < keep.sum() < len(keep)
+    at = at.take(keep)
+    at.z_D_p[:, 3] = 0.0  # a clone that saw nothing
+    for sigma2 in (1e-6, 1.0):
+        np.testing.assert_allclose(multiview.robust_weights(at, sigma2), numpy_twins.robust_weights(at, sigma2))
+
+
+def test_points_follow_the_clones_as_in_numpy() -> None:
+    T, p, views = _scene()
+    at = multiview.residuals(CAMERA, T, p, views)
+    at, p = at.take(at.ahead), p[at.ahead]
+    info = multiview.track_information(CAMERA, T, at, p, np.ones(at.r.shape[:2]))
+    rng = np.random.default_rng(15)
+    errors, other = rng.normal(0, 1e-3, 6 * len(T)), rng.normal(0, 1.0, (len(p), 3))
+    np.testing.assert_allclose(info.moved_points(errors, other), numpy_twins.moved_points(info, errors, other))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 101])
+def test_middle_is_the_median(count: int) -> None:
+    values = np.random.default_rng(count).integers(0, 12, count).astype(np.float64)  # with ties
+    assert track_loops.middle(values.copy()) == np.median(values)
+
+
+def test_landmarks_are_added_as_in_numpy() -> None:
+    rng = np.random.default_rng(16)
+    r, J, w = rng.normal(size=(7, 4)), rng.normal(size=(7, 4, 3)), rng.uniform(size=7)
+    A, b = np.zeros((30, 30)), np.zeros(30)
+    track_loops.add_landmarks(r, J, w, 3, 9, A, b)
+    H = np.zeros((7, 4, 30))
+    for k in range(7):
+        H[k, :, 9 + 3 * k : 12 + 3 * k], H[k, :, 3:6] = J[k], -J[k]
+    np.testing.assert_allclose(A, np.einsum("k,kai,kaj->ij", w, H, H), atol=1e-12)
+    np.testing.assert_allclose(b, np.einsum("k,kai,ka->i", w, H, r), atol=1e-12)
+
+
+def test_poses_and_velocities_move_as_in_numpy() -> None:
+    rng = np.random.default_rng(17)
+    T, T_cam0_imu, now = se3_exp(rng.normal(size=(5, 6))), se3_exp(rng.normal(size=6)), se3_exp(rng.normal(size=6))
+    eta, error, gravity = rng.normal(size=6), 0.1 * rng.normal(size=15), np.array([0.0, 0.0, -9.8])
+    cameras, moves = np.empty(T.shape), np.zeros((5, 6))
+    pose_loops.camera_poses(T_cam0_imu, T, cameras)
+    np.testing.assert_allclose(cameras, T_cam0_imu @ se3_inverse(T), atol=1e-14)
+    pose_loops.add_extrinsic_moves(T, now, eta, moves)
+    np.testing.assert_allclose(moves, se3_adjoint(T @ se3_inverse(now)) @ eta, atol=1e-13)
+    for size in (1e-4, 1.0):
+        phi, xi, p = size * rng.normal(size=3), rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
+        expected = p @ so3_exp(phi).T + xi @ so3_left_jacobian(phi).T
+        pose_loops.move_points(phi, xi, p)
+        np.testing.assert_allclose(p, expected, atol=1e-14)
+    ages, velocities = np.arange(5) * 0.05, rng.normal(size=(5, 3))
+    expected = numpy_twins.moved_velocities(gravity, ages, T[:, :3, :3], error, velocities)
+    pose_loops.move_earlier_velocities(gravity, ages, np.ascontiguousarray(T[:, :3, :3]), error, velocities)
+    np.testing.assert_allclose(velocities, expected, atol=1e-13)
+    rows, part = np.array([0, 2, 3]), np.empty((3, 3))
+    pose_loops.take_rows(cameras[0], rows, part)
+    np.testing.assert_array_equal(part, cameras[0][np.ix_(rows, rows)])
+
+
+def test_missing_samples_are_found() -> None:
+    t = np.cumsum(np.random.default_rng(18).uniform(0.5, 1.5, 9))
+    inside, longest = np.linspace(t[0], t[-1], 7), np.diff(t).max()
+    assert not pose_loops.lacks_samples(inside, t, longest)
+    assert pose_loops.lacks_samples(inside, t, longest - 1e-9)
+    assert pose_loops.lacks_samples(inside, t[1:], longest)
+    assert pose_loops.lacks_samples(inside, t[:-1], longest)
+
+
+def test_the_imu_is_integrated_as_in_numpy() -> None:
+    rng = np.random.default_rng(19)
+    times = np.cumsum(rng.uniform(2e6, 8e6, 12))
+    readings, bias, gravity = rng.normal(size=(12, 6)), 0.1 * rng.normal(size=6), np.array([0.0, 0.0, -9.8])
+    densities, hidden = np.array([0.02, 0.003]), rng.uniform(0, 1e-4, (2, 11))
+    T, v, turned = se3_exp(rng.normal(size=6)), rng.normal(size=3), np.zeros(3)
+    given = times - times[0], readings, bias, gravity, densities, hidden
+    R_k, p_k, v_k, biases, noise = numpy_twins.integrated(*given, T, v)
+    Phi, Q = np.eye(15), np.zeros((2, 15, 15))
+    pose_loops.integrate(*given, T, v, turned, Phi, Q)
+    np.testing.assert_allclose(T, se3_from_parts(R_k[-1], p_k[-1]), atol=1e-13)
+    np.testing.assert_allclose(v, v_k[-1], atol=1e-13)
+    gyro = readings[:, :3] - bias[:3]
+    np.testing.assert_allclose(turned, np.diff(times) * 1e-9 @ (gyro[1:] + gyro[:-1]) / 2, atol=1e-14)
+    np.testing.assert_allclose(Phi[:9, 9:], biases, atol=1e-13)
+    np.testing.assert_allclose(Q[:, :9, :9], noise, rtol=1e-9, atol=1e-16)
+    assert not Q[:, 9:].any()
+    assert not Q[:, :, 9:].any()
+
+
 def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     T, p, views = _scene()
     rng = np.random.default_rng(13)
-    rows, states = rng.normal(0, 0.01, 6), rng.normal(0, 0.01, 8)
+    rows, states = rng.normal(0, 0.01, 7), rng.normal(0, 0.01, 10)
     expected = numpy_twins.corrected(CAMERA, rows, states, views.z, views.weight)
-    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(8)).corrected(views)
+    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(10)).corrected(views)
     np.testing.assert_allclose(views.z, expected, rtol=1e-12)
     at = multiview.residuals(CAMERA, T, p, views)
     at, p = at.take(at.ahead), p[at.ahead]
