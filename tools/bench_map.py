@@ -118,12 +118,12 @@ def draw(rows: list[dict[str, float]]) -> Any:
     figure = Figure(figsize=(8, 2.8), dpi=80, layout="constrained")
     x = [row["keyframes"] for row in rows]
     panels: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
-        ("CPU ms a query", (("query_ms", "place not known"), ("followed_ms", "place about known"))),
+        ("CPU ms a query", (("query_ms", "place not known"),)),
         ("memory, MB", (("index_MB", "words"), ("overlap_MB", "points"))),
     )
     for k, (label, lines) in enumerate(panels):
         axes = figure.add_subplot(1, 2, k + 1)
-        for (name, text), color in zip(lines, ("#1f5fbf", "#c25b00"), strict=True):
+        for (name, text), color in zip(lines, ("#1f5fbf", "#c25b00"), strict=False):
             axes.plot(x, [row[name] for row in rows], "o-", color=color, markersize=4, label=text)
         axes.set(xlabel="keyframes", ylabel=label, xlim=(0, None), ylim=(0, None))
         axes.grid(alpha=0.3)
