@@ -12,7 +12,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.guided_search import View, _pairs, _Target, place_points, search
+from vio.mapping.guided_search import View, _pairs, _Target, place_points, search, shown
 from vio.mapping.loop_geometry import Terms, points_of, verify
 from vio.mapping.map_store import MapStore
 from vio.mapping.overlap import Overlaps
@@ -44,7 +44,7 @@ def _place(paper: Wallpaper) -> list[View]:
     """Two views of it, the second one a little to the side."""
     aside = RelativePose(se3_exp([0.2, 0.0, 0.1, 0.0, 0.05, 0.0]), 1e-8 * np.eye(6))
     origin = RelativePose(np.eye(4), np.zeros((6, 6)))
-    return [View(n, CAMERA, paper.seen_from(r.T_i_j), r) for n, r in enumerate((origin, aside))]
+    return [View(n, shown(CAMERA, paper.seen_from(r.T_i_j)), r) for n, r in enumerate((origin, aside))]
 
 
 def _start(T: FloatArray) -> RelativePose:
@@ -56,7 +56,7 @@ def test_repeated_patterns_are_told_apart_by_where_they_should_be() -> None:
     for seed in range(8):
         paper = Wallpaper(seed)
         views, here = _place(paper), paper.seen_from(T_I_K)
-        assert verify(CAMERA, views[0].features, CAMERA, here) is None
+        assert verify(CAMERA, views[0].shown.features, CAMERA, here) is None
         seen = search(place_points(views), CAMERA, here, _start(T_I_K), None)
         assert seen is not None
         r = se3_log(se3_inverse(seen.pose.T_i_j) @ T_I_K)
@@ -163,11 +163,9 @@ def test_windows_are_as_wide_as_the_covariance_of_the_pose_makes_them() -> None:
     """Against central differences of the predicted pixels."""
     p = np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 8], (6, 3))
     T, C = se3_exp([0.1, 0.0, 0.05, 0.02, -0.03, 0.01]), np.diag(np.array([0.02, 0.03, 0.05, 0.01, 0.006, 0.02]) ** 2)
-    view = View(
-        0, CAMERA, KeyframeFeatures(project(CAMERA, p), np.ones(6, bool), np.ones(6), np.zeros((6, 32), np.uint8)), OFF
-    )
-    place = place_points([view._replace(place=RelativePose(np.eye(4), np.zeros((6, 6))))])
-    pairs = _pairs(place, _Target.of(CAMERA, view.features), T, C)
+    seen = KeyframeFeatures(project(CAMERA, p), np.ones(6, bool), np.ones(6), np.zeros((6, 32), np.uint8))
+    place = place_points([View(0, shown(CAMERA, seen), RelativePose(np.eye(4), np.zeros((6, 6))))])
+    pairs = _pairs(place, _Target.of(CAMERA, seen), T, C)
     step = 1e-6 * np.eye(6)
     ahead, back = (
         np.array([project(CAMERA, transform_points(se3_inverse(T @ se3_exp(s * e)), p))[:, :2] for e in step])

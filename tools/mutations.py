@@ -1883,8 +1883,8 @@ MUTATIONS = (
     Mutation(
         "guided search: windows as if the pose were known",
         "vio/mapping/guided_search.py",
-        "radius = radius + _SIGMAS *",
-        "radius = radius + 0 * _SIGMAS *",
+        "if covariance is None else _SIGMAS**2 * covariance",
+        "if covariance is None else 0 * _SIGMAS**2 * covariance",
         _GUIDED,
     ),
     Mutation(

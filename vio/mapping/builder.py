@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.loops import LoopEvent, LoopMatches
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.guided_search import LEAST_CORNERS, Guided, View, place_points, search
+from vio.mapping.guided_search import LEAST_CORNERS, Guided, Shown, View, place_points, search, shown
 from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
@@ -47,11 +48,14 @@ _NEIGHBOURS_M = 50.0  # path between two places up to which the map's own drift 
 _SETTLED = 6.0  # squared error of a new loop, its expected value, up to which the optimisation can wait …
 _PATIENCE = 8  # … for so many loops
 _COMMIT_EVERY = 20  # keyframes
-_GUIDED_PLACES, _GUIDED_NEIGHBOURS = 3, 3  # places that are searched, and keyframes to each side that belong to one
+_GUIDED_PLACES = 3  # that are searched together
+_GUIDED_NEIGHBOURS, _GUIDED_OTHERS = 3, 2  # keyframes to each side that belong to the first place, and to the others
 # Of what errors of the calibration may do (`MapGraph.drift`), what a search and its gate count on: it looks where the
 # odometry is right to 0.25 % and 0.12 deg/100 m, which is a quarter of what a place found without it is held against.
 _GUIDED_SHARE = 0.25
 _GUIDED_M = 0.5  # standard deviation of the position up to which places are searched
+_SHOWN = 64  # keyframes whose points are held, 6 MB: from query to query, most of those searched are the same
+_OF_THE_FILE = ("_store", "_index", "_overlaps", "_shown")
 _ONLY = ("pinhole", "stereo")  # projection and kind of the cameras that maps know
 _SAME_RIG = 0.03  # by which two calibrations of one rig may differ in focal length and baseline
 _LOCAL = 20  # keyframes of a localised session that are optimised together
@@ -147,6 +151,7 @@ class MapBuilder:
         _check_sessions(store, camera)
         self._store, self._camera, self._localise = store, camera, localise
         self.graph = MapGraph(store)
+        self._shown = lru_cache(_SHOWN)(self._read_shown)
         self._index, self._overlaps = PlaceIndex(), Overlaps()
         for k in range(len(self.graph)):
             self._remember(self.graph.sessions[int(self.graph.session[k])].camera, store.features(k))
@@ -235,11 +240,12 @@ class MapBuilder:
 
     def __getstate__(self) -> dict[str, Any]:
         """State for a checkpoint: all but the file and the index, which is made of it."""
-        return {key: value for key, value in self.__dict__.items() if key not in ("_store", "_index", "_overlaps")}
+        return {key: value for key, value in self.__dict__.items() if key not in _OF_THE_FILE}
 
     def reopen(self, store: MapStore) -> None:
         """Go on from a checkpoint with the file as it was then: what was added since is forgotten."""
         self._store, self._index, self._overlaps = store, PlaceIndex(), Overlaps()
+        self._shown = lru_cache(_SHOWN)(self._read_shown)
         graph = self.graph
         if not self._localise:
             store.truncate(len(graph.sessions), len(graph), len(graph.loops))
@@ -330,7 +336,10 @@ class MapBuilder:
         if not places:
             return None
         prior = priors[places[0]]
-        views = [view for i in places for view in self._views(i, places[0])]
+        first, *others = places
+        views = self._views(first, first)
+        for i in others:
+            views += self._views(i, first, reach=_GUIDED_OTHERS)
         seen = search(place_points(views), self._camera, features, prior, prior)
         if seen is None:
             return None
@@ -362,18 +371,18 @@ class MapBuilder:
             around[max(middle - 2 * _GUIDED_NEIGHBOURS, 0) : middle + 2 * _GUIDED_NEIGHBOURS + 1] = 0.0
         return out
 
-    def _views(self, i: int, origin: int) -> list[View]:
+    def _views(self, i: int, origin: int, *, reach: int = _GUIDED_NEIGHBOURS) -> list[View]:
         """Return keyframe i and its neighbours in its session, with their motion from another keyframe."""
         graph, session = self.graph, self.graph.session
-        rows = range(max(i - _GUIDED_NEIGHBOURS, 0), min(i + _GUIDED_NEIGHBOURS + 1, len(self._index)))
+        rows = range(max(i - reach, 0), min(i + reach + 1, len(self._index)))
         near = np.array(sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)), dtype=np.int64)
         covariance = graph.drift(np.full(len(near), origin), near, systematic=0.0)
         motion = se3_inverse(graph.T_map_cam[origin]) @ graph.T_map_cam[near]
-        camera = graph.sessions[int(session[i])].camera
-        return [
-            View(m, camera, self._store.features(m), RelativePose(motion[n], covariance[n]))
-            for n, m in enumerate(near.tolist())
-        ]
+        return [View(m, self._shown(m), RelativePose(motion[n], covariance[n])) for n, m in enumerate(near.tolist())]
+
+    def _read_shown(self, keyframe: int) -> Shown:
+        graph = self.graph
+        return shown(graph.sessions[int(graph.session[keyframe])].camera, self._store.features(keyframe))
 
     def _is_rival(self, other: FoundPlace, best: FoundPlace, depth: float) -> bool:
         """Whether another place of the same part of the map fits nearly as well as the best one."""
@@ -417,7 +426,7 @@ class MapBuilder:
         graph, count = self.graph, len(covariance)
         own = graph.session[:count] == self._own
         passed = graph.path_m[number] - graph.path_m[:count]
-        sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2))
+        sigma = np.sqrt(np.maximum(np.trace(covariance, axis1=1, axis2=2), 0.0))  # large numbers cancel
         near_path = (passed < _REVISIT_DEPTHS * depth) & (sigma < _LOST_M)
         recent = own & ((np.arange(count) > number - _RECENT) | near_path)
         T = se3_inverse(graph.T_map_cam[number]) @ graph.T_map_cam[:count]
@@ -504,7 +513,7 @@ def _as_place(views: list[View], number: int, seen: Guided, features: KeyframeFe
     """Return a place found by search as a motion from the keyframe that shows most of what was found."""
     most = int(np.argmax(np.bincount(seen.view)))
     best, own = views[most], seen.view == most
-    a, b, f = seen.row[own], seen.row_here[own], views[most].features
+    a, b, f = seen.row[own], seen.row_here[own], views[most].shown.features
     matches = LoopMatches(f.z[a], features.z[b], f.has_right[a], features.has_right[b])
     pose = best.place.inverse().then(seen.pose)
     return FoundPlace(best.keyframe, number, Verified(pose, seen.inliers, len(seen.row), a, b, matches), needed)

@@ -43,12 +43,22 @@ LEAST_CORNERS = 12
 _OVER_CHANCE = 6.0  # times the mean number of pairs of chance
 
 
+class Shown(NamedTuple):
+    """The stereo points that a keyframe shows."""
+
+    camera: StereoCamera
+    features: KeyframeFeatures
+    row: IntArray  # (N,) feature of each
+    p: FloatArray  # (N, 3) in the keyframe's camera
+    size_px: FloatArray  # (N,) of the feature
+    descriptors: npt.NDArray[np.uint64]  # (N, 4)
+
+
 class View(NamedTuple):
     """A keyframe of a place."""
 
     keyframe: int
-    camera: StereoCamera
-    features: KeyframeFeatures
+    shown: Shown
     place: RelativePose  # in the frame of the place's first keyframe
 
 
@@ -73,9 +83,9 @@ class PlacePoints:
         """Return the points with their covariance; errors of the keyframes' poses count as those of their points."""
         P = np.zeros((len(self.p), 3, 3))
         for n in np.unique(self.view).tolist():
-            _, camera, f, place = self.views[n]
+            _, source, place = self.views[n]
             own = self.view == n
-            seen = points_of(camera, f, self.row[own])
+            seen = points_of(source.camera, source.features, self.row[own])
             D = np.concatenate([np.broadcast_to(np.eye(3), (len(seen.p), 3, 3)), -so3_hat(seen.p)], axis=2)
             R = place.T_i_j[:3, :3]
             P[own] = R @ (seen.covariance + D @ place.covariance @ np.swapaxes(D, 1, 2)) @ R.T
@@ -94,16 +104,22 @@ class Guided:
     row_here: IntArray  # (P,) feature of this keyframe
 
 
+def shown(camera: StereoCamera, features: KeyframeFeatures) -> Shown:
+    """Return the stereo points of a keyframe."""
+    p, valid = triangulate(camera, features.z, min_disparity_px=LEAST_DISPARITY_PX)
+    row = np.flatnonzero(valid & features.has_right)
+    return Shown(camera, features, row, p[row], features.sigma_px[row], _as_words(features.descriptors[row]))
+
+
 def place_points(views: Sequence[View]) -> PlacePoints:
     """Return the points that the keyframes of a place show."""
-    parts = []
-    for n, (_, camera, f, place) in enumerate(views):
-        p, valid = triangulate(camera, f.z, min_disparity_px=LEAST_DISPARITY_PX)
-        rows = np.flatnonzero(valid & f.has_right)
-        p = transform_points(place.T_i_j, p[rows])
-        eye = np.broadcast_to(place.T_i_j[:3, 3], p.shape)
-        parts.append((p, eye, f.sigma_px[rows], _as_words(f.descriptors[rows]), np.full(len(rows), n), rows))
-    p, eye, size_px, descriptors, view, row = (np.concatenate(column) for column in zip(*parts, strict=True))
+    each = [view.shown for view in views]
+    p = np.concatenate([transform_points(view.place.T_i_j, view.shown.p) for view in views])
+    view = np.repeat(np.arange(len(views)), [len(s.row) for s in each])
+    eye = np.array([v.place.T_i_j[:3, 3] for v in views])[view]
+    size_px, descriptors, row = (
+        np.concatenate(x) for x in zip(*((s.size_px, s.descriptors, s.row) for s in each), strict=True)
+    )
     return PlacePoints(views, p, eye, size_px, descriptors, view, row)
 
 
