@@ -191,7 +191,8 @@ def _refine_on_all(
     converged: float,
 ) -> None:
     """Refine one motion (1, 4, 4) in place on points (N, 3) and pixels (N, 2); see `_refine`."""
-    weight, before, once = np.empty((1, len(points))), np.empty((4, 4)), np.int64(1)  # no literal: see `vio.compiled`
+    weight, before = np.empty((1, len(points))), np.empty((4, 4))
+    once = int(np.int64(1))  # no literal: see `vio.compiled`
     for _ in range(_REFINE_ITERATIONS):
         _distances(lens, T, points, pixels, weight)
         for n in range(len(points)):
