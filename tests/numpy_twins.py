@@ -5,10 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from frontend.align import FLAT_RMS, Templates, offsets
-from vio.filters.multiview import MIN_DEPTH, InverseDepth, Residuals, TrackInformation, Views, point_D_pose
+from vio.filters.multiview import (
+    CAUCHY,
+    LEAST_DISPARITY_PX,
+    MIN_DEPTH,
+    InverseDepth,
+    Residuals,
+    TrackInformation,
+    Views,
+    point_D_pose,
+)
 from vio.filters.stereo_calibration import StereoColumns, StereoInformation
-from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp
-from vio.geometry.stereo import StereoCamera, depth_of, project, z_D_p_cam
+from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
 from vio.records import BoolArray
 
 PRIOR = 1e-6  # per px^2, on a disparity: that of `vio.filters.multiview`
@@ -116,7 +125,7 @@ def gauss_newton(
     return T
 
 
-def refined(
+def refined_motion(
     camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray, scale_px: float, converged: float
 ) -> FloatArray:
     """A motion (4, 4) refined on all points (N, 3) and pixels (N, 2), with Geman-McClure weights."""
@@ -176,6 +185,64 @@ def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: Float
     return InverseDepth(anchor, centre, disparity, p_D_q, q_D_p)
 
 
+def moved(q: InverseDepth, dq: FloatArray, most: FloatArray | float) -> FloatArray:
+    """Points (F, 3) in the world after steps (F, 3); the disparity stays between its least value and `most`."""
+    disparity = np.maximum(np.minimum(q.disparity + dq[:, 2], most), LEAST_DISPARITY_PX)
+    across = np.squeeze(q.p_D_q[:, :, :2] @ dq[:, :2, None], axis=2)
+    ray = across - q.p_D_q[:, :, 2] * q.disparity[:, None]
+    out: FloatArray = q.centre + ray * (q.disparity / disparity)[:, None]
+    return out
+
+
+def on_rays(camera: StereoCamera, T: FloatArray, pixels: FloatArray, disparity: float | FloatArray) -> FloatArray:
+    """Points (F, 3) in the world that cameras (F, 4, 4) see at left pixels (F, 2), at disparities."""
+    scale = camera.fu * camera.baseline_m / np.asarray(disparity) * np.ones(len(T))
+    p_cam = left_rays(camera, pixels) * scale[:, None]
+    out: FloatArray = np.einsum("fji,fj->fi", T[:, :3, :3], p_cam - T[:, :3, 3])
+    return out
+
+
+def refined(
+    camera: StereoCamera, T: FloatArray, p: FloatArray, views: Views, steps: int, scale_px: float
+) -> FloatArray:
+    """Points (F, 3) after Gauss-Newton steps with Cauchy weights, ahead of all cameras that saw them."""
+    seen, least = views.weight[..., 0] > 0, MIN_DEPTH * camera.baseline_m
+    first = np.argmax(seen, axis=1)
+    for _ in range(steps):
+        p_first = np.einsum("fij,fj->fi", T[first, :3, :3], p) + T[first, :3, 3]
+        far = on_rays(camera, T[first], views.z[np.arange(len(p)), first, :2], LEAST_DISPARITY_PX)
+        p = np.where((depth_of(camera, p_first) > least)[:, None], p, far)
+        at, q = residuals(camera, T, p, views), inverse_depth(camera, T, p, seen)
+        w = 1 / (1 + np.sum(at.r**2, axis=2) / (4 * scale_px**2))
+        J = at.z_D_p @ q.p_D_q[:, None]
+        C = np.einsum("fn,fnai,fnaj->fij", w, J, J) + np.diag([1e-12, 1e-12, PRIOR])
+        dq = np.linalg.solve(C, np.einsum("fn,fnai,fna->fi", w, J, at.r)[..., None])[..., 0]
+        most = np.full(len(p), camera.fu * camera.baseline_m / (1.01 * least))
+        if not camera.is_cylinder:
+            ray_z = (p - q.centre) @ T[:, 2, :3].T * q.disparity[:, None]
+            room = 1.01 * least - (q.centre @ T[:, 2, :3].T + T[:, 2, 3])
+            most = np.divide(ray_z, room, out=np.full(room.shape, np.inf), where=seen & (room > 0) & (ray_z > 0)).min(1)
+        p = moved(q, dq, most)
+    return p
+
+
+def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
+    """Cauchy weights (F, N) of all views; the scale is each clone's own."""
+    squares, used = np.sum(at.r**2, axis=2), np.any(at.z_D_p[:, :, 1], axis=2)
+    median = np.array([np.median(s[u]) if u.any() else 0.0 for s, u in zip(squares.T, used.T, strict=True)])
+    return np.asarray(used / (1 + squares / (4 * np.maximum(sigma2, median / 2.37) * CAUCHY**2)))
+
+
+def usable_points(camera: StereoCamera, T: FloatArray, p: FloatArray, views: Views, at: Residuals) -> BoolArray:
+    """Which tracks (F,) have a finite point ahead, and a right view or the parallax of one."""
+    q = inverse_depth(camera, T, p, views.weight[..., 0] > 0)
+    J = at.z_D_p.reshape(len(p), -1, 3) @ q.p_D_q
+    variance = np.linalg.inv(np.swapaxes(J, 1, 2) @ J + np.diag([1e-12, 1e-12, PRIOR]))[:, 2, 2]
+    limit = (0.15 * q.disparity) ** 2 if camera.kind == "mono" else 2.0
+    by_stereo = np.any(views.weight[..., 2] > 0, axis=1)
+    return np.asarray(at.ahead & np.isfinite(p).all(axis=1) & (by_stereo | (variance < limit)))
+
+
 def track_information(
     camera: StereoCamera, T_cam0_world: FloatArray, at: Residuals, p_world: FloatArray, weight: FloatArray
 ) -> TrackInformation:
@@ -194,6 +261,12 @@ def track_information(
     return TrackInformation(q, G_i.reshape(F, 6 * N, 3), C_i.sum(axis=1), B, gradient, g_i.sum(axis=1))
 
 
+def moved_points(info: TrackInformation, clone_errors: FloatArray, other: FloatArray) -> FloatArray:
+    """Solve each point's own equations once the clones have moved."""
+    right = info.point_gradient - np.einsum("fik,i->fk", info.G, clone_errors) - other
+    return moved(info.q, np.linalg.solve(info.C, right[..., None])[..., 0], np.inf)
+
+
 def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Information matrix (6N, 6N) and vector (6N,) about the clones of the chosen tracks, equation (M4)."""
     G, N = info.G[chosen], info.G.shape[1] // 6
@@ -210,30 +283,32 @@ def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatAr
 
 
 def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the coefficients of (R3) and (R4), (..., 4, 8), pixels."""
-    x, y = (z[..., 0] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
-    xr = (z[..., 2] - camera.cu) / camera.fu
-    out = np.zeros((*z.shape[:-1], 4, 8))
-    for row, u in ((0, x), (2, xr)):
+    """Derivatives of pixels (..., 4) by the coefficients of (R3) and (R4), (..., 4, 10)."""
+    x, xr = ((z[..., c] - camera.cu) / camera.fu for c in (0, 2))
+    y, one = (z[..., 1] - camera.cv) / camera.fv, np.ones(z.shape[:-1])
+    out = np.zeros((*z.shape[:-1], 4, 10))
+    for column, u in ((0, x), (2, xr)):
         r2 = u * u + y * y
-        out[..., row, 3], out[..., row, 4], out[..., row, 5] = u * r2, 2 * u * y, r2 + 2 * u * u
-    r2 = x * x + y * y
-    out[..., 1, 3], out[..., 1, 4], out[..., 1, 5] = y * r2, r2 + 2 * y * y, 2 * x * y
-    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 1.0, xr, xr * xr + y * y
-    out[..., 2, 6] = xr - x
-    out[..., :3, 7] = np.stack([x, y, xr], axis=-1)
-    return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
+        along = np.stack([u * r2, u * r2 * r2, 2 * u * y, r2 + 2 * u * u], axis=-1)
+        across = np.stack([y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * u * y], axis=-1)
+        out[..., column, 4:8], out[..., column, 9] = camera.fu * along, camera.fu * u
+        if column == 0:
+            out[..., 1, 4:8], out[..., 1, 9] = camera.fv * across, camera.fv * y
+    r2 = xr * xr + y * y
+    out[..., 2, :4] = camera.fu * np.stack([one, xr, r2, r2 * r2], axis=-1)
+    out[..., 2, 8] = z[..., 2] - z[..., 0]
+    return out
 
 
 def corrected(
     camera: StereoCamera, rows: FloatArray, coefficients: FloatArray, z: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Pixels (..., 4) without the field of (R3) and (R4), (8,), and what follows from the rows (6,) of (R2)."""
+    """Pixels (..., 4) without the field of (R3) and (R4), (10,), and what follows from the rows (7,) of (R2)."""
     x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
-    out = z - field_jacobian(camera, z)[..., :6] @ coefficients[:6]
+    out = z - field_jacobian(camera, z)[..., :8] @ coefficients[:8]
     out[..., 2] -= camera.fu * (-rows[1] * y + (rows[5] - rows[4]) * x * y - rows[3] * y * y)
     out = np.where(weight > 0, out, z)
-    baseline, focal = np.exp(coefficients[6:])
+    baseline, focal = np.exp(coefficients[8:])
     left = [camera.cu, camera.cv] + (out[..., :2] - [camera.cu, camera.cv]) / focal
     right = left[..., 0] - (out[..., 0] - out[..., 2]) / (focal * baseline)
     scaled = np.concatenate([left, right[..., None], out[..., 3:]], axis=-1)
@@ -248,10 +323,8 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
     WH = H * weight[..., None, None]
     by_point = np.asarray(sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3)))
     by_q = np.swapaxes(p_D_q, 1, 2) @ np.swapaxes(by_point, 1, 2).reshape(F, 3, N * S)
-    flat = (F, 4 * N, S)
-    return StereoColumns(
-        np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2), H.reshape(flat), WH.reshape(flat), at.r.reshape(F, 4 * N)
-    )
+    A, b = np.einsum("fnas,fnat->fst", WH, H), np.einsum("fnas,fna->fs", WH, at.r)
+    return StereoColumns(np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2), A, b)
 
 
 def eliminate_points_from_columns(
@@ -260,14 +333,68 @@ def eliminate_points_from_columns(
     """Take the points of the chosen tracks out of the coefficients' part of the normal equations, as (M4) does."""
     by_point = columns.by_point[chosen]
     F, N, _, S = by_point.shape
-    H, WH, r = (a[chosen] for a in (columns.H, columns.WH, columns.r))
     G = by_point.sum(axis=1)  # (F, 3, S)
     CG = np.linalg.solve(info.C[chosen], G)  # (F, 3, S)
     flat_G, flat_CG = G.reshape(3 * F, S), CG.reshape(3 * F, S)
-    A = WH.reshape(-1, S).T @ H.reshape(-1, S) - flat_G.T @ flat_CG
+    A = columns.A[chosen].sum(axis=0) - flat_G.T @ flat_CG
     B = info.q_D_clone[chosen].reshape(3 * F, 6)
     per_view = np.swapaxes(by_point, 1, 2).reshape(3 * F, N * S)
     cross = (B.T @ per_view).reshape(6, N, S).transpose(1, 0, 2).reshape(6 * N, S)
     cross = cross - np.swapaxes(info.G[chosen], 1, 2).reshape(3 * F, 6 * N).T @ flat_CG
-    b = WH.reshape(-1, S).T @ r.reshape(-1) - flat_CG.T @ info.point_gradient[chosen].reshape(-1)
+    b = columns.b[chosen].sum(axis=0) - flat_CG.T @ info.point_gradient[chosen].reshape(-1)
     return StereoInformation(A, cross.T, b)
+
+
+# --- poses of the window, and the IMU's samples ------------------------------------------------------------------
+
+
+def moved_velocities(
+    gravity: FloatArray, ages_s: FloatArray, R: FloatArray, error: FloatArray, velocities: FloatArray
+) -> FloatArray:
+    """Velocities (N, 3) of the past, moved by a present error (15,): (N2) back, with the accelerometer's bias."""
+    xi_v = (free_flow(-ages_s, gravity) @ error[:9])[:, 6:9] + ages_s[:, None] * (R @ error[12:15])
+    out: FloatArray = velocities @ so3_exp(error[3:6]).T + xi_v @ so3_left_jacobian(error[3:6]).T
+    return out
+
+
+def free_flow(s: FloatArray, gravity: FloatArray) -> FloatArray:
+    """Transition (K, 9, 9) of [rho phi xi_v] over times (K,)."""
+    out = np.zeros((len(s), 9, 9))
+    out[:] = np.eye(9)
+    G = so3_hat(gravity)
+    out[:, 0:3, 6:9] = s[:, None, None] * np.eye(3)
+    out[:, 0:3, 3:6] = (0.5 * s**2)[:, None, None] * G
+    out[:, 6:9, 3:6] = s[:, None, None] * G
+    return out
+
+
+def integrated(
+    times: FloatArray,
+    readings: FloatArray,
+    bias: FloatArray,
+    gravity: FloatArray,
+    densities: FloatArray,
+    hidden: FloatArray,
+    T: FloatArray,
+    velocity: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Rotations (K, 3, 3), positions and velocities (K, 3), Phi's biases (9, 6) and noise (2, 9, 9), (N1) to (N4)."""
+    dt, (gyro, accel) = np.diff(times) * 1e-9, np.split(readings - bias, 2, axis=1)
+    R = np.empty((len(times), 3, 3))
+    R[0] = T[:3, :3]
+    for k, step in enumerate(so3_exp(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None])):
+        R[k + 1] = R[k] @ step
+    force = (R @ accel[..., None])[..., 0] + gravity
+    a = 0.5 * (force[:-1] + force[1:])
+    v = velocity + np.concatenate([np.zeros((1, 3)), np.cumsum(a * dt[:, None], axis=0)])
+    moves = v[:-1] * dt[:, None] + 0.5 * a * (dt**2)[:, None]
+    p = T[:3, 3] + np.concatenate([np.zeros((1, 3)), np.cumsum(moves, axis=0)])
+    left = (times[-1] - 0.5 * (times[:-1] + times[1:])) * 1e-9
+    B = np.zeros((len(dt), 9, 6))
+    B[:, 0:3, 0:3] = -so3_hat(0.5 * (p[:-1] + p[1:])) @ R[:-1]
+    B[:, 3:6, 0:3] = B[:, 6:9, 3:6] = -R[:-1]
+    B[:, 6:9, 0:3] = -so3_hat(0.5 * (v[:-1] + v[1:])) @ R[:-1]
+    moved = free_flow(left, gravity) @ B
+    variance = densities[:, None] ** 2 * dt + hidden
+    Q = [np.einsum("k,kij,klj->il", s, M, M) for s, M in zip(variance, (moved[:, :, 3:], moved[:, :, :3]), strict=True)]
+    return R, p, v, np.einsum("kij,k->ij", moved, dt), np.array(Q)

@@ -26,9 +26,18 @@ from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.compiled import invert_positive, move_by_twist, solve_positive
 from vio.datasets import png_rows
-from vio.filters import multiview, stereo_calibration
+from vio.filters import multiview, pose_loops, stereo_calibration, track_loops
 from vio.filters.multiview import Views
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
+from vio.geometry.lie import (
+    FloatArray,
+    se3_adjoint,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+    so3_left_jacobian,
+    transform_points,
+)
 from vio.geometry.stereo import StereoCamera, project, triangulate
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
@@ -93,10 +102,10 @@ def test_refinement_of_a_motion_equals_numpy(camera: StereoCamera) -> None:
     pixels = project(camera, transform_points(true, points))[:, :2] + rng.normal(0, 0.3, (60, 2))
     pixels[::5] += 40.0  # on something that moves
     ours = _refine(camera, np.eye(4), points, pixels, 60.0, slice(0, 6))
-    twin = numpy_twins.refined(camera, np.eye(4), points, pixels, 60.0, 3e-6)
+    twin = numpy_twins.refined_motion(camera, np.eye(4), points, pixels, 60.0, 3e-6)
     np.testing.assert_allclose(ours, twin, atol=1e-9)
     close = _refine(camera, ours, points, pixels, 5.0, slice(0, 6))
-    np.testing.assert_allclose(close, numpy_twins.refined(camera, ours, points, pixels, 5.0, 3e-6), atol=1e-9)
+    np.testing.assert_allclose(close, numpy_twins.refined_motion(camera, ours, points, pixels, 5.0, 3e-6), atol=1e-9)
     assert np.abs(ours - np.eye(4)).max() > 0.05  # from both starts it moves
     assert np.abs(close - ours).max() > 0.01
 
@@ -231,12 +240,113 @@ def test_tracks_are_linearised_and_eliminated_as_in_numpy(camera: StereoCamera) 
         np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
 
 
+@both_cameras
+def test_points_are_refined_chosen_and_weighed_as_in_numpy(camera: StereoCamera) -> None:
+    T, p, views = _scene(camera)
+    views.weight[5:15, :, 2] = 0.0
+    views.weight[5:8, 2:, :2] = 0.0  # two views at most: little parallax
+    start = p + np.random.default_rng(14).normal(0, 0.2, p.shape)
+    start[3] = transform_points(se3_inverse(T[1]), [0.0, 0.0, 1e-3])
+    ours = multiview.refine_points(camera, T, start, views, 3, 1.0)
+    np.testing.assert_allclose(ours, numpy_twins.refined(camera, T, start, views, 3, 1.0), rtol=1e-6)
+    ours[20] = np.nan
+    for lens in (camera, replace(camera, kind="mono")):
+        at = multiview.residuals(lens, T, ours, views)
+        keep = multiview.usable_points(lens, T, ours, views, at)
+        assert keep.tolist() == numpy_twins.usable_points(lens, T, ours, views, at).tolist()
+        assert 0 < keep.sum() < len(keep)
+    at = at.take(keep)
+    at.z_D_p[:, 3] = 0.0  # a clone that saw nothing
+    for sigma2 in (1e-6, 1.0):
+        np.testing.assert_allclose(multiview.robust_weights(at, sigma2), numpy_twins.robust_weights(at, sigma2))
+
+
+def test_points_follow_the_clones_as_in_numpy() -> None:
+    T, p, views = _scene()
+    at = multiview.residuals(CAMERA, T, p, views)
+    at, p = at.take(at.ahead), p[at.ahead]
+    info = multiview.track_information(CAMERA, T, at, p, np.ones(at.r.shape[:2]))
+    rng = np.random.default_rng(15)
+    errors, other = rng.normal(0, 1e-3, 6 * len(T)), rng.normal(0, 1.0, (len(p), 3))
+    np.testing.assert_allclose(info.moved_points(errors, other), numpy_twins.moved_points(info, errors, other))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 101])
+def test_middle_is_the_median(count: int) -> None:
+    values = np.random.default_rng(count).integers(0, 12, count).astype(np.float64)  # with ties
+    assert track_loops.middle(values.copy()) == np.median(values)
+
+
+def test_landmarks_are_added_as_in_numpy() -> None:
+    rng = np.random.default_rng(16)
+    r, J, w = rng.normal(size=(7, 4)), rng.normal(size=(7, 4, 3)), rng.uniform(size=7)
+    A, b = np.zeros((30, 30)), np.zeros(30)
+    track_loops.add_landmarks(r, J, w, 3, 9, A, b)
+    H = np.zeros((7, 4, 30))
+    for k in range(7):
+        H[k, :, 9 + 3 * k : 12 + 3 * k], H[k, :, 3:6] = J[k], -J[k]
+    np.testing.assert_allclose(A, np.einsum("k,kai,kaj->ij", w, H, H), atol=1e-12)
+    np.testing.assert_allclose(b, np.einsum("k,kai,ka->i", w, H, r), atol=1e-12)
+
+
+def test_poses_and_velocities_move_as_in_numpy() -> None:
+    rng = np.random.default_rng(17)
+    T, T_cam0_imu, now = se3_exp(rng.normal(size=(5, 6))), se3_exp(rng.normal(size=6)), se3_exp(rng.normal(size=6))
+    eta, error, gravity = rng.normal(size=6), 0.1 * rng.normal(size=15), np.array([0.0, 0.0, -9.8])
+    cameras, moves = np.empty(T.shape), np.zeros((5, 6))
+    pose_loops.camera_poses(T_cam0_imu, T, cameras)
+    np.testing.assert_allclose(cameras, T_cam0_imu @ se3_inverse(T), atol=1e-14)
+    pose_loops.add_extrinsic_moves(T, now, eta, moves)
+    np.testing.assert_allclose(moves, se3_adjoint(T @ se3_inverse(now)) @ eta, atol=1e-13)
+    for size in (1e-4, 1.0):
+        phi, xi, p = size * rng.normal(size=3), rng.normal(size=(4, 3)), rng.normal(size=(4, 3))
+        expected = p @ so3_exp(phi).T + xi @ so3_left_jacobian(phi).T
+        pose_loops.move_points(phi, xi, p)
+        np.testing.assert_allclose(p, expected, atol=1e-14)
+    ages, velocities = np.arange(5) * 0.05, rng.normal(size=(5, 3))
+    expected = numpy_twins.moved_velocities(gravity, ages, T[:, :3, :3], error, velocities)
+    pose_loops.move_earlier_velocities(gravity, ages, np.ascontiguousarray(T[:, :3, :3]), error, velocities)
+    np.testing.assert_allclose(velocities, expected, atol=1e-13)
+    rows, part = np.array([0, 2, 3]), np.empty((3, 3))
+    pose_loops.take_rows(cameras[0], rows, part)
+    np.testing.assert_array_equal(part, cameras[0][np.ix_(rows, rows)])
+
+
+def test_missing_samples_are_found() -> None:
+    t = np.cumsum(np.random.default_rng(18).uniform(0.5, 1.5, 9))
+    inside, longest = np.linspace(t[0], t[-1], 7), np.diff(t).max()
+    assert not pose_loops.lacks_samples(inside, t, longest)
+    assert pose_loops.lacks_samples(inside, t, longest - 1e-9)
+    assert pose_loops.lacks_samples(inside, t[1:], longest)
+    assert pose_loops.lacks_samples(inside, t[:-1], longest)
+
+
+def test_the_imu_is_integrated_as_in_numpy() -> None:
+    rng = np.random.default_rng(19)
+    times = np.cumsum(rng.uniform(2e6, 8e6, 12))
+    readings, bias, gravity = rng.normal(size=(12, 6)), 0.1 * rng.normal(size=6), np.array([0.0, 0.0, -9.8])
+    densities, hidden = np.array([0.02, 0.003]), rng.uniform(0, 1e-4, (2, 11))
+    T, v, turned = se3_exp(rng.normal(size=6)), rng.normal(size=3), np.zeros(3)
+    given = times - times[0], readings, bias, gravity, densities, hidden
+    R_k, p_k, v_k, biases, noise = numpy_twins.integrated(*given, T, v)
+    Phi, Q = np.eye(15), np.zeros((2, 15, 15))
+    pose_loops.integrate(*given, T, v, turned, Phi, Q)
+    np.testing.assert_allclose(T, se3_from_parts(R_k[-1], p_k[-1]), atol=1e-13)
+    np.testing.assert_allclose(v, v_k[-1], atol=1e-13)
+    gyro = readings[:, :3] - bias[:3]
+    np.testing.assert_allclose(turned, np.diff(times) * 1e-9 @ (gyro[1:] + gyro[:-1]) / 2, atol=1e-14)
+    np.testing.assert_allclose(Phi[:9, 9:], biases, atol=1e-13)
+    np.testing.assert_allclose(Q[:, :9, :9], noise, rtol=1e-9, atol=1e-16)
+    assert not Q[:, 9:].any()
+    assert not Q[:, :, 9:].any()
+
+
 def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     T, p, views = _scene()
     rng = np.random.default_rng(13)
-    rows, states = rng.normal(0, 0.01, 6), rng.normal(0, 0.01, 8)
+    rows, states = rng.normal(0, 0.01, 7), rng.normal(0, 0.01, 10)
     expected = numpy_twins.corrected(CAMERA, rows, states, views.z, views.weight)
-    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(8)).corrected(views)
+    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(10)).corrected(views)
     np.testing.assert_allclose(views.z, expected, rtol=1e-12)
     at = multiview.residuals(CAMERA, T, p, views)
     at, p = at.take(at.ahead), p[at.ahead]

@@ -201,3 +201,16 @@ def test_samples_that_are_missing_for_seconds_are_no_matter_of_clocks() -> None:
     assert at_end(lambda t: not 4 < t < 7) == []
     assert at_end(lambda t: t < 7) == ["clocks overlap in part"]
     assert at_end(lambda t: t > 4) == ["clocks overlap in part"]
+
+
+@pytest.mark.parametrize("fault", [_one_gyro_spike, _two_per_mille, _zeros, _stuck, _dead_gyro])
+def test_samples_of_a_frame_at_once_are_judged_as_one_by_one(fault: Change) -> None:
+    samples = Faulty(fault).imu(np.random.default_rng(3), MsckfSettings(), np.zeros(6))
+    single, at_once = ImuSampleCheck(), ImuSampleCheck()
+    expected = [x.time_ns for sample in samples for x in single.take(sample)]
+    cuts = np.cumsum(np.random.default_rng(4).integers(0, 25, len(samples)))
+    parts = np.split(np.arange(len(samples)), cuts[cuts < len(samples)])
+    got = [x.time_ns for part in parts for x in at_once.take_all([samples[k] for k in part])]
+    assert got == expected
+    assert at_once.finish() == single.finish()
+    assert len(got) < len(samples)

@@ -6,19 +6,20 @@ import numpy as np
 import pytest
 
 from tests.numerics import numeric_jacobian
+from tests.numpy_twins import moved
 from vio.filters.multiview import (
     CAUCHY,
     Residuals,
     Views,
     eliminate_points,
     first_points,
-    has_parallax,
     inverse_depth,
     point_D_pose,
     refine_points,
     residuals,
     robust_weights,
     track_information,
+    usable_points,
 )
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
@@ -205,8 +206,8 @@ def test_coordinates_of_a_point_equal_central_differences(left_only: bool) -> No
         np.testing.assert_allclose(q.q_D_p[f], numeric_jacobian(coordinates, p[f]), atol=1e-5)
         np.testing.assert_allclose(q.q_D_p[f] @ q.p_D_q[f], np.eye(3), atol=1e-12)
         dq = np.array([3.0, -2.0, 1.5])
-        moved = coordinates(q.moved(np.tile(dq, (8, 1)), np.inf)[f])
-        np.testing.assert_allclose(moved, coordinates(p[f]) + dq, atol=1e-9)
+        after = coordinates(moved(q, np.tile(dq, (8, 1)), np.inf)[f])
+        np.testing.assert_allclose(after, coordinates(p[f]) + dq, atol=1e-9)
 
 
 @pytest.mark.parametrize(("spread_m", "enough"), [(1e-3, False), (0.02, False), (0.5, True), (1.45, True)])
@@ -214,7 +215,7 @@ def test_left_views_need_the_parallax_of_a_baseline_and_stereo_views_none(spread
     for left_only in (True, False):
         T, p, at = _sideways(spread_m, 5.0, left_only)
         views = Views(np.zeros_like(at.r), np.ones_like(at.r))
-        found = has_parallax(CAMERA, T, p, _left_only(views) if left_only else views, at)
+        found = usable_points(CAMERA, T, p, _left_only(views) if left_only else views, at)
         assert np.all(found == (enough or not left_only))
 
 

@@ -6,6 +6,7 @@ import copy
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from vio.filters.navigation import DIM, Measurement, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
@@ -154,10 +155,32 @@ def test_fit_by_factors_equals_the_dense_covariance() -> None:
         P_new, shift = posterior(prior, H.T @ H, b)
         np.testing.assert_allclose(fitted.covariance(), P_new, atol=1e-12)
         np.testing.assert_allclose(fitted.move(b), shift, atol=1e-9)
-        S = fitted.spread(J)
+        S = fitted.whitened(J @ fitted.prior.L)
         np.testing.assert_allclose(S @ np.swapaxes(S, 1, 2), J @ P_new @ np.swapaxes(J, 1, 2), atol=1e-9)
-        first = factor(prior).leading(4).L
-        np.testing.assert_allclose(first @ first.T, prior[:4, :4], atol=1e-7)
+
+
+@pytest.mark.parametrize("about_all", [False, True])
+def test_a_fit_of_some_errors_equals_the_one_of_all(about_all: bool) -> None:
+    """Of pixels, which navigation state and calibration follow by their correlation, and of everything."""
+    window, rng = _window(), np.random.default_rng(5)
+    D = len(window.P)
+    root = rng.normal(size=(D, D))
+    window.P, window.prior_delta = root @ root.T, rng.normal(size=D)
+    H, r = rng.normal(size=(20, D)), rng.normal(size=20)
+    if not about_all:
+        H[:, : window.first_clone] = 0.0
+    for size in (window.first_landmark, D):
+        A, b = np.zeros((D, D)), np.zeros(D)
+        A[:size, :size], b[:size] = H[:, :size].T @ H[:, :size], H[:, :size].T @ r
+        P, shift = posterior(window.P, A, b + A @ window.prior_delta)
+        fitted, error = window.optimum(A, b, size)
+        assert fitted.prior.first == (0 if about_all else window.first_clone)
+        np.testing.assert_allclose(error, shift - window.prior_delta, atol=1e-8)
+        np.testing.assert_allclose(fitted.covariance(), P[:size, :size], atol=1e-8)
+    delta = window.prior_delta
+    window.absorb(A, b)
+    np.testing.assert_allclose(window.P, P, atol=1e-8)
+    np.testing.assert_allclose(window.prior_delta, delta - shift, atol=1e-8)
 
 
 def test_changes_in_place_are_seen_by_the_next_fit() -> None:

@@ -14,17 +14,20 @@ How often that is due to coarse quantisation is learned from the record.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 import numpy as np
 
-from vio.records import ImuSample
+from vio.compiled import compiled
+from vio.geometry.lie import FloatArray
+from vio.records import ImuSample, IntArray
 from vio.robust import robust_sigmas
 
 ImuFaultKind: TypeAlias = Literal["gyro spike", "accelerometer spike", "stuck IMU", "stuck gyro", "stuck accelerometer"]
 
-_HISTORY_S = 2.0  # changes between samples that a spike is compared with
+_HISTORY_NS = 2_000_000_000  # changes between samples that a spike is compared with
 _LEAST_HISTORY = 20  # changes; with fewer nothing is called a spike, nor stuck: a simulated IMU may have no noise
 _REFRESH, _REFRESH_SHARE = 20, 4  # samples between two evaluations of their scale, and the least share of all, 1 / 4
 _SPIKE_SIGMAS = 30.0  # robust standard deviations of the changes; real motion reached 23
@@ -71,23 +74,50 @@ class ImuSampleCheck:
 
     def take(self, sample: ImuSample) -> tuple[ImuSample, ...]:
         """Take a sample; return those that may be used now, in time order."""
-        reading = _reading(sample)
+        return tuple(self.take_all([sample]))
+
+    def take_all(self, samples: Sequence[ImuSample]) -> list[ImuSample]:
+        """Take samples in order of time, as `take` does one by one; return those that may be used now."""
+        if not samples:
+            return []
+        times = np.array([x.time_ns for x in samples], dtype=np.int64)
+        usable: list[ImuSample] = []
+        readings, k = readings_of(samples), 0
+        while k < len(samples):
+            passed = self._pass_on(times[k:], readings[k:])
+            usable += samples[k : k + passed]
+            k += passed
+            if passed == 0:
+                usable += self._take_unusual(samples[k], readings[k].tolist())
+                k += 1
+            self._previous, self._last_reading = samples[k - 1], readings[k - 1].tolist()
+        return usable
+
+    def _pass_on(self, times: IntArray, readings: FloatArray) -> int:
+        """Count the first of some samples, of times (K,) and readings (K, 6), that nothing is to be said of."""
+        if self._previous is None or self._held or any(r.repeats for r in self._repeats):
+            return 0
+        passed = self._spikes.pass_on(times, readings)
+        for r in self._repeats:
+            r.count_others(passed)
+        return passed
+
+    def _take_unusual(self, sample: ImuSample, reading: _Reading) -> list[ImuSample]:
         if self._previous is not None:
             equal = [a == b for a, b in zip(self._last_reading, reading, strict=True)]
             ended = [f for r in self._repeats for f in r.take(self._previous, sample, equal)]
             self._faults += ended[:1]  # that of the whole IMU is that of both sensors
-        self._previous, self._last_reading = sample, reading
         if any(r.stuck for r in self._repeats) or not any(reading[3:]):  # gravity is never zero in all axes
             self._held = []
-            return ()
+            return []
         if any(r.unusual for r in self._repeats):
             self._held.append(sample)
-            return ()
+            return []
         held, self._held = self._held, []
         usable = [x for candidate in held for x in self._spikes.take(candidate, _reading(candidate))]
         usable += self._spikes.take(sample, reading)
         self._faults += self._spikes.new_faults()
-        return tuple(usable)
+        return usable
 
     def new_faults(self) -> tuple[ImuFault, ...]:
         """Return the faults that ended since the last call."""
@@ -123,6 +153,14 @@ class _Repetition:
             self._count(repeated)
         self.repeats, self.stuck = 0, False
         return ended
+
+    def count_others(self, count: int) -> None:
+        """Count samples that repeat nothing, after one that repeated nothing."""
+        if self._equal == 0:
+            self._counted.extend([False] * count)
+            return
+        for _ in range(count):
+            self._count(False)
 
     @property
     def unusual(self) -> bool:
@@ -162,11 +200,26 @@ class _SpikeCheck:
     def __init__(self) -> None:
         self._last: tuple[int, _Reading] | None = None  # time and reading of the last sample that passed
         self._suspect: ImuSample | None = None
-        self._steps: deque[tuple[int, _Reading]] = deque()  # times and changes
+        self._times: IntArray = np.zeros(0, dtype=np.int64)  # (S,) of the samples of the last seconds that passed
+        self._changes: FloatArray = np.zeros((0, 6))  # (S, 6) to each of them
         self._limit: _Reading | None = None  # (6,) a larger change is suspect; None: unknown
         self._period_ns = 0.0
         self._until_refresh = 0
         self._faults: list[ImuFault] = []
+
+    def pass_on(self, times: IntArray, readings: FloatArray) -> int:
+        """Take the first of some samples, up to one that is suspect or repeats a reading; return how many."""
+        if self._last is None or self._suspect is not None:
+            return 0
+        most = max(self._until_refresh, 1)  # then the limits change
+        times, readings = times[:most], readings[:most]
+        changes, limit = np.empty(readings.shape), np.array([np.inf] * 6 if self._limit is None else self._limit)
+        longest = _LONG_PERIODS * self._period_ns
+        last_ns, last = self._last
+        passed = _count_plain(times, readings, last_ns, np.array(last), limit, longest, changes)
+        if passed:
+            self._accept(times[:passed], changes[:passed], readings[passed - 1].tolist())
+        return passed
 
     def take(self, sample: ImuSample, reading: _Reading) -> tuple[ImuSample, ...]:
         if self._last is None:
@@ -175,13 +228,13 @@ class _SpikeCheck:
         suspect, self._suspect = self._suspect, None
         if suspect is not None:
             if self._has_returned(suspect, reading):
-                self._accept(sample, reading)
+                self._accept_one(sample, reading)
                 return (sample,)
-            self._accept(suspect, _reading(suspect))
+            self._accept_one(suspect, _reading(suspect))
         elif self._is_suspect(sample.time_ns, reading):
             self._suspect = sample
             return ()
-        self._accept(sample, reading)
+        self._accept_one(sample, reading)
         return (sample,) if suspect is None else (suspect, sample)
 
     def new_faults(self) -> list[ImuFault]:
@@ -211,20 +264,59 @@ class _SpikeCheck:
                 self._faults.append(ImuFault(kind, suspect.time_ns, suspect.time_ns, size))  # type: ignore[arg-type]
         return True
 
-    def _accept(self, sample: ImuSample, reading: _Reading) -> None:
+    def _accept_one(self, sample: ImuSample, reading: _Reading) -> None:
         assert self._last is not None
-        self._steps.append((sample.time_ns, [now - last for now, last in zip(reading, self._last[1], strict=True)]))
-        self._last = sample.time_ns, reading
-        while sample.time_ns - self._steps[0][0] > _HISTORY_S / _NS:
-            self._steps.popleft()
-        self._until_refresh -= 1
-        if self._until_refresh <= 0 and len(self._steps) >= _LEAST_HISTORY:
-            self._until_refresh = max(_REFRESH, len(self._steps) // _REFRESH_SHARE)
-            times, changes = zip(*self._steps, strict=True)
-            self._period_ns = float(np.median(np.diff(np.array(times, dtype=np.int64))))
+        change = np.array(reading) - np.array(self._last[1])
+        self._accept(np.array([sample.time_ns], dtype=np.int64), change[None], reading)
+
+    def _accept(self, times: IntArray, changes: FloatArray, reading: _Reading) -> None:
+        """Add changes (K, 6) at times (K,); the reading is the last one."""
+        now, count = int(times[-1]), len(times)
+        times, changes = np.concatenate([self._times, times]), np.concatenate([self._changes, changes])
+        old = int(np.searchsorted(times, now - _HISTORY_NS))
+        self._last, self._times, self._changes = (now, reading), times[old:], changes[old:]
+        self._until_refresh -= count
+        if self._until_refresh <= 0 and len(self._times) >= _LEAST_HISTORY:
+            self._until_refresh = max(_REFRESH, len(self._times) // _REFRESH_SHARE)
+            self._period_ns = float(np.median(np.diff(self._times)))
             least = np.array(_SPIKE_IMPULSE) / max(self._period_ns * _NS, 1e-6)
-            self._limit = np.maximum(_SPIKE_SIGMAS * robust_sigmas(np.array(changes)), least).tolist()
+            self._limit = np.maximum(_SPIKE_SIGMAS * robust_sigmas(self._changes), least).tolist()
 
 
 def _reading(sample: ImuSample) -> _Reading:
     return [*sample.gyro.tolist(), *sample.accel.tolist()]
+
+
+def readings_of(samples: Sequence[ImuSample]) -> FloatArray:
+    """Return the readings (K, 6) `[gyro, accel]` of one or more samples."""
+    return np.concatenate([part for x in samples for part in (x.gyro, x.accel)]).reshape(-1, 6)
+
+
+@compiled
+def _count_plain(
+    times: IntArray,
+    readings: FloatArray,
+    last_ns: int,
+    last: FloatArray,
+    limit: FloatArray,
+    longest_ns: float,
+    changes: FloatArray,
+) -> int:
+    """Count the first of some samples, of times (K,) and readings (K, 6), that neither stand out nor repeat one.
+
+    Their changes (K, 6) are written: none above its limit (6,), unless the sample comes late, is suspect.
+    """
+    for k in range(len(times)):
+        before = last if k == 0 else readings[k - 1]
+        near = times[k] - (last_ns if k == 0 else times[k - 1]) <= longest_ns
+        gyro_changed, accel_changed, accel_reads = False, False, False
+        for i in range(6):
+            changes[k, i] = readings[k, i] - before[i]
+            if near and abs(changes[k, i]) > limit[i]:
+                return k
+            gyro_changed = gyro_changed or (i < 3 and readings[k, i] != before[i])
+            accel_changed = accel_changed or (i >= 3 and readings[k, i] != before[i])
+            accel_reads = accel_reads or (i >= 3 and readings[k, i] != 0.0)
+        if not (gyro_changed and accel_changed and accel_reads):
+            return k
+    return len(times)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vio.evaluation import Evaluation
+from vio.filters.stereo_calibration import RIGHT_TERMS
 from vio.frame_result import STAGES
 from vio.geometry.lie import FloatArray, transform_points
 from vio.pipeline import RunResult
@@ -97,10 +98,11 @@ def _draw_calibration(axes: Any, seconds: FloatArray, result: RunResult) -> None
     fields = [estimate.stereo_field for estimate in result.estimates]
     has = np.array([field is not None for field in fields])
     known = [field for field in fields if field is not None]
-    values = f * np.array([field.coefficients[:3] for field in known])
-    sigmas = f * np.array([np.sqrt(np.diag(field.covariance)[:3]) for field in known])
-    colours = (_ESTIMATE, _DEAD_RECKONING, "#3a9d5d")
-    for k, (name, colour) in enumerate(zip(("all columns", "along u", "with radius²"), colours, strict=True)):
+    values = f * np.array([field.coefficients[:RIGHT_TERMS] for field in known])
+    sigmas = f * np.array([np.sqrt(np.diag(field.covariance)[:RIGHT_TERMS]) for field in known])
+    colours = (_ESTIMATE, _DEAD_RECKONING, "#3a9d5d", "#8a5fb0")
+    names = ("all columns", "along u", "with radius²", "with radius⁴")
+    for k, (name, colour) in enumerate(zip(names, colours, strict=True)):
         axes.plot(seconds[has], values[:, k], color=colour, lw=1.2, label=name)
         axes.fill_between(
             seconds[has], values[:, k] - sigmas[:, k], values[:, k] + sigmas[:, k], color=colour, alpha=0.2, lw=0

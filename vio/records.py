@@ -308,11 +308,11 @@ class StereoFieldEstimate:
     All are in focal lengths.
     """
 
-    coefficients: FloatArray  # (6,) a0, a1, a2 of the right columns; k, q1, q2 of both lenses
-    covariance: FloatArray  # (6, 6)
+    coefficients: FloatArray  # (8,) a0, a1, a2, a3 of the right columns; k1, k2, q1, q2 of both lenses
+    covariance: FloatArray  # (8, 8)
     rows_rms_px: float = 0.0  # root mean square over the features of what the rows of left and right differ by
-    rows: FloatArray | None = None  # (6,) of 1, x, y, x y, x^2, y^2 in the right rows (R2); None: not learned
-    rows_covariance: FloatArray | None = None  # (6, 6)
+    rows: FloatArray | None = None  # (7,) of 1, x, y, x y, x^2, y^2, d in the right rows (R2); None: not learned
+    rows_covariance: FloatArray | None = None  # (7, 7)
 
 
 @dataclass(frozen=True, slots=True)

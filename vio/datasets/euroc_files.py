@@ -7,7 +7,9 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +17,9 @@ import numpy as np
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.yaml_files import as_number, numbers, read_yaml
 from vio.errors import CalibrationError, DataError
-from vio.geometry.distortion import CameraModel, DistortionModel
-from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
+from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
+from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, se3_inverse
+from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 from vio.text_files import INT64_MAX, check_increasing, exact_text, text_lines
 
@@ -30,6 +33,7 @@ DISTORTION_MODELS: dict[str, DistortionModel] = {
 SENSOR_YAML_MODELS: tuple[DistortionModel, ...] = ("pinhole", "radtan", "equidistant")  # those it has a name for
 STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, within mav0
 TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
+_ULPS = 2  # units in the last place within which a translation is looked for that is read back as it was
 _NOISE = {  # entries of the IMU's sensor.yaml, and their units
     "gyroscope_noise_density": "rad / s / sqrt(Hz)",
     "gyroscope_random_walk": "rad / s^2 / sqrt(Hz)",
@@ -146,6 +150,44 @@ def _T_BS(entries: Mapping[str, object], path: Path) -> FloatArray:
 def _T_BS_yaml(T_body_sensor: FloatArray) -> str:
     rows = ",\n         ".join(exact_text(row, ", ") for row in T_body_sensor)
     return f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n"
+
+
+def rig_read_as(camera: StereoCamera, T_cam0_imu: FloatArray) -> StereoRig:
+    """Return the rig of a rectified pair whose poses `T_BS`, when they are read, give this very pair, to the last bit.
+
+    The files hold the inverses of `T_cam0_imu` (4, 4) and of the right camera's pose, and inverting twice rounds. Of
+    the translations within a few units in the last place one is taken that does not; where there is none, the nearest.
+
+    Raises:
+        CalibrationError: the image size is unknown.
+    """
+    rig = rig_from_rectified(camera, T_cam0_imu)
+    R, baseline = rig.T_imu_cam0[:3, :3], np.array([camera.baseline_m, 0.0, 0.0])
+    T0, T1 = rig.T_imu_cam0.copy(), rig.T_imu_cam1.copy()
+
+    def left_fits(t: FloatArray) -> bool:
+        return np.array_equal(se3_inverse(se3_from_parts(R, t)), T_cam0_imu)
+
+    def right_fits(t: FloatArray) -> bool:
+        found = rectified_pair(replace(rig, T_imu_cam0=T0, T_imu_cam1=se3_from_parts(R, t)))
+        return found is not None and found.baseline_m == camera.baseline_m
+
+    # R is a rotation to its own digits only, so its transpose is not its inverse.
+    T0[:3, 3] = _first(_neighbours(np.asarray(np.linalg.solve(R.T, -T_cam0_imu[:3, 3]), dtype=np.float64)), left_fits)
+    right: FloatArray = np.asarray(T0[:3, 3] + np.linalg.solve(R.T, baseline), dtype=np.float64)
+    T1[:3, 3] = _first(_neighbours(right), right_fits)
+    return replace(rig, T_imu_cam0=T0, T_imu_cam1=T1)
+
+
+def _first(values: Sequence[FloatArray], fits: Callable[[FloatArray], bool]) -> FloatArray:
+    """Return the first value that fits, else the first one."""
+    return next((value for value in values if fits(value)), values[0])
+
+
+def _neighbours(t: FloatArray) -> list[FloatArray]:
+    """Return a vector (3,) and those around it, the nearest first, by units in the last place of its numbers."""
+    steps = sorted(product(range(-_ULPS, _ULPS + 1), repeat=3), key=lambda step: max(map(abs, step)))
+    return [t + np.array(step) * np.spacing(np.abs(t)) for step in steps]
 
 
 # --- data.csv -------------------------------------------------------------------------------------------------------

@@ -9,10 +9,12 @@ docs/math.md. Reference: Kolmogorov's structure function, as in Monin & Yaglom, 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from vio.filters.pose_loops import lacks_samples
 from vio.geometry.lie import FloatArray
 from vio.records import ImuSample, IntArray
 
@@ -42,11 +44,11 @@ class ImuHistory:
         self._samples: deque[ImuSample] = deque()
         self._period, self._unmeasured = 0.0, 0  # median distance, and samples since it was computed
 
-    def take(self, sample: ImuSample) -> None:
-        """Take a sample and drop what is too old."""
-        self._samples.append(sample)
-        self._unmeasured += 1
-        while sample.time_ns - self._samples[0].time_ns > _MEMORY_S / _NS:
+    def take(self, samples: Sequence[ImuSample]) -> None:
+        """Take samples in order of time and drop what is too old."""
+        self._samples.extend(samples)
+        self._unmeasured += len(samples)
+        while self._samples and self._samples[-1].time_ns - self._samples[0].time_ns > _MEMORY_S / _NS:
             self._samples.popleft()
 
     def hidden(self, cuts_ns: FloatArray, times_ns: FloatArray) -> Hidden | None:
@@ -57,6 +59,8 @@ class ImuHistory:
             times_ns: (S,) of the samples at hand, on the same scale, increasing.
         """
         period_ns = self._period_ns()
+        if not lacks_samples(cuts_ns, times_ns, _LONG_PERIODS * period_ns):
+            return None
         after = np.searchsorted(times_ns, 0.5 * (cuts_ns[1:] + cuts_ns[:-1]))
         left = np.concatenate([[-np.inf], times_ns])[after]  # the samples around each step
         right = np.concatenate([times_ns, [np.inf]])[after]
@@ -64,8 +68,6 @@ class ImuHistory:
         silent = np.where(held, np.minimum(cuts_ns[1:] - left, right - cuts_ns[:-1]), right - left)
         gap = silent > _LONG_PERIODS * period_ns
         uncertain = gap | held
-        if not uncertain.any():
-            return None
         counts = np.where(uncertain, np.ceil(np.diff(cuts_ns) / max(period_ns, _SHORTEST_CUT_NS)), 1)
         parts = np.clip(counts, 1, _MOST_CUTS).astype(np.int64)
         ends = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(cuts_ns[:-1], cuts_ns[1:], parts, strict=True)]

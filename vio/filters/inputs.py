@@ -66,7 +66,11 @@ class InputOrder:
             (sample.gyro, sample.accel) if isinstance(sample, ImuSample) else (sample.linear, sample.angular)
         )
         kind, now = "IMU" if imu else "velocity", sample.time_ns
-        if not all(-_LARGEST < value < _LARGEST for value in (*first.tolist(), *second.tolist())):
+        (a, b, c), (d, e, f), most = first.tolist(), second.tolist(), _LARGEST
+        # Written out, as it is asked of every sample.
+        if not (-most < a < most and -most < b < most and -most < c < most) or not (
+            -most < d < most and -most < e < most and -most < f < most
+        ):
             raise DataError(f"{self.name}: the {kind} sample at {now} ns holds {_values(first, second)}; drop it")
         if self._sample_ns is not None and now <= self._sample_ns:
             raise DataError(

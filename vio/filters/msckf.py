@@ -36,6 +36,7 @@ from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
     FIELD_TERMS,
+    ROW_TERMS,
     RowField,
     StereoField,
     StereoInformation,
@@ -672,7 +673,7 @@ class Msckf:
         calibration = window.calibration
         if not calibration.stereo_dim:
             return None
-        rows = self._rows.coefficients if calibration.stereo_field else np.zeros(FIELD_TERMS)
+        rows = self._rows.coefficients if calibration.stereo_field else np.zeros(ROW_TERMS)
         return StereoField(self._camera, rows, calibration.stereo, calibration.stereo_terms)
 
     def _fit(
@@ -735,23 +736,23 @@ class Msckf:
         self, window: Window, tracks: LinearTracks, chosen: BoolArray, pixels: Views | None
     ) -> tuple[FloatArray, FloatArray]:
         """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
-        poses, size = 6 * len(window.clones), 6 * len(window.clones) + 3 * len(window.landmarks)
-        A, b, variance = np.zeros((size, size)), np.zeros(size), self._tracks.variance
-        field, stereo = self._field(window), None
+        poses, variance, field = 6 * len(window.clones), self._tracks.variance, self._field(window)
+        A, b, stereo = np.zeros((poses, poses)), np.zeros(poses), None
         if field is not None:
-            stereo = StereoInformation.none(len(field.terms), size)
+            stereo = StereoInformation.none(len(field.terms), poses + 3 * len(window.landmarks))
         if chosen.any():
-            A[:poses, :poses], b[:poses] = eliminate_points(tracks.information, chosen)
+            A, b = eliminate_points(tracks.information, chosen)
             if stereo is not None and tracks.stereo is not None:
                 stereo = stereo + eliminate_points_from_columns(tracks.stereo, tracks.information, chosen)
-        if pixels is not None and len(pixels.z):
-            at = self._landmark_residuals(window, pixels)
-            window.add_landmark_information(A, b, *at.information())
-            if field is not None and stereo is not None:
-                H = field.jacobian(pixels.z - at.r)  # at the predicted pixels
-                stereo = stereo + landmark_columns(at, H, len(window.clones))
+        at = self._landmark_residuals(window, pixels) if pixels is not None and len(pixels.z) else None
+        if at is not None and pixels is not None and field is not None and stereo is not None:
+            H = field.jacobian(pixels.z - at.r)  # at the predicted pixels
+            stereo = stereo + landmark_columns(at, H, len(window.clones))
         scaled = None if stereo is None else stereo.scaled(1 / variance)
-        return window.lift_information(A / variance, b / variance, scaled)
+        A, b = window.lift_information(A / variance, b / variance, scaled)
+        if at is not None:
+            window.add_landmarks_information(A, b, at, variance)
+        return A, b
 
     def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
         """Residuals of the landmarks' pixels in the newest exposure."""

@@ -14,9 +14,8 @@ import numpy as np
 
 from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray, so3_hat
-from vio.geometry.stereo import StereoCamera, depth_of, left_rays
+from vio.geometry.stereo import StereoCamera, left_rays
 from vio.records import BoolArray, IntArray
-from vio.robust import median
 
 MIN_DEPTH = 0.5  # baselines; nearer points are mismatches
 CAUCHY = 3.0  # residuals beyond this many sigmas lose most of their weight
@@ -96,14 +95,6 @@ class InverseDepth:
     p_D_q: FloatArray  # (F, 3, 3) metres in the world per pixel; the third column points from the point to the camera
     q_D_p: FloatArray  # (F, 3, 3) its inverse
 
-    def moved(self, dq: FloatArray, most: FloatArray | float) -> FloatArray:
-        """Points (F, 3) in the world after steps (F, 3); the disparity stays between its least value and `most`."""
-        disparity = np.maximum(np.minimum(self.disparity + dq[:, 2], most), LEAST_DISPARITY_PX)
-        across = np.squeeze(self.p_D_q[:, :, :2] @ dq[:, :2, None], axis=2)
-        ray = across - self.p_D_q[:, :, 2] * self.disparity[:, None]
-        out: FloatArray = self.centre + ray * (self.disparity / disparity)[:, None]
-        return out
-
 
 def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, seen: BoolArray) -> InverseDepth:
     """Return the coordinates (M5) of points (F, 3) that lie ahead of the first camera that saw them.
@@ -130,12 +121,11 @@ def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -
     The mask (F,) is False where neither is there. The newest clone's view counts only where it is the only stereo view,
     and never for parallax, as its pose has yet to be corrected. A disparity not above zero is a point at infinity.
     """
-    stereo = np.where(views.weight[..., 2] > 0, views.z[..., 0] - views.z[..., 2], -np.inf)
-    stereo[:, -1] = np.where(np.isfinite(stereo[:, :-1]).any(axis=1), -np.inf, stereo[:, -1])
-    best, rows = np.argmax(stereo, axis=1), np.arange(len(stereo))
-    known: BoolArray = np.isfinite(stereo[rows, best])
-    z = np.where(known[:, None], views.z[rows, best], 0.0)
-    p = _on_rays(camera, T_cam0_world[best], z[:, :2], z[:, 0] - z[:, 2])
+    p, known = np.zeros((len(views.z), 3)), np.empty(len(views.z), dtype=np.bool_)
+    disparities = LEAST_DISPARITY_PX, camera.fu / MIN_DEPTH
+    loops.start_by_stereo(loops.lens_of(camera), disparities, T_cam0_world, views.z, views.weight, p, known)
+    if known.all():
+        return p, known
     earlier = views.weight.copy()
     earlier[:, -1] = 0.0
     left_only: BoolArray = ~known & (np.sum(earlier[..., 0] > 0, axis=1) >= 2)
@@ -187,44 +177,15 @@ def refine_points(
 
     Steps are taken in the coordinates (M5), damped by their prior, and end ahead of all cameras that saw the point.
     """
-    p, seen, dq = p_world, views.weight[..., 0] > 0, np.empty((len(p_world), 3))
+    lens, least, T = loops.lens_of(camera), MIN_DEPTH * camera.baseline_m, T_cam0_world
+    p, seen, dq = p_world.copy(), views.weight[..., 0] > 0, np.empty((len(p_world), 3))
     for _ in range(steps):
-        p = _ahead_of_first(camera, T_cam0_world, p, views, seen)
-        at, q = residuals(camera, T_cam0_world, p, views), inverse_depth(camera, T_cam0_world, p, seen)
+        loops.put_ahead(lens, least, LEAST_DISPARITY_PX, T, views.z, views.weight, p)
+        at, q = residuals(camera, T, p, views), inverse_depth(camera, T, p, seen)
         loops.step_points(at.r, at.z_D_p, q.p_D_q, scale_px**2, _TINY, _PRIOR, dq)
-        p = q.moved(dq, _most_disparity(camera, T_cam0_world, q, p, seen))
+        point = q.centre, q.p_D_q, q.disparity
+        loops.move_points(lens, least, LEAST_DISPARITY_PX, T, views.weight, *point, dq, p)
     return p
-
-
-def _ahead_of_first(
-    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, seen: BoolArray
-) -> FloatArray:
-    """Points (F, 3) with those behind the first camera that saw them put far away on its ray."""
-    first = np.argmax(seen, axis=1)
-    depth = np.einsum("fi,fi->f", T_cam0_world[first, 2, :3], p_world) + T_cam0_world[first, 2, 3]
-    if camera.is_cylinder:
-        R, t = T_cam0_world[first, :3, :3], T_cam0_world[first, :3, 3]
-        depth = depth_of(camera, np.einsum("fij,fj->fi", R, p_world) + t)
-    behind = ~(depth > MIN_DEPTH * camera.baseline_m)
-    if not behind.any():
-        return p_world
-    p, k = p_world.copy(), first[behind]
-    p[behind] = _on_rays(camera, T_cam0_world[k], views.z[behind, k, :2], np.full(len(k), LEAST_DISPARITY_PX))
-    return p
-
-
-def _most_disparity(
-    camera: StereoCamera, T_cam0_world: FloatArray, q: InverseDepth, p_world: FloatArray, seen: BoolArray
-) -> FloatArray:
-    """Disparity (F,) beyond which a point would come nearer to one of its cameras than the least depth."""
-    least = 1.01 * MIN_DEPTH * camera.baseline_m
-    if camera.is_cylinder:  # a point that comes too near to another camera than its anchor is dropped afterwards
-        return np.full(len(p_world), camera.fu * camera.baseline_m / least)
-    ray_z = (p_world - q.centre) @ T_cam0_world[:, 2, :3].T * q.disparity[:, None]
-    room = least - (q.centre @ T_cam0_world[:, 2, :3].T + T_cam0_world[:, 2, 3])
-    limits = np.divide(ray_z, room, out=np.full(room.shape, np.inf), where=seen & (room > 0) & (ray_z > 0))
-    out: FloatArray = limits.min(axis=1)
-    return out
 
 
 def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
@@ -234,15 +195,8 @@ def robust_weights(at: Residuals, sigma2: float) -> FloatArray:
         at: residuals and Jacobians.
         sigma2: the pixel noise's variance, the smallest scale.
     """
-    squares = np.sum(at.r**2, axis=2)
-    used = measured_pixels(at)[:, :, 1]  # the row of vl is measured in every view
-    if not used.any():
-        return np.zeros(squares.shape)
-    count, clones = used.sum(axis=0), np.arange(used.shape[1])
-    ordered = np.sort(np.where(used, squares, np.inf), axis=0)
-    median = 0.5 * (ordered[(count - 1) // 2, clones] + ordered[count // 2, clones])
-    scale2 = np.maximum(sigma2, median / _MEDIAN)  # infinite where nothing was seen
-    weights: FloatArray = used / (1 + squares / (4 * scale2 * CAUCHY**2))
+    weights = np.empty(at.r.shape[:2])
+    loops.weigh_views(at.r, at.z_D_p, sigma2, _MEDIAN, CAUCHY, weights)
     return weights
 
 
@@ -253,11 +207,6 @@ class LandmarkResiduals:
     r: FloatArray  # (K, 4) pixels, zero where not measured
     J: FloatArray  # (K, 4, 3) with respect to the point in the world frame, zero where not measured
     weight: FloatArray  # (K,) robust weights
-
-    def information(self) -> tuple[FloatArray, FloatArray]:
-        """Information (K, 3, 3) and vector (K, 3) about `dp`, for one pixel of noise."""
-        J, w = self.J, self.weight
-        return np.einsum("k,kai,kaj->kij", w, J, J), np.einsum("k,kai,ka->ki", w, J, self.r)
 
 
 def landmark_residuals(
@@ -274,10 +223,8 @@ def landmark_residuals(
     """
     one = Views(views.z[:, None], views.weight[:, None])
     at = residuals(camera, T_cam0_world[None], p_world, one)
-    r, J = at.r[:, 0], at.z_D_p[:, 0]
-    squares, seen = np.sum(r**2, axis=1), at.ahead & (views.weight[:, 1] > 0)
-    scale2 = max(sigma2, median(squares[seen]) / _MEDIAN) if seen.any() else sigma2
-    return LandmarkResiduals(r, J, seen / (1 + squares / (4 * scale2 * CAUCHY**2)))
+    r, J = at.r.reshape(-1, 4), at.z_D_p.reshape(-1, 4, 3)
+    return LandmarkResiduals(r, J, robust_weights(at, sigma2)[:, 0])
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,9 +248,11 @@ class TrackInformation:
         Returns:
             Points (F, 3) in the world.
         """
-        right = self.point_gradient - np.einsum("fik,i->fk", self.G, clone_errors) - other
-        dq = np.linalg.solve(self.C, right[..., None])[..., 0]
-        return self.q.moved(dq, np.inf)
+        q, p = self.q, np.empty((len(self.C), 3))
+        gradient = self.point_gradient - other
+        point = q.centre, q.p_D_q, q.disparity, LEAST_DISPARITY_PX
+        loops.substitute_back(self.G, self.C, gradient, *point, np.ascontiguousarray(clone_errors), p)
+        return p
 
     def point_D_clones(self, chosen: IntArray) -> FloatArray:
         """How the estimated points of tracks (K,) follow errors of the clones (K, 3, 6N), world: `-C^-1 G'`."""
@@ -345,11 +294,13 @@ def track_information(
         weight: (F, N) robust weight of each view.
     """
     F, N = at.r.shape[:2]
-    q = inverse_depth(camera, T_cam0_world, p_world, measured_pixels(at)[:, :, 1])
-    B = q.q_D_p @ point_D_pose(p_world)
-    info = TrackInformation(q, np.empty((F, 6 * N, 3)), np.empty((F, 3, 3)), B, np.empty((F, 6 * N)), np.empty((F, 3)))
-    columns = info.G, info.C, info.gradient, info.point_gradient
-    loops.collect_tracks(at.r, at.z_D_p, weight, q.p_D_q, B, q.anchor, _PRIOR, *columns)
+    seen: BoolArray = np.empty((F, N), dtype=np.bool_)
+    loops.mark_views(at.z_D_p, seen)
+    q = inverse_depth(camera, T_cam0_world, p_world, seen)
+    B, G, C = np.empty((F, 3, 6)), np.empty((F, 6 * N, 3)), np.empty((F, 3, 3))
+    info = TrackInformation(q, G, C, B, np.empty((F, 6 * N)), np.empty((F, 3)))
+    point = p_world, q.p_D_q, q.q_D_p, q.anchor, _PRIOR
+    loops.collect_tracks(at.r, at.z_D_p, weight, *point, B, G, C, info.gradient, info.point_gradient)
     return info
 
 
@@ -363,32 +314,25 @@ def relative_stereo_sigma(at: Residuals, q: InverseDepth) -> FloatArray:
     return out / q.disparity
 
 
-def has_parallax(
-    camera: StereoCamera,
-    T_cam0_world: FloatArray,
-    p_world: FloatArray,
-    views: Views,
-    at: Residuals,
+def usable_points(
+    camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, views: Views, at: Residuals
 ) -> BoolArray:
-    """Which tracks (F,) have a right view, or a parallax that fixes the depth as well as one stereo view would.
+    """Which tracks (F,) have a finite point ahead of all cameras that saw it, and its depth by stereo or parallax.
 
-    With less, the estimated depth follows the noise, and its Jacobian by the clones' translations with it: information
-    that is not there, and a scale that shrinks. Of one camera, whose unit of length is arbitrary, the depth must be
-    known relative to itself.
+    That is a right view, or a parallax that fixes the depth as well as one stereo view would. With less, the estimated
+    depth follows the noise, and its Jacobian by the clones' translations with it: information that is not there, and a
+    scale that shrinks. Of one camera, whose unit of length is arbitrary, the depth must be known relative to itself.
     """
-    out: BoolArray = np.any(views.weight[..., 2] > 0, axis=1)
-    left_only = ~out
-    if left_only.any():
-        seen = views.weight[left_only, :, 0] > 0
-        q = inverse_depth(camera, T_cam0_world, p_world[left_only], seen)
-        J = at.z_D_p[left_only].reshape(len(seen), -1, 3) @ q.p_D_q
+    keep = at.ahead & np.isfinite(p_world).all(axis=1)
+    left_only = np.flatnonzero(keep & ~np.any(views.weight[..., 2] > 0, axis=1))
+    if len(left_only):
+        q = inverse_depth(camera, T_cam0_world, p_world[left_only], views.weight[left_only, :, 0] > 0)
+        J = at.z_D_p[left_only].reshape(len(left_only), -1, 3) @ q.p_D_q
         C = np.swapaxes(J, 1, 2) @ J + np.diag([_TINY, _TINY, _PRIOR])
-        variance = np.linalg.inv(C)[:, 2, 2]
-        if camera.kind == "mono":
-            out[left_only] = variance < (_MONO_DEPTH_SIGMA * q.disparity) ** 2
-        else:
-            out[left_only] = variance < _STEREO_VARIANCE
-    return out
+        relative = camera.kind == "mono"
+        limit = (_MONO_DEPTH_SIGMA * q.disparity) ** 2 if relative else _STEREO_VARIANCE
+        keep[left_only] = np.linalg.inv(C)[:, 2, 2] < limit
+    return keep
 
 
 def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatArray, FloatArray]:

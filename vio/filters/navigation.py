@@ -14,7 +14,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.compiled import move_by_twist
 from vio.errors import EstimationError
+from vio.filters import pose_loops as loops
 from vio.filters.imu_gaps import Hidden, ImuHistory
 from vio.filters.imu_start import imu_start
 from vio.filters.settings import MsckfSettings
@@ -26,12 +28,12 @@ from vio.geometry.lie import (
     se3_left_jacobian,
     so3_exp,
     so3_hat,
-    so3_left_jacobian,
 )
-from vio.imu_faults import ImuSampleCheck
-from vio.records import ImuSample, MotionSample, VelocitySample
+from vio.imu_faults import ImuSampleCheck, readings_of
+from vio.records import ImuSample, IntArray, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state
+_BIASES: IntArray = np.arange(9, DIM)
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
 _SAMPLE_S = 0.005  # between two samples of a usual IMU, where only one has come
@@ -105,26 +107,30 @@ class ImuMotion:
     def __init__(self, settings: MsckfSettings) -> None:
         self._settings = settings
         self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
-        self._samples: list[ImuSample] = []
+        self._new: list[ImuSample] = []  # not checked yet
+        self._kept: list[ImuSample] = []
         self._history = ImuHistory()
         self._check = ImuSampleCheck()
 
     def take(self, sample: MotionSample) -> None:
         """Keep a sample until the interval that needs it; leave out faulty ones."""
         assert isinstance(sample, ImuSample)
-        for usable in self._check.take(sample):
-            self._samples.append(usable)
-            self._history.take(usable)
+        self._new.append(sample)
 
     @property
     def samples(self) -> Sequence[ImuSample]:
-        """The samples that are kept, in order of time."""
-        return self._samples
+        """The samples that are kept, in order of time; new ones are checked here, all since the last use at once."""
+        if self._new:
+            usable = self._check.take_all(self._new)
+            self._new = []
+            self._kept += usable
+            self._history.take(usable)
+        return self._kept
 
     @property
     def ready(self) -> bool:
         """Whether there is a sample to start with."""
-        return bool(self._samples)
+        return bool(self.samples)
 
     def start(self, time_ns: int) -> tuple[NavState, FloatArray]:
         """Return the state at the first frame and its covariance (15, 15), from the last half second of samples.
@@ -137,7 +143,7 @@ class ImuMotion:
             EstimationError: the accelerometer reads nothing.
         """
         s = self._settings
-        begin = imu_start(self._samples, time_ns, s)
+        begin = imu_start(self.samples, time_ns, s)
         R = rotation_to_up(begin.force / np.linalg.norm(begin.force))
         T = se3_from_parts(R, np.zeros(3))
         nav = NavState(T, np.zeros(3), begin.rate - begin.gyro_bias, begin.gyro_bias, np.zeros(3))
@@ -174,32 +180,29 @@ class ImuMotion:
         Raises:
             EstimationError: there is no sample at all.
         """
-        times, gyro, accel, hidden = self._interval(start_ns, end_ns)
-        dt = np.diff(times) * 1e-9
-        gyro, accel = gyro - nav.gyro_bias, accel - nav.accel_bias
-        steps = so3_exp(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None])
-        R = np.empty((len(times), 3, 3))
-        R[0] = nav.T_world_imu[:3, :3]
-        for k, step in enumerate(steps):
-            R[k + 1] = R[k] @ step
-        force = (R @ accel[..., None])[..., 0] + self._gravity
-        a = 0.5 * (force[:-1] + force[1:])
-        v = nav.velocity + np.concatenate([np.zeros((1, 3)), np.cumsum(a * dt[:, None], axis=0)])
-        moves = v[:-1] * dt[:, None] + 0.5 * a * (dt**2)[:, None]
-        p = nav.T_world_imu[:3, 3] + np.concatenate([np.zeros((1, 3)), np.cumsum(moves, axis=0)])
-        Phi, Q, Q_parts = self._linearise(times, dt, R, v, p, factors, hidden)
-        turned = np.sum(0.5 * (gyro[:-1] + gyro[1:]) * dt[:, None], axis=0) / max(dt.sum(), 1e-9)
-        moved = replace(nav, T_world_imu=se3_from_parts(R[-1], p[-1]), velocity=v[-1], rate=gyro[-1])
+        times, readings, hidden = self._interval(start_ns, end_ns)
+        s, steps = self._settings, len(times) - 1
+        densities = factors * [s.accel_noise_density, s.gyro_noise_density]
+        variance = np.zeros((2, steps)) if hidden is None else hidden.variance
+        T, v, turned = nav.T_world_imu.copy(), nav.velocity.copy(), np.zeros(3)
+        total = float(times[-1]) * 1e-9
+        Phi, Q_parts = np.eye(DIM), np.zeros((2, DIM, DIM))
+        Phi[:9, :9] = _free_flow(np.array([total]), self._gravity)[0]  # depends on gravity alone
+        bias = np.concatenate([nav.gyro_bias, nav.accel_bias])
+        loops.integrate(times, readings, bias, self._gravity, densities, variance, T, v, turned, Phi, Q_parts)
+        Q = Q_parts[0] + Q_parts[1]
+        Q[_BIASES, _BIASES] = np.repeat([s.gyro_bias_walk**2 * total, s.accel_bias_walk**2 * total], 3)
+        moved = NavState(T, v, readings[-1, :3] - nav.gyro_bias, nav.gyro_bias, nav.accel_bias)
         if hidden is not None and hidden.gap:
             return Transition(moved, Phi, Q, Q_parts, bridged=True)
-        return Transition(moved, Phi, Q, Q_parts, turned + nav.gyro_bias)
+        return Transition(moved, Phi, Q, Q_parts, turned / max(total, 1e-9) + nav.gyro_bias)
 
     def forget_before(self, time_ns: int) -> None:
         """Drop the samples that no interval from this time on needs."""
-        keep = 0
-        while keep + 1 < len(self._samples) and self._samples[keep + 1].time_ns <= time_ns:
+        samples, keep = self.samples, 0
+        while keep + 1 < len(samples) and samples[keep + 1].time_ns <= time_ns:
             keep += 1
-        self._samples = self._samples[keep:]
+        self._kept = self._kept[keep:]
 
     def measurement(self, nav: NavState) -> Measurement | None:
         """The IMU drives the state and measures nothing."""
@@ -235,10 +238,12 @@ class ImuMotion:
 
     def corrected(self, nav: NavState, error: FloatArray) -> NavState:
         """Return the state moved by an error (15,)."""
-        phi = error[3:6]
+        T, v = nav.T_world_imu.copy(), nav.velocity.copy()
+        move_by_twist(error[:6], T)
+        loops.move_points(error[3:6], error[None, 6:9], v[None])
         return NavState(
-            se3_exp(error[:6]) @ nav.T_world_imu,
-            so3_exp(phi) @ nav.velocity + so3_left_jacobian(phi) @ error[6:9],
+            T,
+            v,
             nav.rate - error[9:12],
             nav.gyro_bias + error[9:12],
             nav.accel_bias + error[12:15],
@@ -255,83 +260,37 @@ class ImuMotion:
             ages_s: (N,) seconds from then to now.
             error: (15,) of the present state.
         """
-        phi = error[3:6]
-        xi_v = (_free_flow(-ages_s, self._gravity) @ error[:9])[:, 6:9]
-        xi_v = xi_v + ages_s[:, None] * (R_world_imu @ error[12:15])
-        out: FloatArray = velocities @ so3_exp(phi).T + xi_v @ so3_left_jacobian(phi).T
+        out: FloatArray = velocities.copy()
+        loops.move_earlier_velocities(self._gravity, ages_s, np.ascontiguousarray(R_world_imu), error, out)
         return out
 
     def rate_variance(self, factors: FloatArray) -> float:
         """Variance (rad/s)^2 of the rate that the gyro reads in one sample; factors (2,) as in `advance`."""
-        times = [x.time_ns for x in self._samples[-2:]]
+        times = [x.time_ns for x in self.samples[-2:]]
         period_s = (times[-1] - times[0]) * 1e-9 if len(times) > 1 else _SAMPLE_S
         return float((factors[1] * self._settings.gyro_noise_density) ** 2 / period_s)
 
     def covered(self, time_ns: int) -> int:
         """The latest time, up to a given one, that the samples reach; the given one where they end long before."""
-        latest = self._samples[-1].time_ns
+        latest = self.samples[-1].time_ns
         return time_ns if time_ns - latest > _EXTRAPOLATE_NS else min(time_ns, latest)
 
-    def _interval(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, FloatArray, Hidden | None]:
-        """Times relative to the start (K,) in ns, gyro (K, 3), accel (K, 3), and what gaps hide.
+    def _interval(self, start_ns: int, end_ns: int) -> tuple[FloatArray, FloatArray, Hidden | None]:
+        """Times relative to the start (K,) in ns, readings `[gyro, accel]` (K, 6), and what gaps hide.
 
         Values are interpolated between samples and held beyond the first and the last; None: no sample is missing.
         """
-        samples = self._samples
+        samples = self.samples
         if not samples:
             raise EstimationError(f"no IMU sample before {end_ns} ns; check that IMU and camera share a clock")
-        all_times = np.array([x.time_ns for x in samples], dtype=np.int64)
-        t = (all_times - start_ns).astype(np.float64)
+        t = np.array([float(x.time_ns - start_ns) for x in samples])
         end = float(end_ns - start_ns)
-        inside = t[(t > 0) & (t < end)]
-        cuts = np.concatenate([[0.0], inside, [end]])
+        cuts = np.concatenate([[0.0], t[(t > 0) & (t < end)], [end]])
         hidden = self._history.hidden(cuts, t)
         if hidden is not None:
             cuts = hidden.cuts_ns
-        values = np.array([np.concatenate([x.gyro, x.accel]) for x in samples])
-        at = np.stack([np.interp(cuts, t, column) for column in values.T], axis=1)
-        return cuts, at[:, :3], at[:, 3:], hidden
-
-    def _linearise(
-        self,
-        times: FloatArray,
-        dt: FloatArray,
-        R: FloatArray,
-        v: FloatArray,
-        p: FloatArray,
-        factors: FloatArray,
-        hidden: Hidden | None,
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Transition (15, 15), noise (15, 15) and its parts (2, 15, 15) over the interval, hidden signals included.
-
-        The transition of the navigation part depends on gravity alone.
-        """
-        s = self._settings
-        total = float(times[-1]) * 1e-9
-        left = (times[-1] - 0.5 * (times[:-1] + times[1:])) * 1e-9  # from the middle of each step to the end
-        Rm = R[:-1]
-        vm, pm = 0.5 * (v[:-1] + v[1:]), 0.5 * (p[:-1] + p[1:])
-        B = np.zeros((len(dt), 9, 6))  # how bias errors and noise of gyro and accelerometer enter [rho phi xi_v]
-        B[:, 0:3, 0:3] = -so3_hat(pm) @ Rm
-        B[:, 3:6, 0:3] = -Rm
-        B[:, 6:9, 0:3] = -so3_hat(vm) @ Rm
-        B[:, 6:9, 3:6] = -Rm
-        moved = _free_flow(left, self._gravity) @ B
-        Phi = np.eye(DIM)
-        Phi[:9, :9] = _free_flow(np.array([total]), self._gravity)[0]
-        Phi[:9, 9:] = np.einsum("kij,k->ij", moved, dt)
-        densities = factors * [s.accel_noise_density, s.gyro_noise_density]
-        Q_parts = np.zeros((2, DIM, DIM))
-        for k, (part, columns) in enumerate(zip(Q_parts, (slice(3, 6), slice(0, 3)), strict=True)):
-            sigmas = densities[k] * np.sqrt(dt)
-            if hidden is not None:
-                sigmas = np.sqrt(sigmas**2 + hidden.variance[k])
-            out_D_noise = moved[:, :, columns] * sigmas[:, None, None]
-            part[:9, :9] = np.einsum("kij,klj->il", out_D_noise, out_D_noise)
-        Q = Q_parts.sum(axis=0)
-        walks = np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) ** 2 * total
-        Q[9:, 9:] = np.diag(walks)
-        return Phi, Q, Q_parts
+        readings = np.stack([np.interp(cuts, t, column) for column in readings_of(samples).T], axis=1)
+        return cuts, readings, hidden
 
 
 class TwistMotion:

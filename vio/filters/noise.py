@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lapack
 
 from vio.geometry.lie import FloatArray
 from vio.statistics import chi_square_cdf, chi_square_quantile
@@ -14,6 +15,7 @@ _INFORMED = 0.3  # share of its predicted variance that the images must have rem
 _LOG_VARIANCE_SIGMA = 1.5  # initial standard deviation of the logarithm of the squared factor
 _LOG_VARIANCE_WALK = 0.15  # its random walk per sum of steps
 _SURPRISE = 0.9999  # chi-square probability beyond which a single step is an exception
+_SURPRISING = chi_square_quantile(_SURPRISE, np.arange(1, 4)).tolist()
 _MOST = 1e6
 _PARTS = slice(0, 3), slice(3, 6)  # translation, rotation
 _SENSITIVITY = (0.0, 1 / np.pi, 0.5, 2 / np.pi)  # d E[2 F_k(e^t x) - 1] / dt at t = 0 for x ~ chi-square(k), k = 0..3
@@ -45,7 +47,7 @@ class StepErrors:
         out = np.zeros(2)
         for k, part in enumerate(_PARTS):
             test = whitened_correction(self, part)
-            if test.dof and test.squared > chi_square_quantile(_SURPRISE, test.dof):
+            if test.dof and test.squared > _SURPRISING[test.dof - 1]:
                 out[k] = min((test.squared / test.dof - 1) / max(test.share, 1e-12), _MOST)
         return out
 
@@ -69,16 +71,18 @@ def whitened_correction(step: StepErrors, part: slice) -> WhitenedCorrection:
     scale = float(np.trace(B))
     if not scale > 0:
         return WhitenedCorrection(0.0, 0, 0.0)
-    L = np.linalg.cholesky(B + 1e-12 * scale * np.eye(3))
-    inverse = np.linalg.inv(L)
-    removed, V = np.linalg.eigh(inverse @ (B - step.remaining[part, part]) @ inverse.T)
+    # Rows of V' whiten the predicted correction and make the removed covariance diagonal.
+    removed, V, failed = lapack.dsygv(B - step.remaining[part, part], B + 1e-12 * scale * np.eye(3))
+    if failed:
+        raise np.linalg.LinAlgError("the predicted covariance is not positive")
     chosen = removed > _INFORMED
-    if not chosen.any():
+    dof = int(np.count_nonzero(chosen))
+    if not dof:
         return WhitenedCorrection(0.0, 0, 0.0)
-    whiten = V[:, chosen].T @ inverse
+    whiten = V.T[chosen]
     y = whiten @ step.correction[part]
-    share = float(np.mean(np.einsum("ij,jk,ik->i", whiten, step.process[part, part], whiten)))
-    return WhitenedCorrection(float(y @ (y / removed[chosen])), int(chosen.sum()), min(share, 1.0))
+    share = float(np.vdot(whiten @ step.process[part, part], whiten)) / dof
+    return WhitenedCorrection(float(y @ (y / removed[chosen])), dof, min(share, 1.0))
 
 
 class MotionNoise:

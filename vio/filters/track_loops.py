@@ -80,6 +80,20 @@ def compare_views(
 
 
 @compiled
+def _is_measured(J: FloatArray, f: int, n: int) -> bool:
+    """Whether a clone saw a track: the row of vl is measured in every view."""
+    return J[f, n, 1, 0] != 0.0 or J[f, n, 1, 1] != 0.0 or J[f, n, 1, 2] != 0.0
+
+
+@compiled
+def mark_views(J: FloatArray, out: BoolArray) -> None:
+    """Write which views (F, N) of tracks were measured."""
+    for f in range(J.shape[0]):
+        for n in range(J.shape[1]):
+            out[f, n] = _is_measured(J, f, n)
+
+
+@compiled
 def mark_measured(J: FloatArray, out: BoolArray) -> None:
     """Write which pixel coordinates (F, N, 4) have a Jacobian (F, N, 4, 3) other than zero."""
     for f in range(J.shape[0]):
@@ -135,6 +149,106 @@ def anchor_points(
 
 
 @compiled
+def middle(values: FloatArray) -> float:
+    """Median of one or more values (n,), which are reordered. Reference: Hoare, Algorithm 65: Find, CACM (1961)."""
+    k, low, high = len(values) // 2, 0, len(values) - 1
+    while low < high:
+        pivot, i, j = values[k], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if j < k:
+            low = i
+        if k < i:
+            high = j
+    if len(values) % 2 == 1:
+        return values[k]
+    below = values[0]
+    for i in range(1, k):
+        below = max(below, values[i])
+    return 0.5 * (below + values[k])
+
+
+@compiled
+def _first_view(weight: FloatArray, f: int) -> int:
+    """The first clone that saw a track; 0 where none did."""
+    for n in range(weight.shape[1]):
+        if weight[f, n, 0] > 0.0:
+            return n
+    return 0
+
+
+@compiled
+def _put_on_ray(lens: Lens, T: FloatArray, u: float, v: float, disparity: float, p: FloatArray) -> None:
+    """Write the point (3,) in the world that a camera (4, 4) sees at a left pixel, at a disparity."""
+    fu, fv, cu, cv, baseline, cylinder = lens
+    scale = fu * baseline / disparity
+    angle = (v - cv) / fv
+    y, z = angle, 1.0
+    if cylinder:
+        y, z = np.sin(angle), np.cos(angle)
+    x, y, z = (u - cu) / fu * scale - T[0, 3], y * scale - T[1, 3], z * scale - T[2, 3]
+    for i in range(3):
+        p[i] = T[0, i] * x + T[1, i] * y + T[2, i] * z
+
+
+@compiled
+def start_by_stereo(
+    lens: Lens,
+    disparities: tuple[float, float],
+    T: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
+    p: FloatArray,
+    known: BoolArray,
+) -> None:
+    """Write points (F, 3) at the stereo view of largest disparity, and which tracks (F,) have one.
+
+    The newest clone's view counts only where it is the only one. Disparities are kept between two values.
+    """
+    last = len(T) - 1
+    for f in range(len(p)):
+        best, largest = -1, -np.inf
+        for n in range(last):
+            disparity = z[f, n, 0] - z[f, n, 2]
+            if weight[f, n, 2] > 0.0 and disparity > largest:
+                best, largest = n, disparity
+        if best < 0 and weight[f, last, 2] > 0.0:
+            best, largest = last, z[f, last, 0] - z[f, last, 2]
+        known[f] = best >= 0
+        if best >= 0:
+            disparity = min(max(largest, disparities[0]), disparities[1])
+            _put_on_ray(lens, T[best], z[f, best, 0], z[f, best, 1], disparity, p[f])
+
+
+@compiled
+def put_ahead(
+    lens: Lens,
+    least_depth: float,
+    least_disparity: float,
+    T: FloatArray,
+    z: FloatArray,
+    weight: FloatArray,
+    p: FloatArray,
+) -> None:
+    """Put points (F, 3) that are behind the first camera that saw them far away on its ray, in place."""
+    for f in range(len(p)):
+        k = _first_view(weight, f)
+        depth = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
+        if lens[5]:
+            y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
+            depth = np.sqrt(y * y + depth * depth)
+        if depth > least_depth:
+            continue
+        _put_on_ray(lens, T[k], z[f, k, 0], z[f, k, 1], least_disparity, p[f])
+
+
+@compiled
 def step_points(
     r: FloatArray, J: FloatArray, p_D_q: FloatArray, scale2: float, tiny: float, prior: float, dq: FloatArray
 ) -> None:
@@ -147,9 +261,13 @@ def step_points(
                 C[i, j] = 0.0
         C[0, 0], C[1, 1], C[2, 2] = tiny, tiny, prior
         for n in range(r.shape[1]):
+            if not _is_measured(J, f, n):
+                continue
             squares = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
             w = 1.0 / (1.0 + squares / (4.0 * scale2))
             for a in range(4):
+                if J[f, n, a, 0] == 0.0 and J[f, n, a, 1] == 0.0 and J[f, n, a, 2] == 0.0:
+                    continue
                 for i in range(3):
                     row[i] = (
                         J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
@@ -162,14 +280,147 @@ def step_points(
 
 
 @compiled
+def _most_disparity(
+    lens: Lens,
+    least: float,
+    T: FloatArray,
+    weight: FloatArray,
+    f: int,
+    centre: FloatArray,
+    disparity: float,
+    p: FloatArray,
+) -> float:
+    """Disparity beyond which a point (3,) would come nearer to one of its cameras than the least depth."""
+    if lens[5]:  # of a cylinder, a point that comes too near to another camera than its anchor is dropped afterwards
+        return lens[0] * lens[4] / least
+    most = np.inf
+    for n in range(len(T)):
+        if weight[f, n, 0] > 0.0:
+            a, b, c = T[n, 2, 0], T[n, 2, 1], T[n, 2, 2]
+            ray = (a * (p[0] - centre[0]) + b * (p[1] - centre[1]) + c * (p[2] - centre[2])) * disparity
+            room = least - (a * centre[0] + b * centre[1] + c * centre[2] + T[n, 2, 3])
+            if room > 0.0 and ray > 0.0:
+                most = min(most, ray / room)
+    return most
+
+
+@compiled
+def _move(
+    centre: FloatArray, p_D_q: FloatArray, disparity: float, dq: FloatArray, least: float, most: float, p: FloatArray
+) -> None:
+    """Write the point (3,) after a step (3,) in the coordinates (M5); its disparity stays between two values."""
+    moved = max(min(disparity + dq[2], most), least)
+    for i in range(3):
+        ray = p_D_q[i, 0] * dq[0] + p_D_q[i, 1] * dq[1] - p_D_q[i, 2] * disparity
+        p[i] = centre[i] + ray * (disparity / moved)
+
+
+@compiled
+def move_points(
+    lens: Lens,
+    least_depth: float,
+    least_disparity: float,
+    T: FloatArray,
+    weight: FloatArray,
+    centre: FloatArray,
+    p_D_q: FloatArray,
+    disparity: FloatArray,
+    dq: FloatArray,
+    p: FloatArray,
+) -> None:
+    """Move points (F, 3) by steps (F, 3) in the coordinates (M5), to what is ahead of all cameras that saw them."""
+    for f in range(len(p)):
+        most = _most_disparity(lens, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f])
+        _move(centre[f], p_D_q[f], disparity[f], dq[f], least_disparity, most, p[f])
+
+
+@compiled
+def weigh_views(r: FloatArray, J: FloatArray, sigma2: float, median: float, cauchy: float, weights: FloatArray) -> None:
+    """Write Cauchy weights (F, N) of views, zero where not measured; the scale is each clone's own.
+
+    It is the median of its squared residuals over `median`, and `sigma2` at least.
+    """
+    F, N = weights.shape
+    squares = np.empty(F)
+    for n in range(N):
+        count = 0
+        for f in range(F):
+            weights[f, n] = -1.0
+            if _is_measured(J, f, n):
+                weights[f, n] = r[f, n, 0] ** 2 + r[f, n, 1] ** 2 + r[f, n, 2] ** 2 + r[f, n, 3] ** 2
+                squares[count] = weights[f, n]
+                count += 1
+        scale2 = max(sigma2, middle(squares[:count]) / median) if count > 0 else sigma2
+        for f in range(F):
+            weights[f, n] = 0.0 if weights[f, n] < 0.0 else 1.0 / (1.0 + weights[f, n] / (4.0 * scale2 * cauchy**2))
+
+
+@compiled
+def add_landmarks(
+    r: FloatArray, J: FloatArray, weight: FloatArray, exposure: int, first: int, A: FloatArray, b: FloatArray
+) -> None:
+    """Add what landmarks' pixels say of `dp = xi_f - xi_rho` to A (D, D) and b (D,).
+
+    Args:
+        r: residuals (K, 4).
+        J: their Jacobians by dp (K, 4, 3).
+        weight: (K,) over the pixels' variance.
+        exposure: first row of xi_rho.
+        first: row of the first landmark.
+        A: information about all errors.
+        b: its vector.
+    """
+    for k in range(len(r)):
+        own = first + 3 * k
+        for i in range(3):
+            for a in range(4):
+                wJ = weight[k] * J[k, a, i]
+                b[own + i] += wJ * r[k, a]
+                b[exposure + i] -= wJ * r[k, a]
+                for j in range(3):
+                    C = wJ * J[k, a, j]
+                    A[own + i, own + j] += C
+                    A[exposure + i, exposure + j] += C
+                    A[own + i, exposure + j] -= C
+                    A[exposure + i, own + j] -= C
+
+
+@compiled
+def substitute_back(
+    G: FloatArray,
+    C: FloatArray,
+    gradient: FloatArray,
+    centre: FloatArray,
+    p_D_q: FloatArray,
+    disparity: FloatArray,
+    least_disparity: float,
+    clone_errors: FloatArray,
+    p: FloatArray,
+) -> None:
+    """Write points (F, 3) that solve their own equations once the clones (6N,) have moved; see `TrackInformation`."""
+    dq, factor = np.empty(3), np.empty((3, 3))
+    for f in range(len(p)):
+        for i in range(3):
+            dq[i] = gradient[f, i]
+            for k in range(len(clone_errors)):
+                dq[i] -= G[f, k, i] * clone_errors[k]
+            for j in range(3):
+                factor[i, j] = C[f, i, j]
+        solve_positive(factor, dq)
+        _move(centre[f], p_D_q[f], disparity[f], dq, least_disparity, np.inf, p[f])
+
+
+@compiled
 def collect_tracks(
     r: FloatArray,
     J: FloatArray,
     weight: FloatArray,
+    p: FloatArray,
     p_D_q: FloatArray,
-    B: FloatArray,
+    q_D_p: FloatArray,
     anchor: IntArray,
     prior: float,
+    B: FloatArray,
     G: FloatArray,
     C: FloatArray,
     gradient: FloatArray,
@@ -178,16 +429,23 @@ def collect_tracks(
     """Write the normal equations of tracks, (M2), (M3), (M5), (M6): the columns of `TrackInformation`."""
     C_i, g_i, row = np.empty((3, 3)), np.empty(3), np.empty(3)
     for f in range(len(r)):
+        _point_D_pose(q_D_p[f], p[f], B[f])
         for i in range(3):
             point_gradient[f, i] = 0.0
             for j in range(3):
                 C[f, i, j] = 0.0
         for n in range(r.shape[1]):
+            if weight[f, n] == 0.0 and n != anchor[f]:
+                for k in range(6 * n, 6 * n + 6):
+                    gradient[f, k] = G[f, k, 0] = G[f, k, 1] = G[f, k, 2] = 0.0
+                continue
             for i in range(3):
                 g_i[i] = 0.0
                 for j in range(3):
                     C_i[i, j] = 0.0
             for a in range(4):
+                if J[f, n, a, 0] == 0.0 and J[f, n, a, 1] == 0.0 and J[f, n, a, 2] == 0.0:
+                    continue
                 for i in range(3):
                     row[i] = (
                         J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
@@ -210,6 +468,24 @@ def collect_tracks(
 
 
 @compiled
+def _point_D_pose(q_D_p: FloatArray, p: FloatArray, B: FloatArray) -> None:
+    """Write `S^-1 [-I, p^]` (3, 6) of one point, equation (M2)."""
+    for i in range(3):
+        a, b, c = q_D_p[i, 0], q_D_p[i, 1], q_D_p[i, 2]
+        B[i, 0], B[i, 1], B[i, 2] = -a, -b, -c
+        B[i, 3], B[i, 4], B[i, 5] = b * p[2] - c * p[1], c * p[0] - a * p[2], a * p[1] - b * p[0]
+
+
+@compiled
+def _has_part(G: FloatArray, f: int, n: int) -> bool:
+    """Whether a clone has a part in a track's normal equations: most clones saw most tracks not."""
+    part = False
+    for k in range(6 * n, 6 * n + 6):
+        part = part or G[f, k, 0] != 0.0 or G[f, k, 1] != 0.0 or G[f, k, 2] != 0.0
+    return part
+
+
+@compiled
 def eliminate_tracks(
     chosen: IntArray,
     G: FloatArray,
@@ -226,7 +502,7 @@ def eliminate_tracks(
     The blocks of the clones on the diagonal are added to A (6N, 6N), and the vector to b (6N,).
     """
     L, y = np.empty((3, 3)), np.empty(3)
-    size = G.shape[1]
+    size, takes_part = G.shape[1], True
     for c, f in enumerate(chosen):
         for i in range(3):
             for j in range(i + 1):
@@ -238,6 +514,11 @@ def eliminate_tracks(
         y[1] = (point_gradient[f, 1] - L[1, 0] * y[0]) / L[1, 1]
         y[2] = (point_gradient[f, 2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
         for k in range(size):
+            if k % 6 == 0:
+                takes_part = _has_part(G, f, k // 6)
+            if not takes_part:
+                V[3 * c, k] = V[3 * c + 1, k] = V[3 * c + 2, k] = 0.0
+                continue
             v0 = G[f, k, 0] / L[0, 0]
             v1 = (G[f, k, 1] - L[1, 0] * v0) / L[1, 1]
             v2 = (G[f, k, 2] - L[2, 0] * v0 - L[2, 1] * v1) / L[2, 2]
@@ -249,38 +530,41 @@ def eliminate_tracks(
 
 
 @compiled
-def stereo_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
-    """Write the derivatives (M, 4, 8) of pixels (M, 4) by the coefficients of (R3) and (R4)."""
+def stereo_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray) -> None:
+    """Write the derivatives (M, 4, S) of pixels (M, 4) by S coefficients of (R3) and (R4), from the `first` one on."""
     fu, fv, cu, cv, _, _ = lens
+    H = np.zeros((4, 10))
     for m in range(len(z)):
         x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
         r2, rr2 = x * x + y * y, xr * xr + y * y
+        H[0, 4], H[0, 5], H[0, 6], H[0, 7] = fu * x * r2, fu * x * r2 * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
+        H[1, 4], H[1, 5], H[1, 6], H[1, 7] = fv * y * r2, fv * y * r2 * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y
+        H[2, 0], H[2, 1], H[2, 2], H[2, 3] = fu, fu * xr, fu * rr2, fu * rr2 * rr2
+        H[2, 4], H[2, 5] = fu * xr * rr2, fu * xr * rr2 * rr2
+        H[2, 6], H[2, 7] = fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
+        H[2, 8], H[0, 9], H[1, 9], H[2, 9] = z[m, 2] - z[m, 0], fu * x, fv * y, fu * xr
         for a in range(4):
-            for s in range(8):
-                out[m, a, s] = 0.0
-        out[m, 0, 3], out[m, 0, 4], out[m, 0, 5] = fu * x * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
-        out[m, 1, 3], out[m, 1, 4], out[m, 1, 5] = fv * y * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y
-        out[m, 2, 0], out[m, 2, 1], out[m, 2, 2] = fu, fu * xr, fu * rr2
-        out[m, 2, 3], out[m, 2, 4], out[m, 2, 5] = fu * xr * rr2, fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
-        out[m, 2, 6] = z[m, 2] - z[m, 0]
-        out[m, 0, 7], out[m, 1, 7], out[m, 2, 7] = fu * x, fv * y, fu * xr
+            for s in range(out.shape[2]):
+                out[m, a, s] = H[a, first + s]
 
 
 @compiled
 def correct_pixels(
     lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
-    """Write pixels (M, 4) without the field of (R3) and (R4), (8,), and what follows from the rows (6,) of (R2)."""
+    """Write pixels (M, 4) without the field of (R3) and (R4), (10,), and what follows from the rows (7,) of (R2)."""
     fu, fv, cu, cv, _, _ = lens
-    a0, a1, a2, k, q1, q2, baseline, focal = coefficients
+    a0, a1, a2, a3, k1, k2, q1, q2, baseline, focal = coefficients
     by_focal, by_both = np.exp(-focal), np.exp(-focal - baseline)
     metric = baseline != 0.0 or focal != 0.0
     for m in range(len(z)):
         x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
         r2, rr2 = x * x + y * y, xr * xr + y * y
-        left = x * r2 * k + 2.0 * x * y * q1 + (r2 + 2.0 * x * x) * q2
-        row = y * r2 * k + (r2 + 2.0 * y * y) * q1 + 2.0 * x * y * q2
-        right = a0 + a1 * xr + a2 * rr2 + xr * rr2 * k + 2.0 * xr * y * q1 + (rr2 + 2.0 * xr * xr) * q2
+        radial, right_radial = r2 * (k1 + r2 * k2), rr2 * (k1 + rr2 * k2)
+        left = x * radial + 2.0 * x * y * q1 + (r2 + 2.0 * x * x) * q2
+        row = y * radial + (r2 + 2.0 * y * y) * q1 + 2.0 * x * y * q2
+        right = a0 + a1 * xr + rr2 * (a2 + rr2 * a3)
+        right += xr * right_radial + 2.0 * xr * y * q1 + (rr2 + 2.0 * xr * xr) * q2
         right += -rows[1] * y + (rows[5] - rows[4]) * xr * y - rows[3] * y * y
         out[m, 0] = z[m, 0] - fu * left if weight[m, 0] > 0.0 else z[m, 0]
         out[m, 1] = z[m, 1] - fv * row if weight[m, 1] > 0.0 else z[m, 1]
@@ -313,120 +597,143 @@ def _lens_plane(x: float, azimuth: float) -> tuple[float, float, float, float, f
 
 @compiled
 def cylinder_terms(x: float, azimuth: float, out: FloatArray) -> None:
-    """Write by how much (2, 12) a right camera's coordinates on a cylinder move, for one unit of each coefficient.
+    """Write by how much (2, 14) a right camera's coordinates on a cylinder move, for one unit of each coefficient.
 
-    Columns: a0, a1, a2, k, q1, q2 of the states, then the six of the rows, equation (R6).
+    Columns: a0 to a3, k1, k2, q1, q2 of the states, then the first six of the rows, equation (R6).
     """
     u, v, xx, xy, yx, yy = _lens_plane(x, azimuth)
     s, c, r2 = np.sin(azimuth), np.cos(azimuth), u * u + v * v
     # What moves in the lens, in angles off the axis; then on the cylinder.
-    lens_u = 4.0, u, r2, r2 * u, 2.0 * u * v, r2 + 2.0 * u * u, 0.0, 0.0, 0.0, 0.0, 0.0, r2 * u
-    lens_v = 0.0, 0.0, 0.0, r2 * v, r2 + 2.0 * v * v, 2.0 * u * v, 0.0, 0.0, v, 0.0, 3.0, r2 * v
-    for j in range(12):
+    r4 = r2 * r2
+    lens_u = 4.0, u, r2, r4, r2 * u, r4 * u, 2.0 * u * v, r2 + 2.0 * u * u, 0.0, 0.0, 0.0, 0.0, 0.0, r2 * u
+    lens_v = 0.0, 0.0, 0.0, 0.0, r2 * v, r4 * v, r2 + 2.0 * v * v, 2.0 * u * v, 0.0, 0.0, v, 0.0, 3.0, r2 * v
+    for j in range(14):
         out[0, j] = xx * lens_u[j] + xy * lens_v[j]
         out[1, j] = yx * lens_u[j] + yy * lens_v[j]
     # The turns about y, z and x.
     out[0, 0] -= 3.0 * (1.0 + x * x) * c
     out[1, 0] -= 3.0 * x * s
-    out[0, 9] += (1.0 + x * x) * c
-    out[1, 9] += x * s
-    out[0, 7] -= (1.0 + x * x) * s
-    out[1, 7] += x * c
-    out[1, 6] += 1.0
-    out[1, 10] -= 3.0
+    out[0, 11] += (1.0 + x * x) * c
+    out[1, 11] += x * s
+    out[0, 9] -= (1.0 + x * x) * s
+    out[1, 9] += x * c
+    out[1, 8] += 1.0
+    out[1, 12] -= 3.0
 
 
 @compiled
-def cylinder_field_jacobian(lens: Lens, z: FloatArray, out: FloatArray) -> None:
-    """Write the derivatives (M, 4, 8) of a cylinder's pixels (M, 4) by the coefficients of (R3); by (R4)'s, zero."""
+def cylinder_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray) -> None:
+    """Write the same for a cylinder's pixels; by the coefficients of (R4), zero."""
     fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 12)), np.empty((2, 12))
+    left, right = np.empty((2, 14)), np.empty((2, 14))
     for m in range(len(z)):
         y = (z[m, 1] - cv) / fv
         cylinder_terms((z[m, 0] - cu) / fu, y, left)
         cylinder_terms((z[m, 2] - cu) / fu, y, right)
-        for j in range(8):
-            for a in range(4):
-                out[m, a, j] = 0.0
-        for j in range(6):
-            out[m, 2, j] = fu * right[0, j]
-        for j in range(3, 6):
-            out[m, 0, j], out[m, 1, j] = fu * left[0, j], fv * left[1, j]
+        for s in range(out.shape[2]):
+            k = first + s
+            out[m, 0, s] = fu * left[0, k] if 4 <= k < 8 else 0.0
+            out[m, 1, s] = fv * left[1, k] if 4 <= k < 8 else 0.0
+            out[m, 2, s] = fu * right[0, k] if k < 8 else 0.0
+            out[m, 3, s] = 0.0
 
 
 @compiled
 def correct_cylinder_pixels(
     lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
-    """Write a cylinder's pixels (M, 4) without the field of (R3), (8,), and what follows from the rows (6,) of (R2)."""
+    """Write a cylinder's pixels (M, 4) without the field of (R3), (10,), and what the rows (7,) of (R2) tell."""
     fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 12)), np.empty((2, 12))
+    left, right = np.empty((2, 14)), np.empty((2, 14))
     for m in range(len(z)):
         y = (z[m, 1] - cv) / fv
         for a in range(4):
             out[m, a] = z[m, a]
         if weight[m, 0] > 0.0:
             cylinder_terms((z[m, 0] - cu) / fu, y, left)
-            for j in range(3, 6):
+            for j in range(4, 8):
                 out[m, 0] -= fu * left[0, j] * coefficients[j]
                 out[m, 1] -= fv * left[1, j] * coefficients[j]
         if weight[m, 2] > 0.0:
             cylinder_terms((z[m, 2] - cu) / fu, y, right)
+            for j in range(8):
+                out[m, 2] -= fu * right[0, j] * coefficients[j]
             for j in range(6):
-                out[m, 2] -= fu * (right[0, j] * coefficients[j] + right[0, 6 + j] * rows[j])
+                out[m, 2] -= fu * right[0, 8 + j] * rows[j]
+            out[m, 2] += rows[6] * (z[m, 2] - cu) * (z[m, 0] - z[m, 2]) / fu * np.sin(y)
 
 
 @compiled
 def cylinder_rows(lens: Lens, z: FloatArray, rows: FloatArray, common: FloatArray) -> None:
     """Write the derivatives of right minus left rows, in focal lengths, of a cylinder's pixels (M, 4).
 
-    By the coefficients of (R2), (M, 6), and by k, q1 and q2 of (R3), (M, 3).
+    By the coefficients of (R2), (M, 7), and by k1, k2, q1 and q2 of (R3), (M, 4).
     """
     fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 12)), np.empty((2, 12))
+    left, right = np.empty((2, 14)), np.empty((2, 14))
     for m in range(len(z)):
         y = (z[m, 1] - cv) / fv
         cylinder_terms((z[m, 0] - cu) / fu, y, left)
         cylinder_terms((z[m, 2] - cu) / fu, y, right)
         for j in range(6):
-            rows[m, j] = right[1, 6 + j]
-        for j in range(3):
-            common[m, j] = right[1, 3 + j] - left[1, 3 + j]
+            rows[m, j] = right[1, 8 + j]
+        rows[m, 6] = (z[m, 0] - z[m, 2]) / fu * np.cos(y)
+        for j in range(4):
+            common[m, j] = right[1, 4 + j] - left[1, 4 + j]
 
 
 @compiled
 def collect_columns(
-    J: FloatArray, H: FloatArray, weight: FloatArray, p_D_q: FloatArray, by_point: FloatArray, WH: FloatArray
+    r: FloatArray,
+    J: FloatArray,
+    H: FloatArray,
+    weight: FloatArray,
+    p_D_q: FloatArray,
+    by_point: FloatArray,
+    A: FloatArray,
+    b: FloatArray,
 ) -> None:
-    """Write `J' W H` (F, N, 3, S) and `W H` (F, N, 4, S); H (F, N, 4, S) becomes zero where nothing was measured."""
-    row = np.empty(3)
-    terms = H.shape[3]
+    """Write `J' W H` (F, N, 3, S) of each view, and `H' W H` (F, S, S) and `H' W r` (F, S) of each track.
+
+    H (F, N, 4, S) are the derivatives of the pixels, of which those count that were measured.
+    """
+    terms, wH = H.shape[3], np.empty(H.shape[3])
     for f in range(len(J)):
+        for s in range(terms):
+            b[f, s] = 0.0
+            for t in range(terms):
+                A[f, s, t] = 0.0
         for n in range(J.shape[1]):
             for i in range(3):
                 for s in range(terms):
                     by_point[f, n, i, s] = 0.0
+            if weight[f, n] == 0.0:
+                continue
             for a in range(4):
-                measured = J[f, n, a, 0] != 0.0 or J[f, n, a, 1] != 0.0 or J[f, n, a, 2] != 0.0
-                for i in range(3):
-                    row[i] = (
-                        J[f, n, a, 0] * p_D_q[f, 0, i] + J[f, n, a, 1] * p_D_q[f, 1, i] + J[f, n, a, 2] * p_D_q[f, 2, i]
-                    )
+                row = J[f, n, a]
+                if row[0] == 0.0 and row[1] == 0.0 and row[2] == 0.0:
+                    continue
                 for s in range(terms):
-                    if not measured:
-                        H[f, n, a, s] = 0.0
-                    WH[f, n, a, s] = weight[f, n] * H[f, n, a, s]
-                    for i in range(3):
-                        by_point[f, n, i, s] += row[i] * WH[f, n, a, s]
+                    wH[s] = weight[f, n] * H[f, n, a, s]
+                    b[f, s] += wH[s] * r[f, n, a]
+                for s in range(terms):
+                    for t in range(s + 1):
+                        A[f, s, t] += wH[s] * H[f, n, a, t]
+                for i in range(3):
+                    by_q = row[0] * p_D_q[f, 0, i] + row[1] * p_D_q[f, 1, i] + row[2] * p_D_q[f, 2, i]
+                    for s in range(terms):
+                        by_point[f, n, i, s] += by_q * wH[s]
+        for s in range(terms):
+            for t in range(s):
+                A[f, t, s] = A[f, s, t]
 
 
 @compiled
 def eliminate_columns(
     chosen: IntArray,
     by_point: FloatArray,
-    H: FloatArray,
-    WH: FloatArray,
-    r: FloatArray,
+    own_A: FloatArray,
+    own_b: FloatArray,
     G: FloatArray,
     C: FloatArray,
     B: FloatArray,
@@ -435,31 +742,32 @@ def eliminate_columns(
     cross: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Add to A (S, S), cross (S, 6N) and b (S,) what is left of the chosen tracks once their points are eliminated."""
+    """Add to A (S, S), cross (6N, S) and b (S,) what is left of the chosen tracks once their points are eliminated."""
     clones, terms = by_point.shape[1], by_point.shape[3]
-    own, X, factor = np.empty((3, terms)), np.empty((terms, 3)), np.empty((3, 3))
+    own, X, CG, factor = np.empty((3, terms)), np.empty(3), np.empty((3, terms)), np.empty((3, 3))
     for f in chosen:
         for s in range(terms):
             for i in range(3):
                 own[i, s] = 0.0
                 for n in range(clones):
                     own[i, s] += by_point[f, n, i, s]
-                X[s, i] = own[i, s]
+                X[i] = own[i, s]
                 for j in range(3):
                     factor[i, j] = C[f, i, j]
-            solve_positive(factor, X[s])
-            b[s] -= X[s, 0] * point_gradient[f, 0] + X[s, 1] * point_gradient[f, 1] + X[s, 2] * point_gradient[f, 2]
+            solve_positive(factor, X)
+            b[s] += own_b[f, s]
+            for i in range(3):
+                CG[i, s] = X[i]
+                b[s] -= X[i] * point_gradient[f, i]
         for s in range(terms):
             for t in range(terms):
-                A[s, t] -= own[0, s] * X[t, 0] + own[1, s] * X[t, 1] + own[2, s] * X[t, 2]
-        for m in range(H.shape[1]):
-            for s in range(terms):
-                b[s] += WH[f, m, s] * r[f, m]
-                for t in range(terms):
-                    A[s, t] += WH[f, m, s] * H[f, m, t]
+                A[s, t] += own_A[f, s, t] - own[0, s] * CG[0, t] - own[1, s] * CG[1, t] - own[2, s] * CG[2, t]
         for n in range(clones):
+            if not _has_part(G, f, n):
+                continue
             for k in range(6):
-                row = 6 * n + k
-                for s in range(terms):
-                    for i in range(3):
-                        cross[s, row] += B[f, i, k] * by_point[f, n, i, s] - G[f, row, i] * X[s, i]
+                g, add = G[f, 6 * n + k], cross[6 * n + k]
+                for i in range(3):
+                    by_pose = B[f, i, k]
+                    for s in range(terms):
+                        add[s] += by_pose * by_point[f, n, i, s] - g[i] * CG[i, s]

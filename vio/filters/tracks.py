@@ -15,6 +15,7 @@ class TrackTable:
     def __init__(self, columns: int) -> None:
         self._columns = columns
         self._row_of: dict[int, int] = {}
+        self._rows: IntArray | None = None  # all rows in order of their ids; None: tracks have come or gone
         self._free: list[int] = []
         self._ids = np.zeros(0, dtype=np.int64)
         self._z = np.zeros((0, columns, 4))
@@ -33,8 +34,10 @@ class TrackTable:
 
     def rows(self) -> IntArray:
         """Rows (F,) of all tracks, in order of their ids, so that no result depends on the table's history."""
-        rows = np.fromiter(self._row_of.values(), dtype=np.int64, count=len(self._row_of))
-        return rows[np.argsort(self._ids[rows])]
+        if self._rows is None:
+            rows = np.fromiter(self._row_of.values(), dtype=np.int64, count=len(self._row_of))
+            self._rows = rows[np.argsort(self._ids[rows])]
+        return self._rows
 
     def ids(self, rows: IntArray) -> IntArray:
         """Ids (F,) of rows."""
@@ -66,6 +69,7 @@ class TrackTable:
 
     def remove(self, rows: IntArray) -> None:
         """Remove tracks."""
+        self._rows = None
         for row in rows.tolist():
             del self._row_of[int(self._ids[row])]
             self._free.append(row)
@@ -76,7 +80,7 @@ class TrackTable:
         if not self._free:
             self._grow(2 * len(self._ids))
         row = self._free.pop()
-        self._row_of[track] = row
+        self._row_of[track], self._rows = row, None
         self._ids[row] = track
         return row
 

@@ -15,6 +15,9 @@ import numpy as np
 from scipy.linalg import blas, lapack
 
 from vio.compiled import move_poses
+from vio.filters import pose_loops as loops
+from vio.filters import track_loops
+from vio.filters.multiview import LandmarkResiduals
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.filters.online_calibration import Calibration, Twist
 from vio.filters.scale_test import ScaleTest, is_clear
@@ -27,7 +30,6 @@ from vio.geometry.lie import (
     se3_inverse,
     so3_exp,
     so3_hat,
-    so3_left_jacobian,
 )
 from vio.records import BoolArray, IntArray
 
@@ -57,7 +59,7 @@ class Window:
         calibration: Calibration = _NO_CALIBRATION,
     ) -> None:
         self.motion = motion
-        self._L: Factor | None = None  # factor of P; None: not computed since P changed
+        self._factors: dict[tuple[int, int], Factor] = {}  # of parts of P, since it changed
         self.nav = nav
         self.calibration = calibration
         self.clones: list[Clone] = []
@@ -74,12 +76,17 @@ class Window:
 
     @P.setter
     def P(self, P: FloatArray) -> None:
-        self._P, self._L = P, None
+        self._P, self._factors = P, {}
 
     @property
-    def first_clone(self) -> int:
-        """Row of the first clone, the one after the calibration's."""
-        return DIM + self.calibration.dim
+    def calibration(self) -> Calibration:
+        """The estimate of the rig's calibration."""
+        return self._calibration
+
+    @calibration.setter
+    def calibration(self, calibration: Calibration) -> None:
+        self._calibration = calibration
+        self.first_clone = DIM + calibration.dim  # row of the first clone, the one after the calibration's
 
     @property
     def first_landmark(self) -> int:
@@ -97,7 +104,9 @@ class Window:
 
     def T_cam0_world(self) -> FloatArray:
         """Camera poses (N, 4, 4) at all exposures."""
-        out: FloatArray = self.calibration.T_cam0_imu @ se3_inverse(self.exposures())
+        T = self.exposures()
+        out: FloatArray = np.empty(T.shape)
+        loops.camera_poses(self.calibration.T_cam0_imu, T, out)
         return out
 
     def body_D_error(self) -> FloatArray:
@@ -130,38 +139,32 @@ class Window:
             out[..., self.stereo_rows] = out_D_stereo
         return out
 
-    def add_landmark_information(self, A: FloatArray, b: FloatArray, C: FloatArray, g: FloatArray) -> None:
+    def add_landmarks_information(self, A: FloatArray, b: FloatArray, at: LandmarkResiduals, variance: float) -> None:
         """Add what the landmarks' pixels in their anchor, the newest clone, say: `dp = xi_f - xi_rho`; in place.
 
         Args:
-            A: information about exposures' poses and landmarks (6N + 3M, 6N + 3M).
-            b: its vector (6N + 3M,).
-            C: information about `dp` of each landmark (M, 3, 3).
-            g: its vector (M, 3).
+            A: information about the errors (D, D).
+            b: its vector (D,).
+            at: their residuals.
+            variance: of one pixel coordinate, px^2.
         """
-        first = 6 * len(self.clones)
-        rho, blocks = slice(first - 6, first - 3), C.reshape(-1, 3)
-        A[rho, rho] += C.sum(axis=0)
-        b[rho] -= g.sum(axis=0)
-        own = first + np.arange(len(blocks)).reshape(-1, 3)
-        A[own[:, :, None], own[:, None]] += C
-        A[first:, rho] -= blocks
-        A[rho, first:] -= blocks.T
-        b[first:] += g.reshape(-1)
+        exposure = self.clone_rows(len(self.clones) - 1).start
+        track_loops.add_landmarks(at.r, at.J, at.weight / variance, exposure, self.first_landmark, A, b)
 
     def lift_information(
         self, A: FloatArray, b: FloatArray, stereo: StereoInformation | None = None
     ) -> tuple[FloatArray, FloatArray]:
-        """Turn information about exposures' poses and landmarks (6N + 3M) into that about the error vector (D).
+        """Turn information about exposures' poses (6N) into that about the error vector (D).
 
         Args:
-            A: information matrix (6N + 3M, 6N + 3M).
-            b: information vector (6N + 3M,).
-            stereo: the part that concerns the stereo field, where it is estimated.
+            A: information matrix (6N, 6N).
+            b: information vector (6N,).
+            stereo: the part that concerns the stereo field, where it is estimated, beside poses and landmarks.
         """
-        out, vector = np.zeros_like(self.P), np.zeros(len(self.P))
-        first = self.first_clone
-        out[first:, first:], vector[first:] = A, b
+        D, first = len(self.P), self.first_clone
+        out, vector = np.zeros((D, D)), np.zeros(D)
+        poses = slice(first, first + len(b))
+        out[poses, poses], vector[poses] = A, b
         if stereo is not None:
             rows = self.stereo_rows
             out[rows, first:], out[first:, rows] = stereo.cross, stereo.cross.T
@@ -184,10 +187,8 @@ class Window:
 
     def move_covariance(self, index: int, fitted: Fit) -> FloatArray:
         """Covariance (6, 6) of `xi_newest - xi_clone` after a fit of all errors."""
-        J = np.zeros((6, len(self.P)))
-        J[:, self.clone_rows(len(self.clones) - 1)] = np.eye(6)
-        J[:, self.clone_rows(index)] -= np.eye(6)
-        S = fitted.spread(J)
+        newest, clone = self.clone_rows(len(self.clones) - 1), self.clone_rows(index)
+        S = fitted.whitened(fitted.rows(newest.start, newest.stop) - fitted.rows(clone.start, clone.stop))
         return S @ S.T
 
     def landmark_covariance(self, fitted: Fit) -> FloatArray:
@@ -196,11 +197,14 @@ class Window:
         That is `xi_f - xi_rho`, the landmark relative to the newest exposure, and the coefficients of the stereo
         calibration.
         """
-        M, D, S = len(self.landmarks), len(self.P), self.calibration.stereo_dim
-        exposure = self.chain(np.eye(6 * len(self.clones))[-6:-3])  # (3, D)
-        J = np.eye(3 * M, D, self.first_landmark).reshape(-1, 3, D) - exposure
-        stereo = np.broadcast_to(fitted.spread(np.eye(S, D, DIM)), (M, S, D)) if S else np.zeros((M, 0, D))
-        root = np.concatenate([fitted.spread(J), stereo], axis=1)
+        M, S = len(self.landmarks), self.calibration.stereo_dim
+        exposure = self.clone_rows(len(self.clones) - 1).start
+        first, n = self.first_landmark, len(fitted.prior.L)
+        moved = fitted.rows(first, first + 3 * M).reshape(M, 3, n) - fitted.rows(exposure, exposure + 3)
+        root = fitted.whitened(moved)
+        if S:
+            stereo = fitted.whitened(fitted.rows(self.stereo_rows.start, self.stereo_rows.stop))
+            root = np.concatenate([root, np.broadcast_to(stereo, (M, S, n))], axis=1)
         out: FloatArray = root @ np.swapaxes(root, 1, 2)
         return out
 
@@ -222,7 +226,7 @@ class Window:
             V[own] = Phi @ V[own]
             V[:DIM] += step.Phi @ before - self._scaled_nav(step.nav)
         self.nav = step.nav
-        P, self._L = self.P, None
+        P, self._factors = self.P, {}
         P[own] = Phi @ P[own]
         P[:, own] = P[:, own] @ Phi.T
         P[:DIM, :DIM] += step.Q
@@ -323,10 +327,11 @@ class Window:
         else:
             self.P[:6, :6] += noise
         P = np.empty((D + 6, D + 6))
-        old = np.concatenate([np.arange(at), np.arange(at + 6, D + 6)])
-        new = slice(at, at + 6)
-        P[np.ix_(old, old)] = self.P
-        P[new, old], P[old, new], P[new, new] = added, beside, block
+        new, end = slice(at, at + 6), slice(at + 6, D + 6)
+        P[:at, :at], P[:at, end] = self.P[:at, :at], self.P[:at, at:]
+        P[end, :at], P[end, end] = self.P[at:, :at], self.P[at:, at:]
+        P[new, :at], P[new, end] = added[:, :at], added[:, at:]
+        P[:at, new], P[end, new], P[new, new] = beside[:at], beside[at:], block
         delta = self.prior_delta
         self.prior_delta = np.concatenate([delta[:at], camera_D_own @ delta[own], delta[at:]])
         if self.scale_test is not None:
@@ -377,7 +382,7 @@ class Window:
         first, newest = self.first_landmark, self.clone_rows(len(self.clones) - 1).start + 3
         turn, before = slice(newest, newest + 3), slice(previous_rotation, previous_rotation + 3)
         p_cross = so3_hat(self.landmarks).reshape(-1, 3)
-        P, delta, self._L = self.P, self.prior_delta, None
+        P, delta, self._factors = self.P, self.prior_delta, {}
         P[first:] += p_cross @ (P[turn] - P[before])
         P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
@@ -400,7 +405,9 @@ class Window:
         self.landmark_ids, self.landmarks = self.landmark_ids[chosen], self.landmarks[chosen]
 
     def _keep_rows(self, rows: IntArray) -> None:
-        self.P = self.P[np.ix_(rows, rows)]
+        P = np.empty((len(rows), len(rows)))
+        loops.take_rows(self.P, rows, P)
+        self.P = P
         self.prior_delta = self.prior_delta[rows]
         if self.scale_test is not None:
             self.scale_test.error_D_scale = self.scale_test.error_D_scale[rows]
@@ -434,19 +441,27 @@ class Window:
             The fit, with the covariance (k, k) of the first errors there, and the error vector (D,) that moves the
             means there.
         """
-        own = slice(0, size)
+        prior = self._prior_of(information, size)
+        own = slice(prior.first, size)
         A, b = information[own, own], vector[own] + information[own, own] @ self.prior_delta[own]
-        fitted = fit(self._factor().leading(size), A)
-        shift = fitted.move(b)
-        if size < len(self.P):  # P (b - A shift) is the shift; the others follow by their correlation
-            shift = np.concatenate([shift, self.P[size:, own] @ (b - A @ shift)])
+        fitted = fit(prior, A)
+        moved = fitted.move(b)
+        shift: FloatArray = self.P[:, own] @ (b - A @ moved)  # the others follow by their correlation
+        shift[own] = moved
         return fitted, shift - self.prior_delta
 
-    def _factor(self) -> Factor:
-        """The factor of the present covariance, computed once for all fits to it."""
-        if self._L is None:
-            self._L = factor(self.P)
-        return self._L
+    def _prior_of(self, information: FloatArray, size: int) -> Factor:
+        """The factor of the present covariance, up to row `size`, of the errors that information (D, D) is about.
+
+        Pixels depend on no error of navigation state and extrinsics: then it is that of the errors after them, unless
+        these are singular beyond rounding. It is computed once for all fits to one covariance.
+        """
+        first = DIM if self.calibration.stereo_dim else self.first_clone
+        if information[:first].any():
+            first = 0
+        if (first, size) not in self._factors:
+            self._factors[first, size] = factor(self.P[:size, :size], first)
+        return self._factors[first, size]
 
     def absorb(self, information: FloatArray, vector: FloatArray, scaled: FloatArray | None = None) -> None:
         """Absorb measurements into the prior.
@@ -456,7 +471,9 @@ class Window:
             vector: `H' R^-1 r` (D,).
             scaled: for measurements in metres, how the errors (D,) move with the logarithm of the world's scale.
         """
-        P = fit(self._factor(), information).covariance()
+        prior = self._prior_of(information, len(self.P))
+        own = slice(prior.first, None)
+        P = fit(prior, information[own, own]).covariance()
         self.prior_delta = self.prior_delta - P @ (vector + information @ self.prior_delta)
         self.P = P
         if self.scale_test is not None:
@@ -482,12 +499,15 @@ class Window:
 
     def relinearise(self, error: FloatArray) -> None:
         """Move the means by an error vector (D,); the prior stays where it is."""
-        T, moves = self.exposures(), self.body_D_error() @ error[: self.first_landmark]
-        move_poses(moves.reshape(-1, 6), T)
+        T, moves = self.exposures(), self.exposure_errors(error).reshape(-1, 6).copy()
+        if self.calibration.extrinsics:
+            eta = error[self.calibration.extrinsic_rows + DIM]
+            loops.add_extrinsic_moves(T, self.nav.T_world_imu, eta, moves)
+        move_poses(moves, T)
         if len(self.landmarks):
-            phi = self.exposure_errors(error)[-3:]
+            self.landmarks = self.landmarks.copy()
             xi_f = error[self.first_landmark :].reshape(-1, 3)
-            self.landmarks = self.landmarks @ so3_exp(phi).T + xi_f @ so3_left_jacobian(phi).T
+            loops.move_points(self.exposure_errors(error)[-3:], xi_f, self.landmarks)
         velocities = [c.velocity for c in self.clones]
         if isinstance(self.motion, ImuMotion):
             velocities = self._corrected_velocities(self.motion, T, error[:DIM])
@@ -540,55 +560,77 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Factor:
-    """A covariance `P = L L'`."""
+    """A covariance, and a factor of that of its last n errors: `P_n = L L'`."""
 
-    L: FloatArray  # (D, D)
+    P: FloatArray  # (D, D)
+    L: FloatArray  # (n, n)
     triangular: bool  # by Cholesky; False: by the eigenvectors of a P that is singular beyond rounding
 
-    def leading(self, size: int) -> Factor:
-        """The factor of the covariance of the first errors alone."""
-        if size == len(self.L):
-            return self
-        if self.triangular:
-            return Factor(np.ascontiguousarray(self.L[:size, :size]), True)
-        return factor(self.L[:size] @ self.L[:size].T)
+    @property
+    def first(self) -> int:
+        """Row of the first error that is factored."""
+        return len(self.P) - len(self.L)
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The covariance after a measurement in information form, as factors: `P_new = L (K K')^-1 L'`."""
+    """The covariance after a measurement of the last n errors in information form: `P_n_new = L (K K')^-1 L'`."""
 
-    L: FloatArray  # (D, D) of the prior
-    K_transposed: FloatArray  # (D, D) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
+    prior: Factor
+    K_transposed: FloatArray  # (n, n) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
 
     def move(self, vector: FloatArray) -> FloatArray:
-        """Return `P_new v` (D,), for the information vector v (D,) the shift of the mean."""
-        inner = lapack.dpotrs(self.K_transposed, self.L.T @ vector, lower=0)[0]
-        out: FloatArray = self.L @ inner
+        """Return `P_n_new v` (n,), for the information vector v (n,) the shift of their mean."""
+        L = self.prior.L
+        out: FloatArray = L @ lapack.dpotrs(self.K_transposed, L.T @ vector, lower=0)[0]
         return out
 
-    def spread(self, J: FloatArray) -> FloatArray:
-        """Return S (..., k, D) with `S S'` the covariance of `J error`, for a Jacobian J (..., k, D)."""
-        rows = np.ascontiguousarray((J @ self.L).reshape(-1, J.shape[-1]))
+    def rows(self, start: int, stop: int) -> FloatArray:
+        """Return the rows (stop - start, n) of L that belong to rows of P: `J L` for a choice J of the errors."""
+        first = self.prior.first
+        return self.prior.L[start - first : stop - first]
+
+    def whitened(self, J_L: FloatArray) -> FloatArray:
+        """Return S (..., k, n) with `S S'` the covariance of `J error`, from `J L` (..., k, n)."""
+        rows = np.ascontiguousarray(J_L).reshape(-1, J_L.shape[-1])
         S: FloatArray = blas.dtrsm(1.0, self.K_transposed, rows.T, lower=0, trans_a=1).T
-        return S.reshape(J.shape)
+        return S.reshape(J_L.shape)
 
     def covariance(self) -> FloatArray:
-        """Return the covariance (D, D): symmetric and positive by construction."""
-        W = blas.dtrsm(1.0, self.K_transposed, self.L.T, lower=0, trans_a=1)
-        P_new: FloatArray = W.T @ W
-        return P_new
+        """Return the covariance (D, D) of all errors: symmetric and positive by construction.
+
+        That of the last n is `W' W`. With N the others' covariance with them before, times `L'^-1 K'^-1`, the others'
+        covariance with them is `N W`, and their own is `N N'` and what it is given the last n.
+        """
+        P, L, first = self.prior.P, self.prior.L, self.prior.first
+        W = blas.dtrsm(1.0, self.K_transposed, L.T, lower=0, trans_a=1)
+        out: FloatArray = np.empty(P.shape)
+        out[first:, first:] = W.T @ W
+        if first:
+            G: FloatArray = blas.dtrsm(1.0, L.T, P[:first, first:].T, lower=0, trans_a=1).T
+            N = self.whitened(G)
+            out[:first, first:] = N @ W
+            out[first:, :first] = out[:first, first:].T
+            out[:first, :first] = P[:first, :first] - G @ G.T + N @ N.T
+            _keep_positive(out, P, first)
+        return out
 
 
-def factor(P: FloatArray) -> Factor:
-    """Factor a covariance (D, D)."""
-    try:
-        L = np.asarray(np.linalg.cholesky(P + np.diag(1e-14 * np.diag(P) + 1e-24)), dtype=np.float64)
-        return Factor(L, True)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(P)
-        root: FloatArray = np.array(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C")
-        return Factor(root, False)
+def _keep_positive(out: FloatArray, P: FloatArray, count: int) -> None:
+    """Add to the first variances of a covariance what keeps it positive to rounding, also where P knows one exactly."""
+    np.einsum("ii->i", out)[:count] += 1e-14 * P.diagonal()[:count] + 1e-24
+
+
+def factor(P: FloatArray, first: int = 0) -> Factor:
+    """Factor a covariance (D, D) from the row `first` on; the whole where that part is singular beyond rounding."""
+    A = np.array(P[first:, first:], order="C")
+    _keep_positive(A, A, len(A))
+    upper, failed = lapack.dpotrf(A.T, lower=0, overwrite_a=1)
+    if not failed:
+        return Factor(P, upper.T, True)
+    values, vectors = np.linalg.eigh(P)
+    root: FloatArray = np.array(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C")
+    return Factor(P, root, False)
 
 
 def fit(prior: Factor, information: FloatArray) -> Fit:
@@ -609,7 +651,7 @@ def fit(prior: Factor, information: FloatArray) -> Fit:
     K_transposed, failed = lapack.dpotrf(inner, lower=0, overwrite_a=1)
     if failed:
         raise np.linalg.LinAlgError("the information is not positive")
-    return Fit(L, K_transposed)
+    return Fit(prior, K_transposed)
 
 
 def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:

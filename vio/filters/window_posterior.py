@@ -14,7 +14,7 @@ from vio.records import Estimate
 from vio.statistics import chi_square_quantile
 
 _LEAST_MOTION_M = 1e-3  # of all poses from the oldest one: less has no scale
-_STATIONARY_PROBABILITY = 0.95  # chi-square limit of the motion over the window
+_STATIONARY_LIMIT = float(chi_square_quantile(0.95, 6))  # of the motion over the window
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ class WindowPosterior:
         A = se3_adjoint(se3_inverse(old.T_world_imu))
         C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
         xi = se3_log(se3_inverse(old.T_world_imu) @ new.T_world_imu)
-        limit = float(chi_square_quantile(_STATIONARY_PROBABILITY, 6))
+        limit = _STATIONARY_LIMIT
         if float(xi @ xi) > limit * (float(np.trace(C)) + 6e-18):  # no eigenvalue of C is larger than its trace
             return False
         largest = np.sqrt([np.linalg.eigvalsh(C[p, p])[-1] for p in (slice(0, 3), slice(3, 6))]) / seconds
@@ -125,4 +125,4 @@ def _with_velocities(clones: tuple[Clone, ...]) -> tuple[Clone, ...]:
     t = np.array([c.time_ns - clones[0].time_ns for c in clones]) * 1e-9
     p = np.array([c.T_world_imu[:3, 3] for c in clones])
     v = np.gradient(p, t, axis=0)
-    return tuple(replace(c, velocity=v[k]) for k, c in enumerate(clones))
+    return tuple(Clone(c.frame_index, c.time_ns, c.T_world_imu, v[k]) for k, c in enumerate(clones))

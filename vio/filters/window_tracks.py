@@ -16,12 +16,12 @@ from vio.filters.multiview import (
     TrackInformation,
     Views,
     first_points,
-    has_parallax,
     measured_pixels,
     refine_points,
     residuals,
     robust_weights,
     track_information,
+    usable_points,
 )
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import StereoColumns, StereoField, stereo_columns
@@ -100,14 +100,15 @@ class WindowTracks:
         if fresh.any():
             start, known = first_points(camera, T, views.take(fresh))
             table.points[rows[fresh]], table.has_point[rows[fresh]] = start, known
-            rows = rows[table.has_point[rows]]
-            views = self._views(rows, clones, field)
+            started = table.has_point[rows]
+            rows, views = rows[started], views.take(started)
         p = refine_points(camera, T, table.points[rows], views, steps, CAUCHY * float(np.sqrt(self.variance)))
         at = residuals(camera, T, p, views)
-        keep = at.ahead & np.isfinite(p).all(axis=1)
-        keep[keep] = has_parallax(camera, T, p[keep], views.take(keep), at.take(keep))
+        keep = usable_points(camera, T, p, views, at)
         table.points[rows], table.has_point[rows] = p, keep
-        return self._linear(T, rows[keep], p[keep], at.take(keep), field, views.z[keep])
+        if not keep.all():
+            rows, p, at, views = rows[keep], p[keep], at.take(keep), views.take(keep)
+        return self._linear(T, rows, p, at, field, views.z)
 
     def without_wrong_views(self, tracks: LinearTracks) -> LinearTracks:
         """Drop single views that contradict the rest of their track permanently, and linearise what is left."""

@@ -212,7 +212,9 @@ def se3_inverse(T: npt.ArrayLike) -> FloatArray:
     """Inverse transforms (..., 4, 4), by transposing the rotation."""
     T = np.asarray(T, dtype=np.float64)
     if T.ndim == 2:
-        return se3_from_parts(T[:3, :3].T, -(T[:3, 3] @ T[:3, :3]))
+        (a, b, c, x), (d, e, f, y), (g, h, i, z) = T[:3].tolist()
+        p, q, r = -(a * x + d * y + g * z), -(b * x + e * y + h * z), -(c * x + f * y + i * z)
+        return np.array([[a, d, g, p], [b, e, h, q], [c, f, i, r], [0.0, 0.0, 0.0, 1.0]])
     Rt = np.swapaxes(T[..., :3, :3], -1, -2)
     return se3_from_parts(Rt, -(Rt @ T[..., :3, 3, None])[..., 0])
 
@@ -239,6 +241,12 @@ def se3_adjoint(T: npt.ArrayLike) -> FloatArray:
     """Adjoint matrices (..., 6, 6): `T exp(xi) T^-1 = exp(Ad(T) xi)`."""
     T = np.asarray(T, dtype=np.float64)
     R = T[..., :3, :3]
+    if T.ndim == 2:
+        one = np.zeros((6, 6))
+        one[:3, :3] = one[3:, 3:] = R
+        x, y, z = T[:3, 3].tolist()
+        one[:3, 3:] = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ R
+        return one
     out = np.zeros((*T.shape[:-2], 6, 6))
     out[..., :3, :3] = out[..., 3:, 3:] = R
     out[..., :3, 3:] = so3_hat(T[..., :3, 3]) @ R

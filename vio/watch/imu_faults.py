@@ -28,10 +28,10 @@ class ImuFaultReport:
         """Take the number of a frame, for the lines that follow."""
         self._frame = index
 
-    def sample(self, sample: ImuSample) -> tuple[tuple[ImuSample, ...], list[str]]:
-        """Take a sample; return those that may be used now, and the lines on faults that have ended."""
-        self._samples += 1
-        usable = self._check.take(sample)
+    def samples(self, samples: list[ImuSample]) -> tuple[list[ImuSample], list[str]]:
+        """Take samples; return those that may be used now, and the lines on faults that have ended."""
+        self._samples += len(samples)
+        usable = self._check.take_all(samples)
         return usable, [line for fault in self._check.new_faults() for line in self._line(fault)]
 
     def finish(self) -> list[str]:

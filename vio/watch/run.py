@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, ImuSample, MotionSample, Observations, Prediction, StereoFrame, UpdateReport
-from vio.watch.frozen import FrozenImages, RepeatReport
+from vio.watch.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.watch.health import RunHealth
 from vio.watch.imu_faults import ImuFaultReport
 from vio.watch.silence import ImuSilence
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
     from vio.watch.inertial import InertialCheck
 
 log = logging.getLogger(__name__)
+
+_PREVENTS_START = ("size", "overlap")  # groups of faults without whose cure one camera finds no scale
 
 
 class RunWatch:
@@ -36,31 +41,50 @@ class RunWatch:
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
-        self._frozen, self._repeats = FrozenImages(), RepeatReport()
+        self._frozen, self._repeats, self._depths = FrozenImages(), RepeatReport(IMAGES), RepeatReport(DEPTHS)
         self._repeated = False  # the present frame shows an earlier exposure
         if imu:
             from vio.watch.inertial import InertialCheck  # it loads scipy.optimize
 
             self._inertial = InertialCheck(camera, T_cam0_body)
+        self._new: list[ImuSample] = []  # since the last frame
         self._frames = self._features = 0
         self._refused_last = -2
         self.frames_refused = 0
         self.frames_waiting = 0  # that have no pose, as the back end had not begun
         self._waiting_since: int | None = None
         self._waits_for = ""
+        self._imu_at_fault = False
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
-        """Add one motion sample."""
-        if isinstance(sample, ImuSample):
-            if self._silence is not None:
-                self._report(self._silence.sample(sample.time_ns))
-            if self._faults is not None and self._inertial is not None:
-                usable, lines = self._faults.sample(sample)
-                self._report(lines)
-                for x in usable:
-                    self._inertial.imu(x)
-                    self._frozen.sample(x)
+        """Add one motion sample; it is judged with all others before the next frame."""
+        if self._silence is not None and isinstance(sample, ImuSample):
+            self._new.append(sample)
+
+    def _take_new(self) -> None:
+        """Judge the samples since the last frame."""
+        new, self._new = self._new, []
+        if self._silence is None or not new:
+            return
+        taken = 0
+        for k, sample in enumerate(new):
+            gap = self._silence.sample(sample.time_ns)
+            if gap:  # what is to be said of earlier samples comes first
+                self._check(new[taken:k])
+                self._report(gap)
+                taken = k
+        self._check(new[taken:])
+
+    def _check(self, samples: list[ImuSample]) -> None:
+        """Report faulty samples, and hand the others on."""
+        if self._faults is None or self._inertial is None:
+            return
+        usable, lines = self._faults.samples(samples)
+        self._report(lines)
+        for x in usable:
+            self._inertial.imu(x)
+            self._frozen.sample(x)
 
     def repeats(self, frame: StereoFrame, expected: Prediction | None) -> bool:
         """Return whether a frame shows an earlier exposure again and must not be used; called before `observations`.
@@ -69,13 +93,23 @@ class RunWatch:
             frame: in time order.
             expected: the back end's prediction of it.
         """
+        self._take_new()
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
         self._report(self._repeats.frame(frame, repeated))
         return self._repeated
 
+    def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
+        """Return a frame that `repeats` let pass, without its depths where they are those of an earlier frame."""
+        if frame.depth is None:
+            return frame
+        repeated = self._frozen.check_depth(frame)
+        self._report(self._depths.frame(frame, repeated))
+        return frame if repeated is None else replace(frame, depth=np.zeros_like(frame.depth))
+
     def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
         """Add the front end's observations, before feature selection, and what it says of the images."""
+        self._take_new()
         self._report(warnings)
         self._frames += 1
         self._features += len(seen)
@@ -134,13 +168,12 @@ class RunWatch:
 
     def close(self) -> None:
         """Finish at the end of the run, also of a failed one."""
+        self._take_new()
         if self._frames and not self._features:
             self._report(
                 [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
             )
-        if self._waiting_since is not None:
-            self._report([f"one camera: {self.frames_waiting} frames have no pose; {self._waits_for}"])
-        self._report(self._repeats.finish())
+        self._report([*self._repeats.finish(), *self._depths.finish()])
         if self._silence is not None:
             self._report(self._silence.finish())
         if self._faults is not None:
@@ -150,9 +183,14 @@ class RunWatch:
             if self._faults is not None and self._faults.stuck_at_end:  # which is no matter of clocks
                 findings = tuple(f for f in findings if f.group != "overlap")
             self._report_findings(findings)
+        if self._waiting_since is not None:
+            why = "mend the fault of the IMU that is named above first" if self._imu_at_fault else self._waits_for
+            self._report([f"one camera: {self.frames_waiting} frames have no pose; {why}"])
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
         """Log findings; gaps are reported one by one by `ImuSilence`."""
+        findings = tuple(findings)
+        self._imu_at_fault |= any(f.certain and f.group in _PREVENTS_START for f in findings)
         self._report(finding.message for finding in findings if finding.fault != "IMU gap")
 
     def _report(self, lines: Iterable[str]) -> None:

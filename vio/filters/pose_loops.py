@@ -1,0 +1,212 @@
+"""The compiled loops over the poses of the window and over the IMU's samples, behind `window` and `navigation`.
+
+Shapes: N clones, M points, K times of an integration. Each loop changes or fills the arrays that come last.
+`tests/numpy_twins.py` holds the same in NumPy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.compiled import compiled
+from vio.geometry.lie import FloatArray
+from vio.records import IntArray
+
+
+@compiled
+def _sinc_terms(squared: float) -> tuple[float, float, float]:
+    """Return `sin(a)/a`, `(1 - cos a)/a^2` and `(a - sin a)/a^3` of a squared angle, as `vio.geometry.lie` does."""
+    if squared < 1e-4:  # cancellation in the closed forms
+        a = 1.0 - squared / 6.0 * (1.0 - squared / 20.0 * (1.0 - squared / 42.0))
+        b = 0.5 - squared / 24.0 * (1.0 - squared / 30.0 * (1.0 - squared / 56.0))
+        return a, b, 1.0 / 6.0 - squared / 120.0 * (1.0 - squared / 42.0 * (1.0 - squared / 72.0))
+    angle = np.sqrt(squared)
+    half = np.sin(angle / 2.0)
+    return np.sin(angle) / angle, 2.0 * half * half / squared, (angle - np.sin(angle)) / (angle * squared)
+
+
+@compiled
+def _turned(x: float, y: float, z: float, first: float, second: float, v: FloatArray) -> tuple[float, float, float]:
+    """Return `(I + first W + second W W) v`, with W the skew-symmetric matrix of (x, y, z)."""
+    cx, cy, cz = y * v[2] - z * v[1], z * v[0] - x * v[2], x * v[1] - y * v[0]
+    dx, dy, dz = y * cz - z * cy, z * cx - x * cz, x * cy - y * cx
+    return v[0] + first * cx + second * dx, v[1] + first * cy + second * dy, v[2] + first * cz + second * dz
+
+
+@compiled
+def move_points(phi: FloatArray, xi: FloatArray, p: FloatArray) -> None:
+    """Replace points or velocities (M, 3) by `exp(phi) p + J_l(phi) xi`, with one phi (3,) and xi (M, 3)."""
+    x, y, z = phi[0], phi[1], phi[2]
+    a, b, c = _sinc_terms(x * x + y * y + z * z)
+    for m in range(len(p)):
+        px, py, pz = _turned(x, y, z, a, b, p[m])
+        qx, qy, qz = _turned(x, y, z, b, c, xi[m])
+        p[m, 0], p[m, 1], p[m, 2] = px + qx, py + qy, pz + qz
+
+
+@compiled
+def camera_poses(T_cam0_imu: FloatArray, T_world_imu: FloatArray, out: FloatArray) -> None:
+    """Write `T_cam0_imu T_world_imu^-1` (N, 4, 4)."""
+    for n in range(len(out)):
+        T = T_world_imu[n]
+        for i in range(3):
+            out[n, i, 3] = T_cam0_imu[i, 3]
+            for j in range(3):
+                total = 0.0
+                for k in range(3):
+                    total += T_cam0_imu[i, k] * T[j, k]
+                out[n, i, j] = total
+                out[n, i, 3] -= total * T[j, 3]
+            out[n, 3, i] = 0.0
+        out[n, 3, 3] = 1.0
+
+
+@compiled
+def add_extrinsic_moves(T_world_imu: FloatArray, now: FloatArray, eta: FloatArray, moves: FloatArray) -> None:
+    """Add how the extrinsics' error eta (6,) moves the body's poses (N, 4, 4), `Ad(T T_now^-1) eta`: moves (N, 6)."""
+    for n in range(len(moves)):
+        T, t, turned = T_world_imu[n], moves[n], np.zeros(6)  # R' eta of the present pose, then by that of the clone
+        for i in range(3):
+            for j in range(3):
+                turned[i] += now[j, i] * (eta[j] - _cross(now[:, 3], eta[3:], j))
+                turned[3 + i] += now[j, i] * eta[3 + j]
+        rho, phi = np.zeros(3), np.zeros(3)
+        for i in range(3):
+            for j in range(3):
+                rho[i] += T[i, j] * turned[j]
+                phi[i] += T[i, j] * turned[3 + j]
+        for i in range(3):
+            t[i] += rho[i] + _cross(T[:, 3], phi, i)
+            t[3 + i] += phi[i]
+
+
+@compiled
+def _cross(a: FloatArray, b: FloatArray, i: int) -> float:
+    """One entry of the cross product."""
+    j, k = (i + 1) % 3, (i + 2) % 3
+    return a[j] * b[k] - a[k] * b[j]
+
+
+@compiled
+def move_earlier_velocities(
+    gravity: FloatArray, ages: FloatArray, R: FloatArray, error: FloatArray, velocities: FloatArray
+) -> None:
+    """Move velocities (N, 3) of the past by a present error (15,), see `ImuMotion.corrected_earlier`."""
+    xi = np.empty(velocities.shape)
+    for n in range(len(ages)):
+        for i in range(3):
+            by_bias = R[n, i, 0] * error[12] + R[n, i, 1] * error[13] + R[n, i, 2] * error[14]
+            xi[n, i] = error[6 + i] + ages[n] * (by_bias - _cross(gravity, error[3:6], i))
+    move_points(error[3:6], xi, velocities)
+
+
+@compiled
+def take_rows(P: FloatArray, rows: IntArray, out: FloatArray) -> None:
+    """Write the chosen rows and columns (K, K) of a matrix."""
+    for i in range(len(rows)):
+        for j in range(len(rows)):
+            out[i, j] = P[rows[i], rows[j]]
+
+
+@compiled
+def _add_noise(
+    R: FloatArray,
+    p: FloatArray,
+    v: FloatArray,
+    gravity: FloatArray,
+    left: float,
+    dt: float,
+    gyro2: float,
+    accel2: float,
+    Phi: FloatArray,
+    Q_parts: FloatArray,
+) -> None:
+    """Add what one step of dt (s), `left` (s) before the end, brings to Phi and Q_parts (2, 15, 15): (N3), (N4).
+
+    `gyro2` and `accel2` are the variances of the integrals of gyro and accelerometer over it.
+    """
+    # How noise and bias errors of gyro and accelerometer enter [rho phi xi_v] (9, 6) there, carried to the end.
+    out, lever, swing = np.zeros((9, 6)), np.empty(3), np.empty(3)
+    for i in range(3):
+        swing[i] = v[i] + left * gravity[i]
+        lever[i] = p[i] + left * (v[i] + 0.5 * left * gravity[i])
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            out[i, c] = lever[k] * R[j, c] - lever[j] * R[k, c]
+            out[3 + i, c] = -R[i, c]
+            out[6 + i, c] = swing[k] * R[j, c] - swing[j] * R[k, c]
+            out[i, 3 + c], out[6 + i, 3 + c] = -left * R[i, c], -R[i, c]
+    for i in range(9):
+        for j in range(6):
+            Phi[i, 9 + j] += out[i, j] * dt
+        for j in range(9):
+            Q_parts[0, i, j] += accel2 * (out[i, 3] * out[j, 3] + out[i, 4] * out[j, 4] + out[i, 5] * out[j, 5])
+            Q_parts[1, i, j] += gyro2 * (out[i, 0] * out[j, 0] + out[i, 1] * out[j, 1] + out[i, 2] * out[j, 2])
+
+
+@compiled
+def integrate(
+    times_ns: FloatArray,
+    readings: FloatArray,
+    bias: FloatArray,
+    gravity: FloatArray,
+    densities: FloatArray,
+    hidden: FloatArray,
+    T: FloatArray,
+    v: FloatArray,
+    turned: FloatArray,
+    Phi: FloatArray,
+    Q_parts: FloatArray,
+) -> None:
+    """Integrate readings (K, 6) `[gyro, accel]` at times (K,), equations (N1) to (N4).
+
+    Moves the pose T (4, 4) and the velocity v (3,); adds the rotation to `turned` (3,), the biases' part to Phi
+    (15, 15), and to Q_parts (2, 15, 15) the noise of accelerometer and gyro, of densities (2,) and what gaps hide
+    (2, K - 1).
+    """
+    R, p = T[:3, :3].copy(), T[:3, 3].copy()
+    new, phi, force = np.empty((3, 3)), np.empty(3), np.empty(3)
+    pm, vm = np.empty(3), np.empty(3)
+    end = times_ns[-1]
+    for k in range(len(times_ns) - 1):
+        dt = (times_ns[k + 1] - times_ns[k]) * 1e-9
+        for i in range(3):
+            phi[i] = (0.5 * (readings[k, i] + readings[k + 1, i]) - bias[i]) * dt
+            turned[i] += phi[i]
+        a, b, _ = _sinc_terms(phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2])
+        for i in range(3):  # R exp(phi) is the transpose of exp(-phi) R'
+            new[i, 0], new[i, 1], new[i, 2] = _turned(-phi[0], -phi[1], -phi[2], a, b, R[i])
+        for i in range(3):
+            force[i] = gravity[i]
+            for j in range(3):
+                before, after = readings[k, 3 + j] - bias[3 + j], readings[k + 1, 3 + j] - bias[3 + j]
+                force[i] += 0.5 * (R[i, j] * before + new[i, j] * after)
+        for i in range(3):
+            pm[i], vm[i] = p[i], v[i]
+            p[i] += v[i] * dt + 0.5 * force[i] * dt * dt
+            v[i] += force[i] * dt
+            pm[i], vm[i] = 0.5 * (pm[i] + p[i]), 0.5 * (vm[i] + v[i])
+        left = (end - 0.5 * (times_ns[k] + times_ns[k + 1])) * 1e-9
+        accel2, gyro2 = densities[0] ** 2 * dt + hidden[0, k], densities[1] ** 2 * dt + hidden[1, k]
+        _add_noise(R, pm, vm, gravity, left, dt, gyro2, accel2, Phi, Q_parts)
+        for i in range(3):
+            for j in range(3):
+                R[i, j] = new[i, j]
+    for i in range(3):
+        T[i, 3] = p[i]
+        for j in range(3):
+            T[i, j] = R[i, j]
+
+
+@compiled
+def lacks_samples(cuts: FloatArray, t: FloatArray, longest: float) -> bool:
+    """Whether any step between cuts (K,) lies beyond the samples at times (S,), or between two that are far apart."""
+    s = 0
+    for k in range(len(cuts) - 1):
+        middle = 0.5 * (cuts[k] + cuts[k + 1])
+        while s < len(t) and t[s] < middle:
+            s += 1
+        if s == 0 or s == len(t) or t[s] - t[s - 1] > longest:
+            return True
+    return False
