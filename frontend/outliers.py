@@ -192,6 +192,7 @@ def _refine_on_all(
 ) -> None:
     """Refine one motion (1, 4, 4) in place on points (N, 3) and pixels (N, 2); see `_refine`."""
     weight, before = np.empty((1, len(points))), np.empty((4, 4))
+    once = int(np.int64(1))  # no literal: see `vio.compiled`
     for _ in range(_REFINE_ITERATIONS):
         _distances(lens, T, points, pixels, weight)
         for n in range(len(points)):
@@ -200,7 +201,7 @@ def _refine_on_all(
         for i in range(4):
             for j in range(4):
                 before[i, j] = T[0, i, j]
-        _iterate(lens, T, points.reshape(1, -1, 3), pixels.reshape(1, -1, 2), weight, 1, free)
+        _iterate(lens, T, points.reshape(1, -1, 3), pixels.reshape(1, -1, 2), weight, once, free)
         change = 0.0
         for i in range(4):
             for j in range(4):

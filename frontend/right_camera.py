@@ -183,7 +183,8 @@ def image_change(image: Image, other: Image) -> float:
 def _difference(image: Image, other: Image) -> float:
     """Mean absolute difference of two images, each less its mean and over its contrast; 0: equal to the bit."""
     height, width = image.shape
-    (mean, contrast), (other_mean, other_contrast) = statistics(image, 1), statistics(other, 1)
+    all_pixels = int(np.int64(1))  # no literal: see `vio.compiled`
+    (mean, contrast), (other_mean, other_contrast) = statistics(image, all_pixels), statistics(other, all_pixels)
     scale, other_scale = max(contrast, 1.0), max(other_contrast, 1.0)
     total, unlike = 0.0, 0
     for y in range(height):

@@ -12,7 +12,10 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from numba.core import types
+from numba.core.dispatcher import Dispatcher
 
+from frontend import outliers, patches, right_camera
 from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
 from frontend.lens import lens_of
 from frontend.outliers import _gauss_newton, _refine, pixel_errors
@@ -22,6 +25,7 @@ from frontend.weighted_fit import add_equations
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.compiled import invert_positive, move_by_twist, solve_positive
+from vio.datasets import png_rows
 from vio.filters import multiview, pose_loops, stereo_calibration, track_loops
 from vio.filters.multiview import Views
 from vio.geometry.lie import (
@@ -159,6 +163,19 @@ def test_unknown_depths_are_the_median_of_the_three_nearest_known_ones() -> None
     _borrow(known, depth, pixels, found)
     nearest = np.argsort(np.abs(pixels[:, None] - known).sum(axis=2), axis=1)[:, :3]
     np.testing.assert_array_equal(found, np.median(depth[nearest], axis=1))
+
+
+def test_no_loop_is_compiled_for_one_number_alone() -> None:
+    """numba compiles a function anew for a whole number that another compiled function writes out as its argument."""
+    raw = np.zeros((40, 31), dtype=np.uint8)
+    png_rows.unfilter(raw, np.zeros((40, 30), dtype=np.uint8))
+    assert right_camera.image_change(PLAIN, PLAIN) == 0.0
+    p = np.random.default_rng(16).uniform([-1, -1, 3], [1, 1, 9], (20, 3))
+    _refine(CAMERA, np.eye(4), p, project(CAMERA, p)[:, :2], 1.0, slice(0, 6))
+    loops = [f for module in (outliers, patches, png_rows, right_camera) for f in vars(module).values()]
+    signatures = [s for f in loops if isinstance(f, Dispatcher) for s in f.signatures]
+    assert signatures
+    assert not [s for s in signatures if any(isinstance(part, types.Literal) for part in s)]
 
 
 @pytest.mark.parametrize("size", [1e-9, 5e-3, 0.3, 3.0])

@@ -2,7 +2,8 @@
 
 For loops over small matrices and patches, where NumPy spends its time on calls and temporary arrays. Import this module
 only where arrays are worked on: it loads numba. Inside a compiled function, write out assignments of whole rows and
-sums of arrays as loops: numba's own forms of these take seconds to compile.
+sums of arrays as loops: numba's own forms of these take seconds to compile. A whole number that is written out as an
+argument of a compiled function makes numba compile that function anew, for this number alone: pass `int(np.int64(1))`.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ _Lanes = npt.NDArray[np.int16]  # (16,) one number a row
 @compiled
 def unfilter(rows: Image, out: Image) -> None:
     """Write the pixels (H, W) of filtered rows (H, 1 + W), each with the number of its filter in front."""
-    y = 0
+    y = int(np.int64(0))  # no literal: see `vio.compiled`
     while y < len(out):
         if y > 0 and _paeth_rows(rows, y) >= _SIDE_BY_SIDE:
             _side_by_side(rows, out, y)
