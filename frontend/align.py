@@ -17,9 +17,9 @@ import numpy.typing as npt
 
 from vio.compiled import compiled, compiled_sums, invert_positive
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, IntArray
+from vio.records import BoolArray, Image, IntArray
 
-from .patches import FloatImage, Patches, inside
+from .patches import Patches, inside
 
 _PARAMETERS = 8  # shift u, v; gain; offset; linear part in row-major order
 _ROW_PARAMETERS = 6  # the same without the second row of the linear part
@@ -63,7 +63,7 @@ def offsets(radius: int) -> Pixels:
     return out
 
 
-def warped_patches(image: FloatImage, warp: FloatArray, radius: int) -> Pixels:
+def warped_patches(image: Image, warp: FloatArray, radius: int) -> Pixels:
     """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated."""
     out = np.empty((len(warp), (2 * radius + 1) ** 2), dtype=np.float32)
     _sample_all(np.ascontiguousarray(image), warp, offsets(radius), out)
@@ -71,7 +71,7 @@ def warped_patches(image: FloatImage, warp: FloatArray, radius: int) -> Pixels:
 
 
 @compiled
-def _sample_all(image: FloatImage, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
+def _sample_all(image: Image, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
     size = xy.shape[1]
     at, part = np.empty(size, np.int32), np.empty((2, size), np.float32)
     for n in range(len(warp)):
@@ -79,9 +79,7 @@ def _sample_all(image: FloatImage, warp: FloatArray, xy: Pixels, out: Pixels) ->
 
 
 @compiled
-def _sample(
-    image: FloatImage, warp: FloatArray, xy: Pixels, at: npt.NDArray[np.int32], part: Pixels, out: Pixels
-) -> None:
+def _sample(image: Image, warp: FloatArray, xy: Pixels, at: npt.NDArray[np.int32], part: Pixels, out: Pixels) -> None:
     """Write the gray levels (S,) under one warp (2, 3) into `out`; `at` (S,) and `part` (2, S) are overwritten."""
     height, width = image.shape
     radius = -xy[0, 0]
@@ -103,24 +101,31 @@ def _sample(
         at[k] = np.int32(j * row) + i
     # Unsigned indices are not checked for being negative.
     pixels, one, down = image.reshape(-1)[first_v * width + first_u :], np.uint32(1), np.uint32(width)
-    for k in range(len(at)):
+    for k in range(len(at)):  # the four pixels in one number
         p = np.uint32(at[k])
         q = np.uint32(p + down)
-        above = pixels[p] + part[0, k] * (pixels[np.uint32(p + one)] - pixels[p])
-        below = pixels[q] + part[0, k] * (pixels[np.uint32(q + one)] - pixels[q])
+        above = np.int32(pixels[p]) | np.int32(pixels[np.uint32(p + one)]) << np.int32(8)
+        below = np.int32(pixels[q]) | np.int32(pixels[np.uint32(q + one)]) << np.int32(8)
+        at[k] = above | below << np.int32(16)
+    byte = np.int32(255)
+    for k in range(len(at)):
+        four = at[k]
+        a, b = np.float32(four & byte), np.float32(four >> np.int32(8) & byte)
+        c, d = np.float32(four >> np.int32(16) & byte), np.float32(four >> np.int32(24) & byte)
+        above, below = a + part[0, k] * (b - a), c + part[0, k] * (d - c)
         out[k] = above + part[1, k] * (below - above)
 
 
 @compiled
-def _sample_border(image: FloatImage, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
+def _sample_border(image: Image, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
     """Write the gray levels (S,) under one warp (2, 3) into `out`, pixels outside the image from its border."""
     height, width = image.shape
     for k in range(len(out)):
         u = _clamped(warp[0, 0] * xy[0, k] + warp[0, 1] * xy[1, k] + warp[0, 2], width - 1.0)
         v = _clamped(warp[1, 0] * xy[0, k] + warp[1, 1] * xy[1, k] + warp[1, 2], height - 1.0)
         i, j = min(int(u), width - 2), min(int(v), height - 2)
-        above = image[j, i] + (u - i) * (image[j, i + 1] - image[j, i])
-        below = image[j + 1, i] + (u - i) * (image[j + 1, i + 1] - image[j + 1, i])
+        a, b, c, d = float(image[j, i]), float(image[j, i + 1]), float(image[j + 1, i]), float(image[j + 1, i + 1])
+        above, below = a + (u - i) * (b - a), c + (u - i) * (d - c)
         out[k] = above + (v - j) * (below - above)
 
 
@@ -132,7 +137,7 @@ def _clamped(value: float, most: float) -> float:
     return min(value, most)
 
 
-def cut_patches(image: FloatImage, centres: FloatArray, radius: int) -> Patches:
+def cut_patches(image: Image, centres: FloatArray, radius: int) -> Patches:
     """Patches (N, 2r+3, 2r+3) around sub-pixel points (N, 2), one pixel wider than the template made of them."""
     side = 2 * radius + 3
     return warped_patches(image, shift_warps(centres), radius + 1).reshape(-1, side, side)
@@ -160,20 +165,17 @@ def _prepare(
     basis, normal = np.empty((_PARAMETERS, size)), np.empty((_PARAMETERS, _PARAMETERS))
     on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
     for n in range(len(wide)):
-        total = 0.0
-        for k in range(size):
-            total += wide[n, k // side + 1, k % side + 1]
-        mean = np.float32(total / size)
-        for k in range(size):
-            y, x = k // side, k % side
-            centred = wide[n, y + 1, x + 1] - mean
-            gu = (wide[n, y + 1, x + 2] - wide[n, y + 1, x]) / np.float32(2.0)
-            gv = (wide[n, y + 2, x + 1] - wide[n, y, x + 1]) / np.float32(2.0)
-            patch[n, k], gradient[n, 0, k], gradient[n, 1, k] = centred, gu, gv
-            energy[n] += centred * centred
-            basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, centred, 1.0
-            basis[4, k], basis[5, k] = gu * (x - radius), gu * (y - radius)
-            basis[6, k], basis[7, k] = gv * (x - radius), gv * (y - radius)
+        mean = _mean_inside(wide[n])
+        for y in range(side):
+            above, here, below = wide[n, y], wide[n, y + 1], wide[n, y + 2]
+            for x in range(side):
+                k, centred = y * side + x, here[x + 1] - mean
+                gu, gv = (here[x + 2] - here[x]) / np.float32(2.0), (below[x + 1] - above[x + 1]) / np.float32(2.0)
+                patch[n, k], gradient[n, 0, k], gradient[n, 1, k] = centred, gu, gv
+                energy[n] += centred * centred
+                basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, centred, 1.0
+                basis[4, k], basis[5, k] = gu * (x - radius), gu * (y - radius)
+                basis[6, k], basis[7, k] = gv * (x - radius), gv * (y - radius)
         for i in range(_PARAMETERS):
             for j in range(i + 1):
                 normal[i, j] = _product(basis[i], basis[j])
@@ -184,6 +186,17 @@ def _prepare(
                 on_row[i, j] = normal[i, j]
         on_row[1, 1] += _ROW_WEIGHT
         invert_positive(on_row, row_inverse[n])
+
+
+@compiled
+def _mean_inside(wide: Pixels) -> np.float32:
+    """Mean of a patch (h, w) without its outermost pixels."""
+    height, width = wide.shape
+    total = 0.0
+    for y in range(1, height - 1):
+        for x in range(1, width - 1):
+            total += wide[y, x]
+    return np.float32(total / ((height - 2) * (width - 2)))
 
 
 @compiled_sums
@@ -197,7 +210,7 @@ def _product(a: FloatArray, b: FloatArray) -> float:
 def align(
     store: Templates,
     slots: IntArray,
-    image: FloatImage,
+    image: Image,
     warp: FloatArray,
     iterations: int,
     rows: FloatArray | None = None,
@@ -234,7 +247,7 @@ def _refine(
     inverse: Pixels,
     xy: Pixels,
     slots: IntArray,
-    image: FloatImage,
+    image: Image,
     warp: FloatArray,
     rows: FloatArray,
     row_weight: float,

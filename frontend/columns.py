@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, is_dataclass
+from dataclasses import fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,19 +11,27 @@ from vio.records import BoolArray, IntArray
 
 Record = TypeVar("Record")
 
+_names: dict[type, tuple[str, ...]] = {}  # of the columns of each kind: to find them takes as long as to index them
+
 
 def take(record: Record, index: BoolArray | IntArray) -> Record:
     """Select rows of a record by a mask (N,) or indices (K,); the record itself where the mask selects all."""
-    if index.dtype == np.bool_ and index.all():
-        return record
-    return type(record)(*(take(c, index) if is_dataclass(c) else c[index] for c in _columns(record)))
+    if index.dtype == np.bool_:
+        if index.all():
+            return record
+        index = np.flatnonzero(index)
+    columns = _columns(record)
+    return type(record)(*[c.take(index, axis=0) if isinstance(c, np.ndarray) else take(c, index) for c in columns])
 
 
 def joined(first: Record, second: Record) -> Record:
     """Concatenate the rows of two records."""
     pairs = zip(_columns(first), _columns(second), strict=True)
-    return type(first)(*(joined(a, b) if is_dataclass(a) else np.concatenate([a, b]) for a, b in pairs))
+    return type(first)(*[np.concatenate([a, b]) if isinstance(a, np.ndarray) else joined(a, b) for a, b in pairs])
 
 
 def _columns(record: Any) -> list[Any]:
-    return [getattr(record, column.name) for column in fields(record)]
+    kind = type(record)
+    if kind not in _names:
+        _names[kind] = tuple(column.name for column in fields(kind))
+    return [getattr(record, name) for name in _names[kind]]

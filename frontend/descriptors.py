@@ -18,7 +18,7 @@ from .columns import joined, take
 from .detect import spread_evenly
 from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
 from .outliers import RansacProblem, predicted_motion, static_tracks
-from .patches import FloatImage, inside
+from .patches import inside
 from .prediction import moved_pixels, prior_pixels, usable_prior
 from .settings import FrontendSettings, MatchSettings
 
@@ -151,7 +151,7 @@ class _PreviousFrame:
     """State kept from the previous frame."""
 
     time_ns: int
-    left: FloatImage
+    left: Image
     tracks: _Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
 
@@ -179,18 +179,17 @@ class DescriptorFrontend:
         """Extract, match and reject in one rectified stereo pair; see `vio.protocols.Frontend`."""
         watch = Stopwatch()
         images = self._validator.validate(frame)
-        views = images[0].astype(np.float32), images[1].astype(np.float32)
         watch.lap("prepare")
         found = [self._extract(image) for image in images]
         left, right = (take(points, inside(images[0], points.pixels, _BORDER_PX)) for points in found)
         watch.lap("extract")
-        pair = self._stereo(left, right, views)
+        pair = self._stereo(left, right, images)
         watch.lap("stereo")
-        tracks, twist, used = self._track(frame, pair, views[0], usable_prior(prior))
+        tracks, twist, used = self._track(frame, pair, images[0], usable_prior(prior))
         watch.lap("track")
         tracked = len(tracks)
         tracks = self._add_new_features(tracks, pair, used, images[0])
-        self._previous = _PreviousFrame(frame.time_ns, views[0], tracks, twist)
+        self._previous = _PreviousFrame(frame.time_ns, images[0].copy(), tracks, twist)
         width = images[0].shape[1]
         self._swap.check(
             frame,
@@ -213,7 +212,7 @@ class DescriptorFrontend:
             & (disparity <= limits.max_disparity * width)
         )
 
-    def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[FloatImage, FloatImage]) -> _Pair:
+    def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[Image, Image]) -> _Pair:
         """Match the key points of the left image into the right one."""
         right_pixels, has_right = np.zeros((len(left), 2)), np.zeros(len(left), dtype=np.bool_)
         pairs = self._match(left, right, self._allowed(left, right, views[0].shape[1]))
@@ -226,9 +225,9 @@ class DescriptorFrontend:
 
     def _refine(
         self,
-        source: FloatImage,
+        source: Image,
         points: FloatArray,
-        target: FloatImage,
+        target: Image,
         start: FloatArray,
         rows: FloatArray | None = None,
     ) -> tuple[FloatArray, BoolArray]:
@@ -246,7 +245,7 @@ class DescriptorFrontend:
     # --- tracking in time ---------------------------------------------------------------------------------------------
 
     def _track(
-        self, frame: StereoFrame, pair: _Pair, view: FloatImage, prior: TrackPrior | None
+        self, frame: StereoFrame, pair: _Pair, view: Image, prior: TrackPrior | None
     ) -> tuple[_Tracks, FloatArray, BoolArray]:
         """Match the previous tracks to key points; return tracks, motion per second, and the mask of used points."""
         previous, used = self._previous, np.zeros(len(pair.keypoints), dtype=np.bool_)

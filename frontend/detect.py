@@ -96,10 +96,11 @@ def _find_maxima(
                 free[v, u] = 0.0
     count = 0
     for v in range(border, height - border):
+        row, above = free[v], free[v - 1]
         for u in range(border, width - border):
-            here = free[v, u]
+            here = row[u]
             # Nearly all pixels fail one of the first comparisons.
-            if here < least or here < free[v, u - 1] or here < free[v, u + 1] or here < free[v - 1, u]:
+            if here < least or here < row[u - 1] or here < row[u + 1] or here < above[u]:
                 continue
             if _is_largest(free, u, v, distance):
                 found[count, 0], found[count, 1] = u, v

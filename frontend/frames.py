@@ -12,7 +12,7 @@ import numpy as np
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, observations
+from vio.records import BoolArray, FrontendOutput, Image, IntArray, Observations, StereoFrame
 
 _SWAP_FRAMES = 3  # consecutive suspicious frames before an error is raised
 _SWAP_MIN_POINTS = 20  # with fewer features the check is skipped
@@ -163,15 +163,33 @@ class Features(Protocol):
 
 
 def make_output(
-    frame: StereoFrame, features: Features, tracked: int, watch: Stopwatch, warnings: tuple[str, ...] = ()
+    frame: StereoFrame,
+    features: Features,
+    tracked: int,
+    watch: Stopwatch,
+    warnings: tuple[str, ...] = (),
+    *,
+    shown: BoolArray | None = None,
 ) -> FrontendOutput:
-    """Return the output of a front end for a frame; `tracked` features were in the previous output, too."""
-    z = np.concatenate([features.left, features.right], axis=1)
+    """Return the output of a front end for a frame.
+
+    Args:
+        frame: the frame.
+        features: those tracked.
+        tracked: how many of those output were in the previous output, too.
+        watch: the times of the stages.
+        warnings: what the frame says of the images.
+        shown: mask (N,) of the features to output; None: all.
+    """
+    rows = np.arange(len(features.ids)) if shown is None else np.flatnonzero(shown)
+    z = np.empty((len(rows), 4))
+    z[:, :2], z[:, 2:] = features.left[rows], features.right[rows]
+    has_right = features.has_right[rows]
     return FrontendOutput(
-        observations(frame.index, frame.time_ns, features.ids, z, features.has_right),
+        Observations(frame.index, frame.time_ns, features.ids[rows], z, has_right, np.zeros(len(rows), dtype=np.bool_)),
         tracked=tracked,
-        matched=int(features.has_right.sum()),
-        detected=len(features.ids) - tracked,
+        matched=int(has_right.sum()),
+        detected=len(rows) - tracked,
         stages_ms=watch.stages_ms,
         warnings=warnings,
     )

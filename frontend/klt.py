@@ -12,7 +12,6 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, Image, StereoFrame, TrackPrior
 
 from .anchor_fit import AnchorFit
-from .columns import take
 from .detect import detect_corners, half_mask, load_mask
 from .exchange import ExchangeDetector, MatchCounts
 from .flicker import BandRemoval
@@ -144,12 +143,11 @@ class KltFrontend:
         watch: Stopwatch,
     ) -> FrontendOutput:
         """Return the features that are output in a frame, and store what the next one needs."""
+        tracked = int(tracks.shown.sum())  # those shown now that were shown before
         tracks = self._promote(tracks)
-        seen = take(tracks, tracks.shown)
-        tracked = self._count_tracked(seen)
         self._store(frame, left, right_half, tracks, motion)
         watch.lap("check")
-        return make_output(frame, seen, tracked, watch, self._take_lines())
+        return make_output(frame, tracks, tracked, watch, self._take_lines(), shown=tracks.shown)
 
     @property
     def _needs_right(self) -> bool:
@@ -181,7 +179,7 @@ class KltFrontend:
         """Equalise and convert an image; the result does not share memory with it."""
         if self._clahe is not None:
             image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
-        return View(image.astype(np.float32), half_image(image))
+        return View(image.copy(), half_image(image))
 
     def _set_up(self, left: View) -> tuple[StereoFit, BoolArray | None]:
         """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame."""
@@ -215,13 +213,6 @@ class KltFrontend:
         points = points[inside(left.full, points, 0.0)][:_EXCHANGE_POINTS]
         positive = int(stereo.search(left, right, points)[1].sum())
         return MatchCounts(len(points), positive, stereo.count_mirrored(left, right, points))
-
-    def _count_tracked(self, seen: Tracks) -> int:
-        """Count the features that were output in the previous frame, too."""
-        if self._previous is None:
-            return 0
-        old = self._previous.tracks
-        return int(np.isin(seen.ids, old.ids[old.shown], assume_unique=True).sum())
 
     def _store(
         self, frame: StereoFrame, left: View, right_half: Image | None, tracks: Tracks, motion: Consensus | None

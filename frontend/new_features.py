@@ -8,12 +8,12 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
-from vio.records import BoolArray, IntArray
+from vio.records import BoolArray, Image, IntArray
 
 from .align import rounded
 from .columns import joined, take
 from .outliers import Consensus
-from .patches import FloatImage, View, inside
+from .patches import View, inside
 from .settings import GridSettings, KltSettings
 from .stereo_fit import StereoFit
 from .tracks import AnchorBank, Tracks, new_tracks
@@ -52,6 +52,8 @@ class NewFeatures:
             delayed: whether the right image is of another time: a corner is matched once two frames have seen it.
         """
         tracks, disparity_new, unique = self._search_right(left, right, tracks, corners, motion, stereo, delayed)
+        if not len(corners):
+            return tracks
         stays = self._stay_visible(corners, disparity_new, motion, left.full)
         chosen, with_depth = self._select_corners(tracks, unique, stays, delayed)
         centres = rounded(corners[chosen])
@@ -89,6 +91,8 @@ class NewFeatures:
             # A feature with a known point that was not matched near it must not be matched elsewhere.
             unmatched &= ~tracks.has_point
         rows = np.flatnonzero(unmatched)
+        if not len(rows) + len(corners):
+            return self._without_old_left_only(tracks), *nothing
         disparity, unique = stereo.search(left, right, np.concatenate([tracks.left[rows], corners]))
         disparity_old, disparity_new = np.split(disparity, [len(rows)])
         known, unique = np.split(unique, [len(rows)])
@@ -120,7 +124,7 @@ class NewFeatures:
         return np.concatenate([staying, leaving, no_depth]), len(staying) + len(leaving)
 
     def _stay_visible(
-        self, corners: FloatArray, disparity: FloatArray, motion: Consensus | None, image: FloatImage
+        self, corners: FloatArray, disparity: FloatArray, motion: Consensus | None, image: Image
     ) -> BoolArray:
         """Mask (K,) of corners that stay in the image for a while if the camera motion continues."""
         if motion is None or self._settings.wanted_life_frames == 0:

@@ -13,7 +13,6 @@ exact rotation between two images independently of the translation, ECCV (2012),
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -24,6 +23,7 @@ from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, proje
 from vio.records import BoolArray, IntArray
 from vio.robust import median
 
+from .lens import Lens, lens_of, moved_pixel
 from .settings import ConsensusSettings
 
 _MIN_DEPTH_M = 0.05
@@ -41,8 +41,6 @@ _SURE_BEARING_SHARE = 0.9  # share of inliers of a predicted rotation above whic
 _FIVE_POINT_CONFIDENCE = 0.999
 _EPSILON = 1e-9  # added to denominators
 _LEAST_FORWARD = 0.5  # of a cylinder's ray: beyond 60 degrees off the axis a pinhole's pixels are four times as large
-
-_Lens: TypeAlias = tuple[float, float, float, float, bool]  # fu, fv, cu, cv, whether the projection is a cylinder
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,30 +69,18 @@ def pixel_errors(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArr
     T = np.ascontiguousarray(T_curr_prev).reshape(-1, 4, 4)
     out = np.empty((len(T), len(p_prev)))
     points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
-    _distances(_lens(camera), T, points, seen, out)
+    _distances(lens_of(camera), T, points, seen, out)
     return out.reshape(*T_curr_prev.shape[:-2], len(p_prev))
 
 
-def _lens(camera: StereoCamera) -> _Lens:
-    return camera.fu, camera.fv, camera.cu, camera.cv, camera.is_cylinder
-
-
 @compiled
-def _distances(lens: _Lens, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
+def _distances(lens: Lens, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
     """Write the distances (H, N) of points (N, 3) moved by motions (H, 4, 4) from pixels (N, 2)."""
-    fu, fv, cu, cv, cylinder = lens
     for h in range(len(T)):
+        motion = T[h]
         for n in range(len(points)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            depth = T[h, 2, 0] * x + T[h, 2, 1] * y + T[h, 2, 2] * z + T[h, 2, 3]
-            across = T[h, 0, 0] * x + T[h, 0, 1] * y + T[h, 0, 2] * z + T[h, 0, 3]
-            down = T[h, 1, 0] * x + T[h, 1, 1] * y + T[h, 1, 2] * z + T[h, 1, 3]
-            if cylinder:
-                dv = fv * np.arctan2(down, depth) + cv - pixels[n, 1]
-                depth = np.sqrt(down * down + depth * depth)
-            else:
-                dv = fv * down / depth + cv - pixels[n, 1]
-            du = fu * across / depth + cu - pixels[n, 0]
+            u, v, depth = moved_pixel(lens, motion, points[n, 0], points[n, 1], points[n, 2])
+            du, dv = u - pixels[n, 0], v - pixels[n, 1]
             out[h, n] = np.sqrt(du * du + dv * dv) if depth > _MIN_DEPTH_M else np.inf
 
 
@@ -114,13 +100,13 @@ def _gauss_newton(
     """
     T = np.array(T, order="C")  # of one layout, so that one version is compiled
     points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
-    _iterate(_lens(camera), T, points, seen, w, iterations, free.stop)
+    _iterate(lens_of(camera), T, points, seen, w, iterations, free.stop)
     return T
 
 
 @compiled
 def _iterate(
-    lens: _Lens,
+    lens: Lens,
     T: FloatArray,
     points: FloatArray,
     pixels: FloatArray,
@@ -188,14 +174,39 @@ def _refine(
     converged: float = _CONVERGED,
 ) -> FloatArray:
     """Refine one motion (4, 4) on all points, with Geman-McClure weights."""
+    T = np.array(T[None], order="C")
+    points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
+    _refine_on_all(lens_of(camera), T, points, seen, scale_px, free.stop, converged)
+    return T[0]
+
+
+@compiled
+def _refine_on_all(
+    lens: Lens,
+    T: FloatArray,
+    points: FloatArray,
+    pixels: FloatArray,
+    scale_px: float,
+    free: int,
+    converged: float,
+) -> None:
+    """Refine one motion (1, 4, 4) in place on points (N, 3) and pixels (N, 2); see `_refine`."""
+    weight, before = np.empty((1, len(points))), np.empty((4, 4))
     for _ in range(_REFINE_ITERATIONS):
-        error = pixel_errors(camera, T, p_prev, pixels)
-        weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
-        before = T
-        T = _gauss_newton(camera, T[None], p_prev[None], pixels[None], weight[None], iterations=1, free=free)[0]
-        if np.abs(T - before).max() < converged:
+        _distances(lens, T, points, pixels, weight)
+        for n in range(len(points)):
+            error = weight[0, n]
+            weight[0, n] = 1.0 / (1.0 + (error / scale_px) ** 2) if error < 3.0 * scale_px else 0.0
+        for i in range(4):
+            for j in range(4):
+                before[i, j] = T[0, i, j]
+        _iterate(lens, T, points.reshape(1, -1, 3), pixels.reshape(1, -1, 2), weight, 1, free)
+        change = 0.0
+        for i in range(4):
+            for j in range(4):
+                change = max(change, abs(T[0, i, j] - before[i, j]))
+        if change < converged:
             break
-    return T
 
 
 def _ransac(
@@ -231,8 +242,8 @@ def best_motion(
 
 def _best_start(camera: StereoCamera, starts: FloatArray, p_prev: FloatArray, pixels: FloatArray, limit: float) -> int:
     """Return the index of the start with the smallest median error; errors far beyond the limit are clipped."""
-    error = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)
-    return int(np.argmin(np.median(error, axis=1)))
+    errors = np.minimum(pixel_errors(camera, starts, p_prev, pixels), 1e3 * limit)
+    return int(np.argmin([median(error) for error in errors]))
 
 
 def static_tracks(

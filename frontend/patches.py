@@ -12,7 +12,6 @@ import numpy.typing as npt
 from vio.compiled import compiled
 from vio.records import BoolArray, Image
 
-FloatImage: TypeAlias = npt.NDArray[np.float32]  # (H, W) gray levels
 Patches: TypeAlias = npt.NDArray[np.float32]  # (N, h, w) gray levels
 
 
@@ -20,7 +19,7 @@ Patches: TypeAlias = npt.NDArray[np.float32]  # (N, h, w) gray levels
 class View:
     """One image in the forms that tracking needs."""
 
-    full: FloatImage  # (H, W) gray levels
+    full: Image  # (H, W)
     half: Image  # (H/2, W/2) by `half_image`
 
 
@@ -29,7 +28,7 @@ def half_image(image: Image) -> Image:
     return np.asarray(cv2.pyrDown(image), dtype=np.uint8)
 
 
-def inside(image: Image | FloatImage, points: npt.NDArray[np.float64], margin: float) -> BoolArray:
+def inside(image: Image, points: npt.NDArray[np.float64], margin: float) -> BoolArray:
     """Mask (N,) of finite points (N, 2) at least `margin` pixels away from the image's outermost pixel centres."""
     height, width = image.shape
     u, v = points[:, 0], points[:, 1]
@@ -38,12 +37,13 @@ def inside(image: Image | FloatImage, points: npt.NDArray[np.float64], margin: f
 
 def mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:
     """Mean and standard deviation of an image's gray levels, from every `stride`-th pixel of every `stride`-th row."""
-    mean, contrast = _mean_and_contrast(image, stride)
+    mean, contrast = statistics(image, stride)
     return float(mean), float(contrast)
 
 
 @compiled
-def _mean_and_contrast(image: Image, stride: int) -> tuple[float, float]:
+def statistics(image: Image, stride: int) -> tuple[float, float]:
+    """Return what `mean_and_contrast` does, to compiled functions."""
     height, width = image.shape
     total, squares, count = np.int64(0), np.int64(0), 0
     for y in range(0, height, stride):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, se3_from_parts, transform_points
-from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
-from vio.records import BoolArray, IntArray, TrackPrior
+from vio.compiled import compiled
+from vio.geometry.lie import FloatArray, se3_from_parts
+from vio.geometry.stereo import StereoCamera, depth_of, left_rays
+from vio.records import BoolArray, Image, IntArray, TrackPrior
 
-from .patches import FloatImage, inside
+from .lens import Lens, lens_of, moved_pixel
+from .patches import inside
 from .tracks import Tracks
 
 _ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
@@ -36,8 +38,18 @@ def usable_prior(prior: TrackPrior | None) -> TrackPrior | None:
 
 def prior_pixels(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:
     """Rows (K,) of the ids (N,) that a usable prior contains, and the left pixels (K, 2) that it predicts."""
-    _, rows, given = np.intersect1d(ids, prior.ids, assume_unique=True, return_indices=True)
+    rows, given = _common_rows(ids, prior)
     return rows, prior.z[given, :2]
+
+
+def _common_rows(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, IntArray]:
+    """Rows (K,) of the ids (N,) that a usable prior contains, and its rows (K,) for them."""
+    if not len(prior.ids):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+    order = np.argsort(prior.ids)
+    at = order[np.minimum(np.searchsorted(prior.ids, ids, sorter=order), len(order) - 1)]
+    rows = np.flatnonzero(prior.ids[at] == ids)
+    return rows, at[rows]
 
 
 def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tuple[FloatArray, BoolArray]:
@@ -47,7 +59,7 @@ def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tupl
     """
     depth, known = np.ones(len(ids)), np.zeros(len(ids), dtype=np.bool_)
     named = np.flatnonzero(ids >= 0)
-    _, rows, given = np.intersect1d(ids[named], prior.ids, assume_unique=True, return_indices=True)
+    rows, given = _common_rows(ids[named], prior)
     disparity = prior.z[given, 0] - prior.z[given, 2]
     ahead = np.isfinite(disparity) & (disparity > 0)
     rows = named[rows[ahead]]
@@ -57,14 +69,22 @@ def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tupl
 
 def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, left: FloatArray) -> FloatArray:
     """Left pixels (N, 2) of points (N, 3) after a camera motion; points behind the camera keep their pixels `left`."""
-    moved = transform_points(T_curr_prev, p_prev)
-    ahead = depth_of(camera, moved) > _MIN_DEPTH_M
-    pixels = project(camera, np.where(ahead[:, None], moved, [0.0, 0.0, 1.0]))[:, :2]
-    return np.where(ahead[:, None], pixels, left)
+    out = left.copy()
+    _move(lens_of(camera), np.ascontiguousarray(T_curr_prev), np.ascontiguousarray(p_prev), out)
+    return out
+
+
+@compiled
+def _move(lens: Lens, T: FloatArray, points: FloatArray, pixels: FloatArray) -> None:
+    """Replace the pixels (N, 2) of points (N, 3) that are ahead after a motion (4, 4) by those after it."""
+    for n in range(len(points)):
+        u, v, depth = moved_pixel(lens, T, points[n, 0], points[n, 1], points[n, 2])
+        if depth > _MIN_DEPTH_M:
+            pixels[n, 0], pixels[n, 1] = u, v
 
 
 def guessed_pixels(
-    camera: StereoCamera, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: FloatImage
+    camera: StereoCamera, old: Tracks, prior: TrackPrior | None, expected: FloatArray, image: Image
 ) -> FloatArray:
     """Predict the left pixels (N, 2) of features in the current frame: from the prior, else by the last motion.
 
@@ -92,12 +112,31 @@ def _points_with_borrowed_depth(camera: StereoCamera, old: Tracks) -> FloatArray
     known, unknown = np.flatnonzero(old.has_point), np.flatnonzero(~old.has_point)
     if len(unknown) == 0 or len(known) < _NEIGHBOURS:
         return np.where(old.has_point[:, None], old.point, left_rays(camera, old.left) * _FAR_M)
-    gap = np.abs(old.left[unknown, None] - old.left[known]).sum(axis=2)
-    nearest = known[np.argpartition(gap, _NEIGHBOURS - 1, axis=1)[:, :_NEIGHBOURS]]
+    depth = depth_of(camera, old.point)[known]
+    borrowed = np.empty(len(unknown))
+    _borrow(old.left[known], depth, old.left[unknown], borrowed)
     point = old.point.copy()
-    depth = np.median(depth_of(camera, old.point)[nearest], axis=1)
-    point[unknown] = left_rays(camera, old.left[unknown]) * depth[:, None]
+    point[unknown] = left_rays(camera, old.left[unknown]) * borrowed[:, None]
     return point
+
+
+@compiled
+def _borrow(known: FloatArray, depth: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
+    """Write the median depth of the three nearest of known pixels (K, 2), K >= 3, for each of some pixels (N, 2)."""
+    gap, near = np.empty(_NEIGHBOURS), np.empty(_NEIGHBOURS)
+    for n in range(len(pixels)):
+        for i in range(_NEIGHBOURS):
+            gap[i] = np.inf
+        for k in range(len(known)):
+            distance = abs(pixels[n, 0] - known[k, 0]) + abs(pixels[n, 1] - known[k, 1])
+            if not distance < gap[2]:
+                continue
+            i = 2
+            while i > 0 and distance < gap[i - 1]:  # kept in order
+                gap[i], near[i] = gap[i - 1], near[i - 1]
+                i -= 1
+            gap[i], near[i] = distance, depth[k]
+        out[n] = max(min(near[0], near[1]), min(max(near[0], near[1]), near[2]))
 
 
 def prior_rows(tracks: Tracks, rows: IntArray, prior: TrackPrior) -> tuple[IntArray, FloatArray]:

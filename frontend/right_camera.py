@@ -16,7 +16,7 @@ import numpy as np
 from vio.compiled import compiled_sums
 from vio.records import BoolArray, Image
 
-from .patches import mean_and_contrast
+from .patches import mean_and_contrast, statistics
 
 Cause: TypeAlias = Literal["frozen", "dark", "contradicts"]
 
@@ -176,21 +176,21 @@ class RightCamera:
 
 def image_change(image: Image, other: Image) -> float:
     """Mean absolute difference of two images, in gray levels at a common mean and contrast; 0: equal to the bit."""
-    if np.array_equal(image, other):
-        return 0.0
-    (mean, contrast), (other_mean, other_contrast) = mean_and_contrast(image, 1), mean_and_contrast(other, 1)
-    return _CONTRAST * _difference(image, other, mean, other_mean, max(contrast, 1.0), max(other_contrast, 1.0))
+    return float(_CONTRAST * _difference(image, other))
 
 
 @compiled_sums
-def _difference(image: Image, other: Image, mean: float, other_mean: float, scale: float, other_scale: float) -> float:
-    """Mean absolute difference of two images, each less its mean and over its scale."""
-    total = 0.0
+def _difference(image: Image, other: Image) -> float:
+    """Mean absolute difference of two images, each less its mean and over its contrast; 0: equal to the bit."""
     height, width = image.shape
+    (mean, contrast), (other_mean, other_contrast) = statistics(image, 1), statistics(other, 1)
+    scale, other_scale = max(contrast, 1.0), max(other_contrast, 1.0)
+    total, unlike = 0.0, 0
     for y in range(height):
         for x in range(width):
+            unlike += image[y, x] != other[y, x]
             total += abs((image[y, x] - mean) / scale - (other[y, x] - other_mean) / other_scale)
-    return total / (height * width)
+    return total / (height * width) if unlike else 0.0
 
 
 def _is_frozen(change: float, other_change: float) -> bool:

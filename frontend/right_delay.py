@@ -11,10 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.compiled import solve_positive
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 
 from .tracks import Tracks
+from .weighted_fit import add_equations
 
 _MEMORY = 0.97  # per frame, of the normal equations
 _LEAST_MATCHES = 30  # in a frame that is learned from
@@ -74,22 +76,25 @@ class RightDelay:
             return False
         camera = self._camera
         x, y = (left[:, 0] - camera.cu) / camera.fu, (left[:, 1] - camera.cv) / camera.fv
-        terms = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y, flow[:, 1]], axis=1)
-        weight = 1 / (1 + ((rows - terms @ self._solution) / _ROW_SIGMA_PX) ** 2) if self._frames else np.ones(len(x))
-        self._normal = _MEMORY * self._normal + (terms * weight[:, None]).T @ terms
-        self._moment = _MEMORY * self._moment + terms.T @ (weight * rows)
-        self._square = _MEMORY * self._square + float(weight @ rows**2)
-        self._count = _MEMORY * self._count + float(weight.sum())
+        terms = np.column_stack([np.ones(len(x)), x, y, x * y, x * x, y * y, flow[:, 1]])
+        self._normal, self._moment = _MEMORY * self._normal, _MEMORY * self._moment
+        sigma = _ROW_SIGMA_PX if self._frames else np.inf
+        count, square = add_equations(terms, rows, self._solution, sigma, self._normal, self._moment)
+        self._square, self._count = _MEMORY * self._square + square, _MEMORY * self._count + count
         self._frames += 1
-        self._solution = np.asarray(np.linalg.solve(self._normal + 1e-6 * np.eye(_TERMS + 1), self._moment), np.float64)
+        self._solution = self._moment.copy()
+        solve_positive(self._normal + 1e-6 * np.eye(_TERMS + 1), self._solution)
         before = self.frames
         self._decide(index, frame_s)
         return (before == 0.0) != (self.frames == 0.0)
 
     def _decide(self, index: int, frame_s: float) -> None:
         """Take a delay out where it is significant, and say so once."""
+        small = abs(self._solution[_TERMS]) <= _LEAST_DELAY
+        if self._frames < _LEAST_FRAMES or (self.frames == 0.0 and small):
+            return
         delay, sigma, explained = self._significance()
-        if self._frames < _LEAST_FRAMES or _SIGMAS * sigma > _LEAST_DELAY:
+        if _SIGMAS * sigma > _LEAST_DELAY:
             return
         whole = float(np.rint(delay))
         rounded = whole if abs(delay - whole) < _WHOLE else delay

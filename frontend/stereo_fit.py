@@ -10,12 +10,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from vio.compiled import compiled
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera, depth_of, triangulate
+from vio.geometry.stereo import StereoCamera, depth_of
 from vio.records import BoolArray, Image, IntArray
 
 from .align import align, on_peak
 from .columns import take
+from .lens import Lens, lens_of, point_at
 from .patches import View
 from .settings import DisparitySettings, KltSettings
 from .stereo_match import RowField, match_rows, shifted_rows
@@ -25,6 +27,7 @@ _ITERATIONS = 5
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
 _COARSE_SLACK = 0.2  # how much lower the correlation of the coarse search may be than that of the alignment
 _MIN_DEPTH_M = 0.05
+_MIN_DISPARITY_PX = 0.1  # below, a point is too far away to be located
 _FEW_MATCHES = 0.2  # share of features with a right match below which other row differences are tried
 _GOOD_MATCH = 0.9  # correlation of patches whose rows agree
 _LEAST_POINTS = 20
@@ -62,8 +65,8 @@ class StereoFit:
             moved: whether the depths were propagated with a consensus motion.
         """
         depth = depth_of(self._camera, tracks.point)
-        rows = np.flatnonzero(tracks.has_point & (depth > _MIN_DEPTH_M))
-        known = take(tracks, rows)
+        has_depth = tracks.has_point & (depth > _MIN_DEPTH_M)
+        rows, known = np.flatnonzero(has_depth), take(tracks, has_depth)
         expected = self._camera.fu * self._camera.baseline_m / depth[rows]
         pixels, skew, valid = self._fit(known, right, expected)
         if moved:
@@ -166,7 +169,26 @@ class StereoFit:
         """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of the given rows (K,)."""
         right, has_right, skews = tracks.right.copy(), tracks.has_right.copy(), tracks.skew.copy()
         right[rows], has_right[rows], skews[rows] = pixels, True, skew
-        p_cam, valid = triangulate(self._camera, np.concatenate([tracks.left[rows], pixels], axis=1))
         point, has_point = tracks.point.copy(), tracks.has_point.copy()
-        point[rows[valid]], has_point[rows[valid]] = p_cam[valid], True
+        f_baseline = self._camera.fu * self._camera.baseline_m
+        _triangulate(lens_of(self._camera), f_baseline, tracks.left, rows, pixels, point, has_point)
         return replace(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)
+
+
+@compiled
+def _triangulate(
+    lens: Lens,
+    f_baseline: float,
+    left: FloatArray,
+    rows: IntArray,
+    right: FloatArray,
+    point: FloatArray,
+    has_point: BoolArray,
+) -> None:
+    """Set the points of rows (K,) of features at left pixels (N, 2) with right pixels (K, 2); the row is the mean."""
+    for k, n in enumerate(rows):
+        disparity = left[n, 0] - right[k, 0]
+        if disparity >= _MIN_DISPARITY_PX:
+            v = (left[n, 1] + right[k, 1]) / 2.0
+            point[n, 0], point[n, 1], point[n, 2] = point_at(lens, left[n, 0], v, f_baseline / disparity)
+            has_point[n] = True

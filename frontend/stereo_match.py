@@ -6,14 +6,17 @@ half resolution, left to right and back; `frontend.align` then finds the sub-pix
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled
+from vio.compiled import compiled, solve_positive
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
 from .align import FLAT_RMS
+from .weighted_fit import add_equations
 
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
@@ -21,6 +24,8 @@ _FIELD_MEMORY = 0.95  # forgetting factor of previous frames, per frame
 _FIELD_PRIOR = 4.0  # weight of the prior of zero row difference, in matches
 _FIELD_SIGMA_PX = 0.5
 _FIELD_ITERATIONS = 3
+
+Scores = npt.NDArray[np.float32]  # correlations, and what they are computed from
 
 
 class RowField:
@@ -39,8 +44,11 @@ class RowField:
         self.rms_px = 0.0  # of the field over the matches of the last frame
 
     def _terms(self, pixels: FloatArray) -> FloatArray:
-        x, y = ((pixels - self._centre) / self._scale).T
-        return np.stack([np.ones_like(x), x, y, x * y, y * y], axis=1)
+        terms = np.empty((len(pixels), 5))
+        terms[:, 0] = 1.0
+        terms[:, 1:3] = (pixels - self._centre) / self._scale
+        terms[:, 3:] = terms[:, 1:3] * terms[:, 2:3]  # x y, y y
+        return terms
 
     @property
     def offset_px(self) -> float:
@@ -64,12 +72,13 @@ class RowField:
         prior = (1 - _FIELD_MEMORY) * _FIELD_PRIOR * np.eye(5)
         kept, moment = _FIELD_MEMORY * self._normal + prior, _FIELD_MEMORY * self._moment
         for _ in range(_FIELD_ITERATIONS):
-            weight = 1.0 / (1.0 + ((off - terms @ self._field) / _FIELD_SIGMA_PX) ** 2)
-            self._normal = kept + (terms * weight[:, None]).T @ terms
-            self._moment = moment + terms.T @ (weight * off)
-            self._field = np.asarray(np.linalg.solve(self._normal, self._moment), dtype=np.float64)
+            self._normal, self._moment = kept.copy(), moment.copy()
+            add_equations(terms, off, self._field, _FIELD_SIGMA_PX, self._normal, self._moment)
+            self._field = self._moment.copy()
+            solve_positive(self._normal.copy(), self._field)
         if len(terms):
-            self.rms_px = float(np.sqrt(np.mean((terms @ self._field) ** 2)))
+            fitted = terms @ self._field
+            self.rms_px = math.sqrt(float(fitted @ fitted) / len(fitted))
 
 
 def shifted_rows(image: Image, rows: int) -> Image:
@@ -82,7 +91,7 @@ def shifted_rows(image: Image, rows: int) -> Image:
 
 def row_correlation(
     source: Image, target: Image, centres: IntArray, first_column: IntArray, count: int, radius: int
-) -> npt.NDArray[np.float32]:
+) -> Scores:
     """Normalised correlation (N, count) of source patches with the target patches of the same row.
 
     Candidate k of point n is centred at column `first_column[n] + k`. Candidates whose patch leaves the image, and
@@ -95,46 +104,66 @@ def row_correlation(
 
 @compiled
 def _correlate(
-    source: Image, target: Image, centres: IntArray, first_column: IntArray, radius: int, out: npt.NDArray[np.float32]
+    source: Image, target: Image, centres: IntArray, first_column: IntArray, radius: int, out: Scores
 ) -> None:
-    """Write the correlations (N, count); the sums run over whole gray levels, and are exact."""
+    """Write the correlations (N, count); sums of products of 81 pairs of gray levels are exact in 32 bits of float."""
     width, count, side = target.shape[1], out.shape[1], 2 * radius + 1
     size, flat = side * side, FLAT_RMS**2 * side * side
-    strip = np.empty(count + side - 1, np.int32)
-    product, total, squares = np.empty(count, np.int32), np.empty(len(strip), np.int32), np.empty(len(strip), np.int32)
+    strip, product = np.empty(count + side - 1, np.float32), np.empty(count, np.float32)
+    total, squares = np.empty(len(strip), np.float32), np.empty(len(strip), np.float32)
     for n in range(len(centres)):
-        column, row = centres[n, 0], centres[n, 1]
+        column, row, first = centres[n, 0] - radius, centres[n, 1], first_column[n]
         own_total, own_squares = 0, 0
         for k in range(len(strip)):
-            total[k] = squares[k] = 0  # of the columns
+            total[k] = squares[k] = 0.0
         for k in range(count):
-            product[k] = 0
+            product[k] = 0.0
         for y in range(row - radius, row + radius + 1):
+            _cut_row(target, y, first - radius, strip)
             for k in range(len(strip)):
-                strip[k] = target[y, min(max(first_column[n] - radius + k, 0), width - 1)]
                 total[k] += strip[k]
                 squares[k] += strip[k] * strip[k]
             for x in range(side):
-                gray = int(source[y, column - radius + x])
+                gray = int(source[y, column + x])
                 own_total += gray
                 own_squares += gray * gray
-                for k in range(count):
-                    product[k] += gray * strip[x + k]
+                level = np.float32(gray)
+                for k in range(count):  # unsigned indices are not checked for being negative
+                    product[k] += level * strip[np.uint64(x) + np.uint64(k)]
         energy = own_squares - own_total**2 / size
-        other_total, other_squares = 0, 0  # of the window, which moves along the columns
-        for k in range(side - 1):
-            other_total += total[k]
-            other_squares += squares[k]
+        _sum_windows(total, side)
+        _sum_windows(squares, side)
         for k in range(count):
-            other_total += total[k + side - 1]
-            other_squares += squares[k + side - 1]
-            other = other_squares - float(other_total) ** 2 / size
-            inside = radius <= first_column[n] + k < width - radius
-            out[n, k] = -1.0
-            if inside and energy > flat and other > flat:
-                out[n, k] = (product[k] - float(own_total) * other_total / size) / np.sqrt(energy * other)
-            other_total -= total[k]
-            other_squares -= squares[k]
+            level_sum = np.float64(total[k])
+            other = squares[k] - level_sum**2 / size
+            score = (product[k] - own_total * level_sum / size) / np.sqrt(energy * other)
+            inside = radius <= first + k < width - radius
+            out[n, k] = score if inside and energy > flat and other > flat else -1.0
+
+
+@compiled
+def _cut_row(image: Image, y: int, first: int, strip: Scores) -> None:
+    """Write the gray levels of a row from a column on into `strip`; outside the image (H, W) its border is repeated."""
+    last = image.shape[1] - 1
+    if first >= 0 and first + len(strip) <= image.shape[1]:
+        for k in range(len(strip)):
+            strip[k] = image[y, np.uint64(first + k)]
+    else:
+        for k in range(len(strip)):
+            strip[k] = image[y, min(max(first + k, 0), last)]
+
+
+@compiled
+def _sum_windows(values: Scores, side: int) -> None:
+    """Replace each number by the sum of itself and those behind it, `side` in all; the last ones are meaningless."""
+    running = np.float32(0.0)
+    for k in range(side - 1):
+        running += values[k]
+    for k in range(len(values) - side + 1):
+        first = values[k]
+        running += values[k + side - 1]
+        values[k] = running
+        running -= first
 
 
 def _search(
@@ -155,7 +184,7 @@ def _search(
 
 
 @compiled
-def _peaks(score: npt.NDArray[np.float32], offset: FloatArray, top: FloatArray, second: FloatArray) -> None:
+def _peaks(score: Scores, offset: FloatArray, top: FloatArray, second: FloatArray) -> None:
     """Write each row's best candidate (N,), sub-pixel by a parabola, its score, and the best score outside its peak."""
     last = score.shape[1] - 1
     for n in range(len(score)):

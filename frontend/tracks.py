@@ -7,11 +7,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, IntArray
+from vio.records import BoolArray, Image, IntArray
 
 from .align import Templates, cut_patches, empty_templates, shift_warps, templates
 from .columns import joined
-from .patches import FloatImage
+
+_TEMPLATE_COLUMNS = tuple(column.name for column in fields(Templates))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +68,7 @@ class AnchorBank:
         self._radius_px = radius_px
         self._taken = np.zeros(count, dtype=np.bool_)
 
-    def add(self, image: FloatImage, centres: FloatArray) -> IntArray:
+    def add(self, image: Image, centres: FloatArray) -> IntArray:
         """Cut new anchors around pixels (N, 2) of an image; return their slots (N,)."""
         free = np.flatnonzero(~self._taken)[: len(centres)]
         if len(free) < len(centres):
@@ -77,11 +78,11 @@ class AnchorBank:
         self.replace(free, image, centres)
         return free
 
-    def replace(self, slots: IntArray, image: FloatImage, centres: FloatArray) -> None:
+    def replace(self, slots: IntArray, image: Image, centres: FloatArray) -> None:
         """Replace the anchors in slots (N,) by the patches around pixels (N, 2) of an image."""
         new = templates(cut_patches(image, centres, self._radius_px))
-        for column in fields(Templates):
-            getattr(self.store, column.name)[slots] = getattr(new, column.name)
+        for name in _TEMPLATE_COLUMNS:
+            getattr(self.store, name)[slots] = getattr(new, name)
 
     def keep_only(self, slots: IntArray) -> None:
         """Free all slots but these."""

@@ -125,6 +125,29 @@ def gauss_newton(
     return T
 
 
+def refined_motion(
+    camera: StereoCamera, T: FloatArray, p_prev: FloatArray, pixels: FloatArray, scale_px: float, converged: float
+) -> FloatArray:
+    """A motion (4, 4) refined on all points (N, 3) and pixels (N, 2), with Geman-McClure weights."""
+    for _ in range(6):
+        error = moved_errors(camera, T, p_prev, pixels)
+        weight = np.where(error < 3 * scale_px, 1.0 / (1.0 + (np.minimum(error, 1e6) / scale_px) ** 2), 0.0)
+        before = T
+        one = (T[None], p_prev[None], pixels[None], weight[None])
+        T = gauss_newton(camera, *one, iterations=1, free=slice(0, 6))[0]
+        if np.abs(T - before).max() < converged:
+            break
+    return T
+
+
+def equations(
+    terms: FloatArray, values: FloatArray, model: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Cauchy-weighted normal equations (K, K) and (K,), the sum of the weights, and that of the squared values."""
+    weight = 1 / (1 + ((values - terms @ model) / sigma) ** 2)
+    return (terms * weight[:, None]).T @ terms, terms.T @ (weight * values), weight.sum(), weight @ values**2
+
+
 # --- tracks and their views --------------------------------------------------------------------------------------
 
 
@@ -260,30 +283,32 @@ def eliminate_points(info: TrackInformation, chosen: BoolArray) -> tuple[FloatAr
 
 
 def field_jacobian(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by the coefficients of (R3) and (R4), (..., 4, 8), pixels."""
-    x, y = (z[..., 0] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
-    xr = (z[..., 2] - camera.cu) / camera.fu
-    out = np.zeros((*z.shape[:-1], 4, 8))
-    for row, u in ((0, x), (2, xr)):
+    """Derivatives of pixels (..., 4) by the coefficients of (R3) and (R4), (..., 4, 10)."""
+    x, xr = ((z[..., c] - camera.cu) / camera.fu for c in (0, 2))
+    y, one = (z[..., 1] - camera.cv) / camera.fv, np.ones(z.shape[:-1])
+    out = np.zeros((*z.shape[:-1], 4, 10))
+    for column, u in ((0, x), (2, xr)):
         r2 = u * u + y * y
-        out[..., row, 3], out[..., row, 4], out[..., row, 5] = u * r2, 2 * u * y, r2 + 2 * u * u
-    r2 = x * x + y * y
-    out[..., 1, 3], out[..., 1, 4], out[..., 1, 5] = y * r2, r2 + 2 * y * y, 2 * x * y
-    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = 1.0, xr, xr * xr + y * y
-    out[..., 2, 6] = xr - x
-    out[..., :3, 7] = np.stack([x, y, xr], axis=-1)
-    return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
+        along = np.stack([u * r2, u * r2 * r2, 2 * u * y, r2 + 2 * u * u], axis=-1)
+        across = np.stack([y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * u * y], axis=-1)
+        out[..., column, 4:8], out[..., column, 9] = camera.fu * along, camera.fu * u
+        if column == 0:
+            out[..., 1, 4:8], out[..., 1, 9] = camera.fv * across, camera.fv * y
+    r2 = xr * xr + y * y
+    out[..., 2, :4] = camera.fu * np.stack([one, xr, r2, r2 * r2], axis=-1)
+    out[..., 2, 8] = z[..., 2] - z[..., 0]
+    return out
 
 
 def corrected(
     camera: StereoCamera, rows: FloatArray, coefficients: FloatArray, z: FloatArray, weight: FloatArray
 ) -> FloatArray:
-    """Pixels (..., 4) without the field of (R3) and (R4), (8,), and what follows from the rows (6,) of (R2)."""
+    """Pixels (..., 4) without the field of (R3) and (R4), (10,), and what follows from the rows (7,) of (R2)."""
     x, y = (z[..., 2] - camera.cu) / camera.fu, (z[..., 1] - camera.cv) / camera.fv
-    out = z - field_jacobian(camera, z)[..., :6] @ coefficients[:6]
+    out = z - field_jacobian(camera, z)[..., :8] @ coefficients[:8]
     out[..., 2] -= camera.fu * (-rows[1] * y + (rows[5] - rows[4]) * x * y - rows[3] * y * y)
     out = np.where(weight > 0, out, z)
-    baseline, focal = np.exp(coefficients[6:])
+    baseline, focal = np.exp(coefficients[8:])
     left = [camera.cu, camera.cv] + (out[..., :2] - [camera.cu, camera.cv]) / focal
     right = left[..., 0] - (out[..., 0] - out[..., 2]) / (focal * baseline)
     scaled = np.concatenate([left, right[..., None], out[..., 3:]], axis=-1)

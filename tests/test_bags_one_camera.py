@@ -161,6 +161,32 @@ def test_camera_info_of_zeros_is_refused(tmp_path: Path) -> None:
         open_dataset(script.write(tmp_path / "f"))
 
 
+@pytest.mark.parametrize(
+    ("raw", "compressed", "taken"),
+    [(4, 4, "/camera/image_raw"), (1, 4, "/camera/image_raw/compressed")],
+    ids=["both", "raw images of a moment"],
+)
+def test_raw_and_compressed_images_of_one_camera_are_one_camera(
+    raw: int, compressed: int, taken: str, tmp_path: Path
+) -> None:
+    script = Script("mcap")
+    for time_ns, image in FRAMES[:raw]:
+        script.image("/camera/image_raw", time_ns, image)
+    for time_ns, image in FRAMES[:compressed]:
+        script.compressed("/camera/image_raw/compressed", time_ns, image)
+    for sample in SAMPLES:
+        script.imu("/imu", sample)
+    (tmp_path / "c.yaml").write_text(kalibr_camera_text(RIG))
+    path = script.write(tmp_path / "f")
+    bag = open_dataset(path, DatasetSettings(calibration=tmp_path / "c.yaml"))
+    assert bag.recording.camera.kind == "mono"
+    assert len(frames_of(bag)) == 4
+    assert any(note.startswith(f"{taken} is taken; ") and "same camera" in note for note in bag.recording.notes)
+    for right in ("", ",right=none"):
+        named = DatasetSettings(calibration=tmp_path / "c.yaml", topics=f"left=/camera/image_raw{right}")
+        assert len(frames_of(open_dataset(path, named))) == raw
+
+
 # --- topics ---------------------------------------------------------------------------------------------------------
 
 

@@ -91,6 +91,20 @@ def test_stereo_extrinsics_have_consistent_standard_deviations(estimate: StereoE
     assert estimate.residual_deg == pytest.approx(np.degrees(SIGMA_RAD) * np.sqrt(2), rel=0.25)
 
 
+def test_a_residual_distortion_of_a_wide_lens_is_no_wrong_baseline() -> None:
+    matches = _matches(pairs=5, per_pair=300, outliers=0.0)
+    off = np.arccos(matches.ray0[:, 2:])
+    cubic = np.radians(0.15) * (off / np.quantile(off, 0.95)) ** 3  # 0.15 deg at the edge, 0 on the axis
+    across = matches.ray0[:, :2] / np.linalg.norm(matches.ray0[:, :2], axis=1, keepdims=True)
+    bent = replace(matches, ray0=np.concatenate([np.sin(off + cubic) * across, np.cos(off + cubic)], axis=1))
+    found = refine_stereo(bent, T_CAM0_CAM1[:3, :3].T, _direction(T_CAM0_CAM1))
+    assert isinstance(found, StereoEstimate)
+    swing = np.degrees(np.linalg.norm(np.cross(found.direction, _direction(T_CAM0_CAM1))))
+    assert swing > 0.3, "the distortion passes for a direction of the baseline"
+    assert swing < 3 * found.direction_sigma_deg
+    assert judge_stereo(found, T_CAM0_CAM1, bent) == ()
+
+
 @pytest.mark.parametrize(
     ("matches", "because"),
     [

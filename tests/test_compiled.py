@@ -14,7 +14,11 @@ import numpy as np
 import pytest
 
 from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
-from frontend.outliers import _gauss_newton, pixel_errors
+from frontend.lens import lens_of
+from frontend.outliers import _gauss_newton, _refine, pixel_errors
+from frontend.prediction import _borrow, moved_pixels
+from frontend.stereo_fit import _triangulate
+from frontend.weighted_fit import add_equations
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
 from vio.compiled import invert_positive, move_by_twist, solve_positive
@@ -30,7 +34,7 @@ from vio.geometry.lie import (
     so3_left_jacobian,
     transform_points,
 )
-from vio.geometry.stereo import StereoCamera, project
+from vio.geometry.stereo import StereoCamera, project, triangulate
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 CAMERAS = {"pinhole": CAMERA, "cylinder": replace(CAMERA, projection="cylinder")}
@@ -43,25 +47,25 @@ def test_patches_are_sampled_exactly_inside_the_image_and_at_its_border() -> Non
     outside = [[0.0, 0.0], [298.6, 198.9], [-9.0, 50.0], [150.0, 1e9], [7.0, 7.0]]
     warp = shift_warps(np.concatenate([POINTS, across, down, outside]))
     warp[:, :, :2] += np.random.default_rng(3).normal(0, 0.2, (len(warp), 2, 2))
-    image = PLAIN.astype(np.float32)
+    image = PLAIN
     np.testing.assert_allclose(warped_patches(image, warp, 7), numpy_twins.sampled(PLAIN, warp, 7), atol=2e-3)
 
 
 def test_warp_that_is_not_finite_samples_the_border() -> None:
     warp = shift_warps(POINTS[:3])
     warp[0, 0, 0], warp[1, 1, 2], warp[2, 0, 2] = np.nan, np.inf, -np.inf
-    assert np.isfinite(warped_patches(PLAIN.astype(np.float32), warp, 7)).all()
+    assert np.isfinite(warped_patches(PLAIN, warp, 7)).all()
 
 
 @pytest.mark.parametrize("on_rows", [False, True])
 def test_alignment_equals_numpy(on_rows: bool) -> None:
     other = picture(np.array([[1.04, 0.03, -4.0], [-0.02 * (not on_rows), 1 - 0.03 * (not on_rows), 0.3], [0, 0, 1.0]]))
-    image, centres = PLAIN.astype(np.float32), rounded(POINTS)
+    image, centres = PLAIN, rounded(POINTS)
     rows = POINTS[:, 1] - 0.2 if on_rows else None
     start = shift_warps(POINTS + np.array([3.0, -0.3]))
     wide = cut_patches(image, centres, 7)
     twin, expected = numpy_twins.aligned(numpy_twins.prepared(wide.astype(np.float64)), other, start, 5, rows)
-    warp, score = align(templates(wide), np.arange(len(POINTS)), other.astype(np.float32), start, 5, rows)
+    warp, score = align(templates(wide), np.arange(len(POINTS)), other, start, 5, rows)
     inside = score > -1.0  # elsewhere the patch has left the image
     assert inside.mean() > 0.8
     np.testing.assert_allclose(score[inside], expected[inside], atol=1e-4)
@@ -88,6 +92,34 @@ def test_gauss_newton_on_motions_equals_numpy(free: slice, camera: StereoCamera)
 
 
 @both_cameras
+def test_refinement_of_a_motion_equals_numpy(camera: StereoCamera) -> None:
+    rng = np.random.default_rng(12)
+    true, points = se3_exp([0.1, 0.05, -0.2, 0.01, 0.02, -0.01]), rng.uniform([-2, -1, 3], [2, 1, 9], (60, 3))
+    pixels = project(camera, transform_points(true, points))[:, :2] + rng.normal(0, 0.3, (60, 2))
+    pixels[::5] += 40.0  # on something that moves
+    ours = _refine(camera, np.eye(4), points, pixels, 60.0, slice(0, 6))
+    twin = numpy_twins.refined_motion(camera, np.eye(4), points, pixels, 60.0, 3e-6)
+    np.testing.assert_allclose(ours, twin, atol=1e-9)
+    close = _refine(camera, ours, points, pixels, 5.0, slice(0, 6))
+    np.testing.assert_allclose(close, numpy_twins.refined_motion(camera, ours, points, pixels, 5.0, 3e-6), atol=1e-9)
+    assert np.abs(ours - np.eye(4)).max() > 0.05  # from both starts it moves
+    assert np.abs(close - ours).max() > 0.01
+
+
+@pytest.mark.parametrize("sigma", [0.5, np.inf])
+def test_weighted_equations_equal_numpy(sigma: float) -> None:
+    rng = np.random.default_rng(13)
+    terms, model, start = rng.normal(size=(40, 5)), rng.normal(size=5), rng.normal(size=(5, 5))
+    values = terms @ model + rng.normal(0, 1.0, 40)
+    normal, moment = start.copy(), start[0].copy()
+    count, squares = add_equations(terms, values, model, sigma, normal, moment)
+    expected = numpy_twins.equations(terms, values, model, sigma)
+    np.testing.assert_allclose(normal, start + expected[0], rtol=1e-10)
+    np.testing.assert_allclose(moment, start[0] + expected[1], rtol=1e-10)
+    np.testing.assert_allclose((count, squares), expected[2:], rtol=1e-10)
+
+
+@both_cameras
 def test_reprojection_errors_equal_numpy(camera: StereoCamera) -> None:
     rng = np.random.default_rng(8)
     T, points = se3_exp(rng.normal(0, 0.3, (2, 5, 6))), rng.uniform([-2, -2, -1], [2, 2, 8], (30, 3))
@@ -97,6 +129,36 @@ def test_reprojection_errors_equal_numpy(camera: StereoCamera) -> None:
     assert 0 < np.isinf(expected).sum() < 100
     np.testing.assert_allclose(pixel_errors(camera, T, points, pixels), expected, rtol=1e-10)
     np.testing.assert_allclose(pixel_errors(camera, T[0, 1], points, pixels), expected[0, 1], rtol=1e-10)
+
+
+@both_cameras
+def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(camera: StereoCamera) -> None:
+    rng = np.random.default_rng(14)
+    T, points = se3_exp([0.1, -0.2, 0.3, 0.05, 0.1, -0.1]), rng.uniform([-2, -1, 2], [2, 1, 9], (40, 3))
+    moved = transform_points(T, points)
+    pixels = moved_pixels(camera, T, points, np.zeros((40, 2)))
+    np.testing.assert_allclose(pixels, project(camera, moved)[:, :2], rtol=1e-10)
+
+    z = project(camera, moved) + rng.normal(0, 0.3, (40, 4))
+    z[3, 2], z[5, 2] = z[3, 0] - 0.05, z[5, 0] + 4.0  # too far away, and behind the cameras
+    rows, point, has_point = np.arange(0, 40, 2), np.zeros((40, 3)), np.zeros(40, dtype=np.bool_)
+    rows[1], rows[2] = 3, 5
+    f_baseline = camera.fu * camera.baseline_m
+    _triangulate(lens_of(camera), f_baseline, z[:, :2].copy(), rows, z[rows, 2:], point, has_point)
+    expected, valid = triangulate(camera, z[rows])
+    assert not valid[1:3].any()
+    np.testing.assert_array_equal(has_point[rows], valid)
+    np.testing.assert_allclose(point[rows[valid]], expected[valid], rtol=1e-10)
+    assert not point[~has_point].any()
+
+
+def test_unknown_depths_are_the_median_of_the_three_nearest_known_ones() -> None:
+    rng = np.random.default_rng(15)
+    known, depth, pixels = rng.uniform(0, 300, (50, 2)), rng.uniform(1, 9, 50), rng.uniform(0, 300, (20, 2))
+    found = np.zeros(20)
+    _borrow(known, depth, pixels, found)
+    nearest = np.argsort(np.abs(pixels[:, None] - known).sum(axis=2), axis=1)[:, :3]
+    np.testing.assert_array_equal(found, np.median(depth[nearest], axis=1))
 
 
 @pytest.mark.parametrize("size", [1e-9, 5e-3, 0.3, 3.0])
@@ -265,9 +327,9 @@ def test_the_imu_is_integrated_as_in_numpy() -> None:
 def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     T, p, views = _scene()
     rng = np.random.default_rng(13)
-    rows, states = rng.normal(0, 0.01, 6), rng.normal(0, 0.01, 8)
+    rows, states = rng.normal(0, 0.01, 7), rng.normal(0, 0.01, 10)
     expected = numpy_twins.corrected(CAMERA, rows, states, views.z, views.weight)
-    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(8)).corrected(views)
+    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(10)).corrected(views)
     np.testing.assert_allclose(views.z, expected, rtol=1e-12)
     at = multiview.residuals(CAMERA, T, p, views)
     at, p = at.take(at.ahead), p[at.ahead]

@@ -48,6 +48,22 @@ def test_a_converted_flight_is_the_same_recording(form: str, flight: Path, tmp_p
         assert after.imu_noise == before.imu_noise  # type: ignore[attr-defined]
 
 
+def test_a_conversion_never_removes_its_source_nor_what_others_put_beside_it(
+    flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = tmp_path / "first"
+    assert main(["convert", str(flight), "--to", "plain", "--out", str(first), "--stop", "3"]) == 0
+    for source, out in ((first, first), (first, tmp_path)):
+        assert main(["convert", str(source), "--to", "kitti", "--out", str(out)]) == 1
+        assert "itself and will not be replaced; choose another path" in capsys.readouterr().err
+    assert main(["convert", str(flight), "--to", "kitti", "--out", str(first), "--stop", "2"]) == 0, "an earlier result"
+    (first / "run").mkdir()
+    (first / "run" / "notes.txt").write_text("mine")
+    assert main(["convert", str(flight), "--to", "plain", "--out", str(first), "--stop", "2"]) == 1
+    assert "holds run beside an earlier result" in capsys.readouterr().err
+    assert (first / "run" / "notes.txt").is_file()
+
+
 def _needs_rosbags(form: str) -> None:
     if form in BAGS:
         pytest.importorskip("rosbags", reason="needs the extra bags")

@@ -48,6 +48,22 @@ def bag_of(dataset: Dataset, storage: str, path: Path) -> Path:
     return script.write(path)
 
 
+def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path) -> None:
+    script = Script("mcap")
+    pairs = [e for e in open_dataset(flight).events(0, 4) if isinstance(e, StereoFrame)]
+    for pair in pairs:
+        assert pair.left is not None
+        of_stereo(script, [(pair.time_ns, pair.left, pair.left[:8, :8])])  # right images of a wrong size
+    path = script.write(tmp_path / "f")
+    rig = Rig.rectified(40.0, 40.0, 31.5, 23.5, 0.11, *reversed(pairs[0].left.shape))  # type: ignore[union-attr,misc]
+    (tmp_path / "camchain.yaml").write_text(kalibr_text(rig))
+    settings = DatasetSettings(calibration=tmp_path / "camchain.yaml", camera="left")
+    alone = [e for e in open_dataset(path, settings).events() if isinstance(e, StereoFrame)]
+    assert len(alone) == len(pairs)
+    for one, pair in zip(alone, pairs, strict=True):
+        np.testing.assert_array_equal(one.left, pair.left)
+
+
 @pytest.mark.parametrize("storage", STORAGES)
 def test_a_bag_is_the_same_recording_to_the_bit(storage: str, flight: Path, tmp_path: Path) -> None:
     euroc = open_dataset(flight)

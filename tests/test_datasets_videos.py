@@ -72,6 +72,30 @@ def test_a_plain_folder_with_kalibrs_file_is_the_same_recording_to_the_bit(
     assert_same_events(euroc, plain)
 
 
+def test_the_left_camera_alone_needs_no_right_image(flight: Path, tmp_path: Path) -> None:
+    shutil.copytree(flight, tmp_path / "f")
+    for file in (tmp_path / "f" / "mav0" / "cam1" / "data").iterdir():
+        file.write_bytes(b"no image")
+    pairs = [e for e in open_dataset(flight).events(0, 6) if isinstance(e, StereoFrame)]
+    left = open_dataset(tmp_path / "f", DatasetSettings(camera="left"))
+    alone = [e for e in left.events(0, 6) if isinstance(e, StereoFrame)]
+    assert len(alone) == len(pairs)
+    for one, pair in zip(alone, pairs, strict=True):
+        assert one.right is None
+        np.testing.assert_array_equal(one.left, pair.left)
+
+
+def test_the_left_video_alone_is_decoded(videos: Path, flight: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = [e for e in open_dataset(flight).events(0, 4) if isinstance(e, StereoFrame)]
+    left = open_dataset(videos, DatasetSettings(camera="left"))
+    opened, real = [], cv2.VideoCapture
+    monkeypatch.setattr(cv2, "VideoCapture", lambda name: opened.append(name) or real(name))
+    alone = [e for e in left.events(0, 4) if isinstance(e, StereoFrame)]
+    assert [Path(name).name for name in opened] == ["left.avi"]
+    for one, pair in zip(alone, pairs, strict=True):
+        np.testing.assert_array_equal(one.left, pair.left)
+
+
 def copy_of(videos: Path, folder: Path, *leave_out: str) -> Path:
     """A copy of the videos' folder without some files."""
     return Path(shutil.copytree(videos, folder, ignore=shutil.ignore_patterns(*leave_out)))

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from vio.cli import main
 from vio.errors import EvaluationError
 from vio.evaluation import (
     KITTI_LENGTHS_M,
@@ -35,9 +36,18 @@ from vio.evaluation import (
     rotation_angle_deg,
     settle_rotation,
 )
-from vio.geometry.lie import FloatArray, nearest_rotation, se3_exp, se3_from_parts, se3_inverse, so3_exp
+from vio.geometry.lie import (
+    FloatArray,
+    nearest_rotation,
+    quat_xyzw_from_rotation,
+    rotation_from_quat_xyzw,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    so3_exp,
+)
 from vio.records import BodyFrame, Trajectory
-from vio.trajectory_io import read_trajectory
+from vio.trajectory_io import read_trajectory, write_tum
 
 properties = settings(max_examples=30, deadline=None)
 MODES: tuple[AlignMode, ...] = ("se3", "sim3", "none", "first")
@@ -279,6 +289,24 @@ def test_the_drift_of_a_short_path_is_that_over_tenths_of_the_lengths(
     step = path_m / 999  # a segment ends with the first pose beyond its length
     assert 1.0 <= found.kitti.t_err_percent <= 1.0 * (1 + step / lengths[0]) + 1e-9
     assert lengths_text(found.kitti.lengths_m) == f"{lengths[0]} to {lengths[-1]} m"
+
+
+def test_a_drift_of_rotation_over_metres_is_given_by_the_metre(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """0.02 degrees a metre would be 2 degrees for 100 m, of a path of four."""
+    for path_m, unit in ((4.5, "0.0200 deg/m"), (250, "2.0000 deg/100 m")):
+        T_ref = straight(1000)
+        T_ref[:, :3, 3] *= path_m / 999
+        turns = np.radians(0.02) * np.linalg.norm(T_ref[:, :3, 3] - T_ref[0, :3, 3], axis=1)
+        T_est = se3_from_parts(so3_exp(turns[:, None] * [0, 0, 1.0]), T_ref[:, :3, 3])
+        for name, T in (("est", T_est), ("ref", T_ref)):
+            write_tum(tmp_path / name, timed(T))
+        assert main(["eval", str(tmp_path / "est"), str(tmp_path / "ref"), "--align", "none"]) == 0
+        lines = [line for line in capsys.readouterr().out.splitlines() if " deg/" in line]
+        assert len(lines) > 2
+        assert all(unit[:4] in line and unit.split()[1] in line for line in lines)
+        assert ("deg/100 m" in lines[0]) == (path_m > 10)
 
 
 def test_exactly_the_length_is_not_yet_a_segment() -> None:
@@ -680,10 +708,52 @@ def test_reference_of_another_path_length_is_noted() -> None:
     assert evaluate(kitti_form(large), kitti_form(T), align="sim3").notes == ()  # the scale is known to be open
 
 
+@pytest.mark.parametrize(("factor", "unit"), [(1000, "millimetres"), (100, "centimetres")])
+def test_a_reference_in_another_unit_is_named(factor: float, unit: str) -> None:
+    T = wander(100)
+    large = se3_from_parts(T[:, :3, :3], factor * T[:, :3, 3])
+    assert evaluate(timed(drift(T)), timed(large)).notes[0].endswith(f"; the reference seems to be in {unit}")
+    assert evaluate(timed(large), timed(T)).notes[0].endswith(f"; the estimate seems to be in {unit}")
+
+
 def test_reference_that_hardly_matches_is_noted() -> None:
     T = wander(100)
     found = evaluate(timed(T), timed(T, start_ns=7_000_000_000))
     assert any(note.startswith("only 30 poses match, of 100 of the estimate and 100") for note in found.notes)
+
+
+def test_conventions_of_a_references_orientations_are_named() -> None:
+    """Positions agree, whatever the orientations mean, so that the alignment does not show it."""
+    T = wander(200)
+    R, p, estimate = T[:, :3, :3], T[:, :3, 3], timed(drift(T, sigma=0.001))
+    turned, upside, tilted = (so3_exp(np.radians(v)) for v in ([0, 0, 90], [180, 0, 0], [0, 35, 10]))
+    w_first = quat_xyzw_from_rotation(R)[:, [3, 0, 1, 2]]
+    for other, words in (
+        (R @ turned, r"differ by (8|9)\d deg .*its x, y, z are the estimate's \+y -x \+z\): .* body with other axes"),
+        (R @ upside, r"differ by 1(79|80) deg .* \+x -y -z\)"),
+        (R @ tilted, r"differ by 3\d deg .* -3\d -\d+ deg about x y z\)"),
+        (turned @ R, "in a world with other axes than its positions"),
+        (np.swapaxes(R, 1, 2), r"inverse \(body from world\)"),
+        (rotation_from_quat_xyzw(w_first), "quaternions with w first"),
+        (np.tile(np.eye(3), (len(R), 1, 1)), "never change; its orientations are placeholders"),
+        (so3_exp(np.random.default_rng(0).normal(0, 2, (len(R), 3))), "no exchange of axes explains it"),
+    ):
+        found = evaluate(estimate, timed(se3_from_parts(other, p)))
+        assert found.ate_m.rmse < 0.5
+        (note,) = found.notes
+        assert re.search(words, note), note
+
+
+def test_a_rotation_that_straight_paths_leave_open_is_no_convention() -> None:
+    """With noise about a straight path, positions determine the rotation about it to tens of degrees only."""
+    n, rng = 200, np.random.default_rng(0)
+    p = np.stack([np.zeros(n), np.zeros(n), 0.1 * np.arange(n)], axis=1)
+    truth = se3_from_parts(np.tile(np.eye(3), (n, 1, 1)), p + rng.normal(0, 0.02, (n, 3)))
+    wobble = so3_exp(rng.normal(0, [0.02, 0.02, 0.3], (n, 3)))  # not better about the path than the positions
+    estimate = se3_from_parts(wobble, p + rng.normal(0, 0.02, (n, 3)))
+    found = evaluate(timed(estimate), timed(truth))
+    assert found.ate_deg.median > 90
+    assert found.notes == ()
 
 
 # The record

@@ -55,7 +55,7 @@ def test_warped_patches_equal_a_loop() -> None:
     """Coordinates are rounded to 1/32 pixel, so the loop uses rounded ones."""
     warp = shift_warps(POINTS[:5])
     warp[:, :, :2] += np.random.default_rng(3).normal(0, 0.1, (5, 2, 2))
-    patches = warped_patches(PLAIN.astype(np.float32), warp, 2).reshape(5, 5, 5)
+    patches = warped_patches(PLAIN, warp, 2).reshape(5, 5, 5)
     for W, patch in zip(warp, patches, strict=True):
         for dy in range(-2, 3):
             for dx in range(-2, 3):
@@ -67,7 +67,7 @@ def test_warped_patches_equal_a_loop() -> None:
 
 def test_patches_cut_at_rounded_points_hold_exact_pixels() -> None:
     points = rounded(POINTS)
-    centre = cut_patches(PLAIN.astype(np.float32), points, 4)[:, 5, 5]
+    centre = cut_patches(PLAIN, points, 4)[:, 5, 5]
     i, j = np.floor(points).astype(int).T
     a, b = (points % 1).T
     rows = [(1 - a) * PLAIN[j + k, i].astype(float) + a * PLAIN[j + k, i + 1].astype(float) for k in (0, 1)]
@@ -99,8 +99,8 @@ def fitted(
 ) -> tuple[FloatArray, FloatArray]:
     """Templates cut at POINTS of one image, aligned with another."""
     centres = rounded(POINTS)
-    store = templates(cut_patches(source.astype(np.float32), centres, radius))
-    warp, score = align(store, np.arange(60), target.astype(np.float32), shift_warps(start), steps, rows)
+    store = templates(cut_patches(source, centres, radius))
+    warp, score = align(store, np.arange(60), target, shift_warps(start), steps, rows)
     # Undo the rounding of the centres, so that the warps start at the points themselves.
     warp[:, :, 2] += (warp[:, :, :2] @ (POINTS - centres)[:, :, None])[:, :, 0]
     return warp, score
@@ -121,7 +121,7 @@ def test_expected_row_resolves_the_aperture_problem() -> None:
     edge = 128 + 80 * np.tanh((u - 0.5 * v - 60 + 12) / 2)
     moved = 128 + 80 * np.tanh((u - 0.5 * v - 60) / 2)
     noise = np.random.default_rng(2).normal(0, 2, (2, 200, 300))
-    pictures = [np.clip(np.rint(p + n), 0, 255).astype(np.float32) for p, n in zip((edge, moved), noise, strict=True)]
+    pictures = [np.clip(np.rint(p + n), 0, 255).astype(np.uint8) for p, n in zip((edge, moved), noise, strict=True)]
     row = np.arange(60.0, 140.0, 5)
     on_edge = np.stack([0.5 * row + 48, row], axis=1)
     store = templates(cut_patches(pictures[0], on_edge, 6))
@@ -342,7 +342,7 @@ def test_take_and_joined_work_on_nested_records() -> None:
 
 
 def test_anchors_keep_their_slots_when_the_bank_grows() -> None:
-    image = PLAIN.astype(np.float32)
+    image = PLAIN
     bank = AnchorBank(4, 3)
     first = bank.add(image, POINTS[:3])
     before = bank.store.patch[first].copy()

@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
+from vio.camera_rig import with_virtual_baseline
 from vio.config import load_config
 from vio.evaluation import evaluate
 from vio.geometry.lie import se3_exp
+from vio.geometry.stereo import one_camera
 from vio.pipeline import run
 from vio.records import (
     Event,
@@ -215,6 +217,53 @@ def test_a_frozen_camera_does_not_move_the_poses_and_is_named(flight: Flight, no
     assert any(f"frame {FIRST}: both images" in line for line in lines), lines
     assert any(f"frame {LAST + 1}: the images change again, after 10 repetitions (0.50 s)" in line for line in lines)
     assert not any("diverged" in line for line in lines)
+
+
+@pytest.fixture(scope="module")
+def flight_with_depth(flight: Flight) -> Flight:
+    """The left camera of the flight with the noisy depths of a sensor."""
+    simulation = simulate(room(1), small_rig(320, 200), hand_held(duration_s=FRAMES / 20), imu=ImuNoise(), seed=2)
+    rendered, rng = SimulatedRecording(simulation), np.random.default_rng(3)
+    events: list[Event] = []
+    for event in flight[0]:
+        if isinstance(event, StereoFrame):
+            z, _ = rendered.depth(0, int(simulation.taken_ns[event.index]))
+            z = np.where(np.isfinite(z), z, 0.0)
+            event = replace(event, right=None, depth=z + 1.5e-3 * z**2 * rng.normal(size=z.shape))
+        events.append(event)
+    c = flight[1].camera
+    camera = with_virtual_baseline(one_camera(c.fu, c.fv, c.cu, c.cv, c.width, c.height), 1.5e-3)
+    return events, replace(flight[1], kind="rgbd", camera=camera)
+
+
+def test_a_stuck_depth_camera_does_not_move_the_poses_and_is_named(flight_with_depth: Flight) -> None:
+    """Half a second of the same depth image beside new images."""
+    depth = {e.index: e for e in flight_with_depth[0] if isinstance(e, StereoFrame)}[FIRST - 1].depth
+    assert depth is not None
+    stuck, kept = depth, depth.copy()
+
+    def frozen(frame: StereoFrame) -> StereoFrame:
+        return replace(frame, depth=stuck.copy()) if FIRST <= frame.index <= LAST else frame
+
+    right, lines = _ate(flight_with_depth, lambda frame: frame)
+    assert lines == []
+    error, lines = _ate(flight_with_depth, frozen)
+    assert error < 2 * right
+    assert f"frame {FIRST}: the depth image is the same to the last bit since frame {FIRST - 1}" in lines[0]
+    assert f"frame {LAST + 1}: the depth images change again, after 10 repetitions (0.50 s)" in lines[1]
+    assert lines[2:] == ["10 frames repeated earlier depth images, which were left out"]
+    np.testing.assert_array_equal(stuck, kept)
+
+
+def test_the_same_depth_image_is_used_at_standstill() -> None:
+    depth = np.full((240, 400), 2.0)
+    for shaking, repeated in ((False, False), (True, True)):
+        frozen = _watching(shaking=shaking)
+        for k in (1, 2):
+            frame = replace(_frame(k, _shifted(LEFT, 5.0 * k), LEFT), right=None, depth=depth.copy())
+            assert frozen.check(frame, _expected()) is None
+            found = frozen.check_depth(frame)
+        assert (found is not None) == repeated
 
 
 def test_a_clean_flight_gives_no_line(flight: Flight) -> None:

@@ -119,8 +119,8 @@ def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:
 
     Features at stereo pixels z (N, 4), taken for points p (N, 3), move to left pixels uv (N, 2).
     """
-    frontend, blank = KltFrontend(CAMERA, FrontendSettings()), np.zeros((480, 1220))
-    stereo, _ = frontend._set_up(View(blank.astype(np.float32), blank[::2, ::2].astype(np.uint8)))
+    frontend, blank = KltFrontend(CAMERA, FrontendSettings()), np.zeros((480, 1220), dtype=np.uint8)
+    stereo, _ = frontend._set_up(View(blank, blank[::2, ::2]))
     everything = np.ones(len(p), dtype=np.bool_)
     new = new_tracks(z[:, :2].copy(), np.zeros(len(p), dtype=np.int64))
     tracks = replace(new, right=z[:, 2:], has_right=everything, point=p, has_point=everything)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -372,9 +374,11 @@ def test_euroc_folder_with_cam0_alone_is_one_camera(tmp_path: Path) -> None:
         "distortion_model: radial-tangential\ndistortion_coefficients: [-0.1, 0.01, 0, 0]\n"
         "T_BS:\n  cols: 4\n  rows: 4\n  data: [1,0,0,0.1, 0,1,0,0, 0,0,1,0, 0,0,0,1]\n"
     )
+    (cam / "data.csv").write_text("#timestamp [ns],filename\n")
     dataset = open_dataset(tmp_path)
     assert dataset.recording.camera.kind == "mono"
     assert len(list(dataset.events())) == 3
+    assert not any("data.csv" in note for note in dataset.recording.notes), "the names of the images say the same"
 
 
 def test_left_camera_of_a_pair_has_no_right_side(tmp_path: Path) -> None:
@@ -393,7 +397,7 @@ def test_left_camera_of_a_pair_has_no_right_side(tmp_path: Path) -> None:
     assert all(e.right is None for e in dataset.events() if isinstance(e, StereoFrame))
 
 
-@pytest.mark.parametrize("command", [["inspect"], ["calibrate"], ["convert", "--to", "euroc", "--out", "x"]])
+@pytest.mark.parametrize("command", [["calibrate"], ["convert", "--to", "euroc", "--out", "x"]])
 def test_commands_for_pairs_say_so_in_one_line(
     tmp_path: Path, command: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -405,6 +409,80 @@ def test_commands_for_pairs_say_so_in_one_line(
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert len(lines) == 1
     assert "needs a stereo pair" in lines[0]
+
+
+def test_a_start_that_fails_is_explained_once(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    from vio.cli import main
+
+    assert main(["run", str(_mono_folder(tmp_path / "r")), "--out", str(tmp_path / "out")]) == 1
+    lines = [*caplog.messages, *capsys.readouterr().err.splitlines()]
+    assert sum("frames have no pose; there are 0.15 s of frames" in line for line in lines) == 1
+    assert sum("4 frames has a pose; see the warnings above" in line for line in lines) == 1
+
+
+def test_an_accelerometer_in_g_is_named_before_the_start_that_it_prevents(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    from vio.cli import main
+
+    folder = _mono_folder(tmp_path / "r")
+    (folder / "times.txt").write_text("\n".join(f"{0.5 * k:.2f}" for k in range(4)))
+    rng = np.random.default_rng(0)
+    rows = [f"{int(k * 5e6)},{a[0]},{a[1]},{a[2]},{a[3]},{a[4]},{1 + a[5]}" for k in range(320) for a in [_shake(rng)]]
+    (folder / "imu.csv").write_text("\n".join(["#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z", *rows]))
+    assert main(["run", str(folder), "--out", str(tmp_path / "out")]) == 1
+    lines = [m for m in caplog.messages if "accelerometer" in m or "no pose" in m]
+    assert "in g: multiply by 9.81" in lines[0]
+    assert "have no pose; mend the fault of the IMU" in lines[1]
+
+
+def _shake(rng: np.random.Generator) -> FloatArray:
+    """Readings of a hand that moves: gyro in rad/s and accelerometer in g, without gravity."""
+    return rng.normal(0, [0.2, 0.2, 0.2, 0.02, 0.02, 0.02])
+
+
+def _inspected(folder: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, Any]]:
+    from vio.cli import main
+
+    status = main(["inspect", str(folder), "--frames", "3", "--json"])
+    return status, json.loads(capsys.readouterr().out)
+
+
+def test_inspect_shows_one_camera(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = _mono_folder(tmp_path / "r")
+    status, report = _inspected(folder, capsys)
+    assert (status, report["kind"], report["faults"]) == (0, "mono", [])
+    parts = report["parts"]
+    assert parts["camera"]["kind"] == "mono"
+    assert "baseline_m" not in parts["camera"]
+    assert len(parts["images"]["mean"]) == 1
+    assert "stereo" not in parts
+    assert parts["tracking"]["tracked_median"] > 40
+    (folder / "imu.csv").unlink()
+    status, report = _inspected(folder, capsys)
+    assert status == 1
+    assert report["faults"] == [
+        "missing: one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu), depth images or a second camera"
+    ]
+
+
+def test_inspect_shows_depth_images_and_a_wrong_unit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = _mono_folder(tmp_path / "r")
+    (folder / "depth").mkdir()
+    for k in range(4):
+        cv2.imwrite(str(folder / "depth" / f"{k}.png"), _depth_png(k))
+    (folder / "imu.csv").unlink()
+    status, report = _inspected(folder, capsys)
+    assert (status, report["kind"], report["faults"]) == (0, "rgbd", [])
+    true = np.median(_walls()[0][1])
+    assert report["parts"]["depth"]["median_m"] == pytest.approx(true, rel=0.1)
+    assert report["parts"]["tracking"]["matched_median"] > 40
+    (folder / "calibration.yaml").write_text(kalibr_camera_text(replace(RIG, depth_factor=1.0)))
+    status, report = _inspected(folder, capsys)
+    assert status == 1
+    assert "check depth_factor" in report["faults"][0]
 
 
 # --- live -----------------------------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import pytest
 from vio.cli import main
 from vio.config import load_config
 from vio.datasets import open_dataset
+from vio.geometry.stereo import StereoCamera
 from vio.loops import LoopEvent
 from vio.pipeline import RunResult, run
 from vio.records import Estimate, UpdateReport, observations
@@ -89,6 +90,21 @@ def test_marks_lie_on_the_pixels_of_the_shown_image(shown: tuple[Recorder, RunRe
     assert matrix[:2, 2] == pytest.approx([camera.cu + 0.5, camera.cv + 0.5], abs=1e-4)
     seen = RerunViewer._pixels
     assert seen(_Half(), np.array([10.0, 20.0])) == pytest.approx([5.25, 10.25])  # type: ignore[arg-type]
+
+
+def test_a_cylinder_is_outlined_as_a_cylinder(flight: Path) -> None:
+    """Rows of 200 degrees, which no pinhole has: the border lies about the baseline, behind the camera as well."""
+    stream = Recorder()
+    camera = StereoCamera(100.0, 100.0, 100.0, 174.5, 0.2, 200, 350, "cylinder")
+    RerunViewer(stream, ViewedRig(camera, np.eye(4), None, None))  # type: ignore[arg-type]
+    assert not any(isinstance(what, rr.Pinhole) for _, what in stream.sent["world/run/camera"])
+    ((_, lines),) = stream.sent["world/run/camera/outline"]
+    border, *edges = (np.array(strip) for strip in lines.strips.as_arrow_array().to_pylist())
+    np.testing.assert_allclose(np.hypot(border[:, 1], border[:, 2]), 1.0, rtol=1e-6)  # five baselines
+    azimuth = np.degrees(np.arctan2(border[:, 1], border[:, 2]))
+    assert (azimuth.min(), azimuth.max()) == pytest.approx((-100.3, 100.3), abs=0.1)
+    assert len(edges) == 4
+    assert all(np.array_equal(edge[0], np.zeros(3)) for edge in edges)
 
 
 class _Half:

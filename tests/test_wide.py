@@ -242,7 +242,7 @@ def _through_lens(rays: FloatArray, shift: FloatArray) -> FloatArray:
 
 
 def _field(a: FloatArray, v: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
-    """Pixels (N, 4) without a field of states (6,) and rows (6,)."""
+    """Pixels (N, 4) without a field of states (8,) and rows (7,)."""
     z = np.column_stack([left, right[:, 0], left[:, 1]])
     field = StereoField(CYLINDER, v, np.concatenate([a, [0.0, 0.0]]), np.arange(TERMS))
     return field.corrected(Views(z, np.tile([1.0, 1.0, 1.0, 0.0], (len(z), 1)))).z
@@ -257,17 +257,17 @@ def test_the_field_takes_out_turns_and_lens_errors_of_the_right_camera() -> None
     wx, wy, wz, cx, cy = 1e-3, -8e-4, 7e-4, 6e-4, -9e-4
     turned = _through_lens(rays @ so3_exp([wx, wy, wz]).T, np.array([cx, cy]))
     moved = pixels + focal * (_on_cylinder(turned) - _on_cylinder(rays))
-    a = np.array([cx / 4, 0.0, 0.0, 0.0, 0.0, 0.0])
-    v = np.array([cy - wx, wz, 0.0, wy + 3 * cx / 4, cy / 3, 0.0])
+    a = np.array([cx / 4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    v = np.array([cy - wx, wz, 0.0, wy + 3 * cx / 4, cy / 3, 0.0, 0.0])
     assert np.abs(moved - pixels)[:, 0].max() > 0.5
     np.testing.assert_allclose(_field(a, v, pixels, moved)[:, 2], pixels[:, 0], atol=5e-3)
     theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
     angles = rays[:, :2] / np.hypot(rays[:, 0], rays[:, 1])[:, None] * theta[:, None]
-    bent = pixels + focal * (
-        _on_cylinder(_through_lens(rays, 1e-3 * theta[:, None] ** 2 * angles)) - _on_cylinder(rays)
-    )
-    out = _field(np.array([0.0, 0, 0, 1e-3, 0, 0]), np.zeros(6), bent, bent)
-    np.testing.assert_allclose(out[:, :3], np.column_stack([pixels, pixels[:, 0]]), atol=2e-2)
+    for order, state, size in ((2, 4, 1e-3), (4, 5, 3e-4)):
+        radial = size * theta[:, None] ** order * angles
+        bent = pixels + focal * (_on_cylinder(_through_lens(rays, radial)) - _on_cylinder(rays))
+        out = _field(size * np.eye(8)[state], np.zeros(7), bent, bent)
+        np.testing.assert_allclose(out[:, :3], np.column_stack([pixels, pixels[:, 0]]), atol=2e-2)
 
 
 def test_rows_show_a_turned_right_camera() -> None:
@@ -284,13 +284,30 @@ def test_rows_show_a_turned_right_camera() -> None:
     np.testing.assert_allclose(rows.coefficients[[2, 4, 5]], 0.0, atol=1e-4)
 
 
+def test_the_field_takes_out_a_right_camera_below_the_left_one_s_row() -> None:
+    """Near points move along the cylinder's rows and columns; rows show by how much."""
+    _, p = _around(300)
+    z, below = project(CYLINDER, p), 0.02
+    moved = z.copy()
+    shifted = p - CYLINDER.baseline_m * np.array([1.0, below, 0.0])
+    moved[:, 2:] = _on_cylinder(shifted) * [CYLINDER.fu, CYLINDER.fv] + [CYLINDER.cu, CYLINDER.cv]
+    rows = RowField(CYLINDER)
+    for k in range(20):
+        rows.update(observations(k, k, np.arange(300), moved))
+    np.testing.assert_allclose(rows.coefficients[6], -below, atol=1e-3)
+    off = moved[:, 2] - z[:, 2]
+    left = _field(np.zeros(8), rows.coefficients, z[:, :2], moved[:, 2:])[:, 2] - z[:, 2]
+    assert np.abs(off).max() > 0.2
+    assert np.abs(left).max() < 0.15 * np.abs(off).max()
+
+
 def test_derivatives_by_the_field_are_those_of_the_correction() -> None:
     pixels, p = _around(50)
     z, step = project(CYLINDER, p), 1e-4
     H = field_jacobian(CYLINDER, z)
-    for j in range(6):
-        a = step * np.eye(6)[j]
-        change = z[:, :3] - _field(a, np.zeros(6), pixels, z[:, 2:])[:, :3]
+    for j in range(8):
+        a = step * np.eye(8)[j]
+        change = z[:, :3] - _field(a, np.zeros(7), pixels, z[:, 2:])[:, :3]
         np.testing.assert_allclose(H[:, :3, j], change / step, atol=1e-6)
     assert not H[:, 3].any()
-    assert not H[:, :, 6:].any()
+    assert not H[:, :, 8:].any()

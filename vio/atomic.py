@@ -212,6 +212,13 @@ def check_replaceable(target: Path, replace: bool, marker: str | None, own: Coll
         )
 
 
+def check_spares(source: Path, target: Path) -> None:
+    """Raise VioError if replacing a folder would remove the recording that it is made from."""
+    own, there = source.resolve(), target.resolve()
+    if there == own or there in own.parents:
+        raise VioError(f"{target}: holds the recording {source} itself and will not be replaced; choose another path")
+
+
 def check_writable(path: str | os.PathLike[str]) -> None:
     """Check, before work of minutes begins, that a folder can be written: a few MiB beside it, which are removed again.
 

@@ -81,7 +81,8 @@ class Chain:
             if self.watch.repeats(frame, expected):
                 output = no_features(frame)
             else:
-                output = self.frontend.process(frame, expected.tracks if expected and self._use_prior else None)
+                shown = self.watch.without_repeated_depth(frame)
+                output = self.frontend.process(shown, expected.tracks if expected and self._use_prior else None)
         except DataError as error:
             self.watch.refused(frame.index, str(error))
             return None

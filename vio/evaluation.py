@@ -16,6 +16,7 @@ import numpy.typing as npt
 from vio.errors import EvaluationError
 from vio.geometry.lie import FloatArray, nearest_rotation, se3_from_parts, se3_inverse, so3_exp, so3_hat, so3_log
 from vio.records import NS_PER_S, BodyFrame, IntArray, Trajectory
+from vio.reference_axes import attitude_note
 from vio.statistics import chi_square_quantile
 
 AlignMode: TypeAlias = Literal["se3", "sim3", "first", "none"]
@@ -24,12 +25,15 @@ AssociationMode: TypeAlias = Literal["time", "frame"]
 
 KITTI_LENGTHS_M: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_STEP_FRAMES = 10
+_SHORT_M = 10.0  # over shorter lengths a drift for 100 m says nothing that a reader can picture
 RPE_DISTANCE_TOLERANCE = 0.1  # relative tolerance of a pair's path length
 _COLLINEAR = 1e-13  # ratio of squared extents below which points are collinear, to rounding
 _LOOSE_RAD = 0.05  # positions determine the rotation about the path if its standard deviation is below 3 degrees
 _ORIENTATION_GAIN = 10.0  # ratio of standard deviations above which the orientations replace the positions in it
 _CONTRADICTION = 5.0  # standard deviations by which they may differ; more: they do not describe the same body
 _PATH_RATIO = 1.5  # ratio of path lengths above which the reference may be another recording's
+_UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
+_UNIT_SHARE = 0.1  # a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
 _PATH_LEAST_M = 1.0  # paths below this may consist of noise
 _MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
 _STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points coincide, to rounding
@@ -125,7 +129,7 @@ class Evaluation:
     errors_deg: FloatArray  # (M,) rotation angle to the reference after alignment by T_ref_est
     aligned: Trajectory  # the whole estimate (N) in the reference's world and body frame, by T_ref_est
     reference: Trajectory  # the matched poses (M) of the reference; row k matches row rows[k] of the estimate
-    notes: tuple[str, ...] = ()  # signs that the reference is not of this recording
+    notes: tuple[str, ...] = ()  # signs of a reference of another recording, or in other conventions
 
     def as_dict(self) -> dict[str, Any]:
         """Return the figures for JSON: `ate_m` is the RMSE, undefined metrics are None, arrays are omitted."""
@@ -226,7 +230,10 @@ def evaluate(
         errors_deg=errors_deg,
         aligned=aligned,
         reference=_take(reference, reference_rows),
-        notes=_notes(path_length_m(T_aligned[:, :3, 3]), path_length_m(T_ref[:, :3, 3]), rows, moved, reference),
+        notes=(
+            *_notes(path_length_m(T_aligned[:, :3, 3]), path_length_m(T_ref[:, :3, 3]), rows, moved, reference),
+            *_attitude_notes(alignment, T_est, T_ref, T_aligned),
+        ),
     )
 
 
@@ -334,6 +341,19 @@ def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) 
     """
     if alignment.rotation_from != "positions":
         return alignment
+    axis, sigma = _about_path(alignment, T_est, T_ref)
+    R = _rotate_about(axis, alignment.R, _orientation_sum(T_est, T_ref))
+    scatter = so3_log(R @ T_est[:, :3, :3] @ np.swapaxes(T_ref[:, :3, :3], 1, 2)) @ axis
+    angle = np.linalg.norm(so3_log(R @ alignment.R.T))
+    precise = sigma > max(_LOOSE_RAD, _ORIENTATION_GAIN * np.sqrt(np.mean(scatter**2)))
+    if not precise or angle > _CONTRADICTION * sigma:
+        return alignment
+    t = T_ref[:, :3, 3].mean(axis=0) - alignment.scale * (R @ T_est[:, :3, 3].mean(axis=0))
+    return Alignment(R, t, alignment.scale, "direction and orientations")
+
+
+def _about_path(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) -> tuple[FloatArray, float]:
+    """Return the direction (3,) of a path and the standard deviation, radians, of an alignment's rotation about it."""
     x, y = alignment.scale * T_est[:, :3, 3] @ alignment.R.T, T_ref[:, :3, 3]
     x_mean, y_mean = x.mean(axis=0), y.mean(axis=0)
     S = (y - y_mean).T @ (x - x_mean) / len(x)  # symmetric at the least squares
@@ -341,15 +361,7 @@ def settle_rotation(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) 
     across = np.eye(3) - np.outer(axis, axis)
     variance = 0.5 * float(np.mean(np.sum(((y - y_mean - x + x_mean) @ across) ** 2, axis=1)))
     curvature = float(np.trace(across @ S))
-    sigma = np.sqrt(variance / curvature) if curvature > 0 else np.inf
-    R = _rotate_about(axis, alignment.R, _orientation_sum(T_est, T_ref))
-    scatter = so3_log(R @ T_est[:, :3, :3] @ np.swapaxes(T_ref[:, :3, :3], 1, 2)) @ axis
-    angle = np.linalg.norm(so3_log(R @ alignment.R.T))
-    precise = sigma > max(_LOOSE_RAD, _ORIENTATION_GAIN * np.sqrt(np.mean(scatter**2)))
-    if not precise or angle > _CONTRADICTION * sigma:
-        return alignment
-    t = y_mean - alignment.scale * (R @ T_est[:, :3, 3].mean(axis=0))
-    return Alignment(R, t, alignment.scale, "direction and orientations")
+    return axis, float(np.sqrt(variance / curvature)) if curvature > 0 else float("inf")
 
 
 def apply_alignment(alignment: Alignment, T_est: FloatArray) -> FloatArray:
@@ -445,6 +457,13 @@ def lengths_text(lengths_m: Sequence[float]) -> str:
     """Return path lengths in words: `10 to 50 m`."""
     first, last = min(lengths_m), max(lengths_m)
     return f"{first:g} m" if first == last else f"{first:g} to {last:g} m"
+
+
+def rotation_drift_text(deg_per_100m: float, lengths_m: Sequence[float], digits: int = 3) -> str:
+    """Return a drift of rotation with its unit: `0.039 deg/100 m`, or by the metre where no length has ten metres."""
+    if max(lengths_m) < _SHORT_M:
+        return f"{deg_per_100m / 100:.{digits}f} deg/m"
+    return f"{deg_per_100m:.{digits}f} deg/100 m"
 
 
 def _drift(T_est: FloatArray, T_ref: FloatArray) -> KittiError | None:
@@ -605,9 +624,11 @@ def _notes(
     notes = []
     short, long = sorted((estimate_m, reference_m))
     if long > _PATH_LEAST_M and long > _PATH_RATIO * short:
+        units = {name: size for name, size in _UNITS.items() if abs(long / max(short, 1e-12) / size - 1) < _UNIT_SHARE}
+        which = "the reference" if reference_m > estimate_m else "the estimate"
+        what = f"{which} seems to be in {next(iter(units))}" if units else "is it the reference of this recording?"
         notes.append(
-            f"over the same poses the estimate travels {estimate_m:.1f} m and the reference {reference_m:.1f} m; is it "
-            "the reference of this recording?"
+            f"over the same poses the estimate travels {estimate_m:.1f} m and the reference {reference_m:.1f} m; {what}"
         )
     shorter = min(len(estimate), len(reference))
     if len(rows) < _MATCHED_SHARE * shorter:
@@ -616,6 +637,17 @@ def _notes(
             "is it the reference of this recording, on the same clock?"
         )
     return tuple(notes)
+
+
+def _attitude_notes(
+    alignment: Alignment, T_est: FloatArray, T_ref: FloatArray, T_aligned: FloatArray
+) -> tuple[str, ...]:
+    """Name what explains a large attitude error of M poses (M, 4, 4) whose positions were aligned."""
+    if alignment.rotation_from not in ("positions", "direction and orientations"):
+        return ()
+    sigma = _about_path(alignment, T_est, T_ref)[1] if alignment.rotation_from == "positions" else 0.0
+    note = attitude_note(T_aligned[:, :3, :3], T_ref[:, :3, :3], sigma)
+    return () if note is None else (note,)
 
 
 def _rotate_about(axis: FloatArray, R: FloatArray, C: FloatArray) -> FloatArray:

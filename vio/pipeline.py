@@ -253,12 +253,13 @@ def _nothing_done(recording: Recording, odometry: Odometry, stopped: str | None)
 
     Raises:
         StoppedError: it was asked to stop.
-        DataError: its frames could not be read, or were refused.
+        DataError: its frames could not be read, or a start was observable in none.
     """
     if stopped is not None:
         raise StoppedError(f"{stopped} before the first frame was done; nothing was written", status=130)
-    if odometry.frames_refused or odometry.frames_waiting:
-        raise DataError(odometry.warnings[-1])
+    if odometry.frames_waiting:
+        waited = f"none of the {odometry.frames_waiting} frames has a pose"
+        raise DataError(f"{recording.path}: {waited}; see the warnings above")
     raise DataError(f"{recording.path}: no frame could be read; see the warnings above")
 
 

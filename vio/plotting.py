@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from vio.evaluation import Evaluation
+from vio.filters.stereo_calibration import RIGHT_TERMS
 from vio.frame_result import STAGES
 from vio.geometry.lie import FloatArray, transform_points
 from vio.pipeline import RunResult
@@ -26,6 +27,8 @@ _STAGE_COLOURS = ("#c9d1d9", "#6aa2d8", "#b7a2d8", "#e8b04b", "#1f5fbf")
 _MOVED_SIGMAS = 3.0  # a stereo calibration that ends within so many standard deviations of zero is not drawn
 _STANDS_M = 2.0  # extent of a path below which the landmarks set the limits of the map
 _SIGMAS = 3.0  # half width of the bands
+# Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself draws all twice.
+_MARGINS = {"left": 0.06, "right": 0.985, "bottom": 0.06, "top": 0.925, "wspace": 0.18, "hspace": 0.26}
 
 
 def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
@@ -60,9 +63,9 @@ def write_picture(path: Path, draw: Callable[[], Any]) -> None:
 def _figure(result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> Any:
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 9), dpi=110, layout="constrained")
+    figure = Figure(figsize=(13, 9), dpi=110)
     calibrated = has_calibration_panel(result)
-    grid = figure.add_gridspec(6 if calibrated else 5, 2, width_ratios=(1.25, 1))
+    grid = figure.add_gridspec(6 if calibrated else 5, 2, width_ratios=(1.25, 1), **_MARGINS)
     R_view_world = _axes(result)
     _draw_map(figure.add_subplot(grid[:, 0]), R_view_world, result, evaluation, dead_reckoning)
     seconds = np.array(result.frames.column("time_ns") - result.frames[0].time_ns) * 1e-9
@@ -73,6 +76,9 @@ def _figure(result: RunResult, evaluation: Evaluation | None, dead_reckoning: Ev
     _draw_time(figure.add_subplot(grid[4, 1]), seconds, result)
     if calibrated:
         _draw_calibration(figure.add_subplot(grid[5, 1]), seconds, result)
+    for axes in figure.axes[1:-1]:  # all of them have the time axis of the last one
+        axes.tick_params(labelbottom=False)
+        axes.set_xlabel("")
     figure.suptitle(_title(result, evaluation), fontsize=12, parse_math=False)  # a $ in a file name is no formula
     return figure
 
@@ -92,10 +98,11 @@ def _draw_calibration(axes: Any, seconds: FloatArray, result: RunResult) -> None
     fields = [estimate.stereo_field for estimate in result.estimates]
     has = np.array([field is not None for field in fields])
     known = [field for field in fields if field is not None]
-    values = f * np.array([field.coefficients[:3] for field in known])
-    sigmas = f * np.array([np.sqrt(np.diag(field.covariance)[:3]) for field in known])
-    colours = (_ESTIMATE, _DEAD_RECKONING, "#3a9d5d")
-    for k, (name, colour) in enumerate(zip(("all columns", "along u", "with radius²"), colours, strict=True)):
+    values = f * np.array([field.coefficients[:RIGHT_TERMS] for field in known])
+    sigmas = f * np.array([np.sqrt(np.diag(field.covariance)[:RIGHT_TERMS]) for field in known])
+    colours = (_ESTIMATE, _DEAD_RECKONING, "#3a9d5d", "#8a5fb0")
+    names = ("all columns", "along u", "with radius²", "with radius⁴")
+    for k, (name, colour) in enumerate(zip(names, colours, strict=True)):
         axes.plot(seconds[has], values[:, k], color=colour, lw=1.2, label=name)
         axes.fill_between(
             seconds[has], values[:, k] - sigmas[:, k], values[:, k] + sigmas[:, k], color=colour, alpha=0.2, lw=0

@@ -35,11 +35,15 @@ def _type_text(value: object) -> str:
     return f"a {type(value).__name__}"
 
 
+def _is_vector(value: object) -> bool:
+    return isinstance(value, np.ndarray) and value.shape == (3,) and value.dtype == _FLOAT64
+
+
 def _check_sample(name: str, time_ns: object, **vectors: object) -> None:
     if not isinstance(time_ns, (int, np.integer)):
         raise DataError(f"{name}: time_ns is {_type_text(time_ns)}, not whole nanoseconds")
     for key, value in vectors.items():
-        if not isinstance(value, np.ndarray) or value.shape != (3,) or value.dtype != _FLOAT64:
+        if not _is_vector(value):
             raise DataError(
                 f"{name}: {key} is {_type_text(value)}, not an array (3,) of float64; use numpy.array(…, float)"
             )
@@ -55,7 +59,8 @@ class ImuSample:
 
     def __post_init__(self) -> None:
         """Raise DataError unless the types are those above; the filters check the values."""
-        _check_sample("ImuSample", self.time_ns, gyro=self.gyro, accel=self.accel)
+        if not (type(self.time_ns) is int and _is_vector(self.gyro) and _is_vector(self.accel)):
+            _check_sample("ImuSample", self.time_ns, gyro=self.gyro, accel=self.accel)
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,11 +308,11 @@ class StereoFieldEstimate:
     All are in focal lengths.
     """
 
-    coefficients: FloatArray  # (6,) a0, a1, a2 of the right columns; k, q1, q2 of both lenses
-    covariance: FloatArray  # (6, 6)
+    coefficients: FloatArray  # (8,) a0, a1, a2, a3 of the right columns; k1, k2, q1, q2 of both lenses
+    covariance: FloatArray  # (8, 8)
     rows_rms_px: float = 0.0  # root mean square over the features of what the rows of left and right differ by
-    rows: FloatArray | None = None  # (6,) of 1, x, y, x y, x^2, y^2 in the right rows (R2); None: not learned
-    rows_covariance: FloatArray | None = None  # (6, 6)
+    rows: FloatArray | None = None  # (7,) of 1, x, y, x y, x^2, y^2, d in the right rows (R2); None: not learned
+    rows_covariance: FloatArray | None = None  # (7, 7)
 
 
 @dataclass(frozen=True, slots=True)

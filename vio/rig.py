@@ -55,7 +55,11 @@ class Rectifier:
         """Rectify one raw pair, each image (H, W) of its camera's size."""
         if self.maps is None:
             return left, right
-        return remap(left, self.maps[0], self.interpolation), remap(right, self.maps[1], self.interpolation)
+        return self.left(left), remap(right, self.maps[1], self.interpolation)
+
+    def left(self, image: Image) -> Image:
+        """Rectify a raw left image (H, W) alone."""
+        return image if self.maps is None else remap(image, self.maps[0], self.interpolation)
 
 
 def rectifier_of(

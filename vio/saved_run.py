@@ -16,7 +16,7 @@ from vio.datasets.features import FeatureDataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
 from vio.filters.multiview import Views
-from vio.filters.stereo_calibration import FIELD_TERMS, METRIC_TERMS, TERMS, StereoField
+from vio.filters.stereo_calibration import FIELD_TERMS, METRIC_TERMS, ROW_TERMS, TERMS, StereoField
 from vio.filters.tracks import measured
 from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
@@ -101,7 +101,7 @@ def _in_pinhole(
 ) -> tuple[StereoCamera, FeatureTracks]:
     """Return the pinhole inside a cylinder, and those of the tracks' pixels that it shows.
 
-    They are without the stereo field of the coefficients (12,) of (R3) and (R2), where there is one.
+    They are without the stereo field of the coefficients (15,) of (R3) and (R2), where there is one.
     """
     z = tracks.z
     if coefficients is not None:
@@ -119,7 +119,7 @@ def _in_pinhole(
 
 
 def _field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> FloatArray | None:
-    """Return the coefficients (12,) of (R3) and (R2) in a run's metrics; None: the run estimated none.
+    """Return the coefficients (15,) of (R3) and (R2) in a run's metrics; None: the run estimated none.
 
     Raises:
         DataError: the metrics are damaged.
@@ -131,8 +131,10 @@ def _field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, A
         coefficients = np.array([*stated["coefficients_px"], *stated["rows_px"]], dtype=np.float64) / camera.fu
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
-    if coefficients.shape != (12,) or not np.isfinite(coefficients).all():
-        raise DataError(f"{folder}: stereo_field of its metrics holds no 12 finite numbers; repeat the run")
+    if coefficients.shape != (FIELD_TERMS + ROW_TERMS,) or not np.isfinite(coefficients).all():
+        raise DataError(
+            f"{folder}: stereo_field of its metrics holds no {FIELD_TERMS + ROW_TERMS} finite numbers; repeat the run"
+        )
     return coefficients
 
 

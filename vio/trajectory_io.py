@@ -43,19 +43,24 @@ _COLUMNS: dict[TrajectoryFormat, str] = {
     "euroc": "at least 8 comma-separated columns 'timestamp [ns], px, py, pz, qw, qx, qy, qz'",
 }
 _EUROC_HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
+_STAMP = re.compile(r"[+-]?\d{1,19}")
 _HEAD_BYTES = 4096  # that hold the comments and the first row
 _DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
 
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """The fields of a text file as text, with their line numbers."""
+    """The lines of a text file that hold poses, with their numbers."""
 
     path: Path
     comments: list[str]  # without the leading '#'
-    rows: list[list[str]]
+    rows: list[str]
     line_numbers: list[int]  # from 1, one per row
     commas: bool  # what separates the fields of the first row; else white space
+
+    def fields(self, row: int, most: int = -1) -> list[str]:
+        """Return the fields of a row as text; behind the first `most`, the rest is one field."""
+        return self.rows[row].split("," if self.commas else None, most)
 
     def where(self, row: int) -> str:
         return f"{self.path}, line {self.line_numbers[row]}"
@@ -193,13 +198,12 @@ def in_first_cam0(trajectory: Trajectory, T_cam0_imu: FloatArray) -> Trajectory:
 def _read_table(path: Path) -> _Table:
     lines = [(number, line.strip()) for number, line in text_lines(path) if line.strip()]
     data = [(number, line) for number, line in lines if not line.startswith("#")]
-    commas = bool(data) and "," in data[0][1]
     return _Table(
         path,
         comments=[line[1:].strip() for _, line in lines if line.startswith("#")],
-        rows=[[field.strip() for field in line.split(",")] if commas else line.split() for _, line in data],
+        rows=[line for _, line in data],
         line_numbers=[number for number, _ in data],
-        commas=commas,
+        commas=bool(data) and "," in data[0][1],
     )
 
 
@@ -207,7 +211,7 @@ def _detect(table: _Table) -> TrajectoryFormat:
     """Detect the format from the first row."""
     if table.commas:
         return "euroc"
-    n = len(table.rows[0])
+    n = len(table.fields(0))
     if n not in (8, 12):
         forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
         table.fail(0, f"{n} columns fit no known format ({forms})")
@@ -215,22 +219,24 @@ def _detect(table: _Table) -> TrajectoryFormat:
 
 
 def _check_columns(table: _Table, kind: TrajectoryFormat) -> None:
-    expected = len(table.rows[0]) if kind == "euroc" else {"tum": 8, "kitti": 12}[kind]
+    expected = len(table.fields(0)) if kind == "euroc" else {"tum": 8, "kitti": 12}[kind]
     if kind == "euroc":
         expected = max(expected, 8)
-    for row, fields in enumerate(table.rows):
-        if len(fields) != expected:
-            table.fail(row, f"{len(fields)} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}")
+    for row, line in enumerate(table.rows):
+        count = line.count(",") + 1 if table.commas else len(line.split())
+        if count != expected:
+            table.fail(row, f"{count} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}")
 
 
 def _floats(table: _Table, first: int, last: int) -> FloatArray:
     """Columns `first <= column < last` as finite numbers (N, last - first)."""
-    out = np.empty((len(table.rows), last - first))
-    for row, fields in enumerate(table.rows):
-        try:
-            out[row] = [float(field) for field in fields[first:last]]
-        except ValueError as error:
-            table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
+    values, row = [], 0
+    try:
+        for row in range(len(table.rows)):
+            values.append(list(map(float, table.fields(row, last)[first:last])))
+    except ValueError as error:
+        table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
+    out = np.array(values).reshape(-1, last - first)
     bad = ~(np.abs(out) < _LARGEST).all(axis=1)
     if bad.any():
         table.fail(
@@ -247,9 +253,9 @@ def _times_ns(table: _Table, kind: TrajectoryFormat) -> IntArray:
 
 
 def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
-    text = table.rows[row][0]
+    text = table.fields(row, 1)[0].strip()
     if kind == "euroc":
-        if not re.fullmatch(r"[+-]?\d{1,19}", text) or abs(int(text)) > INT64_MAX:
+        if not _STAMP.fullmatch(text) or abs(int(text)) > INT64_MAX:
             table.fail(row, f"the time {text!r} is not in whole nanoseconds; EuRoC form has {_COLUMNS[kind]}")
         return int(text)
     try:

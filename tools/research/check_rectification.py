@@ -228,9 +228,9 @@ def _align(
     first: Image, second: Image, start: FloatArray, guess: FloatArray, *, same_row: bool
 ) -> tuple[FloatArray, BoolArray]:
     """The front end's alignment, from the result of Lucas-Kanade: pixels (N, 2) and a mask of good fits."""
-    prepared = templates(cut_patches(first.astype(np.float32), start, _RADIUS))
+    prepared = templates(cut_patches(first, start, _RADIUS))
     rows = start[:, 1] if same_row else None
-    warps, score = align(prepared, np.arange(len(start)), second.astype(np.float32), shift_warps(guess), 12, rows)
+    warps, score = align(prepared, np.arange(len(start)), second, shift_warps(guess), 12, rows)
     return warps[:, :2, 2], score > _CORRELATION
 
 

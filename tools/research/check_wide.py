@@ -180,9 +180,9 @@ def _tracked(
     end, found = _flow(a, b, p[rows], q[rows])
     back, found_back = _flow(b, a, end, p[rows])
     good = found & found_back & (np.linalg.norm(back - p[rows], axis=1) < _BACK_PX)
-    prepared = templates(cut_patches(a.astype(np.float32), p[rows], _RADIUS))
+    prepared = templates(cut_patches(a, p[rows], _RADIUS))
     same_row = p[rows, 1] if side == 1 and kind.camera is not None else None
-    warps, score = align(prepared, np.arange(len(rows)), b.astype(np.float32), shift_warps(end), 12, same_row)
+    warps, score = align(prepared, np.arange(len(rows)), b, shift_warps(end), 12, same_row)
     rays = kind.rays(side, warps[:, :2, 2])
     kept[rows] = good & (score > _CORRELATION)
     error[rows] = 1e3 * np.linalg.norm(np.cross(rays, truth[rows]), axis=1)

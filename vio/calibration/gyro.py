@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from vio.calibration.egomotion import CameraMotion
 from vio.calibration.findings import NotObservable
@@ -120,6 +119,8 @@ class _GyroProblem:
 
     def fit(self, x: FloatArray, keep: BoolArray) -> FloatArray:
         """Fit by robust least squares from `x` on some of the intervals."""
+        from scipy.optimize import least_squares  # every run imports this module, and few fit
+
         start = x
         for _ in range(2):
             scale = self.spread(start, keep)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from vio.calibration.findings import NotObservable
 from vio.geometry.lie import FloatArray, so3_exp, so3_log
@@ -23,6 +22,8 @@ _STEREO_DIRECTION_DEG = 2.0
 # What a lens model that is off by half a pixel in the corners does to the rotation from single pairs: rows cannot tell
 # a yaw from a tangential distortion of 1e-3, which calibrations leave.
 _LENS_DEG = 0.15
+_EDGE = 0.95  # quantile of the rays' angles off the axis at which a lens model is off by that
+_CELLS = 5  # across the image, a side of the grid on which residuals show a distortion
 _LEAST_IN_CELL = 15  # matches that make a cell's median
 
 _Pose: TypeAlias = tuple[FloatArray, FloatArray]  # R_cam1_cam0 (3, 3), unit direction (3,) from cam0 to cam1 in cam0
@@ -112,11 +113,71 @@ def refine_stereo(
         R_cam1_cam0=R,
         direction=d,
         rotation_sigma_deg=float(np.hypot(np.degrees(rotation_sigma), _LENS_DEG)),
-        direction_sigma_deg=float(np.degrees(direction_sigma)),
+        direction_sigma_deg=float(np.degrees(np.hypot(direction_sigma, _lens_swing(inliers, R, d, max(spread, 1e-6))))),
         matches=len(inliers.pair),
         pairs=len(np.unique(inliers.pair)),
         residual_deg=float(np.degrees(spread)),
     )
+
+
+def _lens_swing(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float) -> float:
+    """Return how far, radians, a lens model that is off turns the baseline's direction.
+
+    Rows of single pairs fit part of a distortion by a direction of the baseline, however many matches there are. What
+    they do not fit is left in the residuals over the image, so a bend that leaves more there than is seen is taken as
+    that much smaller.
+    """
+    angles = epipolar_angles(R, d, matches)
+    cells = _cells(_angles(matches.ray0))
+    seen = _structure(angles, cells)
+    swings = []
+    for bend in _bends(matches.ray0):
+        for sign in (1.0, -1.0):
+            bent = replace(matches, ray0=_bent(matches.ray0, sign * bend))
+            refit = _fit_stereo(bent, R, d, spread)
+            left = _structure(epipolar_angles(*refit, bent) - angles, cells)
+            swings.append(min(1.0, seen / max(left, 1e-12)) * np.linalg.norm(np.cross(d, refit[1])))
+    return float(np.sqrt(0.5 * np.sum(np.square(swings))))  # the two signs are one distortion
+
+
+def _cells(angles: FloatArray) -> IntArray:
+    """Return the cell (N,) of a grid over the image, equally filled along x and y, of angles (N, 2) off the axis."""
+    limits = np.quantile(angles, np.linspace(0, 1, _CELLS + 1)[1:-1], axis=0)
+    column, row = (np.searchsorted(limits[:, k], angles[:, k]) for k in range(2))
+    return column * _CELLS + row
+
+
+def _structure(values: FloatArray, cells: IntArray) -> float:
+    """Return the rms over the cells (N,) of the medians of values (N,)."""
+    medians = [np.median(values[cells == k]) for k, n in enumerate(np.bincount(cells)) if n >= _LEAST_IN_CELL]
+    return float(np.sqrt(np.mean(np.square(medians)))) if medians else float("inf")
+
+
+def _bends(rays: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return by what radial and both tangential distortions move rays (N, 3), each (N, 2), radians, in `_angles`.
+
+    Reference: Brown, Close-range camera calibration (1971), in the angles off the axis, as lenses may be wide.
+    """
+    angles = _angles(rays)
+    edge = max(float(np.quantile(np.linalg.norm(angles, axis=1), _EDGE)), 1e-6)
+    xy = angles / edge
+    r2 = np.sum(xy**2, axis=1, keepdims=True)
+    size = np.radians(_LENS_DEG)
+    return size * xy * r2, *(size / 3 * (r2 * axis + 2 * xy * xy[:, k : k + 1]) for k, axis in enumerate(np.eye(2)))
+
+
+def _angles(rays: FloatArray) -> FloatArray:
+    """Return angles (N, 2) off the optical axis along x and y, radians, of unit rays (N, 3)."""
+    radius = np.linalg.norm(rays[:, :2], axis=1, keepdims=True)
+    out: FloatArray = rays[:, :2] / np.maximum(radius, 1e-12) * np.arctan2(radius, rays[:, 2:])
+    return out
+
+
+def _bent(rays: FloatArray, bend: FloatArray) -> FloatArray:
+    """Return unit rays (N, 3) whose angles off the axis are moved by (N, 2) radians."""
+    angles = _angles(rays) + bend
+    theta = np.linalg.norm(angles, axis=1, keepdims=True)
+    return np.concatenate([angles * np.sinc(theta / np.pi), np.cos(theta)], axis=1)
 
 
 def too_few(matches: RayMatches) -> NotObservable | None:
@@ -132,6 +193,8 @@ def too_few(matches: RayMatches) -> NotObservable | None:
 
 
 def _fit_stereo(matches: RayMatches, R: FloatArray, d: FloatArray, spread: float) -> _Pose:
+    from scipy.optimize import least_squares  # every run imports this module, and few fit
+
     basis = _tangents(d)
 
     def moved(x: FloatArray) -> _Pose:

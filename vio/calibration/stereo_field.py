@@ -2,9 +2,10 @@
 
 The sliding window estimates a low-order field over the rectified images, equations (R1) to (R3) of docs/math.md. Here
 it is taken out of pixels, and turned into a rig: a rotation of the right camera, its principal point, focal lengths
-and tangential distortion against the left one, and the distortion of both. Twelve coefficients of the field determine
-these twelve parameters to first order, but three of them badly (a yaw, a principal point and a tangential distortion of
-the right camera move pixels almost alike); a prior of what real rigs do decides between them.
+and tangential distortion against the left one, the distortion of both, and how far the right camera sits below the row
+of the left one. The field's coefficients determine these parameters to first order, but three of them badly (a yaw, a
+principal point and a tangential distortion of the right camera move pixels almost alike); a prior of what real rigs do
+decides between them. The term of the fourth order of the right columns has no parameter and is left.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.filters.stereo_calibration import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
@@ -22,14 +24,19 @@ from vio.rig import Rig
 
 # Parameters of a rig's correction: rotation of the right camera (rad, in the rectified frame: its points p are seen as
 # `exp(w) p`), its principal point (focal lengths), focal ratios and tangential distortion against the left camera;
-# radial and tangential distortion of both.
-PARAMETERS = ("wx", "wy", "wz", "cu", "cv", "fu", "fv", "p1", "p2", "k", "q1", "q2")
-_BOTH = ("k", "q1", "q2")
+# radial distortion of both, of the third and fifth order, and tangential; how far the right camera is below the left
+# one's row (baselines).
+PARAMETERS = ("wx", "wy", "wz", "cu", "cv", "fu", "fv", "p1", "p2", "k", "k2", "q1", "q2", "ty")
+_BOTH = ("k", "k2", "q1", "q2")
+TERMS = FIELD_TERMS + ROW_TERMS  # coefficients of the field: of (R3), then of the rows (R2)
+_FOURTH = RIGHT_TERMS - 1  # the one of them that no rig has
+_BELOW = TERMS - 1  # the one of the baseline's direction
 # What a calibration of a real rig is usually off by: mounts turn by tenths of a degree; principal point and focal
 # lengths by 2e-3 focal lengths; lens models as the sliding window takes it (msckf.stereo_field_sigma). A Cauchy
 # distribution of this width: a rig that is off by much more (KITTI's by 14 px and 1 degree) is believed.
-_PRIOR = np.array([*[np.radians(0.5)] * 3, *[2e-3] * 4, *[2e-3] * 2, 1e-2, *[2e-3] * 2])
-_MODEL = 1e-4  # focal lengths, 0.05 px: what terms beyond the second order leave in a coefficient of the field
+_PRIOR = np.array([*[np.radians(0.5)] * 3, *[2e-3] * 4, *[2e-3] * 2, 1e-2, 1e-2, *[2e-3] * 2, np.radians(0.5)])
+_MODEL = 1e-4  # focal lengths, 0.05 px: what terms beyond those of the field leave in a coefficient
+_NO_PARAMETER = 1.0  # focal lengths: a coefficient that says nothing of the rig
 _BENDS = ("pinhole", "radtan", "unified")  # models that hold tangential distortion, or become one that does
 _GRID = (11, 9)  # points along the image's width and height at which field and rig are compared
 _STEP = 1e-6  # of numeric derivatives by the parameters, which are all of the size of radians
@@ -44,24 +51,28 @@ _TEXT = {
     "fv": ("its focal length along v off by {} %", 100.0, ".3f"),
     "p1": ("its tangential distortion p1 off by {} e-3", 1e3, ".2f"),
     "p2": ("its tangential distortion p2 off by {} e-3", 1e3, ".2f"),
-    "k": ("radial distortion of both lenses off by {} e-3", 1e3, ".2f"),
+    "k": ("radial distortion k1 of both lenses off by {} e-3", 1e3, ".2f"),
+    "k2": ("radial distortion k2 of both lenses off by {} e-3", 1e3, ".2f"),
     "q1": ("tangential distortion p1 of both lenses off by {} e-3", 1e3, ".2f"),
     "q2": ("tangential distortion p2 of both lenses off by {} e-3", 1e3, ".2f"),
+    "ty": ("right camera {} % of the baseline below the left one's row", 100.0, ".3f"),
 }
 
 
 def field_basis(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Derivatives (N, 4, 12) of pixels `[ul vl ur vr]` (N, 4) by the coefficients of (R3) and the rows (R2)."""
+    """Derivatives (N, 4, 15) of pixels `[ul vl ur vr]` (N, 4) by the coefficients of (R3) and the rows (R2)."""
     x, y, xr = (z[:, 0] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv, (z[:, 2] - camera.cu) / camera.fu
-    out = np.zeros((len(z), 4, 12))
+    out = np.zeros((len(z), 4, TERMS))
+    both, rows = slice(RIGHT_TERMS, FIELD_TERMS), FIELD_TERMS
     for column, u in ((0, x), (2, xr)):
         r2 = u * u + y * y
-        out[:, column, 3:6] = np.stack([u * r2, 2 * u * y, r2 + 2 * u * u], axis=1)
-        out[:, column + 1, 3:6] = np.stack([y * r2, r2 + 2 * y * y, 2 * u * y], axis=1)
-    out[:, 2, 0:3] = np.stack([np.ones_like(x), xr, xr * xr + y * y], axis=1)
+        out[:, column, both] = np.stack([u * r2, u * r2 * r2, 2 * u * y, r2 + 2 * u * u], axis=1)
+        out[:, column + 1, both] = np.stack([y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * u * y], axis=1)
+    r2 = xr * xr + y * y
+    out[:, 2, :RIGHT_TERMS] = np.stack([np.ones_like(x), xr, r2, r2 * r2], axis=1)
     # What the rows tell of the right columns: their coefficients of y, x y and y^2 - x^2.
-    out[:, 2, 7], out[:, 2, 9], out[:, 2, 10], out[:, 2, 11] = -y, -y * y, -xr * y, xr * y
-    out[:, 3, 6:] = np.stack([np.ones_like(y), xr, y, xr * y, xr * xr, y * y], axis=1)
+    out[:, 2, [rows + 1, rows + 3, rows + 4, rows + 5]] = np.stack([-y, -y * y, -xr * y, xr * y], axis=1)
+    out[:, 3, rows:] = np.stack([np.ones_like(y), xr, y, xr * y, xr * xr, y * y, x - xr], axis=1)
     return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
 
 
@@ -70,12 +81,12 @@ class PixelField:
     """How far the pixels of a rectified pair are off, as a run estimated it."""
 
     camera: StereoCamera
-    coefficients: FloatArray  # (12,) of (R3) and of the rows (R2), in focal lengths
+    coefficients: FloatArray  # (15,) of (R3) and of the rows (R2), in focal lengths
 
     @classmethod
     def of(cls, camera: StereoCamera, estimate: StereoFieldEstimate) -> PixelField:
         """Return the field of an estimate, without rows where they are not known."""
-        rows = np.zeros(6) if estimate.rows is None else estimate.rows
+        rows = np.zeros(ROW_TERMS) if estimate.rows is None else estimate.rows
         return cls(camera, np.concatenate([estimate.coefficients, rows]))
 
     def at(self, z: FloatArray) -> FloatArray:
@@ -112,13 +123,13 @@ class CalibratedRig:
     """A rig as a run corrected it."""
 
     rig: Rig
-    parameters: FloatArray  # (12,) what the given rig was off by, in the order and units of `PARAMETERS`
-    covariance: FloatArray  # (12, 12)
+    parameters: FloatArray  # (14,) what the given rig was off by, in the order and units of `PARAMETERS`
+    covariance: FloatArray  # (14, 14)
     left_px: float  # root mean square over the images of the field that the rig cannot express
 
     @property
     def sigmas(self) -> FloatArray:
-        """Standard deviations (12,) of the parameters."""
+        """Standard deviations (14,) of the parameters."""
         return np.sqrt(np.diag(self.covariance))
 
     def lines(self) -> tuple[str, ...]:
@@ -168,7 +179,7 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
 
 
 def field_of(camera: StereoCamera, parameters: FloatArray) -> PixelField:
-    """Return the field of a rectified pair, with image size, that is off by parameters (12,)."""
+    """Return the field of a rectified pair, with image size, that is off by parameters (14,)."""
     assert camera.width is not None
     assert camera.height is not None
     c = camera
@@ -184,17 +195,18 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     frame = _Frame.of(given)
     measured = PixelField.of(frame.camera, field).coefficients
     assert field.rows_covariance is not None
-    P = np.zeros((12, 12))
-    P[:6, :6], P[6:, 6:] = field.covariance, field.rows_covariance
-    P += _MODEL**2 * np.eye(12)
+    P = _MODEL**2 * np.eye(TERMS)
+    P[:FIELD_TERMS, :FIELD_TERMS] += field.covariance
+    P[FIELD_TERMS:, FIELD_TERMS:] += field.rows_covariance
+    P[_FOURTH, _FOURTH] += _NO_PARAMETER**2
     W = np.linalg.inv(P)
     free = _expressible(given)
     x = np.zeros(len(PARAMETERS))
-    J, information = np.zeros((12, 12)), np.diag(1 / _PRIOR**2)
+    J, information = np.zeros((TERMS, len(PARAMETERS))), np.diag(1 / _PRIOR**2)
     for round_ in range(_STEPS):
         prior = np.diag(1 / (_PRIOR**2 + x**2))
         for k in np.flatnonzero(free & (round_ in _LINEARISED)):
-            step = _STEP * np.eye(12)[k]
+            step = _STEP * np.eye(len(PARAMETERS))[k]
             J[:, k] = (frame.coefficients(x + step) - frame.coefficients(x - step)) / (2 * _STEP)
         information = J.T @ W @ J + prior
         gradient = J.T @ W @ (measured - frame.coefficients(x)) - prior @ x
@@ -206,10 +218,10 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
 
 
 def _expressible(given: Rig) -> BoolArray:
-    """Return which parameters (12,) the lens models of a rig can hold."""
+    """Return which parameters (14,) the lens models of a rig can hold."""
     bends = all(c.model in _BENDS for c in (given.cam0, given.cam1))
     radial = all(c.model != "double_sphere" for c in (given.cam0, given.cam1))
-    held = {"p1": bends, "p2": bends, "q1": bends, "q2": bends, "k": radial}
+    held = {"p1": bends, "p2": bends, "q1": bends, "q2": bends, "k": radial, "k2": radial}
     return np.array([held.get(name, True) for name in PARAMETERS])
 
 
@@ -236,11 +248,11 @@ class _Frame:
         return cls(rig, camera, R_rect_cam0, R_rect_cam1, np.stack([u, v, u, v], axis=-1).reshape(-1, 4))
 
     def moved(self, x: FloatArray) -> Rig:
-        """Return the rig whose calibration differs from the given one by parameters (12,)."""
+        """Return the rig whose calibration differs from the given one by parameters (14,)."""
         if not np.any(x):
             return self.given
         given, named = self.given, dict(zip(PARAMETERS, x.tolist(), strict=True))
-        k, q1, q2 = (named[name] for name in _BOTH)
+        k, k2, q1, q2 = (named[name] for name in _BOTH)
         b = given.cam1
         b = replace(
             b,
@@ -249,13 +261,15 @@ class _Frame:
             fu=b.fu * (1 + named["fu"]),
             fv=b.fv * (1 + named["fv"]),
         )
-        cam0, cam1 = _bent(given.cam0, k, q1, q2), _bent(b, k, q1 + named["p1"], q2 + named["p2"])
+        cam0, cam1 = _bent(given.cam0, (k, k2), q1, q2), _bent(b, (k, k2), q1 + named["p1"], q2 + named["p2"])
         R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
         centre = se3_inverse(given.T_cam1_cam0)[:3, 3]
+        down = self.R_rect_cam0[1] * named["ty"] * np.linalg.norm(centre)
+        centre = (centre + down) / np.hypot(1.0, named["ty"])
         return replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
 
     def as_seen(self, x: FloatArray) -> FloatArray:
-        """Return where the given rectification shows the grid's pixels (N, 4) if it is off by parameters (12,)."""
+        """Return where the given rectification shows the grid's pixels (N, 4) if it is off by parameters (14,)."""
         true, out = self.moved(x), np.empty(self.grid.shape)
         turn1 = true.T_cam1_cam0[:3, :3] @ self.R_rect_cam0.T
         sides = (
@@ -272,27 +286,28 @@ class _Frame:
         return np.stack([seen[:, 0], seen[:, 1], seen[:, 2], self.grid[:, 3]], axis=1)
 
     def coefficients(self, x: FloatArray) -> FloatArray:
-        """Return the field's coefficients (12,) that fit best what parameters (12,) do to the grid's pixels."""
+        """Return the field's coefficients (15,) that fit best what parameters (14,) do to the grid's pixels."""
         seen = self.as_seen(x)
-        D = field_basis(self.camera, self.where_read(seen)).reshape(-1, 12)
-        return np.asarray(np.linalg.lstsq(D, (seen - self.grid).ravel(), rcond=None)[0], dtype=np.float64)
+        D = field_basis(self.camera, self.where_read(seen)).reshape(-1, TERMS)[:, :_BELOW]
+        found = np.linalg.lstsq(D, (seen - self.grid).ravel(), rcond=None)[0]
+        return np.append(found, -x[PARAMETERS.index("ty")])  # shown by near points alone
 
 
 def rig_off_by(given: Rig, parameters: FloatArray) -> Rig:
-    """Return the rig whose calibration differs from a given one by parameters (12,)."""
+    """Return the rig whose calibration differs from a given one by parameters (14,)."""
     return _Frame.of(given).moved(parameters)
 
 
-def _bent(camera: CameraModel, k: float, p1: float, p2: float) -> CameraModel:
+def _bent(camera: CameraModel, radial: tuple[float, float], p1: float, p2: float) -> CameraModel:
     """Return a camera with more radial and tangential distortion, as far as its model holds it."""
-    c = camera.coefficients
+    c, (k1, k2) = camera.coefficients, radial
     if camera.model == "pinhole":
-        return replace(camera, model="radtan", coefficients=(k, 0.0, p1, p2))
+        return replace(camera, model="radtan", coefficients=(k1, k2, p1, p2))
     if camera.model == "unified":
         bend = c[1:] or (0.0, 0.0, 0.0, 0.0)
-        return replace(camera, coefficients=(c[0], bend[0] + k, bend[1], bend[2] + p1, bend[3] + p2))
+        return replace(camera, coefficients=(c[0], bend[0] + k1, bend[1] + k2, bend[2] + p1, bend[3] + p2))
     if camera.model == "radtan":
-        return replace(camera, coefficients=(c[0] + k, c[1], c[2] + p1, c[3] + p2, *c[4:]))
+        return replace(camera, coefficients=(c[0] + k1, c[1] + k2, c[2] + p1, c[3] + p2, *c[4:]))
     if camera.model == "equidistant":
-        return replace(camera, coefficients=(c[0] + k, *c[1:]))
+        return replace(camera, coefficients=(c[0] + k1, c[1] + k2, *c[2:]))
     return camera

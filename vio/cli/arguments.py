@@ -49,9 +49,12 @@ def add_lengths_argument(parser: argparse.ArgumentParser) -> None:
 
 def lengths(text: str) -> tuple[float, ...]:
     """Parse '25,50' into metres."""
-    values = tuple(float(part) for part in text.split(","))
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
     if not values or any(not 0 < v < float("inf") for v in values):
-        raise ValueError(text)
+        raise argparse.ArgumentTypeError(f"{text!r} is no list of path lengths; give metres above 0, as in 25,50")
     return values
 
 

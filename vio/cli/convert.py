@@ -74,7 +74,7 @@ def _recording(args: argparse.Namespace) -> int:
     import logging
     from dataclasses import replace
 
-    from vio.atomic import atomic_folder
+    from vio.atomic import atomic_folder, check_spares
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.datasets import open_dataset
@@ -90,7 +90,8 @@ def _recording(args: argparse.Namespace) -> int:
     for note in recording.notes:
         log.warning("%s", note)
     start, stop = frames_between(recording, args.start, args.stop)
-    with atomic_folder(args.out, replace=True, marker=MARKER) as folder:
+    check_spares(recording.path, args.out)
+    with atomic_folder(args.out, replace=True, marker=MARKER, own=_written(args.out)) as folder:
         with ProgressBar(f"convert {recording.path.name}") as bar:
             done = convert(dataset, folder, args.to, start=start, stop=stop, progress=bar.update)
         facts = {
@@ -101,9 +102,21 @@ def _recording(args: argparse.Namespace) -> int:
             "imu_samples": done.imu_samples,
             "velocities": done.velocities,
             "notes": list(done.notes),
+            "files": sorted({MARKER, *(child.name for child in folder.iterdir())}),
         }
         write_text(folder / MARKER, json.dumps(facts, indent=2) + "\n")
     rows = [("folder", str(args.out)), ("form", args.to), ("frames", f"{done.frames}")]
     rows += [("samples", f"{done.imu_samples} of the IMU, {done.velocities} velocities")]
     rows += [("note", note) for note in done.notes]
     return print_result({"out": str(args.out), **facts}, rows, as_json=args.json)
+
+
+def _written(out: Path) -> list[str] | None:
+    """Return the names that an earlier conversion wrote into a folder; None: there is none, or it is not known."""
+    import json
+
+    try:
+        files = json.loads((out / MARKER).read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return [str(name) for name in files] if isinstance(files, list) else None

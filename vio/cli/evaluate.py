@@ -91,7 +91,7 @@ def execute(args: argparse.Namespace) -> int:
 
 def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
     """Yield the figures as rows of a table, one quantity each."""
-    from vio.evaluation import lengths_text
+    from vio.evaluation import lengths_text, rotation_drift_text
 
     share = f"{100 * result.coverage.estimate:.1f} % of the estimate"
     if result.coverage.reference_span is not None:
@@ -107,12 +107,12 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
     if result.kitti is None:
         yield "drift", "the path is shorter than the lengths over which it is measured"
         return
-    drift = f"{result.kitti.t_err_percent:.3f} %, {result.kitti.r_err_deg_per_100m:.4f} deg/100 m"
-    yield "drift", f"{drift} over {lengths_text(result.kitti.lengths_m)}"
+    turned = rotation_drift_text(result.kitti.r_err_deg_per_100m, result.kitti.lengths_m, 4)
+    yield "drift", f"{result.kitti.t_err_percent:.3f} %, {turned} over {lengths_text(result.kitti.lengths_m)}"
     for row in result.kitti.per_length:
-        if row.t_err_percent is not None:
-            figures = f"{row.t_err_percent:8.3f} % {row.r_err_deg_per_100m:9.4f} deg/100 m {row.segments:6d} segments"
-            yield f"  {row.length_m:g} m", figures
+        if row.t_err_percent is not None and row.r_err_deg_per_100m is not None:
+            turned = rotation_drift_text(row.r_err_deg_per_100m, result.kitti.lengths_m, 4)
+            yield f"  {row.length_m:g} m", f"{row.t_err_percent:8.3f} % {turned:>19} {row.segments:6d} segments"
 
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:

@@ -17,12 +17,12 @@ def add_parser(commands: Any) -> None:
         "inspect",
         help="examine a recording before a run",
         description="Say what was found in a recording and how it was understood: clocks, calibration, images, stereo "
-        "rows, IMU (units, standstill, gravity, noise against the data sheet, agreement with images), ground truth, "
-        "and what is missing. Exit status 1 where a run makes no sense, with the remedy.",
+        "rows or depths, IMU (units, standstill, gravity, noise against the data sheet, agreement with images), ground "
+        "truth, and what is missing. Exit status 1 where a run makes no sense, with the remedy.",
     )
     parser.add_argument("source", metavar="SOURCE", help="a recording: folder or file, or kind:path")
     add_config_arguments(parser)
-    parser.add_argument("--pairs", type=int, default=12, metavar="N", help="stereo pairs looked at (default 12)")
+    parser.add_argument("--pairs", type=int, default=12, metavar="N", help="frames looked at (default 12)")
     parser.add_argument("--frames", type=int, default=60, metavar="N", help="frames tracked (default 60; 0: none)")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(execute=execute)
@@ -36,7 +36,6 @@ def execute(args: argparse.Namespace) -> int:
     from vio.datasets import open_dataset
     from vio.errors import ConfigError
     from vio.inspection.inspect import inspect_recording
-    from vio.records import need_stereo
     from vio.threads import one_blas_thread
 
     if args.pairs < 1 or args.frames < 0:
@@ -44,7 +43,6 @@ def execute(args: argparse.Namespace) -> int:
     config = config_from(args)
     dataset = open_dataset(args.source, config.dataset)
     recording = dataset.recording
-    need_stereo(recording, "vio inspect")
     with one_blas_thread(), ProgressBar(f"inspect {recording.path.name}") as bar:
         report = inspect_recording(
             dataset,

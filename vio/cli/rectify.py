@@ -34,7 +34,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import logging
 
-    from vio.atomic import atomic_folder
+    from vio.atomic import atomic_folder, check_spares
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.datasets import DatasetSettings, open_dataset
@@ -70,6 +70,7 @@ def execute(args: argparse.Namespace) -> int:
         "focal_px": camera.fu,
         "baseline_m": camera.baseline_m,
     }
+    check_spares(recording.path, args.out)
     with atomic_folder(args.out, replace=True, marker=MARKER) as folder:
         with ProgressBar(f"rectify {recording.path.name}") as bar:
             frames = writers[recording.kind](dataset, folder, bar.update)

@@ -17,7 +17,7 @@ from vio.config import Config, load_config
 from vio.datasets import open_dataset
 from vio.datasets.span import Seconds, frames_between
 from vio.errors import ConfigError, DataError, StoppedError, VioError
-from vio.evaluation import lengths_text
+from vio.evaluation import lengths_text, rotation_drift_text
 from vio.frame_result import FrameResult
 from vio.pipeline import given_rig, resolve_motion, run
 from vio.protocols import Dataset, Viewer
@@ -310,9 +310,8 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("ATE", f"{metrics['ate_m']:.3f} m after SE(3) alignment{beside}"))
     if metrics["t_err_percent"] is not None:
         over = lengths_text(metrics["drift_lengths_m"])
-        rows.append(
-            ("drift", f"{metrics['t_err_percent']:.2f} %, {metrics['r_err_deg_per_100m']:.3f} deg/100 m over {over}")
-        )
+        turned = rotation_drift_text(metrics["r_err_deg_per_100m"], metrics["drift_lengths_m"])
+        rows.append(("drift", f"{metrics['t_err_percent']:.2f} %, {turned} over {over}"))
     if metrics.get("map") is not None:
         rows.append(("map", _map_row(metrics["map"])))
     if metrics["landmark_error"] is not None:

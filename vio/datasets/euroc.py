@@ -29,6 +29,7 @@ from vio.datasets.euroc_files import (
     read_camera_yaml,
     read_imu_csv,
     read_imu_yaml,
+    rig_read_as,
     stamped_rows,
 )
 from vio.datasets.image_pairs import full_scale
@@ -38,7 +39,7 @@ from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, 
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
-from vio.geometry.distortion import CameraModel, StereoRig, rig_from_rectified
+from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.protocols import Progress
 from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
@@ -140,7 +141,7 @@ def _read_camera(folder: Path) -> _Camera:
     path = folder / "data.csv"
     times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
     there = list_images(folder / "data")
-    files, renamed = _find_images(there, [row[0] for row in rows], path, lines)
+    files, renamed = _find_images(there, rows, path, lines)
     return _Camera(model, T_body_cam, times_ns, files, renamed, len(set(there) - set(files)))
 
 
@@ -248,7 +249,7 @@ def write_rectified_euroc(dataset: RectifiedDataset, out: Path, progress: Progre
         DataError: too many images are unreadable, or a file cannot be copied.
     """
     source, mav = _mav(dataset.recording.path), out / "mav0"
-    rig = rig_from_rectified(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
+    rig = rig_read_as(dataset.recording.camera, dataset.rectifier.T_rect0_imu)
     imu_yaml_path = source / "imu0" / "sensor.yaml"
     T_body_imu = read_imu_yaml(imu_yaml_path)[0] if imu_yaml_path.is_file() else np.eye(4)
     folders = [mav / name for name in ("cam0", "cam1")]

@@ -7,7 +7,9 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +17,9 @@ import numpy as np
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.yaml_files import as_number, numbers, read_yaml
 from vio.errors import CalibrationError, DataError
-from vio.geometry.distortion import CameraModel, DistortionModel
-from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
+from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
+from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, se3_inverse
+from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
 from vio.text_files import INT64_MAX, check_increasing, exact_text, text_lines
 
@@ -30,6 +33,7 @@ DISTORTION_MODELS: dict[str, DistortionModel] = {
 SENSOR_YAML_MODELS: tuple[DistortionModel, ...] = ("pinhole", "radtan", "equidistant")  # those it has a name for
 STATE_CSV = Path("state_groundtruth_estimate0", "data.csv")  # ground truth, within mav0
 TUM_FILE = "groundtruth_tum.txt"  # ground truth beside mav0
+_ULPS = 2  # units in the last place within which a translation is looked for that is read back as it was
 _NOISE = {  # entries of the IMU's sensor.yaml, and their units
     "gyroscope_noise_density": "rad / s / sqrt(Hz)",
     "gyroscope_random_walk": "rad / s^2 / sqrt(Hz)",
@@ -37,6 +41,7 @@ _NOISE = {  # entries of the IMU's sensor.yaml, and their units
     "accelerometer_random_walk": "m / s^3 / sqrt(Hz)",
 }
 _IMAGES_HEADER = "#timestamp [ns],filename"
+_STAMP = re.compile(r"\d{1,19}")
 _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
@@ -147,6 +152,44 @@ def _T_BS_yaml(T_body_sensor: FloatArray) -> str:
     return f"T_BS:\n  cols: 4\n  rows: 4\n  data: [{rows}]\n"
 
 
+def rig_read_as(camera: StereoCamera, T_cam0_imu: FloatArray) -> StereoRig:
+    """Return the rig of a rectified pair whose poses `T_BS`, when they are read, give this very pair, to the last bit.
+
+    The files hold the inverses of `T_cam0_imu` (4, 4) and of the right camera's pose, and inverting twice rounds. Of
+    the translations within a few units in the last place one is taken that does not; where there is none, the nearest.
+
+    Raises:
+        CalibrationError: the image size is unknown.
+    """
+    rig = rig_from_rectified(camera, T_cam0_imu)
+    R, baseline = rig.T_imu_cam0[:3, :3], np.array([camera.baseline_m, 0.0, 0.0])
+    T0, T1 = rig.T_imu_cam0.copy(), rig.T_imu_cam1.copy()
+
+    def left_fits(t: FloatArray) -> bool:
+        return np.array_equal(se3_inverse(se3_from_parts(R, t)), T_cam0_imu)
+
+    def right_fits(t: FloatArray) -> bool:
+        found = rectified_pair(replace(rig, T_imu_cam0=T0, T_imu_cam1=se3_from_parts(R, t)))
+        return found is not None and found.baseline_m == camera.baseline_m
+
+    # R is a rotation to its own digits only, so its transpose is not its inverse.
+    T0[:3, 3] = _first(_neighbours(np.asarray(np.linalg.solve(R.T, -T_cam0_imu[:3, 3]), dtype=np.float64)), left_fits)
+    right: FloatArray = np.asarray(T0[:3, 3] + np.linalg.solve(R.T, baseline), dtype=np.float64)
+    T1[:3, 3] = _first(_neighbours(right), right_fits)
+    return replace(rig, T_imu_cam0=T0, T_imu_cam1=T1)
+
+
+def _first(values: Sequence[FloatArray], fits: Callable[[FloatArray], bool]) -> FloatArray:
+    """Return the first value that fits, else the first one."""
+    return next((value for value in values if fits(value)), values[0])
+
+
+def _neighbours(t: FloatArray) -> list[FloatArray]:
+    """Return a vector (3,) and those around it, the nearest first, by units in the last place of its numbers."""
+    steps = sorted(product(range(-_ULPS, _ULPS + 1), repeat=3), key=lambda step: max(map(abs, step)))
+    return [t + np.array(step) * np.spacing(np.abs(t)) for step in steps]
+
+
 # --- data.csv -------------------------------------------------------------------------------------------------------
 
 
@@ -169,14 +212,14 @@ def read_imu_csv(path: Path) -> ImuRecord:
     """
     times_ns, rows, lines = stamped_rows(path, 7, "timestamp [ns], gyro x y z, accel x y z")
     try:
-        values = np.array(rows, dtype=np.float64)
+        values = np.array([list(map(float, row.split(","))) for row in rows])
     except ValueError:
-        values = np.array([[as_number(text) for text in row] for row in rows])
+        values = np.array([[as_number(text.strip()) for text in row.split(",")] for row in rows])
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         k = int(np.argmax(bad))
         raise DataError(
-            f"{path}, line {lines[k]}: a reading is not a finite number ({','.join(rows[k])}; {int(bad.sum())} lines "
+            f"{path}, line {lines[k]}: a reading is not a finite number ({rows[k]}; {int(bad.sum())} lines "
             "in all); remove such lines"
         )
     return ImuRecord(times_ns, values[:, :3], values[:, 3:])
@@ -205,25 +248,28 @@ def _stamped_csv(header: str, times_ns: IntArray, values: FloatArray) -> str:
     return "\n".join([header, *rows]) + "\n"
 
 
-def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[list[str]], list[int]]:
-    """Return the times (N,) of a csv, its other fields, and their line numbers; '#' comment lines are skipped.
+def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[str], list[int]]:
+    """Return the times (N,) of a csv, the text of each line behind its time, and their line numbers.
+
+    Comment lines, which begin with '#', are skipped. The text holds `columns - 1` fields between commas.
 
     Raises:
         DataError: the file is missing or empty, a line has a wrong number of fields, or the clock does not increase.
     """
     times: list[int] = []
-    rows: list[list[str]] = []
+    rows: list[str] = []
     lines: list[int] = []
     for number, line in text_lines(path):
         if line.startswith("#"):
             continue
-        fields = [field.strip() for field in line.split(",")]
-        if len(fields) != columns:
-            raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns} ({form})")
-        if not re.fullmatch(r"\d{1,19}", fields[0]) or int(fields[0]) > INT64_MAX:
-            raise DataError(f"{path}, line {number}: {fields[0]!r} is no time in whole nanoseconds ({form})")
-        times.append(int(fields[0]))
-        rows.append(fields[1:])
+        if (count := line.count(",") + 1) != columns:
+            raise DataError(f"{path}, line {number}: {count} values instead of {columns} ({form})")
+        stamp, _, rest = line.partition(",")
+        stamp = stamp.strip()
+        if not _STAMP.fullmatch(stamp) or int(stamp) > INT64_MAX:
+            raise DataError(f"{path}, line {number}: {stamp!r} is no time in whole nanoseconds ({form})")
+        times.append(int(stamp))
+        rows.append(rest.strip())
         lines.append(number)
     if not times:
         raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove its folder")

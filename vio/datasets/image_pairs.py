@@ -150,16 +150,22 @@ class ImageDataset:
         """Preprocess a pair as read from the files (H, W each); returned unchanged, as it is rectified."""
         return left, right
 
+    def prepared_left(self, left: Image) -> Image:
+        """Preprocess a left image (H, W) alone, as `prepared` does."""
+        return left
+
     def _frame(self, index: int, left: Image | None, right: Image | None) -> StereoFrame:
         return StereoFrame(index, int(self.recording.frame_times_ns[index]), left, right)
 
     def _load(self, index: int) -> StereoFrame | BadFrame:
         """Read one frame; runs in the prefetch thread."""
-        paths = self.pairs[index]
+        paths = self.pairs[index][: self.settings.cameras]
         try:
-            left, right = (load_gray(path, self.white)[0] for path in paths)
-            for size, image, path in zip(self.sizes, (left, right), paths, strict=True):
+            images = [load_gray(path, self.white)[0] for path in paths]
+            for size, image, path in zip(self.sizes, images, paths, strict=False):
                 size.check(image, path)
         except UnreadableImageError as error:
             return BadFrame(index, str(error))
-        return self._frame(index, *self.prepared(left, right))
+        if len(images) == 1:
+            return self._frame(index, self.prepared_left(images[0]), None)
+        return self._frame(index, *self.prepared(*images))

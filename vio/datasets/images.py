@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import re
 import struct
-import zlib
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
-from vio.datasets.png import decode_gray8
+from vio.datasets.png import crc32, decode_gray8
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.input_files import check_regular, read_input
@@ -215,7 +214,7 @@ def _png_damage(data: bytes) -> str | None:
         end = at + 12 + size
         if end > len(data):
             break
-        if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+        if crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
             return f"the PNG is damaged (wrong checksum in its {kind.decode('latin-1')!r} chunk)"
         if kind == b"IHDR" and size >= 8 and (problem := _too_large(*struct.unpack_from(">II", data, at + 8))):
             return problem

@@ -220,6 +220,8 @@ def _read(layout: Layout, frames: _Frames, settings: DatasetSettings, kind: str)
     factor, factor_notes = _depth_factor(rig, settings, layout.root) if with_depth else (1.0, ())
     reference, reference_file = read_reference(layout, rig, undistorter, frames.times_ns)
     sources = [file, frames.times_file, *used, *motion_files, reference_file]
+    if frames.times_file == layout.left:  # EuRoC's list repeats the times that the images are named by
+        sources.append(layout.left.parent / "data.csv")
     if with_depth:
         sources += [layout.base / "depth", *(layout.root / name for name in _TUM_LISTS)]
     unused = unused_note(layout, [s for s in sources if s is not None])

@@ -216,7 +216,7 @@ def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
         DataError: it lacks an image, or cannot be read.
     """
     times_ns, rows, _ = stamped_rows(file, 2, "timestamp [ns], filename")
-    time_of = {name: t for (name,), t in zip(rows, times_ns.tolist(), strict=True)}
+    time_of = dict(zip(rows, times_ns.tolist(), strict=True))
     missing = next((left.name for left, _ in pairs if left.name not in time_of), None)
     if missing is not None:
         raise DataError(f"{file}: does not list {missing}; copy both again, or remove the image")

@@ -15,11 +15,13 @@ import numpy as np
 
 from vio.records import Image
 
+__all__ = ["crc32", "decode_gray8"]
+
 try:
     from isal.isal_zlib import IsalError as ZlibError  # inflates in half to two thirds of the time
-    from isal.isal_zlib import decompressobj
+    from isal.isal_zlib import crc32, decompressobj
 except ImportError:  # a processor without its wheels
-    from zlib import decompressobj  # type: ignore[assignment]
+    from zlib import crc32, decompressobj  # type: ignore[assignment]
     from zlib import error as ZlibError  # type: ignore[assignment]  # noqa: N812
 
 _START = b"\x89PNG\r\n\x1a\n"

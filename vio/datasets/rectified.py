@@ -54,6 +54,10 @@ class RectifiedDataset(ImageDataset):
         """Rectify one raw pair, each image (H, W) of its camera's size."""
         return self.rectifier(left, right)
 
+    def prepared_left(self, left: Image) -> Image:
+        """Rectify a raw left image (H, W) alone."""
+        return self.rectifier.left(left)
+
 
 def check_not_rectified(dataset: RectifiedDataset) -> None:
     """Raise DataError if a recording is rectified already, as rectifying would only copy it."""

@@ -72,3 +72,8 @@ class DatasetSettings(Section):
     prefetch_frames: int = setting(
         4, "image folders: stereo frames decoded ahead in a thread; 0: no thread", at_least=0, at_most=1000
     )
+
+    @property
+    def cameras(self) -> int:
+        """How many images of a stereo frame are decoded."""
+        return 1 if self.camera == "left" else 2

@@ -41,10 +41,11 @@ def unused_note(layout: Layout, used: Sequence[Path]) -> list[str]:
     for folder in folders:
         if folder != layout.root and layout.root not in folder.parents:
             continue
-        for child in sorted(folder.iterdir()):
-            image = folder in images and child.suffix.lower() in SUFFIXES
+        with_images = folder in images
+        children = (child for child in folder.iterdir() if not (with_images and child.suffix.lower() in SUFFIXES))
+        for child in sorted(children):
             silent = child.name.startswith(".") or any(fnmatch.fnmatch(child.name.lower(), s) for s in _SILENT)
-            if not image and not silent and child.absolute() not in kept:
+            if not silent and child.absolute() not in kept:
                 found.append(str(child.relative_to(layout.root)) + ("/" if child.is_dir() else ""))
     photometric = [name for name in found if any(fnmatch.fnmatch(Path(name).name, p) for p in _PHOTOMETRIC)]
     others = [name for name in found if name not in photometric]

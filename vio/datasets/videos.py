@@ -166,7 +166,7 @@ class VideoDataset:
         """Decode in order; the prefetch thread is the only one that uses the decoders."""
         import cv2
 
-        captures = [cv2.VideoCapture(str(file)) for file in self.files]
+        captures = [cv2.VideoCapture(str(file)) for file in self.files[: self.settings.cameras]]
 
         def load(index: int) -> StereoFrame:
             if index == chosen.start:
@@ -174,8 +174,10 @@ class VideoDataset:
                     for _ in range(index):
                         capture.grab()
             images = [self._gray(capture, side, index) for side, capture in enumerate(captures)]
-            left, right = self.rectifier(*images)
-            return StereoFrame(index, int(self.recording.frame_times_ns[index]), left, right)
+            time_ns = int(self.recording.frame_times_ns[index])
+            if len(images) == 1:
+                return StereoFrame(index, time_ns, self.rectifier.left(images[0]), None)
+            return StereoFrame(index, time_ns, *self.rectifier(*images))
 
         try:
             with contextlib.closing(prefetch(load, chosen, self.settings.prefetch_frames)) as loaded:

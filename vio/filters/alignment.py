@@ -1,7 +1,8 @@
 """Visual-inertial alignment: gyro bias, velocity and gravity from the bearings of tracks and the IMU, without a scale.
 
-Everything is in the body frame of the first of K views ("first"), whose attitude is not known yet. The results are a
-start for a nonlinear estimate (`vio.filters.mono_start`), and come without a covariance.
+Equations (V1) to (V5) of docs/math.md. Everything is in the body frame of the first of K views ("first"), whose
+attitude is not known yet. The results are a start for a nonlinear estimate (`vio.filters.mono_start`), and come without
+a covariance.
 References: Kneip & Lynen, Direct optimization of frame-to-frame rotation, ICCV (2013), for the rotations alone;
 Martinelli, Closed-form solution of visual-inertial structure from motion, IJCV (2014); Dong-Si & Mourikis, Estimator
 initialization in vision-aided inertial navigation with unknown camera-IMU calibration, IROS (2012), for the rest.

@@ -4,6 +4,7 @@ Nothing is estimated before. At standstill (the IMU shows noise alone, and the t
 In motion, a linear solution (`vio.filters.alignment`) starts Gauss-Newton over some views of the last seconds, with the
 same motion model, errors and elimination of points as the filter has; its covariance is that of the start. The frames
 that were used have no pose of their own: the filter begins with the newest one and never sees their pixels again.
+Equations (V1) to (V6) of docs/math.md.
 """
 
 from __future__ import annotations
@@ -104,7 +105,10 @@ class MonoStarter:
             return None
         if is_still(self._frames, motion.samples, self._settings):
             return self._still_start(motion)
-        if (seen.time_ns - self._frames[0].time_ns) * 1e-9 < _LEAST_SPAN_S or self._passed % _EVERY:
+        span_s = (seen.time_ns - self._frames[0].time_ns) * 1e-9
+        if span_s < _LEAST_SPAN_S:
+            self.why = f"there are {span_s:.2f} s of frames, and a start in motion takes {_LEAST_SPAN_S:g} s"
+        if span_s < _LEAST_SPAN_S or self._passed % _EVERY:
             return None
         return self._moving_start(motion)
 

@@ -36,6 +36,7 @@ from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
     FIELD_TERMS,
+    ROW_TERMS,
     RowField,
     StereoField,
     StereoInformation,
@@ -672,7 +673,7 @@ class Msckf:
         calibration = window.calibration
         if not calibration.stereo_dim:
             return None
-        rows = self._rows.coefficients if calibration.stereo_field else np.zeros(FIELD_TERMS)
+        rows = self._rows.coefficients if calibration.stereo_field else np.zeros(ROW_TERMS)
         return StereoField(self._camera, rows, calibration.stereo, calibration.stereo_terms)
 
     def _fit(

@@ -41,7 +41,7 @@ class Calibration:
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
     extrinsics: bool = False  # whether T_cam0_imu is estimated
     timing: bool = False  # whether the offset is estimated
-    stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))  # (8,) coefficients of (R3) and (R4)
+    stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))  # (10,) coefficients of (R3) and (R4)
     stereo_field: bool = False  # whether those of (R3) are estimated
     metric: bool = False  # whether those of (R4) are
 
@@ -123,7 +123,7 @@ class Calibration:
         return estimate
 
     def full(self, error: FloatArray) -> FloatArray:
-        """Fill an error (..., C) up to (..., 13) with zeros."""
+        """Fill an error (..., C) up to (..., 17) with zeros."""
         out = np.zeros((*error.shape[:-1], _FULL))
         out[..., self.columns] = error
         return out
@@ -154,7 +154,8 @@ def calibration_covariance(calibration: Calibration, settings: MsckfSettings) ->
     s = settings
     yaw, other = np.radians(s.stereo_yaw_sigma_deg), s.stereo_field_sigma
     metric = [s.stereo_baseline_sigma, s.stereo_focal_sigma]
-    stereo = np.array([yaw, other, other, _RADIAL * other, other, other, *metric])
+    right, both = [yaw, other, other, other], [_RADIAL * other, _RADIAL * other, other, other]
+    stereo = np.array([*right, *both, *metric])
     rotation, rotation_walk = np.radians([s.extrinsic_rotation_sigma_deg, s.extrinsic_rotation_walk])
     pose = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
     pose_walk = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])

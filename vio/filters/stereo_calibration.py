@@ -2,9 +2,9 @@
 
 A right camera that is turned, shifted or distorted against its calibration moves the right pixels by a smooth field.
 Its rows show in `vl - vr` at once. Its columns look like depth: only motion, which gives the same points a second
-depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three of the six terms of the columns; the
-other three are states, and so are three terms of distortion that both lenses have in common. With a metric sensor, so
-are the length of the baseline and the focal length, equation (R4).
+depth, separates them. Equations (R1) to (R3) of docs/math.md: rows give three terms of the columns; four others are
+states, and so are four terms of distortion that both lenses have in common. With a metric sensor, so are the length of
+the baseline and the focal length, equation (R4).
 References: Dang, Hoffmann & Stiller, Continuous stereo self-calibration by camera parameter tracking, IEEE TIP (2009);
 Cvisic, Markovic & Petrovic, Recalibrating the KITTI dataset camera setup for improved odometry accuracy, ECMR (2021).
 """
@@ -22,10 +22,11 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray, Observations
 from vio.robust import median
 
-FIELD_TERMS = 6  # a0, a1, a2, k, q1, q2 of (R3)
+RIGHT_TERMS = 4  # a0, a1, a2, a3 of (R3), of the right columns
+FIELD_TERMS = 8  # those, and k1, k2, q1, q2 of both lenses
 METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
 TERMS = FIELD_TERMS + METRIC_TERMS
-_ROW_TERMS = 6
+ROW_TERMS = 7  # of (R2)
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
 _LEAST_ROWS_PX = 0.05  # root mean square of the field over the matches; smaller ones do no harm
@@ -46,17 +47,17 @@ def field_jacobian(camera: StereoCamera, z: FloatArray, first: int = 0, terms: i
 
 
 def _row_terms(camera: StereoCamera, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (N, 6) of right minus left rows by the coefficients of (R2), and (N, 3) by k, q1, q2 of (R3).
+    """Derivatives (N, 7) of right minus left rows by the coefficients of (R2), and (N, 4) by k1, k2, q1, q2 of (R3).
 
     In focal lengths, of pixels (N, 4).
     """
     if camera.is_cylinder:
-        basis, common = np.empty((len(z), _ROW_TERMS)), np.empty((len(z), 3))
+        basis, common = np.empty((len(z), ROW_TERMS)), np.empty((len(z), FIELD_TERMS - RIGHT_TERMS))
         loops.cylinder_rows(loops.lens_of(camera), np.ascontiguousarray(z), basis, common)
         return basis, common
-    x, y = (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
-    basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1)
-    return basis, _common_rows((z[:, 0] - camera.cu) / camera.fu, x, y)
+    left, x, y = (z[:, 0] - camera.cu) / camera.fu, (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
+    basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y, left - x], axis=1)
+    return basis, _common_rows(left, x, y)
 
 
 class RowField:
@@ -64,13 +65,14 @@ class RowField:
 
     def __init__(self, camera: StereoCamera) -> None:
         self._camera = camera
-        self._A: FloatArray = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
-        self._b: FloatArray = np.zeros(_ROW_TERMS)
-        self._common: FloatArray = np.zeros((_ROW_TERMS, 3))  # right sides if the rows were those of k, q1, q2 alone
+        self._A: FloatArray = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
+        self._b: FloatArray = np.zeros(ROW_TERMS)
+        # Right sides if the rows were those of k1, k2, q1, q2 alone.
+        self._common: FloatArray = np.zeros((ROW_TERMS, FIELD_TERMS - RIGHT_TERMS))
         self._squares = self._count = 0.0  # of the rows' residuals, in the same memory
         self._matches = 0  # of the last frame
         self.rms_px = 0.0  # of the field over the matches
-        self.coefficients: FloatArray = np.zeros(_ROW_TERMS)  # of 1, x, y, x y, x^2, y^2, in focal lengths
+        self.coefficients: FloatArray = np.zeros(ROW_TERMS)  # of 1, x, y, x y, x^2, y^2, d, in focal lengths
 
     def update(self, seen: Observations) -> None:
         """Take in the rows of a frame's matches, with Cauchy weights against mismatches."""
@@ -87,7 +89,7 @@ class RowField:
         self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
         self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
         self._common = _ROW_MEMORY * self._common + (basis * weight[:, None]).T @ common
-        prior = (1 - _ROW_MEMORY) * np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
+        prior = (1 - _ROW_MEMORY) * np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
         solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
         self.coefficients = solution / camera.fv
         field, self._matches = basis @ solution, len(z)
@@ -96,20 +98,20 @@ class RowField:
         self.rms_px = float(np.sqrt(np.mean(field**2)))
 
     def without_common(self, stereo: FloatArray) -> FloatArray:
-        """Return the coefficients (6,) without what the distortion of both lenses, in (6,) of (R3), does to rows.
+        """Return the coefficients (7,) without what the distortion of both lenses, in (8,) of (R3), does to rows.
 
         Both lenses bend a near point differently, as it lies at different places in the two images.
         """
-        prior = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
-        return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[3:]))
+        prior = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
+        return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[RIGHT_TERMS:]))
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance (6, 6) of the coefficients, in squared focal lengths."""
+        """Covariance (7, 7) of the coefficients, in squared focal lengths."""
         # Rows of one feature share their error from frame to frame, so only the features of one frame count as many.
         shared = max(self._count / max(self._matches, 1), 1.0)
         noise = self._squares / max(self._count, 1.0) if self._count else 1.0
-        prior = np.eye(_ROW_TERMS) / _ROW_PRIOR_PX**2
+        prior = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
         P = noise * shared * np.linalg.inv(self._A + prior)
         return np.asarray(P / self._camera.fv**2, dtype=np.float64)
 
@@ -117,15 +119,16 @@ class RowField:
     def is_significant(self) -> bool:
         """Whether the rows show that the calibration is off: a field beyond its own uncertainty, and beyond harm."""
         # The features of one frame count, as in the covariance.
-        uncertainty = _ROW_TERMS * self._squares / max(self._count, 1.0) / max(self._matches, 1)
+        uncertainty = ROW_TERMS * self._squares / max(self._count, 1.0) / max(self._matches, 1)
         noise = self._squares / max(self._count, 1.0)
         return self.rms_px**2 > max(_LEAST_ROWS_PX**2 + _ROW_SIGNIFICANCE * uncertainty, _ROW_DOMINANCE * noise)
 
 
 def _common_rows(x: FloatArray, xr: FloatArray, y: FloatArray) -> FloatArray:
-    """Derivatives (N, 3) of right minus left rows, in focal lengths, by k, q1 and q2 of (R3)."""
+    """Derivatives (N, 4) of right minus left rows, in focal lengths, by k1, k2, q1 and q2 of (R3)."""
     squares = xr * xr - x * x
-    return np.stack([y * squares, squares, 2 * y * (xr - x)], axis=1)
+    fourth = squares * (xr * xr + x * x + 2 * y * y)
+    return np.stack([y * squares, y * fourth, squares, 2 * y * (xr - x)], axis=1)
 
 
 def _centred(values: FloatArray) -> FloatArray:
@@ -137,8 +140,8 @@ class StereoField:
     """The field at the present estimate: what is taken out of the pixels."""
 
     camera: StereoCamera
-    rows: FloatArray  # (6,) of (R2), in focal lengths; zero where the rows show no fault
-    coefficients: FloatArray  # (8,) of (R3) and (R4)
+    rows: FloatArray  # (7,) of (R2), in focal lengths; zero where the rows show no fault
+    coefficients: FloatArray  # (10,) of (R3) and (R4)
     terms: IntArray  # (S,) which of them are estimated
 
     def jacobian(self, z: FloatArray) -> FloatArray:

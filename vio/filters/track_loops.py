@@ -533,14 +533,16 @@ def eliminate_tracks(
 def stereo_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray) -> None:
     """Write the derivatives (M, 4, S) of pixels (M, 4) by S coefficients of (R3) and (R4), from the `first` one on."""
     fu, fv, cu, cv, _, _ = lens
-    H = np.zeros((4, 8))
+    H = np.zeros((4, 10))
     for m in range(len(z)):
         x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
         r2, rr2 = x * x + y * y, xr * xr + y * y
-        H[0, 3], H[0, 4], H[0, 5], H[0, 7] = fu * x * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x), fu * x
-        H[1, 3], H[1, 4], H[1, 5], H[1, 7] = fv * y * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y, fv * y
-        H[2, 0], H[2, 1], H[2, 2], H[2, 6], H[2, 7] = fu, fu * xr, fu * rr2, z[m, 2] - z[m, 0], fu * xr
-        H[2, 3], H[2, 4], H[2, 5] = fu * xr * rr2, fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
+        H[0, 4], H[0, 5], H[0, 6], H[0, 7] = fu * x * r2, fu * x * r2 * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
+        H[1, 4], H[1, 5], H[1, 6], H[1, 7] = fv * y * r2, fv * y * r2 * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y
+        H[2, 0], H[2, 1], H[2, 2], H[2, 3] = fu, fu * xr, fu * rr2, fu * rr2 * rr2
+        H[2, 4], H[2, 5] = fu * xr * rr2, fu * xr * rr2 * rr2
+        H[2, 6], H[2, 7] = fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
+        H[2, 8], H[0, 9], H[1, 9], H[2, 9] = z[m, 2] - z[m, 0], fu * x, fv * y, fu * xr
         for a in range(4):
             for s in range(out.shape[2]):
                 out[m, a, s] = H[a, first + s]
@@ -550,17 +552,19 @@ def stereo_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray
 def correct_pixels(
     lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
-    """Write pixels (M, 4) without the field of (R3) and (R4), (8,), and what follows from the rows (6,) of (R2)."""
+    """Write pixels (M, 4) without the field of (R3) and (R4), (10,), and what follows from the rows (7,) of (R2)."""
     fu, fv, cu, cv, _, _ = lens
-    a0, a1, a2, k, q1, q2, baseline, focal = coefficients
+    a0, a1, a2, a3, k1, k2, q1, q2, baseline, focal = coefficients
     by_focal, by_both = np.exp(-focal), np.exp(-focal - baseline)
     metric = baseline != 0.0 or focal != 0.0
     for m in range(len(z)):
         x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
         r2, rr2 = x * x + y * y, xr * xr + y * y
-        left = x * r2 * k + 2.0 * x * y * q1 + (r2 + 2.0 * x * x) * q2
-        row = y * r2 * k + (r2 + 2.0 * y * y) * q1 + 2.0 * x * y * q2
-        right = a0 + a1 * xr + a2 * rr2 + xr * rr2 * k + 2.0 * xr * y * q1 + (rr2 + 2.0 * xr * xr) * q2
+        radial, right_radial = r2 * (k1 + r2 * k2), rr2 * (k1 + rr2 * k2)
+        left = x * radial + 2.0 * x * y * q1 + (r2 + 2.0 * x * x) * q2
+        row = y * radial + (r2 + 2.0 * y * y) * q1 + 2.0 * x * y * q2
+        right = a0 + a1 * xr + rr2 * (a2 + rr2 * a3)
+        right += xr * right_radial + 2.0 * xr * y * q1 + (rr2 + 2.0 * xr * xr) * q2
         right += -rows[1] * y + (rows[5] - rows[4]) * xr * y - rows[3] * y * y
         out[m, 0] = z[m, 0] - fu * left if weight[m, 0] > 0.0 else z[m, 0]
         out[m, 1] = z[m, 1] - fv * row if weight[m, 1] > 0.0 else z[m, 1]
@@ -593,43 +597,44 @@ def _lens_plane(x: float, azimuth: float) -> tuple[float, float, float, float, f
 
 @compiled
 def cylinder_terms(x: float, azimuth: float, out: FloatArray) -> None:
-    """Write by how much (2, 12) a right camera's coordinates on a cylinder move, for one unit of each coefficient.
+    """Write by how much (2, 14) a right camera's coordinates on a cylinder move, for one unit of each coefficient.
 
-    Columns: a0, a1, a2, k, q1, q2 of the states, then the six of the rows, equation (R6).
+    Columns: a0 to a3, k1, k2, q1, q2 of the states, then the first six of the rows, equation (R6).
     """
     u, v, xx, xy, yx, yy = _lens_plane(x, azimuth)
     s, c, r2 = np.sin(azimuth), np.cos(azimuth), u * u + v * v
     # What moves in the lens, in angles off the axis; then on the cylinder.
-    lens_u = 4.0, u, r2, r2 * u, 2.0 * u * v, r2 + 2.0 * u * u, 0.0, 0.0, 0.0, 0.0, 0.0, r2 * u
-    lens_v = 0.0, 0.0, 0.0, r2 * v, r2 + 2.0 * v * v, 2.0 * u * v, 0.0, 0.0, v, 0.0, 3.0, r2 * v
-    for j in range(12):
+    r4 = r2 * r2
+    lens_u = 4.0, u, r2, r4, r2 * u, r4 * u, 2.0 * u * v, r2 + 2.0 * u * u, 0.0, 0.0, 0.0, 0.0, 0.0, r2 * u
+    lens_v = 0.0, 0.0, 0.0, 0.0, r2 * v, r4 * v, r2 + 2.0 * v * v, 2.0 * u * v, 0.0, 0.0, v, 0.0, 3.0, r2 * v
+    for j in range(14):
         out[0, j] = xx * lens_u[j] + xy * lens_v[j]
         out[1, j] = yx * lens_u[j] + yy * lens_v[j]
     # The turns about y, z and x.
     out[0, 0] -= 3.0 * (1.0 + x * x) * c
     out[1, 0] -= 3.0 * x * s
-    out[0, 9] += (1.0 + x * x) * c
-    out[1, 9] += x * s
-    out[0, 7] -= (1.0 + x * x) * s
-    out[1, 7] += x * c
-    out[1, 6] += 1.0
-    out[1, 10] -= 3.0
+    out[0, 11] += (1.0 + x * x) * c
+    out[1, 11] += x * s
+    out[0, 9] -= (1.0 + x * x) * s
+    out[1, 9] += x * c
+    out[1, 8] += 1.0
+    out[1, 12] -= 3.0
 
 
 @compiled
 def cylinder_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray) -> None:
     """Write the same for a cylinder's pixels; by the coefficients of (R4), zero."""
     fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 12)), np.empty((2, 12))
+    left, right = np.empty((2, 14)), np.empty((2, 14))
     for m in range(len(z)):
         y = (z[m, 1] - cv) / fv
         cylinder_terms((z[m, 0] - cu) / fu, y, left)
         cylinder_terms((z[m, 2] - cu) / fu, y, right)
         for s in range(out.shape[2]):
             k = first + s
-            out[m, 0, s] = fu * left[0, k] if 3 <= k < 6 else 0.0
-            out[m, 1, s] = fv * left[1, k] if 3 <= k < 6 else 0.0
-            out[m, 2, s] = fu * right[0, k] if k < 6 else 0.0
+            out[m, 0, s] = fu * left[0, k] if 4 <= k < 8 else 0.0
+            out[m, 1, s] = fv * left[1, k] if 4 <= k < 8 else 0.0
+            out[m, 2, s] = fu * right[0, k] if k < 8 else 0.0
             out[m, 3, s] = 0.0
 
 
@@ -637,40 +642,44 @@ def cylinder_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArr
 def correct_cylinder_pixels(
     lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
-    """Write a cylinder's pixels (M, 4) without the field of (R3), (8,), and what follows from the rows (6,) of (R2)."""
+    """Write a cylinder's pixels (M, 4) without the field of (R3), (10,), and what the rows (7,) of (R2) tell."""
     fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 12)), np.empty((2, 12))
+    left, right = np.empty((2, 14)), np.empty((2, 14))
     for m in range(len(z)):
         y = (z[m, 1] - cv) / fv
         for a in range(4):
             out[m, a] = z[m, a]
         if weight[m, 0] > 0.0:
             cylinder_terms((z[m, 0] - cu) / fu, y, left)
-            for j in range(3, 6):
+            for j in range(4, 8):
                 out[m, 0] -= fu * left[0, j] * coefficients[j]
                 out[m, 1] -= fv * left[1, j] * coefficients[j]
         if weight[m, 2] > 0.0:
             cylinder_terms((z[m, 2] - cu) / fu, y, right)
+            for j in range(8):
+                out[m, 2] -= fu * right[0, j] * coefficients[j]
             for j in range(6):
-                out[m, 2] -= fu * (right[0, j] * coefficients[j] + right[0, 6 + j] * rows[j])
+                out[m, 2] -= fu * right[0, 8 + j] * rows[j]
+            out[m, 2] += rows[6] * (z[m, 2] - cu) * (z[m, 0] - z[m, 2]) / fu * np.sin(y)
 
 
 @compiled
 def cylinder_rows(lens: Lens, z: FloatArray, rows: FloatArray, common: FloatArray) -> None:
     """Write the derivatives of right minus left rows, in focal lengths, of a cylinder's pixels (M, 4).
 
-    By the coefficients of (R2), (M, 6), and by k, q1 and q2 of (R3), (M, 3).
+    By the coefficients of (R2), (M, 7), and by k1, k2, q1 and q2 of (R3), (M, 4).
     """
     fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 12)), np.empty((2, 12))
+    left, right = np.empty((2, 14)), np.empty((2, 14))
     for m in range(len(z)):
         y = (z[m, 1] - cv) / fv
         cylinder_terms((z[m, 0] - cu) / fu, y, left)
         cylinder_terms((z[m, 2] - cu) / fu, y, right)
         for j in range(6):
-            rows[m, j] = right[1, 6 + j]
-        for j in range(3):
-            common[m, j] = right[1, 3 + j] - left[1, 3 + j]
+            rows[m, j] = right[1, 8 + j]
+        rows[m, 6] = (z[m, 0] - z[m, 2]) / fu * np.cos(y)
+        for j in range(4):
+            common[m, j] = right[1, 4 + j] - left[1, 4 + j]
 
 
 @compiled

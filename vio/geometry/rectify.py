@@ -27,6 +27,7 @@ _MAX_TANGENT = 1.4  # beyond about 54 degrees off axis a planar image only stret
 PINHOLE_REACH = float(np.arctan(_MAX_TANGENT))  # radians
 _MAX_AZIMUTH = np.pi / 2  # of a cylinder's rows: further round, the rays of a lens of 195 degrees are its dark rim
 _MIN_TANGENT_WIDTH = 0.1
+_ROWS = 16  # of a map, computed at a time: the arrays between stay in the processor's cache
 _MAX_ROTATION_DEG = 30.0  # a camera that needs a larger rotation is not one half of a stereo pair
 
 
@@ -271,11 +272,14 @@ def _inner_rectangle(
 def _lookup(rectified: StereoCamera, camera: CameraModel, R_rect_cam: FloatArray) -> tuple[MapArray, MapArray]:
     assert rectified.width is not None
     assert rectified.height is not None
-    pixels = np.stack(np.meshgrid(np.arange(rectified.width), np.arange(rectified.height)), axis=-1)
-    rays = left_rays(rectified, pixels)
-    uv, valid = project_point(camera, rays @ R_rect_cam)
-    uv = np.where(valid[..., None], uv, -1e4)
-    return uv[..., 0].astype(np.float32), uv[..., 1].astype(np.float32)
+    u, v = np.empty((2, rectified.height, rectified.width), dtype=np.float32)
+    for top in range(0, rectified.height, _ROWS):
+        rows = np.arange(top, min(top + _ROWS, rectified.height))
+        pixels = np.stack(np.meshgrid(np.arange(rectified.width), rows), axis=-1)
+        uv, valid = project_point(camera, left_rays(rectified, pixels) @ R_rect_cam)
+        uv = np.where(valid[..., None], uv, -1e4)
+        u[rows], v[rows] = uv[..., 0], uv[..., 1]
+    return u, v
 
 
 def undistorted(camera: CameraModel) -> tuple[StereoCamera, tuple[MapArray, MapArray]]:

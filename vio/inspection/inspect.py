@@ -9,13 +9,14 @@ import numpy as np
 from vio.geometry.rectify import field_of_view
 from vio.inspection.finding import Inspection, Part
 from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
-from vio.inspection.pictures import images_part, rows_part
+from vio.inspection.pictures import depths_part, images_part, rows_part
 from vio.inspection.times import frames_part, imu_clock_part
 from vio.protocols import Dataset, Frontend
 from vio.records import ImuRecord, ImuSample, Recording, StereoFrame
+from vio.watch.finding import InertialFinding
 from vio.watch.inertial import InertialCheck
 
-PAIRS = 12  # looked at, spread over the recording
+PAIRS = 12  # or single images looked at, spread over the recording
 TRACKED = 60  # frames tracked to compare the IMU with the images' motion
 _VIDEO_FRAMES = 300  # of a video, which can only be decoded in order
 _SHORT_M, _LONG_M = 0.005, 5.0  # baselines outside are another unit
@@ -34,7 +35,7 @@ def inspect_recording(
     Args:
         dataset: the recording.
         build_frontend: makes the front end that tracks its features.
-        pairs: stereo pairs looked at.
+        pairs: frames looked at.
         tracked: frames tracked from the first on, to compare the IMU with the images; 0: none.
         progress: called with (done, total).
 
@@ -45,7 +46,9 @@ def inspect_recording(
     parts = [frames_part(recording), camera_part(recording)]
     if recording.has_images:
         frames = _spread(dataset, pairs, progress)
-        parts += [images_part(frames), rows_part(frames)]
+        parts.append(images_part(frames))
+        if recording.camera.kind != "mono":
+            parts.append(rows_part(frames) if recording.camera.kind == "stereo" else depths_part(frames))
     parts += _imu_parts(dataset)
     if recording.has_images and tracked > 1:
         parts += _tracking_parts(dataset, build_frontend, min(tracked, len(recording.frame_times_ns)), progress)
@@ -54,21 +57,27 @@ def inspect_recording(
 
 
 def camera_part(recording: Recording) -> Part:
-    """Describe the rectified pair."""
+    """Describe the rectified pair, or the undistorted camera."""
     c = recording.camera
-    facts = {"fu": c.fu, "fv": c.fv, "cu": c.cu, "cv": c.cv, "baseline_m": c.baseline_m}
+    stereo = c.kind == "stereo"
+    facts: dict[str, object] = {"kind": c.kind, "fu": c.fu, "fv": c.fv, "cu": c.cu, "cv": c.cv}
+    facts |= {"baseline_m": c.baseline_m} if stereo else {}
     facts |= {"width": c.width or 0, "height": c.height or 0}
     known = c.width is not None and c.height is not None
     wide = " x ".join(f"{angle:.0f}" for angle in np.degrees(field_of_view(c))) if known else ""
     wide = f", {wide} deg" if known else ""
     faults = []
-    if not _SHORT_M <= c.baseline_m <= _LONG_M:
+    if stereo and not _SHORT_M <= c.baseline_m <= _LONG_M:
         faults.append(f"a baseline of {c.baseline_m:g} m is implausible; translations are metres: check the unit")
     if c.width is not None and c.height is not None and not (0 < c.cu < c.width and 0 < c.cv < c.height):
         faults.append(f"the principal point {c.cu:.0f}, {c.cv:.0f} lies outside the image; check its size")
-    one_px_m = c.fu * c.baseline_m  # the depth of one pixel of disparity
-    form = " to a cylinder" if c.is_cylinder else ""
-    text = f"rectified{form}: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, 1 px at {one_px_m:.0f} m"
+    if stereo:
+        one_px_m = c.fu * c.baseline_m  # the depth of one pixel of disparity
+        form = " to a cylinder" if c.is_cylinder else ""
+        text = f"rectified{form}: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, 1 px at {one_px_m:.0f} m"
+    else:
+        beside = "with depth images" if c.kind == "rgbd" else "alone"
+        text = f"one camera {beside}, undistorted: focal {c.fu:.1f} px{wide}"
     return Part("camera", text, facts, faults)
 
 
@@ -115,6 +124,7 @@ def _tracking_parts(
     tracked: list[int] = []
     matched: list[int] = []
     findings: list[str] = []
+    mono = recording.camera.kind == "mono"
     for event in dataset.events(0, frames):
         if isinstance(event, StereoFrame):
             output = frontend.process(event)
@@ -122,23 +132,31 @@ def _tracking_parts(
             matched.append(output.matched)
             progress(len(tracked), frames)
             if imu and check is not None:
-                findings += [f.message for f in check.frame(output.observations)]
+                findings += _messages(check.frame(output.observations), mono=mono)
         elif isinstance(event, ImuSample) and check is not None:
             check.imu(event)
     if imu and check is not None:
-        findings += [f.message for f in check.finish()]
+        findings += _messages(check.finish(), mono=mono)
     kept = float(np.median(tracked[1:])) if len(tracked) > 1 else 0.0
     facts = {"frames": len(tracked), "tracked_median": kept, "matched_median": float(np.median(matched or [0]))}
-    depth = np.median(matched or [0])
-    text = f"{kept:.0f} features from frame to frame, {depth:.0f} with depth (of {len(tracked)} frames)"
+    depth = "" if mono else f", {np.median(matched or [0]):.0f} with depth"
+    text = f"{kept:.0f} features from frame to frame{depth} (of {len(tracked)} frames)"
     faults = []
     if len(tracked) > 1 and kept < 8:
         faults.append("hardly any feature is tracked; the frames may not be consecutive, in disorder, dark or blurred")
     parts = [Part("tracking", text, facts, faults)]
     if imu:
-        verdict = "agrees with the motion of the images, as far as they move" if not findings else "see below"
+        verdict = "agrees with the motion of the images, as far as they move"
+        if mono:
+            verdict = "not compared: the motion of one camera has no scale"
+        verdict = "see below" if findings else verdict
         parts.append(Part("IMU against images", verdict, {"findings": findings}, findings))
     return parts
+
+
+def _messages(found: tuple[InertialFinding, ...], *, mono: bool) -> list[str]:
+    """Return findings of the IMU as lines; of one camera without its units, which the images then say nothing about."""
+    return [f.message for f in found if not (mono and f.group == "size")]
 
 
 def _reference_part(recording: Recording) -> Part:
@@ -155,11 +173,16 @@ def _reference_part(recording: Recording) -> Part:
 
 def _missing_part(recording: Recording) -> Part:
     """Say what the recording lacks, and what is lost with it."""
-    missing = []
-    if not recording.motion:
+    missing, faults = [], []
+    if recording.camera.kind == "mono" and ("imu" not in recording.motion or recording.T_cam0_imu is None):
+        missing.append("no IMU with T_cam0_imu")
+        faults.append(
+            "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu), depth images or a second camera"
+        )
+    elif not recording.motion:
         missing.append("no IMU, no velocity (images alone: no gravity, nothing carries the pose over blind frames)")
     elif recording.T_cam0_imu is None:
         missing.append("no T_cam0_imu")
     if recording.reference is None:
         missing.append("no ground truth (no ATE)")
-    return Part("missing", "; ".join(missing) or "nothing", {"missing": missing})
+    return Part("missing", "; ".join(missing) or "nothing", {"missing": missing}, faults)

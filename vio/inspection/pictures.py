@@ -1,4 +1,4 @@
-"""Brightness, sharpness and stereo rows of some pairs, spread over a recording."""
+"""Brightness, sharpness, depths and stereo rows of some frames, spread over a recording."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ _RANSAC_PX = 1.5
 _LEAST_MATCHES = 20  # a pair with fewer says nothing about the calibration
 _DARK, _BRIGHT, _FLAT = 12.0, 243.0, 3.0  # mean and standard deviation of gray levels of an image without content
 _ROWS_NOTE_PX, _ROWS_FAULT_PX = 0.3, 2.0  # the aim of docs/rectification.md; where matching along rows fails
+_NEAREST_M, _FARTHEST_M = 0.1, 30.0  # medians outside are another unit: structured light ends at 5 m, lidars at 20
 _LEAST_POSITIVE = 0.5  # share of matches with ul > ur; true pairs have nearly all
 
 
@@ -45,26 +46,48 @@ def exposure_of(image: Image) -> Exposure:
 
 def images_part(frames: Sequence[StereoFrame]) -> Part:
     """Describe the images of some frames."""
-    pairs = [(f.left, f.right) for f in frames if f.left is not None and f.right is not None]
-    if not pairs:
+    shown = [tuple(image for image in (f.left, f.right) if image is not None) for f in frames if f.left is not None]
+    cameras = max((len(images) for images in shown), default=0)
+    shown = [images for images in shown if len(images) == cameras]
+    if not shown:
         return Part("images", "none could be read", {}, ["no image could be read; see the warnings above"])
-    found = [[exposure_of(image) for image in side] for side in zip(*pairs, strict=True)]
+    found = [[exposure_of(image) for image in side] for side in zip(*shown, strict=True)]
     means = [float(np.mean([e.mean for e in side])) for side in found]
     clipped = max(e.clipped for side in found for e in side)
     sharpness = float(np.median([e.sharpness for side in found for e in side]))
-    height, width = pairs[0][0].shape
+    height, width = shown[0][0].shape
     facts = {"width": width, "height": height, "mean": means, "clipped": clipped, "sharpness": sharpness}
     faults = []
     flat = [e for side in found for e in side if e.spread < _FLAT or not _DARK < e.mean < _BRIGHT]
-    if len(flat) > len(pairs):
-        faults.append(f"{len(flat)} of {2 * len(pairs)} images are black, white or without content; mend the exposure")
-    if all(np.array_equal(left, right) for left, right in pairs):
+    if 2 * len(flat) > cameras * len(shown):
+        faults.append(
+            f"{len(flat)} of {cameras * len(shown)} images are black, white or without content; mend the exposure"
+        )
+    if cameras == 2 and all(np.array_equal(images[0], images[1]) for images in shown):
         faults.append("left and right are the same images, so there is no depth; give the other camera's images")
-    text = (
-        f"{width} x {height}, mean gray {means[0]:.0f} left and {means[1]:.0f} right, "
-        f"at most {100 * clipped:.1f} % at 0 or 255, sharpness {sharpness:.1f}"
-    )
+    gray = f"{means[0]:.0f} left and {means[1]:.0f} right" if cameras == 2 else f"{means[0]:.0f}"
+    text = f"{width} x {height}, mean gray {gray}, at most {100 * clipped:.1f} % at 0 or 255, sharpness {sharpness:.1f}"
     return Part("images", text, facts, faults)
+
+
+def depths_part(frames: Sequence[StereoFrame]) -> Part:
+    """Describe the depth images of some frames."""
+    depths = [f.depth for f in frames if f.depth is not None]
+    known = [depth[np.isfinite(depth) & (depth > 0)] for depth in depths]
+    share = float(np.mean([len(z) / depth.size for z, depth in zip(known, depths, strict=True)])) if depths else 0.0
+    z = np.concatenate([np.zeros(0), *known])
+    if not len(z):
+        fault = "no depth image holds a depth; check that they have 16 bits, and what their levels mean"
+        return Part("depth", "no depth is known", {"known": 0.0}, [fault])
+    near, middle, far = (float(q) for q in np.quantile(z, [0.05, 0.5, 0.95]))
+    faults = []
+    if not _NEAREST_M < middle < _FARTHEST_M:
+        faults.append(
+            f"the median depth is {middle:.3g} m, which is not that of a depth camera; check depth_factor (levels per "
+            "metre: 1000 for millimetres, 5000 for TUM RGB-D)"
+        )
+    text = f"{100 * share:.0f} % of the pixels have one, {near:.2f} to {far:.2f} m (90 %), median {middle:.2f} m"
+    return Part("depth", text, {"known": share, "near_m": near, "median_m": middle, "far_m": far}, faults)
 
 
 def rows_part(frames: Sequence[StereoFrame]) -> Part:

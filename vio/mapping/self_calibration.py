@@ -38,6 +38,7 @@ _PRIOR = np.array(
     [*[0.05, 0.005, 0.02, 0.02, 1e-2, 2e-3, 2e-3], *[np.radians(0.5)] * 3, *[5e-3] * 2, *[2e-3] * 4, *[2e-3] * 2]
 )
 _OF_RIGHT = {"cu": "right_cu", "cv": "right_cv", "fu": "right_fu", "fv": "right_fv"}  # in `stereo_field.PARAMETERS`
+_FREE = tuple(name for name in PARAMETERS if _OF_RIGHT.get(name, name) in NAMES)  # those estimated here
 INTRINSICS = ("focal", "aspect", "cu", "cv")
 # What lens models leave, beside the scatter: this and the sliding window differ by so much on the same drives.
 _LENS_DEG, _LENS_DIRECTION_DEG = 0.01, 0.3
@@ -102,15 +103,17 @@ class SelfCalibration:
         )
 
     def after(self, parameters: FloatArray) -> SelfCalibration:
-        """Return the calibration of pixels as they were before a field of parameters (12,) was taken out of them."""
+        """Return the calibration of pixels as they were before a field of parameters (14,) was taken out of them."""
         values = self.values.copy()
         for name, value in zip(PARAMETERS, parameters, strict=True):
-            values[NAMES.index(_OF_RIGHT.get(name, name))] += value
+            if name in _FREE:
+                values[NAMES.index(_OF_RIGHT.get(name, name))] += value
         return replace(self, values=values)
 
     def rig_parameters(self) -> FloatArray:
-        """Return what the right camera and both lenses are off by (12,), as `stereo_field.PARAMETERS` names it."""
-        return np.array([self.values[NAMES.index(_OF_RIGHT.get(name, name))] for name in PARAMETERS])
+        """Return what the right camera and both lenses are off by (14,), as `stereo_field.PARAMETERS` names it."""
+        values = [self.values[NAMES.index(_OF_RIGHT.get(name, name))] if name in _FREE else 0.0 for name in PARAMETERS]
+        return np.array(values)
 
 
 def intrinsics_of(camera: StereoCamera, found: SelfCalibration) -> Intrinsics | NotObservable:

@@ -259,7 +259,7 @@ def _measure_in_motion(
 
 
 def _corrected(camera: StereoCamera, tracks: FeatureTracks, off: FloatArray) -> FeatureTracks:
-    """Return tracks without the field of a pair that is off by parameters (12,)."""
+    """Return tracks without the field of a pair that is off by parameters (14,)."""
     return replace(tracks, z=field_of(camera, off).without(tracks.z, tracks.has_right)) if np.any(off) else tracks
 
 

@@ -10,12 +10,19 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
-from vio.datasets.euroc_files import camera_yaml, image_list_csv, image_name, imu_csv, imu_yaml, median_rate_hz
+from vio.datasets.euroc_files import (
+    camera_yaml,
+    image_list_csv,
+    image_name,
+    imu_csv,
+    imu_yaml,
+    median_rate_hz,
+    rig_read_as,
+)
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import NOISE_KEYS, kalibr_text
 from vio.errors import DataError
-from vio.geometry.distortion import rig_from_rectified
 from vio.offline.convert_bag import write_bag
 from vio.protocols import Dataset, Progress
 from vio.records import (
@@ -141,7 +148,7 @@ def _write_images(
 def _finish_euroc(out: Path, recording: Recording, written: _Written, noise: ImuDensities | None) -> list[str]:
     times = np.array(written.times_ns, dtype=np.int64)
     T_cam0_imu = recording.T_cam0_body
-    rig, mav = rig_from_rectified(recording.camera, T_cam0_imu), out / "mav0"
+    rig, mav = rig_read_as(recording.camera, T_cam0_imu), out / "mav0"
     for name, camera, T_imu_cam in (("cam0", rig.cam0, rig.T_imu_cam0), ("cam1", rig.cam1, rig.T_imu_cam1)):
         text = camera_yaml(camera, T_imu_cam, comment=f"rectified {name}", rate_hz=median_rate_hz(times))
         write_text(mav / name / "sensor.yaml", text)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vio.evaluation import lengths_text
+from vio.evaluation import lengths_text, rotation_drift_text
 from vio.finished_run import FinishedRun
 
 _MOTION = {"imu": "an IMU", "velocity": "velocities", "none": "images alone"}
@@ -41,7 +41,7 @@ def summary(run: FinishedRun) -> list[str]:
         if evaluation.kitti is not None:
             lines.append(
                 f"Drift over {lengths_text(evaluation.kitti.lengths_m)} is {evaluation.kitti.t_err_percent:.2g} % and "
-                f"{evaluation.kitti.r_err_deg_per_100m:.2g} deg per 100 m."
+                f"{rotation_drift_text(evaluation.kitti.r_err_deg_per_100m, evaluation.kitti.lengths_m, 2)}."
             )
     lines.append(_speed(run))
     nis = np.nanmedian(run.frames["nis_per_dof"]) if np.isfinite(run.frames["nis_per_dof"]).any() else None
@@ -90,7 +90,7 @@ def figures_of(run: FinishedRun) -> dict[str, str]:
         "largest error (m)": "–" if evaluation is None else f"{evaluation.ate_m.max:.4f}",
         "attitude error (deg)": "–" if evaluation is None else f"{evaluation.ate_deg.rmse:.3f}",
         "drift (%)": "–" if kitti is None else f"{kitti.t_err_percent:.3f}",
-        "drift (deg/100 m)": "–" if kitti is None else f"{kitti.r_err_deg_per_100m:.3f}",
+        "drift of rotation": "–" if kitti is None else rotation_drift_text(kitti.r_err_deg_per_100m, kitti.lengths_m),
         "features used, median": f"{np.nanmedian(run.frames['used']):.0f}",
         "ms a frame, mean": f"{np.nanmean(work):.1f}",
         "ms a frame, 95 %": f"{np.nanpercentile(work, 95):.1f}",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 
 _LEFT = "world/run/camera"  # the left camera; below it, what is drawn into its image
 _MARKS = ("features", "tracks_by_age")
+_OUTLINE = f"{_LEFT}/outline"  # of what a camera sees whose image is not a pinhole's
+_SIDE = 25  # points of a side of it
+_OUTLINE_BASELINES = 5.0  # distance from the camera at which it is drawn
 _SHARE = 0.08  # of the run's time that images, tracks and points may take; the rest is drawn in every frame
 _WIDEST_PX = 752  # images are shown at this width at most
 _JPEG_QUALITY = 75
@@ -177,11 +181,13 @@ class RerunViewer:
         import rerun.blueprint as rrb
 
         plots = rrb.Tabs(*(rrb.TimeSeriesView(origin=f"plots/{name}", name=name) for name in SERIES))
+        camera = self._rig.camera
+        flat = (*_MARKS, "image") if camera.is_cylinder else _MARKS  # a pinhole's image is also drawn in space
+        in_space = ["+ $origin/**", *(f"- /{_LEFT}/{name}" for name in flat)]
+        in_image = ["+ $origin/**", f"- /{_OUTLINE}"]
         views = rrb.Horizontal(
-            rrb.Spatial3DView(
-                origin="world", name="world", contents=["+ $origin/**", *(f"- /{_LEFT}/{name}" for name in _MARKS)]
-            ),
-            rrb.Vertical(rrb.Spatial2DView(origin=_LEFT, name="left image"), plots),
+            rrb.Spatial3DView(origin="world", name="world", contents=in_space),
+            rrb.Vertical(rrb.Spatial2DView(origin=_LEFT, name="left image", contents=in_image), plots),
         )
         self._stream.send_blueprint(rrb.Blueprint(views, collapse_panels=True))
         self._stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -189,8 +195,12 @@ class RerunViewer:
         self._stream.log(_LEFT, rr.AnnotationContext(legend), static=True)
         for name, series in SERIES.items():
             self._stream.log(f"plots/{name}", rr.SeriesLines(names=list(series)), static=True)
-        camera, scale = self._rig.camera, self._scale
-        size = scale * np.array([camera.width or 2 * camera.cu, camera.height or 2 * camera.cv])
+        if camera.is_cylinder:
+            strips = [_OUTLINE_BASELINES * camera.baseline_m * strip for strip in outline(camera)]
+            self._stream.log(_OUTLINE, rr.LineStrips3D(strips, colors=_STATES["used"]), static=True)
+            return
+        scale = self._scale
+        size = scale * np.array(_size(camera))
         focal, centre = scale * np.array([camera.fu, camera.fv]), self._pixels(np.array([camera.cu, camera.cv]))
         self._stream.log(_LEFT, rr.Pinhole(focal_length=focal, principal_point=centre, resolution=size), static=True)
 
@@ -305,6 +315,23 @@ class RerunViewer:
         T_world_cam0 = estimate.T_world_imu @ se3_inverse(self._rig.T_cam0_body)
         points = rr.Points3D(transform_points(T_world_cam0, p_cam), radii=rr.Radius.ui_points(2))
         self._stream.log("world/run/points_of_this_frame", points)
+
+
+def _size(camera: StereoCamera) -> tuple[float, float]:
+    """Return width and height of the left image, pixels; of features alone, what the principal point suggests."""
+    return camera.width or 2 * camera.cu, camera.height or 2 * camera.cv
+
+
+def outline(camera: StereoCamera) -> list[FloatArray]:
+    """Return lines (N, 3) in the cam0 frame: the left image's border at depth 1, and from the camera to its corners.
+
+    The border of a pinhole is a plane rectangle, that of a cylinder lies on the cylinder about the baseline.
+    """
+    width, height = _size(camera)
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height], [0, 0]]) - 0.5
+    share = np.linspace(0, 1, _SIDE)[:, None]
+    border = np.concatenate([a + share * (b - a) for a, b in pairwise(corners)])
+    return [left_rays(camera, border), *(np.stack([np.zeros(3), ray]) for ray in left_rays(camera, corners[:4]))]
 
 
 def states_of(seen: Observations, chosen: BoolArray, report: UpdateReport) -> IntArray:

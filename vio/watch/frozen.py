@@ -1,4 +1,4 @@
-"""Find image pairs that show no motion although the rig moves: frames that a camera or driver gives again.
+"""Find images and depth images that show no motion although the rig moves: a camera or driver gives them again.
 
 Equal to the last bit is the same exposure, as noise differs from one to the next. Nearly equal pairs (encoded again, or
 with noise on top) are the same where the tracked corners have not moved, while the motion predicted since the last
@@ -51,6 +51,8 @@ class FrozenImages:
         self._shown: StereoFrame | None = None  # the last frame that is no repetition
         self._seen: Observations | None = None  # its features
         self._repeating: Repeated | None = None  # of the frame before
+        self._deep: StereoFrame | None = None  # the last frame with a depth image that is no repetition
+        self._same_depth = False  # that of the frame before was one
         self._expected: Prediction | None = None  # of the present frame
         self._errors_px: deque[float] = deque(maxlen=_RECENT)  # median error of each frame's predicted pixels
 
@@ -80,6 +82,20 @@ class FrozenImages:
         if self._repeating is None:
             self._shown = frame
         return self._repeating
+
+    def check_depth(self, frame: StereoFrame) -> Repeated | None:
+        """Return which frame's depth image a frame repeats; None: it is new, or the rig is at standstill.
+
+        Call it after `check`, with frames whose images are new.
+        """
+        before, depth = self._deep, frame.depth
+        if depth is None:
+            return None
+        if before is None or before.depth is None or not _same_depths(depth, before.depth):
+            self._deep, self._same_depth = frame, False
+            return None
+        self._same_depth = self._same_depth or self._moves(self._expected)
+        return Repeated(before.index, True) if self._same_depth else None
 
     def _compare(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
         shown = self._shown
@@ -131,6 +147,11 @@ def _equal(a: Image, b: Image) -> bool:
     return np.array_equal(a[:_FIRST_ROWS], b[:_FIRST_ROWS]) and np.array_equal(a, b)
 
 
+def _same_depths(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two depth images (H, W) are the same to the bit; without any depth they are of a scene out of range."""
+    return a.shape == b.shape and np.array_equal(a, b, equal_nan=True) and bool(np.any(a > 0))
+
+
 def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float) -> Observations:
     """The features of the last frame that the prediction moves clearly in the left image."""
     _, a, b = np.intersect1d(seen.ids, expected.tracks.ids, assume_unique=True, return_indices=True)
@@ -153,10 +174,38 @@ def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     return True
 
 
-class RepeatReport:
-    """Reports pairs that were given again: the first one, long rows of them, and their number."""
+@dataclass(frozen=True, slots=True)
+class RepeatWords:
+    """How a report names what was given again."""
 
-    def __init__(self) -> None:
+    what: str
+    exact: str
+    cause: str
+    effect: str
+    summary: str
+
+
+IMAGES = RepeatWords(
+    "images",
+    "both images are the same to the last bit",
+    "the camera or its driver gave them again",
+    "the pose is a prediction",
+    "repeated earlier images and were left out",
+)
+DEPTHS = RepeatWords(
+    "depth images",
+    "the depth image is the same to the last bit",
+    "the depth camera or its driver gave it again",
+    "its features have no depth",
+    "repeated earlier depth images, which were left out",
+)
+
+
+class RepeatReport:
+    """Reports what was given again: the first time, long rows of it, and its number."""
+
+    def __init__(self, words: RepeatWords) -> None:
+        self._words = words
         self._row: list[StereoFrame] = []  # frames of the present row
         self._reported = 0
         self._total = 0
@@ -172,27 +221,25 @@ class RepeatReport:
         if len(self._row) > 1 or self._reported >= _MOST_LINES:
             return lines
         self._reported += 1
-        seen = "are the same to the last bit" if repeated.exact else "show nothing that has moved"
-        cause = (
-            "the camera or its driver gave them again"
-            if repeated.exact
-            else "the camera or its driver gave them again, or it sees only what moves with it"
-        )
+        seen = self._words.exact if repeated.exact else "both images show nothing that has moved"
+        cause = self._words.cause if repeated.exact else f"{self._words.cause}, or it sees only what moves with it"
         return [
-            f"frame {frame.index}: both images {seen} since frame {repeated.of_index} although the rig moves: {cause}; "
-            "left out, the pose is a prediction"
+            f"frame {frame.index}: {seen} since frame {repeated.of_index} although the rig moves: {cause}; "
+            f"left out, {self._words.effect}"
         ]
 
     def finish(self) -> list[str]:
         """Return the line at the end of the run."""
-        still = [f"the images stayed the same from frame {self._row[0].index} to the end"] if self._row else []
-        return [*still, f"{self._total} frames repeated earlier images and were left out"] if self._total > 1 else still
+        what, effect = self._words.what, self._words.summary
+        still = [f"the {what} stayed the same from frame {self._row[0].index} to the end"] if self._row else []
+        return [*still, f"{self._total} frames {effect}"] if self._total > 1 else still
 
     def _ended(self, frame: StereoFrame) -> list[str]:
         if len(self._row) < 2:
             return []
         seconds = (frame.time_ns - self._row[0].time_ns) * _NS
-        return [f"frame {frame.index}: the images change again, after {len(self._row)} repetitions ({seconds:.2f} s)"]
+        row = f"{len(self._row)} repetitions ({seconds:.2f} s)"
+        return [f"frame {frame.index}: the {self._words.what} change again, after {row}"]
 
 
 def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:

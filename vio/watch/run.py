@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, ImuSample, MotionSample, Observations, Prediction, StereoFrame, UpdateReport
-from vio.watch.frozen import FrozenImages, RepeatReport
+from vio.watch.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.watch.health import RunHealth
 from vio.watch.imu_faults import ImuFaultReport
 from vio.watch.silence import ImuSilence
@@ -19,6 +22,8 @@ if TYPE_CHECKING:
     from vio.watch.inertial import InertialCheck
 
 log = logging.getLogger(__name__)
+
+_PREVENTS_START = ("size", "overlap")  # groups of faults without whose cure one camera finds no scale
 
 
 class RunWatch:
@@ -36,7 +41,7 @@ class RunWatch:
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
-        self._frozen, self._repeats = FrozenImages(), RepeatReport()
+        self._frozen, self._repeats, self._depths = FrozenImages(), RepeatReport(IMAGES), RepeatReport(DEPTHS)
         self._repeated = False  # the present frame shows an earlier exposure
         if imu:
             from vio.watch.inertial import InertialCheck  # it loads scipy.optimize
@@ -49,6 +54,7 @@ class RunWatch:
         self.frames_waiting = 0  # that have no pose, as the back end had not begun
         self._waiting_since: int | None = None
         self._waits_for = ""
+        self._imu_at_fault = False
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
@@ -92,6 +98,14 @@ class RunWatch:
         self._repeated = repeated is not None
         self._report(self._repeats.frame(frame, repeated))
         return self._repeated
+
+    def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
+        """Return a frame that `repeats` let pass, without its depths where they are those of an earlier frame."""
+        if frame.depth is None:
+            return frame
+        repeated = self._frozen.check_depth(frame)
+        self._report(self._depths.frame(frame, repeated))
+        return frame if repeated is None else replace(frame, depth=np.zeros_like(frame.depth))
 
     def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
         """Add the front end's observations, before feature selection, and what it says of the images."""
@@ -159,9 +173,7 @@ class RunWatch:
             self._report(
                 [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
             )
-        if self._waiting_since is not None:
-            self._report([f"one camera: {self.frames_waiting} frames have no pose; {self._waits_for}"])
-        self._report(self._repeats.finish())
+        self._report([*self._repeats.finish(), *self._depths.finish()])
         if self._silence is not None:
             self._report(self._silence.finish())
         if self._faults is not None:
@@ -171,9 +183,14 @@ class RunWatch:
             if self._faults is not None and self._faults.stuck_at_end:  # which is no matter of clocks
                 findings = tuple(f for f in findings if f.group != "overlap")
             self._report_findings(findings)
+        if self._waiting_since is not None:
+            why = "mend the fault of the IMU that is named above first" if self._imu_at_fault else self._waits_for
+            self._report([f"one camera: {self.frames_waiting} frames have no pose; {why}"])
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
         """Log findings; gaps are reported one by one by `ImuSilence`."""
+        findings = tuple(findings)
+        self._imu_at_fault |= any(f.certain and f.group in _PREVENTS_START for f in findings)
         self._report(finding.message for finding in findings if finding.fault != "IMU gap")
 
     def _report(self, lines: Iterable[str]) -> None:

@@ -6,6 +6,7 @@ import heapq
 from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,8 @@ class BagDataset:
     def _load(self, pair: _Pair) -> StereoFrame | BadFrame:
         """Decode and rectify one pair; runs in the prefetch thread."""
         images = []
-        for topic, fields, size in zip(self.roles.cameras, (pair.left, pair.right), self.sizes, strict=True):
+        of_both = zip(self.roles.cameras, (pair.left, pair.right), self.sizes, strict=True)
+        for topic, fields, size in islice(of_both, self.settings.cameras):
             where = f"{self.recording.path}, {topic.name}, frame {pair.index}"
             try:
                 image = gray_of(fields, where, compressed=topic.kind == COMPRESSED, white=self.white)
@@ -115,8 +117,10 @@ class BagDataset:
             except UnreadableImageError as error:
                 return BadFrame(pair.index, str(error))
             images.append(image)
-        left, right = self.rectifier(*images)
-        return StereoFrame(pair.index, int(self.recording.frame_times_ns[pair.index]), left, right)
+        time_ns = int(self.recording.frame_times_ns[pair.index])
+        if len(images) == 1:
+            return StereoFrame(pair.index, time_ns, self.rectifier.left(images[0]), None)
+        return StereoFrame(pair.index, time_ns, *self.rectifier(*images))
 
 
 def read_bag(path: Path, settings: DatasetSettings) -> BagDataset | OneCameraBag:

@@ -39,6 +39,8 @@ _SIDES = (
     ("image_0", "image_1"),
     ("0", "1"),
 )
+_TRANSPORT = "/compressed"  # what image_transport appends to the topic of the raw images
+_WHOLE = 0.9  # share of the other's messages that raw images must have, to be taken in the place of compressed ones
 _NO_GRAY = re.compile(r"depth|disparity|mask|label|semantic|thermal|theora|confidence|points", re.IGNORECASE)
 _TRUTH = re.compile(r"ground_?truth|\bgt\b|_gt|gt_|vicon|mocap|optitrack|leica|truth|vrpn", re.IGNORECASE)
 
@@ -72,12 +74,12 @@ def choose(topics: Sequence[Topic], named: str | None, where: str) -> tuple[Role
     """
     given = _named(topics, named, where)
     filled = [t for t in topics if t.count]
+    notes: list[str] = []
     if "left" in given and "right" in given:
         left, right = given["left"], given["right"]
         assert left is not None
     else:
-        left, right = _pair(filled, given, where)
-    notes: list[str] = []
+        left, right = _cameras(filled, given, where, notes)
     imu = given.get("imu") if "imu" in given else _single(filled, (IMU,), "imu", left, notes)
     reference = given["reference"] if "reference" in given else _reference(filled, notes)
     velocity = given.get("velocity")
@@ -97,7 +99,7 @@ def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, 
         role, equals, name = (x.strip() for x in part.partition("="))
         if role not in _ROLES or not equals or not name:
             raise DataError(f"--topics {named!r}: {part!r} is no ROLE=/TOPIC; roles are {', '.join(_ROLES)}")
-        if name == "none" and role not in ("left", "right"):
+        if name == "none" and role != "left":
             given[role] = None
             continue
         topic = by_name.get(name) or by_name.get(f"/{name}")
@@ -112,13 +114,21 @@ def _named(topics: Sequence[Topic], named: str | None, where: str) -> dict[str, 
     return given
 
 
-def _pair(filled: Sequence[Topic], given: dict[str, Topic | None], where: str) -> tuple[Topic, Topic | None]:
-    """Choose the left and right image topic; None in the place of the right one where there is one image topic."""
+def _cameras(
+    filled: Sequence[Topic], given: dict[str, Topic | None], where: str, notes: list[str]
+) -> tuple[Topic, Topic | None]:
+    """Choose the left and right image topic; None in the place of the right one where there is one camera."""
     images = [t for t in filled if t.kind in (IMAGE, COMPRESSED) and not _NO_GRAY.search(t.name)]
     left_named = given.get("left")
     cameras = images if left_named is None or left_named in images else [*images, left_named]
-    if len(cameras) == 1 and "right" not in given:
-        return cameras[0], None
+    alone, others = _one_camera(cameras)
+    if alone is not None and given.get("right") is None:
+        if others and left_named is None:
+            same = f"{alone.name} is taken; {_list(others)} shows the same camera"
+            notes.append(f"{same} (choose with --topics left=/NAME)")
+        return left_named or alone, None
+    if "right" in given and given["right"] is None:
+        raise DataError(f"{where}: of {_list([t.name for t in images])}, name the camera: --topics left=/A,right=none")
     if len(images) < 2:
         have = _list([t.name for t in images])
         needed = "stereo needs two" if images else "one camera needs one, stereo two"
@@ -143,6 +153,15 @@ def _pair(filled: Sequence[Topic], given: dict[str, Topic | None], where: str) -
         names = _list([t.name for t in images])
         raise DataError(f"{where}: {what} ({names}); name them with --topics left=/A,right=/B")
     return pairs[0]
+
+
+def _one_camera(images: Sequence[Topic]) -> tuple[Topic | None, list[str]]:
+    """Return the topic of the only camera and its others, as one may be recorded raw and compressed; None: several."""
+    if len({t.name.removesuffix(_TRANSPORT) for t in images}) != 1:
+        return None, []
+    most = max(t.count for t in images)
+    best = min((t for t in images if t.count > _WHOLE * most), key=_rank)
+    return best, [t.name for t in images if t != best]
 
 
 def _replaced_last(name: str, a: str, b: str) -> str:

@@ -1,0 +1,217 @@
+"""Consistency of the calibration that the sliding-window filter estimates: NEES over flights whose rig is off.
+
+    python -m tools.calibration_consistency [--rigs RIG …] [--starts START …] [--runs 20] [--seconds 10]
+        [--pixel-sigma 0.5] [--jobs 2]
+
+Monte-Carlo flights as those of tools/consistency.py, each with a rig that is off by what the priors of the settings
+expect: the extrinsics of camera and IMU and their clocks, the right camera's attitude, or the length of the baseline.
+They begin in motion, at a velocity that the filter does not know, or at standstill. Prints NEES of what is estimated,
+halfway and at the end, in Markdown; docs/notes/consistency.md shows it.
+"""
+
+from __future__ import annotations
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Literal, get_args
+
+import numpy as np
+
+from tools.consistency import CAMERA, T_CAM0_IMU, Flight, Scenario
+from vio.errors import VioError
+from vio.evaluation import nees, nees_bounds
+from vio.filters.msckf import Msckf
+from vio.filters.settings import MsckfSettings
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
+from vio.geometry.stereo import left_rays
+from vio.records import Estimate, ImuSample, Observations
+from vio.threads import one_blas_thread
+
+Rig = Literal["camera-IMU", "right camera turned", "baseline"]
+RIGS: tuple[Rig, ...] = get_args(Rig)
+Start = Literal["motion", "standstill"]
+STARTS: tuple[Start, ...] = get_args(Start)
+_STILL_S = 0.75
+_FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
+_BEFORE, _AFTER = 10, 2  # frames of samples around the flight: for the first tilt, and for the offset of clocks
+_BASELINE_SIGMA = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Off:
+    """What a rig is off by; zero where it is right."""
+
+    xi: FloatArray  # (6,) in truth = T_cam0_imu exp(xi), m and rad
+    offset_s: float  # a frame stamped t was exposed at t + offset of the IMU's clock
+    turn: FloatArray  # (3,) rad: the right camera sees points p as exp(turn) p
+    baseline: float  # logarithm of the true baseline over the calibrated one
+
+
+class FromStandstill(Flight):
+    """The same way, begun at standstill."""
+
+    def state(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """As of `Flight`, at a time that begins to pass after a while, without a jump of the acceleration."""
+        s = np.maximum(t - _STILL_S, 0.0)
+        R, p, v = super().state(s**3 / (s**2 + 1))
+        return R, p, v * ((s**4 + 3 * s**2) / (s**2 + 1) ** 2)[:, None]
+
+
+def settings_of(rig: Rig, pixel_sigma_px: float) -> MsckfSettings:
+    """Return the filter's settings: the truth about all noise, and what is estimated of the rig."""
+    known = replace(Scenario(pixel_sigma_px=pixel_sigma_px).settings(learn_noise=False), calibrate_stereo="off")
+    if rig == "camera-IMU":
+        return replace(known, calibrate="both")
+    if rig == "baseline":
+        return replace(known, stereo_baseline_sigma=_BASELINE_SIGMA)
+    return replace(known, calibrate_stereo="on")
+
+
+def drawn(rig: Rig, settings: MsckfSettings, noise: np.random.Generator) -> Off:
+    """Draw what a rig is off by from the priors of the settings; turns about all axes from that about the vertical."""
+    s, right = settings, Off(np.zeros(6), 0.0, np.zeros(3), 0.0)
+    if rig == "camera-IMU":
+        sigmas = np.repeat([s.extrinsic_translation_sigma_m, np.radians(s.extrinsic_rotation_sigma_deg)], 3)
+        return replace(right, xi=noise.normal(0, sigmas), offset_s=float(noise.normal(0, s.time_offset_sigma_s)))
+    if rig == "baseline":
+        return replace(right, baseline=float(noise.normal(0, s.stereo_baseline_sigma)))
+    return replace(right, turn=noise.normal(0, np.radians(s.stereo_yaw_sigma_deg), 3))
+
+
+def fly(
+    rig: Rig, start: Start, seed: int, *, seconds: float = 10.0, pixel_sigma_px: float = 0.5
+) -> list[dict[str, float]]:
+    """Fly once; return NEES by what is estimated, halfway and at the end."""
+    scenario, flight = Scenario(seconds, pixel_sigma_px), Flight() if start == "motion" else FromStandstill()
+    settings, noise = settings_of(rig, pixel_sigma_px), np.random.default_rng(seed)
+    off = drawn(rig, settings, np.random.default_rng(10_000 + seed))
+    filt = Msckf(CAMERA, T_CAM0_IMU @ se3_inverse(se3_exp(off.xi)), settings, motion="imu")
+    R, p, _ = flight.state(np.arange(scenario.frames, dtype=np.float64) * 1e-9 * _FRAME_NS)
+    T = se3_from_parts(R, p)
+    samples = imu_samples(flight, scenario.frames, settings, off.offset_s, noise)
+    fed_ns, ahead_s = -1_000_000_000, 0.0
+    halves: list[dict[str, float]] = []
+    for k in range(scenario.frames):
+        # As in the pipeline: with the sample at or after the exposure, by the offset estimated so far.
+        while fed_ns < k * _FRAME_NS + round(1e9 * max(ahead_s, 0.0)):
+            fed_ns = samples[0].time_ns
+            filt.propagate(samples.pop(0))
+        filt.update(_seen(flight.frame(k, T[k], scenario, noise), off))
+        estimate = filt.estimate()
+        ahead_s = estimate.time_offset_s or 0.0
+        if k + 1 in (scenario.frames // 2, scenario.frames):
+            halves.append(calibration_nees(estimate, off))
+    return halves
+
+
+def imu_samples(
+    flight: Flight, frames: int, settings: MsckfSettings, offset_s: float, noise: np.random.Generator
+) -> list[ImuSample]:
+    """Return samples at 200 Hz from before the first frame to after the last, stamped `offset_s` ahead of the frames.
+
+    Biases are drawn from the prior, and then walk.
+    """
+    s, per_frame = settings, _FRAME_NS // _IMU_NS
+    k = np.arange(-_BEFORE * per_frame, (frames + _AFTER) * per_frame)
+    dt = 1e-9 * _IMU_NS
+    steps = noise.normal(0, 1, (len(k), 6)) * np.repeat([s.gyro_bias_walk, s.accel_bias_walk], 3) * np.sqrt(dt)
+    steps[0] = noise.normal(0, np.repeat([s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2], 3))
+    white = np.repeat([s.gyro_noise_density, s.accel_noise_density], 3) / np.sqrt(dt)
+    exact = np.concatenate(flight.rates(np.asarray(k * dt, dtype=np.float64)), axis=1)
+    read = exact + np.cumsum(steps, axis=0) + noise.normal(0, 1, (len(k), 6)) * white
+    stamps = _IMU_NS * k + round(1e9 * offset_s)
+    return [ImuSample(t, x[:3], x[3:]) for t, x in zip(stamps.tolist(), read, strict=True)]
+
+
+def _seen(expected: Observations, off: Off) -> Observations:
+    """Return what a rig that is off shows in the place of pixels of the calibrated one."""
+    z = expected.z.copy()
+    z[:, 2] = z[:, 0] - (z[:, 0] - z[:, 2]) * np.exp(off.baseline)
+    if off.turn.any():
+        q = left_rays(CAMERA, z[:, 2:]) @ so3_exp(off.turn).T
+        z[:, 2:] = q[:, :2] / q[:, 2:] * [CAMERA.fu, CAMERA.fv] + [CAMERA.cu, CAMERA.cv]
+    return replace(expected, z=z)
+
+
+def calibration_nees(estimate: Estimate, off: Off) -> dict[str, float]:
+    """Return NEES by what an estimate holds of the calibration; names end in the dimension, in brackets."""
+    out = {}
+    if estimate.T_cam0_imu is not None and estimate.T_cam0_imu_covariance is not None:
+        error = se3_log(se3_inverse(estimate.T_cam0_imu) @ T_CAM0_IMU)
+        P = estimate.T_cam0_imu_covariance
+        out["T_cam0_imu (6)"] = float(nees(error[None], P[None])[0])
+        out["its translation (3)"] = float(nees(error[None, :3], P[None, :3, :3])[0])
+        out["its rotation (3)"] = float(nees(error[None, 3:], P[None, 3:, 3:])[0])
+    if estimate.time_offset_s is not None and estimate.time_offset_sigma_s is not None:
+        out["time offset (1)"] = ((estimate.time_offset_s - off.offset_s) / estimate.time_offset_sigma_s) ** 2
+    if estimate.stereo_field is not None:
+        yaw = off.turn[1]  # (R1) in the terms of (R3): a0 and a2; the rows give the rest
+        error = estimate.stereo_field.coefficients - np.array([yaw, 0.0, yaw, 0.0, 0.0, 0.0])
+        P = estimate.stereo_field.covariance
+        out["columns a0 a1 a2 (3)"] = float(nees(error[None, :3], P[None, :3, :3])[0])
+        out["both lenses k q1 q2 (3)"] = float(nees(error[None, 3:], P[None, 3:, 3:])[0])
+    if estimate.stereo_scale is not None:
+        error = estimate.stereo_scale.logs[:1] - off.baseline
+        out["baseline (1)"] = float(error[0] ** 2 / estimate.stereo_scale.covariance[0, 0])
+    return out
+
+
+def table(results: dict[tuple[Rig, Start], list[list[dict[str, float]]]]) -> str:
+    """Return mean NEES ± its standard error over the runs as Markdown, with the band of the mean."""
+    lines = [
+        "| rig | begun in | estimated (dimension) | NEES halfway | at the end | 95 % band |",
+        "|---|---|---|---:|---:|---:|",
+    ]
+    for (rig, start), runs in results.items():
+        for name in runs[0][0]:
+            dimension = int(name.rpartition("(")[2].rstrip(")"))
+            low, high = nees_bounds(dimension, len(runs))
+            cells = [_mean_text([run[half][name] for run in runs]) for half in range(2)]
+            lines.append(f"| {rig} | {start} | {name} | {' | '.join(cells)} | {low:.2f} to {high:.2f} |")
+    return "\n".join(lines) + "\n"
+
+
+def _mean_text(values: list[float]) -> str:
+    return f"{np.mean(values):.2f} ± {np.std(values, ddof=min(len(values) - 1, 1)) / np.sqrt(len(values)):.2f}"
+
+
+def _fly_alone(job: tuple[Rig, Start, int, float, float]) -> list[dict[str, float]]:
+    rig, start, seed, seconds, pixel_sigma_px = job
+    with one_blas_thread():
+        return fly(rig, start, seed, seconds=seconds, pixel_sigma_px=pixel_sigma_px)
+
+
+def main() -> int:
+    """Fly everything and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rigs", nargs="+", default=list(RIGS), choices=RIGS, help="what is off")
+    parser.add_argument("--starts", nargs="+", default=list(STARTS), choices=STARTS, help="how flights begin")
+    parser.add_argument("--runs", type=int, default=20, help="flights per rig")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of a flight")
+    parser.add_argument("--pixel-sigma", type=float, default=0.5, help="noise of a pixel")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    args = parser.parse_args()
+    groups = list(product(args.rigs, args.starts))
+    jobs = [(*group, seed, args.seconds, args.pixel_sigma) for group, seed in product(groups, range(args.runs))]
+    results: dict[tuple[Rig, Start], list[list[dict[str, float]]]] = {group: [] for group in groups}
+    try:
+        with ProcessPoolExecutor(max(args.jobs, 1)) as pool:
+            for job, halves in zip(jobs, pool.map(_fly_alone, jobs), strict=True):
+                results[job[0], job[1]].append(halves)
+                print(*job[:3], file=sys.stderr)
+    except VioError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(table(results))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
