@@ -8,6 +8,7 @@ from tools.calibration_consistency import FromStandstill, Off, _seen, calibratio
 from tools.consistency import CAMERA, T_CAM0_IMU, Flight
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
+from vio.filters.stereo_calibration import FIELD_TERMS
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse
 from vio.geometry.stereo import project
 from vio.records import Estimate, StereoFieldEstimate, StereoScaleEstimate, observations
@@ -43,7 +44,7 @@ def test_a_rig_that_is_off_is_off_by_what_its_errors_say() -> None:
     right = Estimate(
         0, np.eye(4), np.eye(6), T_cam0_imu=T_believed @ se3_exp(xi), T_cam0_imu_covariance=np.eye(6),
         time_offset_s=0.004, time_offset_sigma_s=1e-3,
-        stereo_field=StereoFieldEstimate(np.array([turn[1], 0, turn[1], 0, 0, 0]), np.eye(6)),
+        stereo_field=StereoFieldEstimate(turn[1] * np.eye(FIELD_TERMS)[[0, 2]].sum(axis=0), np.eye(FIELD_TERMS)),
         stereo_scale=StereoScaleEstimate(np.array([0.01, 0.0]), np.eye(2)),
     )  # fmt: skip
     assert max(calibration_nees(right, off).values()) < 1e-12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -97,6 +98,26 @@ def test_too_few_features_do_not_verify() -> None:
     assert verify(CAMERA, i, CAMERA, no_features()) is None
     few = KeyframeFeatures(j.z[:15], j.has_right[:15], j.sigma_px[:15], j.descriptors[:15])
     assert verify(CAMERA, i, CAMERA, few) is None
+
+
+def _pair(gain: float) -> list[np.ndarray]:
+    """Left and right image (180, 320) of a textured wall at 6.3 px of disparity; the right camera's gain falls off."""
+    rng = np.random.default_rng(3)
+    wall = cv2.resize(rng.uniform(40, 200, (60, 110)).astype(np.float32), (340, 180), interpolation=cv2.INTER_CUBIC)
+    left, right = (cv2.warpAffine(wall, np.array([[1.0, 0, -u], [0, 1, 0]]), (320, 180)) for u in (5.0, 11.3))
+    right = right * np.linspace(1.0, gain, 320)
+    return [np.clip(im + rng.normal(0, 1.5, im.shape), 0, 255).astype(np.uint8) for im in (left, right)]
+
+
+def test_a_darker_right_camera_leaves_the_disparities_exact() -> None:
+    """Cameras with their own exposure control and vignetting differ by this much."""
+    errors = []
+    for gain in (1.0, 0.6):
+        features = extract(*_pair(gain))
+        assert features.has_right.sum() > 100
+        disparity = (features.z[:, 0] - features.z[:, 2])[features.has_right]
+        errors.append(np.quantile(np.abs(disparity - 6.3), 0.9))
+    assert max(errors) < 0.1
 
 
 @pytest.mark.parametrize("size", [(64, 64), (180, 320)])

@@ -25,8 +25,9 @@ from vio.geometry.relative_pose import RelativePose
 from vio.loop_files import read_loops, write_loops
 from vio.loops import LoopEvent, LoopMatches
 from vio.mapped_run import corrected
+from vio.mapping.builder import MapBuilder, MapUpdate
 from vio.mapping.map_store import MapStore
-from vio.mapping.session import MapSession
+from vio.mapping.session import HANDOVER_FRAMES, MapSession
 from vio.pipeline import run
 from vio.records import Estimate, StereoFrame, observations
 from vio.run_recorder import GrowingFolder
@@ -143,6 +144,8 @@ def test_maps_are_shown_and_merged(mapped: Path, tmp_path: Path, capsys: pytest.
     assert "session 1" in capsys.readouterr().out
     assert main(["map", "merge", str(path), str(path), "--out", str(out)]) == 1
     assert "exists; give another name" in capsys.readouterr().err
+    assert main(["map", "merge", str(path), str(path), "--out", str(tmp_path / "twice.map")]) == 1
+    assert "is the same map as" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -280,6 +283,30 @@ def test_what_a_covered_camera_does_to_the_place(alone: bool, tmp_path: Path) ->
     np.testing.assert_allclose(sigmas[21] ** 2 - sigmas[11] ** 2, 30.0**2 if alone else 0.1, rtol=1e-3)
     ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
     assert (np.sqrt(motion.covariance[0, 0]) >= 30.0) is np.bool_(alone)
+
+
+def test_a_place_does_not_follow_a_jump_of_the_filter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A filter that learns what it was off by moves its newest pose by half a metre, and no motion of its window."""
+    session = MapSession(tmp_path / "a.map", CAMERA, T_CAM0_IMU, source="made up", imu=False, localise=False)
+    T_map_cam, covariance = se3_exp([3.0, 0.0, 1.0, 0.0, 0.2, 0.0]), 1e-4 * np.eye(6)
+    update = MapUpdate(np.eye(4), T_map_cam, covariance, ())
+    monkeypatch.setattr(MapBuilder, "add", lambda self, keyframe, features: update)
+    step, gray = se3_exp([0.0, 0.0, 0.05, 0.0, 0.01, 0.0]), np.zeros((64, 64), dtype=np.uint8)
+    for k in range(16):
+        motion = np.linalg.matrix_power(step, k)
+        jump = se3_exp([0.5, 0.0, 0.0, 0.0, 0.1, 0.0]) if k > 12 else np.eye(4)
+        estimate = Estimate(k, jump @ motion @ se3_exp([0.1, 0, 0, 0, 0, 0]), 1e-4 * np.eye(6))
+        seen = observations(k, 10**8 * k, np.arange(40), np.tile([9.0, 9, 5, 9], (40, 1)))
+
+        def relative(older: int, newer: int) -> RelativePose:
+            return RelativePose(np.linalg.matrix_power(step, newer - older), 1e-6 * (newer - older) * np.eye(6))
+
+        session.frame(StereoFrame(k, 10**8 * k, gray, gray), seen, estimate, relative)
+        if k >= HANDOVER_FRAMES:
+            expected = T_map_cam @ T_CAM0_IMU @ motion
+            assert session.T_map_odom is not None
+            np.testing.assert_allclose(session.T_map_odom @ estimate.T_world_imu, expected, atol=1e-9)
+    session.close()
 
 
 def test_few_features_are_no_darkness(tmp_path: Path) -> None:

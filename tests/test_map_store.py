@@ -7,16 +7,19 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.conftest import ROOT
-from vio.errors import DataError
+from vio.errors import ConfigError, DataError, VioError
 from vio.geometry.lie import se3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
+from vio.mapping.builder import MapBuilder
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.map_store import VERSION, KeyframeRow, LoopRow, MapStore, SessionRow
 
@@ -141,6 +144,48 @@ def test_a_map_of_another_version_is_refused(tmp_path: Path) -> None:
     database.close()
     with pytest.raises(DataError, match=f"is a map of version {VERSION + 1}, this program reads {VERSION}"):
         MapStore(path)
+
+
+def test_a_map_of_version_1_is_read_and_continued(tmp_path: Path) -> None:
+    """It did not say of what cameras its images were."""
+    path = tmp_path / "a.map"
+    fill(path).close()
+    database = sqlite3.connect(path)
+    for column in ("projection", "kind"):
+        database.execute(f"ALTER TABLE sessions DROP COLUMN {column}")
+    database.execute("PRAGMA user_version = 1")
+    database.commit()
+    database.close()
+    for read_only in (True, False, True):
+        store = MapStore(path, read_only=read_only)
+        assert store.sessions() == [SessionRow("a place", CAMERA, True, 0)]
+        if not read_only:
+            store.add_session(SessionRow("another", replace(CAMERA, fu=300.0), True, 0))
+            store.truncate(1, 4, 1)
+        store.close()
+    assert MapStore(path, read_only=True).version == VERSION
+
+
+@pytest.mark.parametrize(("session", "recording"), [({"kind": "rgbd"}, {}), ({}, {"projection": "cylinder"})])
+def test_another_kind_of_camera_is_refused_in_a_line(
+    session: dict[str, Any], recording: dict[str, Any], tmp_path: Path
+) -> None:
+    store = MapStore(tmp_path / "a.map", create=True)
+    store.add_session(SessionRow("a place", replace(CAMERA, **session), True, 0))
+    with pytest.raises(VioError, match=r"a\.map: (is a map of one camera|a map is made of .* pinhole)") as error:
+        MapBuilder(store, "here", replace(CAMERA, **recording), upright=True, localise=False)
+    assert "\n" not in str(error.value)
+    assert isinstance(error.value, ConfigError if recording else DataError)
+
+
+@pytest.mark.parametrize(("change", "warned"), [({"fu": 1.01 * CAMERA.fu}, False), ({"baseline_m": 0.5}, True)])
+def test_another_rig_is_warned_of(
+    change: dict[str, Any], warned: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    store = fill(tmp_path / "a.map")
+    MapBuilder(store, "here", replace(CAMERA, **change), upright=True, localise=True)
+    assert ("a.map: was made with another rig" in caplog.text) == warned
+    store.close()
 
 
 def test_a_map_in_use_is_refused(tmp_path: Path) -> None:

@@ -1,9 +1,10 @@
 """What a query of the map costs against its size: simulated keyframes, their index and file, one query after the other.
 
-    python tools/bench_map.py [--sizes 500,2000,8000,20000] [--json FILE]
+    python tools/bench_map.py [--sizes 500,2000,8000,20000] [--json FILE] [--png FILE]
 
 Descriptors are random bits; a query is a keyframe of the map with a tenth of its bits wrong, so that its words, the
-candidates and their geometric verification cost what a real one costs. Times are CPU milliseconds of one thread.
+candidates and their geometric verification cost what a real one costs. Times are CPU milliseconds of one thread: where
+nothing is known of the place, and where a session that found its place goes on along the map.
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ import resource
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project
-from vio.mapping.builder import Keyframe, MapBuilder
+from vio.mapping.builder import FoundPlace, Keyframe, MapBuilder
 from vio.mapping.features import MOST_FEATURES, KeyframeFeatures
 from vio.mapping.map_store import KeyframeRow, MapStore
 
@@ -76,11 +78,56 @@ def measure(path: Path, size: int) -> dict[str, float]:
         "query_ms": float(np.median(spent)),
         "query_ms_95": float(np.percentile(spent, 95)),
         "found": found / QUERIES,
+        **followed(path, size),
         "open_s": opened,
         "index_MB": builder.index_bytes / 1e6,
+        "overlap_MB": builder.overlap_bytes / 1e6,
         "file_MB": path.stat().st_size / 1e6,
         "memory_MB": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1e3,
     }
+
+
+def followed(path: Path, size: int) -> dict[str, float]:
+    """Localise a session that follows the map's path from the middle on, and time queries once it has its place."""
+    builder = MapBuilder(MapStore(path, read_only=True), "query", CAMERA, upright=False, localise=True)
+    find, spent, found = builder.find, list[float](), list[bool]()
+
+    def timed(number: int, seen: KeyframeFeatures) -> FoundPlace | None:
+        known, start = builder.is_joined, time.process_time()
+        place = find(number, seen)
+        if known:
+            spent.append(1e3 * (time.process_time() - start))
+            found.append(place is not None)
+        return place
+
+    builder.find = timed  # type: ignore[assignment, method-assign]
+    T: FloatArray = np.eye(4)
+    for k in range(QUERIES):
+        keyframe = Keyframe(k, k, T, None if k == 0 else MOTION, None, 0.0)
+        builder.add(keyframe, features(size // 2 + k, wrong_bits=0.1))
+        T = T @ STEP
+    builder.close()
+    return {"followed_ms": float(np.median(spent)), "followed": float(np.mean(found))}
+
+
+def draw(rows: list[dict[str, float]]) -> Any:
+    """Time and memory against the number of keyframes."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 2.8), dpi=80, layout="constrained")
+    x = [row["keyframes"] for row in rows]
+    panels: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
+        ("CPU ms a query", (("query_ms", "place not known"), ("followed_ms", "place about known"))),
+        ("memory, MB", (("index_MB", "words"), ("overlap_MB", "points"))),
+    )
+    for k, (label, lines) in enumerate(panels):
+        axes = figure.add_subplot(1, 2, k + 1)
+        for (name, text), color in zip(lines, ("#1f5fbf", "#c25b00"), strict=True):
+            axes.plot(x, [row[name] for row in rows], "o-", color=color, markersize=4, label=text)
+        axes.set(xlabel="keyframes", ylabel=label, xlim=(0, None), ylim=(0, None))
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False, fontsize=8)
+    return figure
 
 
 def main() -> None:
@@ -88,6 +135,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sizes", default="500,2000,8000,20000")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--png", type=Path)
     arguments = parser.parse_args()
     rows, filled = [], 0
     with tempfile.TemporaryDirectory() as folder:
@@ -99,6 +147,8 @@ def main() -> None:
             print("  ".join(f"{name} {value:.4g}" for name, value in rows[-1].items()), flush=True)
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    if arguments.png is not None:
+        draw(rows).savefig(arguments.png, format="png")
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import left_rays
-from vio.records import Estimate, ImuSample, Observations
+from vio.records import RIGHT_TERMS, Estimate, ImuSample, Observations
 from vio.threads import one_blas_thread
 
 Rig = Literal["camera-IMU", "right camera turned", "baseline"]
@@ -153,10 +153,10 @@ def calibration_nees(estimate: Estimate, off: Off) -> dict[str, float]:
         out["time offset (1)"] = ((estimate.time_offset_s - off.offset_s) / estimate.time_offset_sigma_s) ** 2
     if estimate.stereo_field is not None:
         yaw = off.turn[1]  # (R1) in the terms of (R3): a0 and a2; the rows give the rest
-        error = estimate.stereo_field.coefficients - np.array([yaw, 0.0, yaw, 0.0, 0.0, 0.0])
-        P = estimate.stereo_field.covariance
-        out["columns a0 a1 a2 (3)"] = float(nees(error[None, :3], P[None, :3, :3])[0])
-        out["both lenses k q1 q2 (3)"] = float(nees(error[None, 3:], P[None, 3:, 3:])[0])
+        error, P, n = estimate.stereo_field.coefficients.copy(), estimate.stereo_field.covariance, RIGHT_TERMS
+        error[[0, 2]] -= yaw
+        out[f"right columns ({n})"] = float(nees(error[None, :n], P[None, :n, :n])[0])
+        out[f"both lenses ({len(error) - n})"] = float(nees(error[None, n:], P[None, n:, n:])[0])
     if estimate.stereo_scale is not None:
         error = estimate.stereo_scale.logs[:1] - off.baseline
         out["baseline (1)"] = float(error[0] ** 2 / estimate.stereo_scale.covariance[0, 0])

@@ -63,6 +63,7 @@ _FILES = ("tests/test_hostile_files.py",)
 _PATCHES = ("tests/test_frontend_patches.py",)
 _GRAPH = ("tests/test_pose_graph.py",)
 _PLACES = ("tests/test_map_places.py",)
+_GUIDED = ("tests/test_guided_search.py",)
 _MAPS = ("tests/test_map_builder.py",)
 _MAP_FILE = ("tests/test_map_store.py",)
 _MAP_RUN = ("tests/test_map_run.py",)
@@ -1742,8 +1743,8 @@ MUTATIONS = (
     Mutation(
         "loops: uncertainty of the points ignored",
         "vio/mapping/loop_geometry.py",
-        "C = J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2)",
-        "C = 0 * J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2)",
+        "C[i, j] += M[i, a] * P[k, a, b] * M[j, b]",
+        "C[i, j] += 0 * M[i, a] * P[k, a, b] * M[j, b]",
         _PLACES,
     ),
     Mutation(
@@ -1871,5 +1872,47 @@ MUTATIONS = (
         "max(_LARGE_DEG, _SIGMAS * float(np.degrees(sigma_rad)))",
         "_LARGE_DEG",
         ("tests/test_evaluation.py",),
+    ),
+    Mutation(
+        "guided search: what agrees by chance not counted",
+        "vio/mapping/guided_search.py",
+        "if inliers < _OVER_CHANCE * chance:",
+        "if inliers < 0 * chance:",
+        _GUIDED,
+    ),
+    Mutation(
+        "guided search: windows as if the pose were known",
+        "vio/mapping/guided_search.py",
+        "radius = radius + _SIGMAS *",
+        "radius = radius + 0 * _SIGMAS *",
+        _GUIDED,
+    ),
+    Mutation(
+        "guided search: the prior pulls the wrong way",
+        "vio/mapping/loop_geometry.py",
+        "P @ se3_log(se3_inverse(T) @ prior.T_i_j)",
+        "-P @ se3_log(se3_inverse(T) @ prior.T_i_j)",
+        _GUIDED,
+    ),
+    Mutation(
+        "map: right pixels refined in unequal images",
+        "vio/mapping/features.py",
+        "_equal_contrast(right),",
+        "right,",
+        _PLACES,
+    ),
+    Mutation(
+        "map: another rig taken for the same",
+        "vio/mapping/builder.py",
+        "if others and not any(_is_alike(other, camera) for other in others):",
+        "if others and any(_is_alike(other, camera) for other in others):",
+        _MAP_FILE,
+    ),
+    Mutation(
+        "map: a place follows the jumps of the filter",
+        "vio/mapping/session.py",
+        "if now is None or self._T_map_cam is None:",
+        "if True or now is None or self._T_map_cam is None:",
+        _MAP_RUN,
     ),
 )

@@ -31,7 +31,7 @@ class LoopEvent:
     time_ns: int
     keyframe: int  # number in the map of the keyframe that showed it before
     keyframe_time_ns: int
-    inliers: int
+    inliers: int  # corners of the frame that agree, with this keyframe or with those around it
     gap_m: float  # by which the loop moved the position of the frame, before the optimisation
     joined: bool  # whether it is the first link between two sessions
     keyframe_frame: int | None = None  # number of the keyframe's frame in this run; None: an earlier session's

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from vio.evaluation import Evaluation
-from vio.filters.stereo_calibration import RIGHT_TERMS
 from vio.frame_result import STAGES
 from vio.geometry.lie import FloatArray, transform_points
 from vio.pipeline import RunResult
 from vio.printable import printable
+from vio.records import RIGHT_TERMS
 from vio.upright import attitude_deg, up_of, upright_axes
 
 log = logging.getLogger(__name__)

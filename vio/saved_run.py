@@ -16,7 +16,7 @@ from vio.datasets.features import FeatureDataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
 from vio.filters.multiview import Views
-from vio.filters.stereo_calibration import FIELD_TERMS, METRIC_TERMS, ROW_TERMS, TERMS, StereoField
+from vio.filters.stereo_calibration import METRIC_TERMS, TERMS, StereoField
 from vio.filters.tracks import measured
 from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
@@ -26,7 +26,7 @@ from vio.loop_files import read_loops
 from vio.loops import LoopEvent
 from vio.mapping.comparison import GroundTruth
 from vio.mapping.keyframes import TrackedPath
-from vio.records import FeatureTracks, IntArray, StereoFrame, need_stereo
+from vio.records import FIELD_TERMS, ROW_TERMS, FeatureTracks, IntArray, StereoFrame, need_stereo
 from vio.rig import Rectifier
 from vio.run_folder import read_metrics
 from vio.trajectory_io import read_trajectory

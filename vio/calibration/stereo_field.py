@@ -14,12 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.filters.stereo_calibration import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
-from vio.records import BoolArray, Estimate, StereoFieldEstimate
+from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, Estimate, StereoFieldEstimate
 from vio.rig import Rig
 
 # Parameters of a rig's correction: rotation of the right camera (rad, in the rectified frame: its points p are seen as

@@ -46,5 +46,8 @@ def _rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     for number, session in enumerate(facts["sessions"]):
         joined = "" if session["joined"] else "; not joined to the first session"
         path = f"{session['keyframes']} keyframes, path {session['path_m']:.1f} m"
-        rows.append((f"session {number}", f"{session['source']}: {path}{joined}"))
+        c = session["camera"]
+        size = f"{c['width']}x{c['height']} px, " if c["width"] else ""
+        rig = f"{size}f {c['fu']:.1f} px, baseline {c['baseline_m']:.4g} m"
+        rows.append((f"session {number}", f"{session['source']}: {path}; {rig}{joined}"))
     return rows

@@ -35,8 +35,6 @@ from vio.filters.restart import GoodState, restarted
 from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
-    FIELD_TERMS,
-    ROW_TERMS,
     RowField,
     StereoField,
     StereoInformation,
@@ -51,6 +49,8 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, depth_of, project
 from vio.records import (
+    FIELD_TERMS,
+    ROW_TERMS,
     BoolArray,
     Estimate,
     ImuSample,

@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import FIELD_TERMS, METRIC_TERMS, TERMS
+from vio.filters.stereo_calibration import METRIC_TERMS, TERMS
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
-from vio.records import Estimate, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
+from vio.records import FIELD_TERMS, Estimate, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
 from vio.statistics import chi_square_quantile
 
 # Columns of the full error [stereo field; baseline and focal length; eta; time offset].

@@ -19,14 +19,11 @@ from vio.filters import track_loops as loops
 from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, IntArray, Observations
+from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, IntArray, Observations
 from vio.robust import median
 
-RIGHT_TERMS = 4  # a0, a1, a2, a3 of (R3), of the right columns
-FIELD_TERMS = 8  # those, and k1, k2, q1, q2 of both lenses
 METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
 TERMS = FIELD_TERMS + METRIC_TERMS
-ROW_TERMS = 7  # of (R2)
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
 _LEAST_ROWS_PX = 0.05  # root mean square of the field over the matches; smaller ones do no harm

@@ -30,6 +30,8 @@ _MOST_DISPARITY = 0.4  # of the width
 _LEAST_DISPARITY_PX = 0.5
 _MOST_BITS = 64  # in which the descriptors of one point differ: a quarter
 _LK_WINDOW = 11  # pixels
+_LK_CONTRAST = 15  # pixels; the images are brought to one brightness and contrast over squares of this size
+_LK_GRAY, _LK_DEVIATION, _LK_LEAST = 128.0, 40.0, 6.0  # mean and standard deviation then; below 6 gray levels less
 _LK_ROWS_PX = 2.0  # by which the rows of a refined match may differ: rectifications are off by up to a pixel
 
 
@@ -89,7 +91,10 @@ def _spread(found: Sequence[cv2.KeyPoint], shape: tuple[int, ...], most: int) ->
 def _right_pixels(
     orb: cv2.ORB, left: Image, right: Image, uv: FloatArray, scale: FloatArray, bits: Bits
 ) -> tuple[FloatArray, BoolArray]:
-    """Match key points (N, 2) in the right image by descriptor near their row, and refine by Lucas-Kanade."""
+    """Match key points (N, 2) in the right image by descriptor near their row, and refine by Lucas-Kanade.
+
+    Lucas-Kanade takes both images to be equally bright, which two cameras with their own exposure are not.
+    """
     out, valid = np.zeros_like(uv), np.zeros(len(uv), dtype=np.bool_)
     there, there_bits = orb.detectAndCompute(right, None)
     if there_bits is None:
@@ -108,8 +113,8 @@ def _right_pixels(
     rows = np.array([m.queryIdx for m in pairs])
     start = at[[m.trainIdx for m in pairs]].astype(np.float32)[:, None]
     refined, status, _ = cv2.calcOpticalFlowPyrLK(
-        left,
-        right,
+        _equal_contrast(left),
+        _equal_contrast(right),
         uv[rows].astype(np.float32)[:, None],
         start.copy(),
         winSize=(_LK_WINDOW, _LK_WINDOW),
@@ -122,3 +127,12 @@ def _right_pixels(
     good &= uv[rows, 0] - found[:, 0] >= _LEAST_DISPARITY_PX
     out[rows[good]], valid[rows[good]] = found[good], True
     return out, valid
+
+
+def _equal_contrast(image: Image) -> Image:
+    """Return an image (H, W) with the same mean and standard deviation around each pixel."""
+    gray = image.astype(np.float32)
+    mean, squared = (cv2.blur(x, (_LK_CONTRAST, _LK_CONTRAST)) for x in (gray, gray * gray))
+    deviation = np.sqrt(np.maximum(squared - mean * mean, 0.0))
+    out = _LK_GRAY + _LK_DEVIATION * (gray - mean) / (deviation + _LK_LEAST)
+    return np.clip(out, 0, 255).astype(np.uint8)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import uuid
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.mapping.builder import Keyframe, MapBuilder
-from vio.mapping.map_store import VERSION, MapStore
+from vio.mapping.map_store import MapStore
 
 
 def describe_map(path: Path) -> dict[str, Any]:
@@ -29,7 +30,7 @@ def describe_map(path: Path) -> dict[str, Any]:
         positions = np.array([k.T_map_cam[:3, 3] for k in keyframes if sessions[k.session].part == home])
         return {
             "map": str(path),
-            "version": VERSION,
+            "version": store.version,
             "bytes": path.stat().st_size,
             "keyframes": len(keyframes),
             "loops": sum(o.kept for o in loops),
@@ -42,6 +43,7 @@ def describe_map(path: Path) -> dict[str, Any]:
                     "path_m": rows[-1].path_m - rows[0].path_m if rows else 0.0,
                     "joined": session.part == home,
                     "upright": session.upright,
+                    "camera": asdict(session.camera),
                 }
                 for session, rows in zip(sessions, own, strict=True)
             ],
@@ -55,10 +57,12 @@ def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
     with the first map beside them. The frame is that of the first map.
 
     Raises:
-        DataError: a file is no map, or `out` exists or cannot be written.
+        DataError: a file is no map, both are the same, or `out` exists or cannot be written.
     """
     if out.exists():
         raise DataError(f"{out}: exists; give another name for the merged map")
+    if first.exists() and second.exists() and first.samefile(second):
+        raise DataError(f"{second}: is the same map as {first}; give two different ones")
     partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:12]}.partial")
     try:
         source = MapStore(first, read_only=True)

@@ -6,6 +6,7 @@ refines it. A pair that agrees with the motion from i to j but not with that fro
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -13,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.compiled import compiled
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp, so3_hat, transform_points
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp
 from vio.geometry.relative_pose import RelativePose
-from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate
 from vio.loops import LoopMatches
 from vio.mapping.features import KeyframeFeatures
 from vio.records import BoolArray, IntArray
@@ -32,7 +33,7 @@ _SAME_M, _SAME_DEG = 0.1, 3.0  # by which both directions may differ; metres, be
 _SAME_DEPTH = 0.05
 _STEPS, _CONVERGED = 10, 1e-5  # largest change, m and rad
 _GATE = 3.0  # standard deviations, of a pixel coordinate
-_LEAST_DISPARITY_PX = 1.0
+LEAST_DISPARITY_PX = 1.0
 # Floor of a loop's standard deviations: errors that its points share, such as those of the calibration.
 _FLOOR_DEPTH, _FLOOR_DEG = 0.002, 0.05
 # Variance of a pixel over the one assumed, which is one pixel at the scale of its level: key points lie on whole pixels
@@ -118,7 +119,7 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
 
 
 def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:
-    p, valid = triangulate(camera, f.z[rows], min_disparity_px=_LEAST_DISPARITY_PX)
+    p, valid = triangulate(camera, f.z[rows], min_disparity_px=LEAST_DISPARITY_PX)
     return p, valid & f.has_right[rows]
 
 
@@ -169,38 +170,72 @@ def _fit(
     """Fit the motion to the stereo pixels of both keyframes; return it and a mask (K,) of the pairs that agree.
 
     The pixels of j are predicted from the points of i, whose covariance is added to theirs; where i has no right pixel,
-    the other way round. Residuals are [ul vl ur] (the right row says nothing new, see docs/math.md).
+    the other way round.
     """
     forward = _points(camera_i, i, a)[1]
     order = np.concatenate([np.flatnonzero(forward), np.flatnonzero(~forward)])
     parts = (
-        _Terms(camera_i, i, a[forward], camera_j, j, b[forward]),
-        _Terms(camera_j, j, b[~forward], camera_i, i, a[~forward]),
+        Terms(points_of(camera_i, i, a[forward]), camera_j, j, b[forward], inverse=True),
+        Terms(points_of(camera_j, j, b[~forward]), camera_i, i, a[~forward], inverse=False),
     )
-    T, normal, fits = T_i_j, np.eye(6), np.zeros(len(a), dtype=np.bool_)
+    fitted = fit_terms(parts, T_i_j)
+    if fitted is None:
+        return None
+    good = np.zeros(len(a), dtype=np.bool_)
+    good[order] = fitted.fits
+    return fitted.motion(_median_depth(camera_j, j, b[good])), good
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """The motion that fits pixels best."""
+
+    T_i_j: FloatArray  # (4, 4)
+    normal: FloatArray  # (6, 6) information of xi in T_i_j = T_hat exp(xi), of pixels as good as they were assumed
+    squared: FloatArray  # (K,) squared normalised residuals
+    fits: BoolArray  # (K,) pairs that agree
+    stereo: BoolArray  # (K,) pairs whose target has a right pixel
+
+    def motion(self, depth_m: float) -> RelativePose:
+        """Return it with a covariance; errors that all points share are in proportion to their median depth."""
+        floor = np.repeat([(_FLOOR_DEPTH * depth_m) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
+        noise = _variance_factor(self.squared[self.fits], self.stereo[self.fits])
+        covariance = noise * _INFLATION**2 * np.asarray(np.linalg.inv(self.normal), dtype=np.float64) + np.diag(floor)
+        return RelativePose(self.T_i_j, covariance)
+
+
+def fit_terms(
+    parts: Sequence[Terms], T_i_j: FloatArray, *, prior: RelativePose | None = None, least: int = LEAST_INLIERS
+) -> Fitted | None:
+    """Fit a motion by iterated reweighted least squares; None: too few pixels agree.
+
+    Residuals are [ul vl ur] (the right row says nothing new, see docs/math.md).
+
+    Args:
+        parts: pixels.
+        T_i_j: (4, 4) where to start.
+        prior: what else is known of the motion: it decides what the pixels leave open, and is not part of `normal`.
+        least: number of pairs that must agree.
+    """
+    T, normal = T_i_j, np.eye(6)
+    P = 1e-9 * np.eye(6) if prior is None else np.asarray(np.linalg.inv(prior.covariance))
+    squared = np.zeros(sum(len(part.stereo) for part in parts))
     for step in range(_STEPS):
         width = _GATE * 2.0 ** max(2 - step, 0)
-        both = parts[0].at(se3_inverse(T), inverse=True), parts[1].at(T, inverse=False)
-        r, W, H, on = (np.concatenate(one) for one in zip(*both, strict=True))
-        squared = np.einsum("ki,kij,kj->k", r, W, r)
-        weight = on / (1 + squared / (3 * width**2)) ** 2
-        fits = on & (squared < 3 * _GATE**2)
-        if fits.sum() < LEAST_INLIERS:
+        normal, pull, begin = np.zeros((6, 6)), np.zeros(6), 0
+        for part in parts:
+            squared[begin : begin + len(part.stereo)] = part.add(T, width, normal, pull)
+            begin += len(part.stereo)
+        fits: BoolArray = squared < 3 * _GATE**2
+        if fits.sum() < least:
             return None
-        HW = np.swapaxes(H, 1, 2) @ (W * weight[:, None, None])
-        normal = np.sum(HW @ H, axis=0)
-        xi = np.linalg.solve(normal + 1e-9 * np.eye(6), np.sum(HW @ r[..., None], axis=0)[:, 0])
+        if prior is not None:
+            pull += P @ se3_log(se3_inverse(T) @ prior.T_i_j)
+        xi = np.linalg.solve(normal + P, pull)
         T = T @ se3_exp(xi)
         if step > 2 and np.abs(xi).max() < _CONVERGED:
             break
-    good = np.zeros(len(a), dtype=np.bool_)
-    good[order] = fits
-    depth = _median_depth(camera_j, j, b[good])
-    floor = np.repeat([(_FLOOR_DEPTH * depth) ** 2, np.radians(_FLOOR_DEG) ** 2], 3)
-    stereo = np.concatenate([j.has_right[b[forward]], i.has_right[a[~forward]]])
-    noise = _variance_factor(squared[fits], stereo[fits])
-    covariance = noise * _INFLATION**2 * np.asarray(np.linalg.inv(normal), dtype=np.float64) + np.diag(floor)
-    return RelativePose(T, covariance), good
+    return Fitted(T, normal, squared, fits, np.concatenate([part.stereo for part in parts]))
 
 
 def _variance_factor(squared: FloatArray, stereo: BoolArray) -> float:
@@ -212,50 +247,146 @@ def _variance_factor(squared: FloatArray, stereo: BoolArray) -> float:
     return max(float(np.median(squared / expected)), _LEAST_VARIANCE)
 
 
-class _Terms:
-    """Residuals of the pixels of one keyframe, predicted from the stereo points of the other."""
+@dataclass(frozen=True, slots=True)
+class StereoPoints:
+    """Points by stereo pixels."""
+
+    p: FloatArray  # (K, 3) m, in the frame of a camera; arbitrary where not valid
+    covariance: FloatArray  # (K, 3, 3) m^2
+    valid: BoolArray  # (K,)
+
+
+def points_of(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> StereoPoints:
+    """Return the points that features (rows, (K,)) of a keyframe show, in the frame of its left camera."""
+    p, valid = _points(camera, f, rows)
+    z = np.where(valid[:, None], f.z[rows], project(camera, [0.0, 0.0, 1.0]))
+    J = p_cam_D_z(camera, z)
+    covariance = np.einsum("kij,klj,k->kil", J, J, f.sigma_px[rows] ** 2)
+    return StereoPoints(np.where(valid[:, None], p, [0.0, 0.0, 1.0]), covariance, valid)
+
+
+class Terms:
+    """Residuals of the pixels of one keyframe, predicted from points in the frame of the other."""
 
     def __init__(
-        self,
-        camera_s: StereoCamera,
-        s: KeyframeFeatures,
-        rows_s: IntArray,
-        camera_t: StereoCamera,
-        t: KeyframeFeatures,
-        rows_t: IntArray,
+        self, source: StereoPoints, camera_t: StereoCamera, t: KeyframeFeatures, rows_t: IntArray, *, inverse: bool
     ) -> None:
-        """Prepare pairs (K,); those without a point in the source count nothing."""
-        p, self._used = _points(camera_s, s, rows_s)
-        self._camera = camera_t
-        self._p = np.where(self._used[:, None], p, [0.0, 0.0, 1.0])
-        z_s = np.where(self._used[:, None], s.z[rows_s], project(camera_s, [0.0, 0.0, 1.0]))
-        J = p_cam_D_z(camera_s, z_s)
-        self._P = np.einsum("kij,klj,k->kil", J, J, s.sigma_px[rows_s] ** 2)
-        self._z, self._stereo = t.z[rows_t], t.has_right[rows_t]
-        self._variance = t.sigma_px[rows_t] ** 2
-
-    def at(self, T_t_s: FloatArray, *, inverse: bool) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Return residuals (K, 3), weights (K, 3, 3), Jacobians (K, 3, 6) for T_i_j <- T_i_j exp(xi), a mask (K,).
+        """Prepare pairs (K,); those without a valid point count nothing.
 
         Args:
-            T_t_s: (4, 4) the source's frame in the target's.
-            inverse: whether T_t_s is the inverse of T_i_j.
+            source: points, in the frame of keyframe i, or j if not `inverse`.
+            camera_t: of the other keyframe, whose pixels are predicted.
+            t: its features.
+            rows_t: (K,) features that show the points.
+            inverse: whether the pixels are those of keyframe j, so that the inverse of T_i_j predicts them.
         """
-        q = transform_points(T_t_s, self._p)
-        on = self._used & (q[:, 2] > 0.05)
-        q = np.where(on[:, None], q, [0.0, 0.0, 1.0])
-        J = z_D_p_cam(self._camera, q)[:, :3]
-        r = (self._z - project(self._camera, q))[:, :3]
-        R = T_t_s[:3, :3]
-        C = J @ (R @ self._P @ R.T) @ np.swapaxes(J, 1, 2) + self._variance[:, None, None] * np.eye(3)
-        W = np.linalg.inv(C)
-        left = ~self._stereo
-        if left.any():  # of a left pixel alone
-            W[left] = 0.0
-            W[left, :2, :2] = np.linalg.inv(C[left, :2, :2])
-        if inverse:  # q = exp(-xi) T_hat^-1 p
-            q_D_xi = np.concatenate([-np.broadcast_to(np.eye(3), (len(q), 3, 3)), so3_hat(q)], axis=2)
-        else:  # q = T_hat exp(xi) p
-            q_D_xi = np.concatenate([np.broadcast_to(R, (len(q), 3, 3)), -R @ so3_hat(self._p)], axis=2)
-        W = W * on[:, None, None]
-        return r * on[:, None], W, J @ q_D_xi * on[:, None, None], on
+        self._inverse = inverse
+        self._camera = np.array([camera_t.fu, camera_t.fv, camera_t.cu, camera_t.cv, camera_t.baseline_m])
+        self._p, self._P, self._used = source.p, source.covariance, source.valid
+        self._z, self.stereo = t.z[rows_t], t.has_right[rows_t]
+        self._variance = t.sigma_px[rows_t] ** 2
+
+    def add(self, T_i_j: FloatArray, width: float, normal: FloatArray, pull: FloatArray) -> FloatArray:
+        """Add the normal equations of xi in T_i_j <- T_i_j exp(xi); return squared residuals (K,), infinite where none.
+
+        Args:
+            T_i_j: (4, 4).
+            width: normalised residual at which a pair counts a quarter.
+            normal: (6, 6), added to.
+            pull: (6,) right-hand side, added to.
+        """
+        T_t_s = se3_inverse(T_i_j) if self._inverse else T_i_j
+        squared = np.full(len(self._p), np.inf)
+        pairs = self._p, self._P, self._used, self._z, self.stereo, self._variance
+        _add_pairs(*pairs, T_t_s, self._inverse, self._camera, 3 * width**2, normal, pull, squared)
+        return squared
+
+
+@compiled
+def _add_pairs(
+    p: FloatArray,
+    P: FloatArray,
+    used: BoolArray,
+    z: FloatArray,
+    stereo: BoolArray,
+    variance: FloatArray,
+    T: FloatArray,
+    inverse: bool,
+    camera: FloatArray,
+    scale: float,
+    normal: FloatArray,
+    pull: FloatArray,
+    squared: FloatArray,
+) -> None:
+    """Whiten the residuals of pairs (K,) by Cholesky, and add their normal equations; arguments as `Terms` has them."""
+    A, M, C, q = np.zeros((3, 7)), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)  # A: rows [J | r]; M: z_D_p
+    for k in range(len(p)):
+        for i in range(3):
+            q[i] = T[i, 0] * p[k, 0] + T[i, 1] * p[k, 1] + T[i, 2] * p[k, 2] + T[i, 3]
+        if not used[k] or q[2] <= 0.05:
+            continue
+        rows = 3 if stereo[k] else 2  # of a left pixel alone, two
+        _linearise(p[k], q, z[k], T, inverse, camera, A, M)
+        for i in range(rows):
+            for j in range(i + 1):
+                C[i, j] = variance[k] if i == j else 0.0
+                for a in range(3):
+                    for b in range(3):
+                        C[i, j] += M[i, a] * P[k, a, b] * M[j, b]
+        for i in range(rows):  # Cholesky factor of C, and A by forward substitution
+            for j in range(i):
+                for n in range(j):
+                    C[i, j] -= C[i, n] * C[j, n]
+                C[i, j] /= C[j, j]
+                C[i, i] -= C[i, j] ** 2
+                for c in range(7):
+                    A[i, c] -= C[i, j] * A[j, c]
+            C[i, i] = np.sqrt(C[i, i])
+            for c in range(7):
+                A[i, c] /= C[i, i]
+        total = 0.0
+        for i in range(rows):
+            total += A[i, 6] ** 2
+        squared[k] = total
+        weight = 1.0 / (1.0 + total / scale) ** 2
+        for i in range(rows):
+            for a in range(6):
+                pull[a] += weight * A[i, a] * A[i, 6]
+                for b in range(6):
+                    normal[a, b] += weight * A[i, a] * A[i, b]
+
+
+@compiled
+def _linearise(
+    p: FloatArray,
+    q: FloatArray,
+    z: FloatArray,
+    T: FloatArray,
+    inverse: bool,
+    camera: FloatArray,
+    A: FloatArray,
+    M: FloatArray,
+) -> None:
+    """Write Jacobian and residual [ul vl ur] of a point p (3,), at q in the target (3,), into A (3, 7), z_D_p into M.
+
+    `q = exp(-xi) T_hat^-1 p` if `inverse`, else `q = T_hat exp(xi) p`: its derivative is [-I, q^] or R [I, -p^].
+    """
+    fu, fv, cu, cv, baseline = camera
+    z_D_q = np.zeros((3, 3))
+    for i in range(3):
+        f = fv if i == 1 else fu
+        across = q[1] if i == 1 else q[0] - (baseline if i == 2 else 0.0)
+        z_D_q[i, 1 if i == 1 else 0] = f / q[2]
+        z_D_q[i, 2] = -f * across / q[2] ** 2
+        A[i, 6] = z[i] - (cv if i == 1 else cu) - f * across / q[2]
+    for i in range(3):
+        for c in range(3):
+            M[i, c] = z_D_q[i, 0] * T[0, c] + z_D_q[i, 1] * T[1, c] + z_D_q[i, 2] * T[2, c]
+        for c in range(3):
+            a, b = (c + 1) % 3, (c + 2) % 3
+            if inverse:
+                A[i, c] = -z_D_q[i, c]
+                A[i, 3 + c] = z_D_q[i, a] * q[b] - z_D_q[i, b] * q[a]
+            else:
+                A[i, c] = M[i, c]
+                A[i, 3 + c] = M[i, b] * p[a] - M[i, a] * p[b]

@@ -105,20 +105,20 @@ class MapGraph:
         moved = float(np.linalg.norm(motion.T_i_j[:3, 3]))
         return before[0] + A @ motion.covariance @ A.T, before[1] + moved
 
-    def drift(self, i: IntArray, k: IntArray, *, systematic: bool = True) -> FloatArray:
+    def drift(self, i: IntArray, k: IntArray, *, systematic: float = 1.0) -> FloatArray:
         """Covariance (N, 6, 6) of the motion between keyframes i and k (N,) along the path, in the frame of the later.
 
         Args:
             i: keyframes.
             k: keyframes.
-            systematic: add what errors of the calibration may do.
+            systematic: share that is added of what errors of the calibration may do.
         """
         late, early = np.maximum(i, k), np.minimum(i, k)
         A = se3_adjoint(se3_inverse(self.T_odom_cam[late]))
         C: FloatArray = A @ (self._drift[late] - self._drift[early]) @ np.swapaxes(A, 1, 2)
         if systematic:
             path = (self.path_m[late] - self.path_m[early])[:, None]
-            sigma = path * np.repeat([_DRIFT_SHARE, _DRIFT_RAD_PER_M], 3)
+            sigma = systematic * path * np.repeat([_DRIFT_SHARE, _DRIFT_RAD_PER_M], 3)
             C = C + sigma[:, :, None] ** 2 * np.eye(6)
         return C
 

@@ -1,4 +1,4 @@
-"""The map's file: SQLite, version 1, described in docs/maps.md.
+"""The map's file: SQLite, version 2, described in docs/maps.md; version 1 is read, and becomes 2 when written to.
 
 What belongs together is written in one transaction, so that a process that dies leaves the state before it.
 """
@@ -20,12 +20,13 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
 
-VERSION = 1
+VERSION = 2
+_OLDEST = 1  # whose sessions name neither projection nor kind of their cameras: all were pinhole stereo pairs
 APPLICATION_ID = 0x53564D50  # "SVMP" in the file's header
 _SCHEMA = """
 CREATE TABLE sessions (id INTEGER PRIMARY KEY, source TEXT NOT NULL, part INTEGER NOT NULL, upright INTEGER NOT NULL,
     fu REAL NOT NULL, fv REAL NOT NULL, cu REAL NOT NULL, cv REAL NOT NULL, baseline_m REAL NOT NULL,
-    width INTEGER, height INTEGER);
+    width INTEGER, height INTEGER, projection TEXT NOT NULL, kind TEXT NOT NULL);
 CREATE TABLE keyframes (id INTEGER PRIMARY KEY, session INTEGER NOT NULL, frame INTEGER NOT NULL,
     time_ns INTEGER NOT NULL, T_map_cam BLOB NOT NULL, T_odom_cam BLOB NOT NULL, drift BLOB NOT NULL,
     path_m REAL NOT NULL, up_cam BLOB, up_sigma_rad REAL);
@@ -110,13 +111,27 @@ class MapStore:
                 )
             elif self._pragma("application_id") != APPLICATION_ID:
                 raise DataError(f"{path}: is no map of this program; give a file that vio run --map wrote")
-            elif self._pragma("user_version") != VERSION:
+            elif not _OLDEST <= self._pragma("user_version") <= VERSION:
                 raise DataError(
                     f"{path}: is a map of version {self._pragma('user_version')}, this program reads {VERSION}; use "
                     "the program that wrote it, or build the map again"
                 )
             if not read_only:
                 self._db.execute("BEGIN IMMEDIATE")
+                self._bring_up_to_date()
+
+    def _bring_up_to_date(self) -> None:
+        """Add what version 1 had not."""
+        if self._pragma("user_version") == VERSION:
+            return
+        for column, value in (("projection", "pinhole"), ("kind", "stereo")):
+            self._db.execute(f"ALTER TABLE sessions ADD COLUMN {column} TEXT NOT NULL DEFAULT '{value}'")
+        self._db.execute(f"PRAGMA user_version = {VERSION}")
+
+    @property
+    def version(self) -> int:
+        """Version of the file's form."""
+        return self._pragma("user_version")
 
     def _pragma(self, name: str) -> int:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
@@ -160,7 +175,7 @@ class MapStore:
         c = row.camera
         values = (row.source, row.part, row.upright, c.fu, c.fv, c.cu, c.cv, c.baseline_m, c.width, c.height)
         number = self._count("sessions")
-        self._insert("sessions", (number, *values))
+        self._insert("sessions", (number, *values, c.projection, c.kind))
         return number
 
     def add_keyframe(self, row: KeyframeRow, features: KeyframeFeatures) -> int:

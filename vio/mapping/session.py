@@ -18,7 +18,7 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.loops import LoopEvent, MapKeyframes
-from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate
+from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate, check_camera
 from vio.mapping.features import extract
 from vio.mapping.map_store import MapStore
 from vio.records import Estimate, Image, IntArray, Observations, StereoFrame
@@ -71,8 +71,10 @@ class MapSession:
             alone: whether the odometry has images alone, so that it is lost where they show nothing.
 
         Raises:
+            ConfigError: the images are not those of a pinhole stereo pair.
             DataError: the map cannot be used.
         """
+        check_camera(path, camera)
         self._path, self._localise, self._imu, self._alone = str(path), localise, imu, alone
         self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
         store = MapStore(path, create=not localise, read_only=localise)
@@ -92,9 +94,11 @@ class MapSession:
         self._dark: RelativePose | None = (
             None  # motion of the body since then, of a frame that the window does not hold
         )
-        self.T_map_odom: FloatArray | None = np.eye(4) if self._builder.first == 0 and not localise else None
-        # (6, 6) covariance in the map of the newest keyframe with a result
-        self._known: FloatArray | None = None if self.T_map_odom is None else np.zeros((6, 6))
+        self._T_map_odom: FloatArray | None = np.eye(4) if self._builder.first == 0 and not localise else None
+        self._T_odom_body: FloatArray = np.eye(4)  # at the newest frame
+        # Of the newest keyframe with a result: (6, 6) covariance in the map, and (4, 4) pose once a loop holds it
+        self._known: FloatArray | None = None if self._T_map_odom is None else np.zeros((6, 6))
+        self._T_map_cam: FloatArray | None = None
         self._moves: list[tuple[int, RelativePose]] = []  # later keyframes, each with the motion since the one before
         self.loops: list[LoopEvent] = []
 
@@ -110,6 +114,7 @@ class MapSession:
             relative: the filter's motion between two frames of its window.
         """
         self._frames += 1
+        self._T_odom_body = estimate.T_world_imu
         events = self._take(lambda due: due <= self._frames)
         fresh = seen.take(seen.has_right & ~seen.stale)
         seen_now = len(fresh) >= _LEAST_TRACKED
@@ -133,7 +138,7 @@ class MapSession:
         """Wait for everything, and write the map."""
         events = self._take(lambda due: True)
         if self._frames:
-            self.T_map_odom = self._executor.submit(self._builder.finish).result().T_map_odom
+            self._T_map_odom, self._T_map_cam = self._executor.submit(self._builder.finish).result().T_map_odom, None
         return events
 
     def close(self) -> None:
@@ -172,23 +177,42 @@ class MapSession:
         return self._last_keyframe
 
     @property
+    def T_map_odom(self) -> FloatArray | None:
+        """Pose (4, 4) of the odometry's world in the map, by the newest frame; None without a place.
+
+        Once a loop holds the place, a frame is where the newest keyframe with a result is, moved by the motions of the
+        filter's window since: a filter that learns what it was off by moves its newest pose, and not these.
+        """
+        now = self._now()
+        if now is None or self._T_map_cam is None:
+            return self._T_map_odom
+        return now.T_i_j @ self._T_cam_body @ se3_inverse(self._T_odom_body)
+
+    @property
     def covariance(self) -> FloatArray | None:
         """Covariance (6, 6) of xi in T_map_body = T_hat exp(xi), [rho; phi], at the newest frame, given the map.
 
         That of the newest keyframe whose place is known, grown by the odometry since; None without a place. Where
         images show nothing, it grows as the filter's own; of images alone, the place is soon not known.
         """
+        now = self._now()
+        if now is None:
+            return None
+        A = se3_adjoint(self._T_body_cam)
+        return A @ now.covariance @ A.T
+
+    def _now(self) -> RelativePose | None:
+        """Return the camera's pose in the map at the newest frame, its keyframe's being the identity if not known."""
         if self._known is None:
             return None
-        now = RelativePose(np.eye(4), self._known)
+        now = RelativePose(np.eye(4) if self._T_map_cam is None else self._T_map_cam, self._known)
         for _, motion in self._moves:
             now = now.then(motion)
         if self._newest is not None:
             now = now.then(self._newest[1])
         if self._dark is not None:
             now = now.then(self._dark.seen_by(self._T_cam_body))
-        A = se3_adjoint(self._T_body_cam)
-        return A @ now.covariance @ A.T
+        return now
 
     @property
     def is_joined(self) -> bool:
@@ -273,7 +297,7 @@ class MapSession:
         while self._waiting and is_due(self._waiting[0][0]):
             _, frame, result = self._waiting.pop(0)
             update = result.result()
-            self.T_map_odom, self._known = update.T_map_odom, update.covariance
+            self._T_map_odom, self._known, self._T_map_cam = update.T_map_odom, update.covariance, update.T_map_cam
             self._moves = [move for move in self._moves if move[0] > frame]
             events += update.loops
         self.loops += events

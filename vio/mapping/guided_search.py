@@ -1,0 +1,356 @@
+"""Where a keyframe stands, by looking for the points of a place where they should be seen.
+
+Where the motion to a place is roughly known, each of its points needs to be told from the few features around its
+predicted pixel alone, in place of all features of the image (search by projection, as in Mur-Artal et al. 2015). Points
+come from several keyframes, so that one of them shows each from a similar view.
+
+A window always holds some feature that looks alike. What agrees by chance is counted with the same search where
+all points are moved aside, and a place needs several times as many.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from vio.compiled import compiled
+from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_hat, transform_points
+from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.mapping.features import KeyframeFeatures
+from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, StereoPoints, Terms, fit_terms, points_of
+from vio.mapping.overlap import LEAST_DEPTH_M, SCALES, VIEW_COS
+from vio.records import IntArray
+
+_MOST_BITS = 64  # in which the descriptors of one point differ: a quarter
+_LEVELS = 1.6  # by which the size of a feature differs from the predicted one: two and a half levels
+_SIGMAS = 3.0
+_WINDOW_PX = 3.0  # half of a window's side at the scale of its feature, where the pose is known
+_MOST_WINDOW_PX = 40.0  # half of a window's side: in larger ones, the best of all descriptors is seldom the point's
+_RANSAC_PX, _RANSAC_STEPS, _RANSAC_SURE = 4.0, 300, 0.999
+_SEARCHES = 2  # with the pose found
+_LEAST_SAMPLE = 8  # pairs that agree before the next search
+_CELL_PX = 8.0  # features closer together are of one corner, on several levels of the pyramid, and count once
+_ROWS = 1 << 20  # more than an image has
+_ASIDE_PX = 25.0  # by which all points are moved to find the pairs of chance: more than a window of the last search
+_ASIDE = 8  # directions
+LEAST_CORNERS = 12
+_OVER_CHANCE = 6.0  # times the mean number of pairs of chance
+
+
+class View(NamedTuple):
+    """A keyframe of a place."""
+
+    keyframe: int
+    camera: StereoCamera
+    features: KeyframeFeatures
+    place: RelativePose  # in the frame of the place's first keyframe
+
+
+@dataclass(frozen=True, slots=True)
+class PlacePoints:
+    """The stereo points of a place, once for each keyframe that shows them."""
+
+    views: Sequence[View]
+    p: FloatArray  # (N, 3) in the frame of the place's first keyframe
+    eye: FloatArray  # (N, 3) position of the camera that saw it, likewise
+    size_px: FloatArray  # (N,) of the feature
+    descriptors: npt.NDArray[np.uint64]  # (N, 4)
+    view: IntArray  # (N,) index of the keyframe in the place
+    row: IntArray  # (N,) feature of that keyframe
+
+    def take(self, rows: IntArray) -> PlacePoints:
+        """Return some of the points."""
+        a = self.p[rows], self.eye[rows], self.size_px[rows], self.descriptors[rows]
+        return PlacePoints(self.views, *a, self.view[rows], self.row[rows])
+
+    def with_covariance(self) -> StereoPoints:
+        """Return the points with their covariance; errors of the keyframes' poses count as those of their points."""
+        P = np.zeros((len(self.p), 3, 3))
+        for n in np.unique(self.view).tolist():
+            _, camera, f, place = self.views[n]
+            own = self.view == n
+            seen = points_of(camera, f, self.row[own])
+            D = np.concatenate([np.broadcast_to(np.eye(3), (len(seen.p), 3, 3)), -so3_hat(seen.p)], axis=2)
+            R = place.T_i_j[:3, :3]
+            P[own] = R @ (seen.covariance + D @ place.covariance @ np.swapaxes(D, 1, 2)) @ R.T
+        return StereoPoints(self.p, P, np.ones(len(P), dtype=np.bool_))
+
+
+@dataclass(frozen=True, slots=True)
+class Guided:
+    """A place found by search."""
+
+    pose: RelativePose  # of the camera in the frame of the place's first keyframe
+    inliers: int  # distinct corners
+    chance: float  # mean number of those where all points are moved aside
+    view: IntArray  # (P,) keyframe of the place that shows each pair
+    row: IntArray  # (P,) feature of that keyframe
+    row_here: IntArray  # (P,) feature of this keyframe
+
+
+def place_points(views: Sequence[View]) -> PlacePoints:
+    """Return the points that the keyframes of a place show."""
+    parts = []
+    for n, (_, camera, f, place) in enumerate(views):
+        p, valid = triangulate(camera, f.z, min_disparity_px=LEAST_DISPARITY_PX)
+        rows = np.flatnonzero(valid & f.has_right)
+        p = transform_points(place.T_i_j, p[rows])
+        eye = np.broadcast_to(place.T_i_j[:3, 3], p.shape)
+        parts.append((p, eye, f.sigma_px[rows], _as_words(f.descriptors[rows]), np.full(len(rows), n), rows))
+    p, eye, size_px, descriptors, view, row = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return PlacePoints(views, p, eye, size_px, descriptors, view, row)
+
+
+def _as_words(descriptors: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint64]:
+    return np.ascontiguousarray(descriptors).view(np.uint64)
+
+
+def search(
+    place: PlacePoints,
+    camera: StereoCamera,
+    here: KeyframeFeatures,
+    start: RelativePose,
+    prior: RelativePose | None,
+) -> Guided | None:
+    """Return where a keyframe stands in the frame of a place; None: not enough of the place is seen.
+
+    Args:
+        place: the place's points.
+        camera: of the keyframe.
+        here: its features.
+        start: about where it stands; the covariance gives the windows of the first search.
+        prior: where it stands by the odometry: it decides what the pixels leave open, and the covariance of the result
+            is that of the pixels alone; None: not known.
+    """
+    if len(here) < LEAST_CORNERS:
+        return None
+    target = _Target.of(camera, here)
+    place = place.take(_in_reach(place, camera, start.T_i_j))
+    pairs = _pairs(place, target, start.T_i_j, start.covariance)
+    T = _ransac(place, camera, here, pairs)
+    fitted = None
+    for _ in range(_SEARCHES):
+        if T is None:
+            return None
+        pairs = _pairs(place, target, T, None)
+        points, rows = place.take(pairs.point), pairs.feature
+        terms = Terms(points.with_covariance(), camera, here, rows, inverse=True)
+        fitted = fit_terms([terms], T, prior=prior, least=LEAST_CORNERS)
+        T = None if fitted is None else fitted.T_i_j
+    if fitted is None:
+        return None
+    found, rows = points.take(np.flatnonzero(fitted.fits)), rows[fitted.fits]
+    inliers = _corners(here.z[rows])
+    if inliers < LEAST_CORNERS:
+        return None
+    chance = _chance(pairs, target)
+    if inliers < _OVER_CHANCE * chance:
+        return None
+    depth = float(np.median(transform_points(se3_inverse(fitted.T_i_j), found.p)[:, 2]))
+    return Guided(fitted.motion(depth), inliers, chance, found.view, found.row, rows)
+
+
+def _in_reach(place: PlacePoints, camera: StereoCamera, T_i_k: FloatArray) -> IntArray:
+    """Return the points (K,) that may be seen from about a pose (4, 4)."""
+    q = transform_points(se3_inverse(T_i_k), place.p)
+    ahead = np.flatnonzero(q[:, 2] > 0)
+    uv = project(camera, q[ahead])[:, :2]
+    margin = _MOST_WINDOW_PX + _ASIDE_PX
+    w, h = camera.width or np.inf, camera.height or np.inf
+    return ahead[(uv > -margin).all(axis=1) & (uv < [w + margin, h + margin]).all(axis=1)]
+
+
+class _Target(NamedTuple):
+    """A keyframe whose features are looked through, in the order of their columns."""
+
+    camera: StereoCamera
+    order: IntArray  # (M,) features
+    z: FloatArray  # (M, 4)
+    size_px: FloatArray  # (M,)
+    descriptors: npt.NDArray[np.uint64]  # (M, 4)
+
+    @classmethod
+    def of(cls, camera: StereoCamera, f: KeyframeFeatures) -> _Target:
+        """Order the features of a keyframe."""
+        order = np.argsort(f.z[:, 0], kind="stable")
+        return cls(camera, order, f.z[order], f.sigma_px[order], _as_words(f.descriptors[order]))
+
+
+class _Pairs(NamedTuple):
+    """Points that should be seen, and the features that look like them."""
+
+    point: IntArray  # (P,)
+    feature: IntArray  # (P,) each once
+    uv: FloatArray  # (N, 2) predicted pixels of all points that should be seen
+    radius: FloatArray  # (N,) half of the window's side
+    size_px: FloatArray  # (N,) of the feature, as predicted
+    descriptors: npt.NDArray[np.uint64]  # (N, 4)
+
+
+def _pairs(place: PlacePoints, target: _Target, T_i_k: FloatArray, covariance: FloatArray | None) -> _Pairs:
+    """Pair points with features: for each feature the point that looks most alike and should be there.
+
+    Args:
+        place: points.
+        target: features.
+        T_i_k: (4, 4) pose of the keyframe that shows them.
+        covariance: (6, 6) of xi in T_i_k = T_hat exp(xi); None: the pose is known.
+    """
+    c, (uv, radius, size) = target.camera, (np.zeros((len(place.p), 2)), np.zeros(len(place.p)), place.size_px.copy())
+    C = np.zeros((6, 6)) if covariance is None else _SIGMAS**2 * covariance
+    camera = np.array([c.fu, c.fv, c.cu, c.cv, c.width or np.inf, c.height or np.inf])
+    _predict(place.p, place.eye, se3_inverse(T_i_k), T_i_k[:3, 3], C, camera, uv, radius, size)
+    seen = np.flatnonzero(radius > 0)
+    uv, radius, size = uv[seen], radius[seen], size[seen]
+    descriptors = place.descriptors[seen]
+    best, bits = _looked_for(uv, radius, size, descriptors, target)
+    found = np.flatnonzero(best >= 0)
+    found = found[np.argsort(bits[found], kind="stable")]
+    feature, first = np.unique(best[found], return_index=True)
+    return _Pairs(seen[found[first]], target.order[feature], uv, radius, size, descriptors)
+
+
+def _looked_for(
+    uv: FloatArray, radius: FloatArray, size: FloatArray, descriptors: npt.NDArray[np.uint64], target: _Target
+) -> tuple[IntArray, IntArray]:
+    """Return for each point (N,) the place of its feature in the target's order, or -1, and their differing bits."""
+    best, bits = np.full(len(uv), -1, dtype=np.int64), np.zeros(len(uv), dtype=np.int64)
+    _best_in_windows(uv, radius, size, descriptors, target.z, target.size_px, target.descriptors, best, bits)
+    return best, bits
+
+
+@compiled
+def _predict(
+    p: FloatArray,
+    eye: FloatArray,
+    T: FloatArray,
+    here: FloatArray,
+    C: FloatArray,
+    camera: FloatArray,
+    uv: FloatArray,
+    radius: FloatArray,
+    size: FloatArray,
+) -> None:
+    """Predict pixels (N, 2), half windows (N,), 0 where a point should not be seen, and sizes of features (N,).
+
+    Args:
+        p: (N, 3) points.
+        eye: (N, 3) positions of the cameras that saw them.
+        T: (4, 4) maps points to the camera.
+        here: (3,) position of the camera.
+        C: (6, 6) covariance of the pose, times the square of the standard deviations that a window has.
+        camera: [fu fv cu cv width height].
+        uv: pixels, written.
+        radius: windows, written.
+        size: of the features in their keyframes; replaced.
+    """
+    fu, fv, cu, cv, width, height = camera
+    D, q = np.zeros((2, 6)), np.zeros(3)
+    for n in range(len(p)):
+        for i in range(3):
+            q[i] = T[i, 0] * p[n, 0] + T[i, 1] * p[n, 1] + T[i, 2] * p[n, 2] + T[i, 3]
+        dot, away, near = 0.0, 0.0, 0.0
+        for i in range(3):
+            there, now = p[n, i] - eye[n, i], p[n, i] - here[i]
+            dot, away, near = dot + there * now, away + there * there, near + now * now
+        away, near = np.sqrt(away), np.sqrt(near)
+        if q[2] <= LEAST_DEPTH_M or dot <= VIEW_COS * away * near or not 1 / SCALES < away / near < SCALES:
+            continue
+        u, v = cu + fu * q[0] / q[2], cv + fv * q[1] / q[2]
+        # uv_D_xi of q = exp(-xi) T p: [-J, J q^], with J = uv_D_q.
+        a, b, x, y = fu / q[2], fv / q[2], q[0] / q[2], q[1] / q[2]
+        D[0, 0], D[0, 2], D[1, 1], D[1, 2] = -a, a * x, -b, b * y
+        D[0, 3], D[0, 4], D[0, 5] = a * x * q[1], -a * (q[2] + x * q[0]), a * q[1]
+        D[1, 3], D[1, 4], D[1, 5] = b * (q[2] + y * q[1]), -b * y * q[0], -b * q[0]
+        largest = 0.0
+        for r in range(2):
+            total = 0.0
+            for i in range(6):
+                for j in range(6):
+                    total += D[r, i] * C[i, j] * D[r, j]
+            largest = max(largest, total)
+        size[n] = size[n] * away / near
+        half = _WINDOW_PX * max(size[n], 1.0) + np.sqrt(largest)
+        if half <= _MOST_WINDOW_PX and -half < u < width + half and -half < v < height + half:
+            uv[n, 0], uv[n, 1], radius[n] = u, v, half
+
+
+@compiled
+def _best_in_windows(
+    uv: FloatArray,
+    radius: FloatArray,
+    size: FloatArray,
+    a: npt.NDArray[np.uint64],
+    z: FloatArray,
+    sizes: FloatArray,
+    b: npt.NDArray[np.uint64],
+    best: IntArray,
+    bits: IntArray,
+) -> None:
+    """Find for each point the feature around its pixel (N, 2) whose descriptor differs least; -1: none does well.
+
+    Features z (M, 2) are in the order of their columns. Bits are counted by sums over pairs, fours and bytes.
+    """
+    pairs, fours = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
+    bytes_, ones = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
+    for i in range(len(uv)):
+        least = np.uint64(_MOST_BITS + 1)
+        j = np.searchsorted(z[:, 0], uv[i, 0] - radius[i])
+        while j < len(z) and z[j, 0] <= uv[i, 0] + radius[i]:
+            ratio = sizes[j] / size[i]
+            if abs(z[j, 1] - uv[i, 1]) <= radius[i] and ratio < _LEVELS and ratio * _LEVELS > 1.0:
+                total = np.uint64(0)
+                for w in range(a.shape[1]):
+                    x = a[i, w] ^ b[j, w]
+                    x = x - ((x >> np.uint64(1)) & pairs)
+                    x = (x & fours) + ((x >> np.uint64(2)) & fours)
+                    x = (x + (x >> np.uint64(4))) & bytes_
+                    total += (x * ones) >> np.uint64(56)
+                if total < least:
+                    least, best[i] = total, j
+            j += 1
+        bits[i] = least
+
+
+def _ransac(place: PlacePoints, camera: StereoCamera, here: KeyframeFeatures, pairs: _Pairs) -> FloatArray | None:
+    """Return the pose (4, 4) with which most pairs agree; None: too few."""
+    if len(pairs.point) < _LEAST_SAMPLE:
+        return None
+    K = np.array([[camera.fu, 0, camera.cu], [0, camera.fv, camera.cv], [0, 0, 1.0]])
+    done, rotation, translation, inliers = cv2.solvePnPRansac(
+        place.p[pairs.point],
+        here.z[pairs.feature, :2],
+        K,
+        None,
+        iterationsCount=_RANSAC_STEPS,
+        reprojectionError=_RANSAC_PX,
+        confidence=_RANSAC_SURE,
+        flags=cv2.SOLVEPNP_P3P,
+    )
+    if not done or inliers is None or len(inliers) < _LEAST_SAMPLE:
+        return None
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = so3_exp(rotation[:, 0]), translation[:, 0]
+    return se3_inverse(T)
+
+
+def _corners(z: FloatArray) -> int:
+    """Count the parts of the image that features (P, 4) are in."""
+    cell = (z[:, :2] // _CELL_PX).astype(np.int64)
+    return len(np.unique(cell[:, 0] * _ROWS + cell[:, 1]))
+
+
+def _chance(pairs: _Pairs, target: _Target) -> float:
+    """Return the mean number of corners that pair where no point is where it should be."""
+    counts = []
+    for angle in np.linspace(0, 2 * np.pi, _ASIDE, endpoint=False):
+        aside = pairs.uv + _ASIDE_PX * np.array([np.cos(angle), np.sin(angle)])
+        best, _ = _looked_for(aside, pairs.radius, pairs.size_px, pairs.descriptors, target)
+        counts.append(_corners(target.z[best[best >= 0]]))
+    return float(np.mean(counts))
