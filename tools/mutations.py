@@ -1883,8 +1883,8 @@ MUTATIONS = (
     Mutation(
         "guided search: windows as if the pose were known",
         "vio/mapping/guided_search.py",
-        "if covariance is None else _SIGMAS**2 * covariance",
-        "if covariance is None else 0 * _SIGMAS**2 * covariance",
+        "C = np.zeros((6, 6)) if covariance is None else _SIGMAS**2 * covariance",
+        "C = np.zeros((6, 6)) if covariance is None else 0 * covariance",
         _GUIDED,
     ),
     Mutation(
