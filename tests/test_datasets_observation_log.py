@@ -203,6 +203,7 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
         ({"frame_times_ns": [0, 0, 200]}, "a clock does not increase"),
         ({"motion_values": np.zeros((1, 6))}, "0 motion times"),
         ({"image_size": [640]}, "the camera is incomplete"),
+        ({"residual_px": -0.5}, "residual_px is -0.5, no number of pixels"),
         ({"run_motion": "wheels"}, "run_motion is 'wheels', none of imu, velocity, none"),
         ({"landmark_ids": [1]}, "landmark_ids lacks landmark_p_world"),
         ({"reference_T_world_body": np.zeros((2, 4)), "reference_body": "imu"}, "reference poses"),

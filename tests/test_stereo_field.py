@@ -31,7 +31,7 @@ from vio.cli import main
 from vio.config import load_config
 from vio.datasets.observation_log import write_observation_log
 from vio.datasets.rigs.kalibr import kalibr_text
-from vio.errors import DataError
+from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.geometry.rectify import rectified_cameras, rectify_pixels
@@ -199,6 +199,24 @@ def test_the_next_run_from_a_saved_calibration_has_nothing_to_correct(turned: Pa
     assert before["rows_rms_px"] > 0.25
     assert abs(before["coefficients_px"][0]) > 10 * before["sigma_px"][0]
     assert not has_calibration_panel(result)
+
+
+@pytest.mark.parametrize("residual_px", [0.0, 0.4])
+def test_what_a_saved_calibration_leaves_is_estimated_from_the_first_frame(tmp_path: Path, residual_px: float) -> None:
+    """Its rows agree, so that only the file can tell: a run that trusted it was worse than the one that wrote it."""
+    rig = replace(RECTIFIED, residual_px=residual_px)
+    file = tmp_path / "camchain-imucam.yaml"
+    file.write_text(kalibr_text(rig))
+    read = vio.load_rig(file)
+    assert read.camera.residual_px == read.rectifier().camera.residual_px == residual_px
+    course = Course(20, 0.3, velocity=(0.5, 0.3, 0.0), depth=(3.0, 12.0), pixel_sigma_px=0.1, features=60)
+    rng, path = np.random.default_rng(0), tmp_path / "log.npz"
+    _write(path, replace(CAMERA, residual_px=residual_px), [course.observe(k, rng) for k in range(course.frames)])
+    result = vio.run(vio.open_dataset(path), load_config())
+    assert (result.estimates[0].stereo_field is not None) == (residual_px > 0)
+    file.write_text(kalibr_text(replace(rig, residual_px=-1.0)))
+    with pytest.raises(CalibrationError, match="residual_px is -1; it must not be negative"):
+        vio.load_rig(file)
 
 
 def test_a_live_user_gets_the_calibrated_rig(turned: Path) -> None:

@@ -1650,6 +1650,13 @@ MUTATIONS = (
         _STEREO_FIELD,
     ),
     Mutation(
+        "a saved calibration's residue is not estimated on",
+        "vio/filters/msckf.py",
+        "known_off = self._camera.residual_px > LEAST_FIELD_PX",
+        "known_off = False",
+        _KEPT,
+    ),
+    Mutation(
         "rows keep what both lenses do to near points",
         "vio/filters/stereo_calibration.py",
         "self.coefficients - np.linalg.solve(self._A + prior,",

@@ -101,6 +101,7 @@ class Rig:
     imu_noise: ImuDensities | None = None
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
     notes: tuple[str, ...] = ()  # what a reader of calibration files found and assumed
+    residual_px: float = 0.0  # by how much pixels are known to be off still (rms): what the lens models cannot hold
 
     def __post_init__(self) -> None:
         _check_rigid(self.T_cam1_cam0, "T_cam1_cam0")
@@ -207,7 +208,8 @@ class Rig:
             CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
         """
         pair = rectified_pair(self.stereo)
-        return rectified_cameras(self.stereo, "auto").camera if pair is None else self._exact(pair)
+        camera = rectified_cameras(self.stereo, "auto").camera if pair is None else self._exact(pair)
+        return replace(camera, residual_px=self.residual_px)
 
     @property
     def T_rect0_imu(self) -> FloatArray | None:
@@ -226,9 +228,11 @@ class Rig:
         """
         made = rectifier_of(self.stereo, interpolation, projection)
         if made.maps is not None:
-            return replace(made, time_offset_s=self.time_offset_s)
+            camera = replace(made.camera, residual_px=self.residual_px)
+            return replace(made, camera=camera, time_offset_s=self.time_offset_s)
         T = made.T_rect0_imu if self.T_cam0_imu is None else self.T_cam0_imu
-        return replace(made, camera=self._exact(made.camera), T_rect0_imu=T, time_offset_s=self.time_offset_s)
+        camera = replace(self._exact(made.camera), residual_px=self.residual_px)
+        return replace(made, camera=camera, T_rect0_imu=T, time_offset_s=self.time_offset_s)
 
     def _exact(self, pair: StereoCamera) -> StereoCamera:
         """Return a rectified pair with the baseline as stated, which the way through the body would round."""

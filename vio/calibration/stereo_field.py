@@ -213,7 +213,8 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     seen = frame.as_seen(x)
     left = seen - frame.grid - field_basis(frame.camera, frame.where_read(seen)) @ measured
-    return CalibratedRig(frame.moved(x), x, covariance, float(np.sqrt(np.mean(left**2))))
+    left_px = float(np.sqrt(np.mean(left**2)))
+    return CalibratedRig(replace(frame.moved(x), residual_px=left_px), x, covariance, left_px)
 
 
 def _expressible(given: Rig) -> BoolArray:

@@ -58,6 +58,7 @@ _OPTIONAL = (
     "projection",
     "run_motion",
     "camera_kind",
+    "residual_px",
     "T_cam0_imu",
     "reference_T_world_body",
     "reference_body",
@@ -117,6 +118,7 @@ def write_observation_log(
         **_optional_arrays(recording),
         **({} if run_motion is None else {"run_motion": np.array(run_motion)}),
         **({} if camera.kind == "stereo" else {"camera_kind": np.array(camera.kind)}),
+        **({"residual_px": np.array(camera.residual_px)} if camera.residual_px else {}),
     }
     stream = io.BytesIO()
     np.savez(stream, **arrays)  # type: ignore[arg-type] # the stubs take every keyword for allow_pickle
@@ -234,6 +236,9 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
         return f"run_motion is {str(arrays['run_motion'])!r}, none of {', '.join(get_args(RunMotion))}"
     if "camera_kind" in arrays and str(arrays["camera_kind"]) not in get_args(CameraKind):
         return f"camera_kind is {str(arrays['camera_kind'])!r}, none of {', '.join(get_args(CameraKind))}"
+    residual = arrays.get("residual_px", np.zeros(()))
+    if residual.shape != () or residual.dtype.kind != "f" or not 0 <= residual < np.inf:
+        return f"residual_px is {residual.tolist()!r}, no number of pixels"
     poses = arrays.get("reference_T_world_body", np.zeros((0, 4, 4)))
     stamps = [len(arrays[key]) for key in ("reference_times_ns", "reference_frame_indices") if key in arrays]
     if poses.shape[1:] != (4, 4) or any(count != len(poses) for count in stamps):
@@ -246,7 +251,8 @@ def _camera(arrays: Mapping[str, np.ndarray]) -> StereoCamera:
     width, height = arrays["image_size"].tolist() or (None, None)
     projection = cast(Projection, str(arrays.get("projection", "pinhole")))
     kind = cast(CameraKind, str(arrays.get("camera_kind", "stereo")))
-    return StereoCamera(fu, fv, cu, cv, b, width, height, projection=projection, kind=kind)
+    residual_px = float(arrays.get("residual_px", 0.0))
+    return StereoCamera(fu, fv, cu, cv, b, width, height, projection, kind, residual_px)
 
 
 def _extrinsics(arrays: Mapping[str, np.ndarray], path: Path) -> FloatArray | None:

@@ -35,6 +35,7 @@ from vio.filters.restart import GoodState, restarted
 from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
+    LEAST_FIELD_PX,
     RowField,
     StereoField,
     StereoInformation,
@@ -645,7 +646,8 @@ class Msckf:
         if self._settings.calibrate_stereo == "off":
             return
         self._rows.update(seen)
-        if not window.calibration.stereo_field and self._rows.is_significant:
+        known_off = self._camera.residual_px > LEAST_FIELD_PX
+        if not window.calibration.stereo_field and (known_off or self._rows.is_significant):
             calibration = replace(window.calibration, stereo_field=True)
             P, _ = calibration_covariance(calibration, self._settings)
             window.start_stereo_field(calibration, P[:FIELD_TERMS, :FIELD_TERMS])

@@ -26,7 +26,7 @@ METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated 
 TERMS = FIELD_TERMS + METRIC_TERMS
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
-_LEAST_ROWS_PX = 0.05  # root mean square of the field over the matches; smaller ones do no harm
+LEAST_FIELD_PX = 0.05  # root mean square of the field over the matches; smaller ones do no harm
 _ROW_DOMINANCE = 4.0  # the field over the variance that it leaves: features that wander calibrate nothing
 _ROW_SIGNIFICANCE = 25.0  # squared standard deviations of the field by noise alone
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
@@ -118,7 +118,7 @@ class RowField:
         # The features of one frame count, as in the covariance.
         uncertainty = ROW_TERMS * self._squares / max(self._count, 1.0) / max(self._matches, 1)
         noise = self._squares / max(self._count, 1.0)
-        return self.rms_px**2 > max(_LEAST_ROWS_PX**2 + _ROW_SIGNIFICANCE * uncertainty, _ROW_DOMINANCE * noise)
+        return self.rms_px**2 > max(LEAST_FIELD_PX**2 + _ROW_SIGNIFICANCE * uncertainty, _ROW_DOMINANCE * noise)
 
 
 def _common_rows(x: FloatArray, xr: FloatArray, y: FloatArray) -> FloatArray:

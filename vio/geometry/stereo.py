@@ -47,6 +47,7 @@ class StereoCamera:
     height: int | None = None
     projection: Projection = "pinhole"  # of both images; see above
     kind: CameraKind = "stereo"  # where right pixels come from: a right camera, depth images, or nowhere
+    residual_px: float = 0.0  # by how much pixels are known to be off still (rms): what no lens model of the rig holds
 
     def __post_init__(self) -> None:
         values = (self.fu, self.fv, self.cu, self.cv, self.baseline_m)

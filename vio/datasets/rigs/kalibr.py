@@ -75,9 +75,9 @@ def read_camchain(path: Path) -> Rig:
     if further := sorted(name for name in entries if name.startswith("cam") and name not in ("cam0", "cam1")):
         notes.append(f"{path}: cam0 and cam1 are used, {', '.join(further)} not")
     noise, imu_notes = _imu_beside(path)
-    offset_s = _time_shift(left, right, path)
+    offset_s, residual_px = _time_shift(left, right, path), _residual(right, f"{path}, cam1")
     with naming(path):
-        return Rig(cam0, cam1, T_cam1_cam0, T_cam0_imu, noise, offset_s, (*notes, *imu_notes))
+        return Rig(cam0, cam1, T_cam1_cam0, T_cam0_imu, noise, offset_s, (*notes, *imu_notes), residual_px)
 
 
 def _camera(block: Mapping[str, Any], where: str) -> CameraModel:
@@ -127,6 +127,14 @@ def _time_shift(left: Mapping[str, Any], right: Mapping[str, Any], path: Path) -
     return sum(shifts) / len(shifts) if shifts else 0.0
 
 
+def _residual(right: Mapping[str, Any], where: str) -> float:
+    """Return what a calibration by `vio run` could not express, pixels; Kalibr itself states nothing of the kind."""
+    value = numbers(right, "residual_px", where, 1)[0] if "residual_px" in right else 0.0
+    if not value >= 0:
+        raise CalibrationError(f"{where}: residual_px is {value:g}; it must not be negative")
+    return value
+
+
 def _imu_beside(path: Path) -> tuple[ImuDensities | None, tuple[str, ...]]:
     """Find the IMU's file in the folder of a camchain: its noise, and a note where several fit."""
     found: list[tuple[Path, ImuDensities]] = []
@@ -172,6 +180,8 @@ def kalibr_text(rig: Rig) -> str:
             sheet["T_cam_imu"] = poses[name].tolist()
         if name == "cam1":
             sheet["T_cn_cnm1"] = rig.T_cam1_cam0.tolist()
+            if rig.residual_px:
+                sheet["residual_px"] = float(rig.residual_px)
         sheet |= _camera_sheet(camera)
         if rig.T_cam0_imu is not None:
             sheet["timeshift_cam_imu"] = float(rig.time_offset_s)
