@@ -206,8 +206,8 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     shapes |= {"velocity_covariance": (3, 3)}
     kept = [f.name for f in fields(Estimate) if not f.name.startswith("T_map")]  # those have a table of their own
     values: dict[str, Any] = {name: rng.normal(size=shapes.get(name, (3,))) for name in kept}
-    rows, rows_P = rng.normal(size=6), rng.normal(size=(6, 6))
-    field = StereoFieldEstimate(rng.normal(size=6), rng.normal(size=(6, 6)), 0.3, rows, rows_P)
+    rows, rows_P = rng.normal(size=7), rng.normal(size=(7, 7))
+    field = StereoFieldEstimate(rng.normal(size=8), rng.normal(size=(8, 8)), 0.3, rows, rows_P)
     scale = StereoScaleEstimate(rng.normal(size=2), rng.normal(size=(2, 2)))
     values |= {"time_ns": 2**60 + 1, "time_offset_s": 0.1, "time_offset_sigma_s": 0.2, "scale_sigma": 0.02}
     values |= {"stereo_field": field, "stereo_scale": scale}
