@@ -429,11 +429,6 @@ def sentences(f: Figures) -> Iterator[tuple[str, str]]:
         f"Rotation is better with them for {sum(better[0])} and {sum(better[1])} of {NOISE_SEEDS} seeds, "
         f"by {gains[0]:.1f} and {gains[1]:.1f} % in the median",
     )
-    yield (
-        readme,
-        f"dead reckoning with OXTS velocities "
-        f"({f.tell('drives/kitti_06_head/window/velocity', 'dead_reckoning_ate_m')} m)",
-    )
 
 
 def differences(figures: Figures, root: Path = ROOT) -> Iterator[str]:
