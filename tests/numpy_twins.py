@@ -15,6 +15,7 @@ from vio.filters.multiview import (
     Views,
     point_D_pose,
 )
+from vio.filters.navigation import _free_flow
 from vio.filters.stereo_calibration import StereoColumns, StereoInformation
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
@@ -352,19 +353,8 @@ def moved_velocities(
     gravity: FloatArray, ages_s: FloatArray, R: FloatArray, error: FloatArray, velocities: FloatArray
 ) -> FloatArray:
     """Velocities (N, 3) of the past, moved by a present error (15,): (N2) back, with the accelerometer's bias."""
-    xi_v = (free_flow(-ages_s, gravity) @ error[:9])[:, 6:9] + ages_s[:, None] * (R @ error[12:15])
+    xi_v = (_free_flow(-ages_s, gravity) @ error[:9])[:, 6:9] + ages_s[:, None] * (R @ error[12:15])
     out: FloatArray = velocities @ so3_exp(error[3:6]).T + xi_v @ so3_left_jacobian(error[3:6]).T
-    return out
-
-
-def free_flow(s: FloatArray, gravity: FloatArray) -> FloatArray:
-    """Transition (K, 9, 9) of [rho phi xi_v] over times (K,)."""
-    out = np.zeros((len(s), 9, 9))
-    out[:] = np.eye(9)
-    G = so3_hat(gravity)
-    out[:, 0:3, 6:9] = s[:, None, None] * np.eye(3)
-    out[:, 0:3, 3:6] = (0.5 * s**2)[:, None, None] * G
-    out[:, 6:9, 3:6] = s[:, None, None] * G
     return out
 
 
@@ -394,7 +384,7 @@ def integrated(
     B[:, 0:3, 0:3] = -so3_hat(0.5 * (p[:-1] + p[1:])) @ R[:-1]
     B[:, 3:6, 0:3] = B[:, 6:9, 3:6] = -R[:-1]
     B[:, 6:9, 0:3] = -so3_hat(0.5 * (v[:-1] + v[1:])) @ R[:-1]
-    moved = free_flow(left, gravity) @ B
+    moved = _free_flow(left, gravity) @ B
     variance = densities[:, None] ** 2 * dt + hidden
     Q = [np.einsum("k,kij,klj->il", s, M, M) for s, M in zip(variance, (moved[:, :, 3:], moved[:, :, :3]), strict=True)]
     return R, p, v, np.einsum("kij,k->ij", moved, dt), np.array(Q)

@@ -227,12 +227,12 @@ class Rig:
             CalibrationError: as `camera`.
         """
         made = rectifier_of(self.stereo, interpolation, projection)
+        camera = replace(made.camera, residual_px=self.residual_px)
+        made = replace(made, camera=camera, time_offset_s=self.time_offset_s)
         if made.maps is not None:
-            camera = replace(made.camera, residual_px=self.residual_px)
-            return replace(made, camera=camera, time_offset_s=self.time_offset_s)
+            return made
         T = made.T_rect0_imu if self.T_cam0_imu is None else self.T_cam0_imu
-        camera = replace(self._exact(made.camera), residual_px=self.residual_px)
-        return replace(made, camera=camera, T_rect0_imu=T, time_offset_s=self.time_offset_s)
+        return replace(made, camera=self._exact(camera), T_rect0_imu=T)
 
     def _exact(self, pair: StereoCamera) -> StereoCamera:
         """Return a rectified pair with the baseline as stated, which the way through the body would round."""

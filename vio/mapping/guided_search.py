@@ -14,16 +14,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from vio.compiled import compiled
-from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_hat, transform_points
+from vio.geometry.lie import FloatArray, se3_inverse, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, StereoPoints, Terms, fit_terms, points_of
+from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, StereoPoints, Terms, fit_terms, points_of, pose_of_most
 from vio.mapping.overlap import LEAST_DEPTH_M, SCALES, VIEW_COS
 from vio.records import IntArray
 
@@ -32,7 +31,6 @@ _LEVELS = 1.6  # by which the size of a feature differs from the predicted one: 
 _SIGMAS = 3.0
 _WINDOW_PX = 3.0  # half of a window's side at the scale of its feature, where the pose is known
 _MOST_WINDOW_PX = 40.0  # half of a window's side: in larger ones, the best of all descriptors is seldom the point's
-_RANSAC_PX, _RANSAC_STEPS, _RANSAC_SURE = 4.0, 300, 0.999
 _SEARCHES = 2  # with the pose found
 _LEAST_SAMPLE = 8  # pairs that agree before the next search
 _CELL_PX = 8.0  # features closer together are of one corner, on several levels of the pyramid, and count once
@@ -149,7 +147,8 @@ def search(
     target = _Target.of(camera, here)
     place = place.take(_in_reach(place, camera, start.T_i_j))
     pairs = _pairs(place, target, start.T_i_j, start.covariance)
-    T = _ransac(place, camera, here, pairs)
+    seen_from = pose_of_most(camera, place.p[pairs.point], here.z[pairs.feature, :2], _LEAST_SAMPLE)
+    T = None if seen_from is None else se3_inverse(seen_from)
     fitted = None
     for _ in range(_SEARCHES):
         if T is None:
@@ -332,28 +331,6 @@ def _best_in_windows(
                     least, best[i] = total, j
             j += 1
         bits[i] = least
-
-
-def _ransac(place: PlacePoints, camera: StereoCamera, here: KeyframeFeatures, pairs: _Pairs) -> FloatArray | None:
-    """Return the pose (4, 4) with which most pairs agree; None: too few."""
-    if len(pairs.point) < _LEAST_SAMPLE:
-        return None
-    K = np.array([[camera.fu, 0, camera.cu], [0, camera.fv, camera.cv], [0, 0, 1.0]])
-    done, rotation, translation, inliers = cv2.solvePnPRansac(
-        place.p[pairs.point],
-        here.z[pairs.feature, :2],
-        K,
-        None,
-        iterationsCount=_RANSAC_STEPS,
-        reprojectionError=_RANSAC_PX,
-        confidence=_RANSAC_SURE,
-        flags=cv2.SOLVEPNP_P3P,
-    )
-    if not done or inliers is None or len(inliers) < _LEAST_SAMPLE:
-        return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = so3_exp(rotation[:, 0]), translation[:, 0]
-    return se3_inverse(T)
 
 
 def _corners(z: FloatArray) -> int:

@@ -138,12 +138,24 @@ def _pnp(
 ) -> FloatArray | None:
     """Return T_b_a (4, 4) from the stereo points of a and the left pixels of b; None: too few agree."""
     p, valid = _points(camera_a, a, rows_a)
-    if valid.sum() < LEAST_INLIERS:
+    return pose_of_most(camera_b, p[valid], b.z[rows_b[valid], :2], LEAST_INLIERS)
+
+
+def pose_of_most(camera: StereoCamera, p: FloatArray, uv: FloatArray, least: int) -> FloatArray | None:
+    """Return the transform (4, 4) into a camera with which most points agree, by RANSAC over samples of three.
+
+    Args:
+        camera: the camera.
+        p: points (K, 3).
+        uv: left pixels (K, 2) that show them.
+        least: how many must agree; with fewer the result is None.
+    """
+    if len(p) < least:
         return None
-    K = np.array([[camera_b.fu, 0, camera_b.cu], [0, camera_b.fv, camera_b.cv], [0, 0, 1.0]])
+    K = np.array([[camera.fu, 0, camera.cu], [0, camera.fv, camera.cv], [0, 0, 1.0]])
     done, rotation, translation, inliers = cv2.solvePnPRansac(
-        p[valid],
-        b.z[rows_b[valid], :2],
+        p,
+        uv,
         K,
         None,
         iterationsCount=_RANSAC_STEPS,
@@ -151,7 +163,7 @@ def _pnp(
         confidence=_RANSAC_SURE,
         flags=cv2.SOLVEPNP_P3P,
     )
-    if not done or inliers is None or len(inliers) < LEAST_INLIERS:
+    if not done or inliers is None or len(inliers) < least:
         return None
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = so3_exp(rotation[:, 0]), translation[:, 0]
