@@ -120,6 +120,13 @@ def test_first_tilt_follows_the_terms() -> None:
     np.testing.assert_allclose(analytic[:2], numeric, atol=1e-8)
     np.testing.assert_allclose(analytic[2], 0.0, atol=1e-14)
 
+    filt = Msckf(CAMERA, T_CAM0_IMU, FULL, motion="imu")
+    filt.propagate(ImuSample(0, np.zeros(3), force))
+    filt.update(Flight().observe(0, 0.5, np.random.default_rng(0), 40))
+    P = filt._started().P
+    np.testing.assert_allclose(P[3:6, DIM : DIM + 15], analytic @ P[DIM : DIM + 15, DIM : DIM + 15], atol=1e-12)
+    assert np.abs(P[3:6, DIM : DIM + 15]).max() > 1e-5
+
 
 def test_rest_is_measured_by_the_calibrated_gyro() -> None:
     motion, gyro = ImuMotion(FULL), np.array([0.03, -0.02, 0.05])  # a step's mean reading, calibrated

@@ -24,6 +24,9 @@ IMU_TERMS = len(IMU_ENTRIES)
 _CLEAR = 500.0
 _USUAL_S = 1.0  # over which readings are averaged: a tenth of a second of noise is a tenth of it
 _SENSOR, _ROW, _COLUMN = np.array(IMU_ENTRIES).T
+# Random walk of the terms per root second, over their initial standard deviation: by their data sheets, consumer
+# accelerometers and gyros change by 0.02 to 0.03 % a degree, so two degrees in a hundred seconds are 0.05 %.
+IMU_WALK = 0.005
 # Which terms are estimated.
 CHOSEN: dict[ImuTerms, IntArray] = {
     "off": np.zeros(0, dtype=np.int64),

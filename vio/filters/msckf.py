@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vio.errors import ConfigError, DivergedError, EstimationError
-from vio.filters.imu_terms import IMU_TERMS
+from vio.filters.imu_terms import CHOSEN, IMU_TERMS
 from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
@@ -405,7 +405,7 @@ class Msckf:
         )
         estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:], window.nav.T_world_imu)
         if window.calibration.imu_dim:
-            sigmas = window.calibration.full(np.sqrt(np.diag(output)[DIM:]))[:IMU_TERMS]
+            sigmas = np.sqrt(np.diag(self.imu_terms_covariance()))
             estimate = replace(estimate, imu_terms=window.nav.imu_terms, imu_terms_sigma=sigmas)
         if self._scale_log is not None and window.scale_test is not None:
             covariance = np.diag([window.scale_test.estimate()[1] ** 2, 0.0])
@@ -416,6 +416,14 @@ class Msckf:
             field = replace(field, rows_rms_px=self._rows.rms_px, rows=own, rows_covariance=P)
             estimate = replace(estimate, stereo_field=field)
         return estimate
+
+    def imu_terms_covariance(self) -> FloatArray:
+        """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`; zero where a term is not estimated."""
+        out = np.zeros((IMU_TERMS, IMU_TERMS))
+        if self._window is not None:
+            chosen, own = CHOSEN[self._window.calibration.imu], slice(DIM, self._window.nav_dim)
+            out[np.ix_(chosen, chosen)] = self._grown_output()[own, own]
+        return out
 
     def _current_pose(self, window: Window, output: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pose (4, 4) of the body at the newest exposure and its covariance (6, 6)."""

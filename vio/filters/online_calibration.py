@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from vio.filters.imu_terms import CHOSEN, IMU_TERMS, ImuTerms, term_sigmas
+from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, ImuTerms, term_sigmas
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import METRIC_TERMS, TERMS
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
@@ -26,9 +26,6 @@ _FULL = IMU_TERMS + TERMS + 7
 _PARTS = slice(0, 3), slice(3, 6)  # of a twist
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
-# Random walk of the IMU's terms per root second, over their initial standard deviation: by their data sheets, consumer
-# accelerometers and gyros change by 0.02 to 0.03 % a degree, so two degrees in a hundred seconds are 0.05 %.
-_IMU_WALK = 0.005
 _STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
 # Which coefficients are estimated, by whether those of (R3) and of (R4) are.
 _TERMS_OF = {
@@ -180,7 +177,7 @@ def calibration_covariance(calibration: Calibration, settings: MsckfSettings) ->
     pose_walk = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])
     imu = term_sigmas(s)
     sigmas = np.concatenate([imu, stereo, pose])
-    walks = np.concatenate([imu * _IMU_WALK, stereo * _STEREO_WALK, pose_walk])
+    walks = np.concatenate([imu * IMU_WALK, stereo * _STEREO_WALK, pose_walk])
     return np.diag(sigmas[calibration.columns] ** 2), np.diag(walks[calibration.columns] ** 2)
 
 
