@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
@@ -13,6 +14,7 @@ from tests.numerics import numeric_jacobian
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from tests.test_online_calibration import Shaking
 from vio.chain import build_backend
+from vio.checkpoint import load_checkpoint, save_checkpoint
 from vio.cli.running import _calibration_rows
 from vio.config import Config
 from vio.errors import ConfigError
@@ -29,6 +31,7 @@ from vio.run_folder import imu_calibration
 
 if TYPE_CHECKING:
     from vio.pipeline import RunResult
+    from vio.protocols import Dataset
 
 OFF = MsckfSettings()
 FULL = MsckfSettings(calibrate_imu="full")
@@ -245,8 +248,8 @@ def test_a_wrong_imu_is_predicted_consistently(found: Run) -> None:
 
 
 def test_standstill_shows_what_gravity_tells_and_no_more() -> None:
-    """Gravity's size is one number, which the scale along it and the bias share; 5 s of noise show nothing else."""
-    terms, sigmas = _fly(Shaking(100, still=True), FULL, OFF_BY_1_PERCENT, sigma=0.1).terms
+    """Gravity's size is one number, which the scale along it and the bias share; 4 s of noise show nothing else."""
+    terms, sigmas = _fly(Shaking(80, still=True), FULL, OFF_BY_1_PERCENT, sigma=0.1).terms
     prior = np.where(np.isin(np.arange(15), CHOSEN["scale"]), 0.01, np.radians(0.5))
     prior[2] = (0.01**-2 + (FULL.accel_bias_sigma_mps2 / 9.81) ** -2) ** -0.5
     np.testing.assert_allclose(sigmas / prior, 1.0, atol=0.01)
@@ -264,11 +267,11 @@ def test_noise_is_no_lever() -> None:
         np.testing.assert_allclose(got, usual + kept * (readings - usual), rtol=7e-3)
 
 
-def test_extrinsics_and_offset_are_found_beside_the_terms() -> None:
-    """All that is estimated of an IMU at once: half a degree, 1 cm, 4 ms, 1 % and half a degree of misalignment."""
-    both = replace(FULL, calibrate="both")
+def test_all_that_can_be_off_is_found_beside_the_terms() -> None:
+    """Of the IMU half a degree, 1 cm, 4 ms, 1 % and half a degree of misalignment, while the stereo field is zero."""
+    both = replace(FULL, calibrate="both", calibrate_stereo="on")
     xi = np.concatenate([0.01 * np.array([0.6, -0.6, 0.5]), np.radians(0.5) * np.array([0.6, 0.6, -0.5])])
-    run = _fly(Shaking(160), both, OFF_BY_1_PERCENT, T_cam0_imu=T_CAM0_IMU @ se3_exp(xi), offset_ns=4_000_000)
+    run = _fly(Shaking(140), both, OFF_BY_1_PERCENT, T_cam0_imu=T_CAM0_IMU @ se3_exp(xi), offset_ns=4_000_000)
     terms, sigmas = run.terms
     assert np.all(np.abs(terms - OFF_BY_1_PERCENT) < 3.5 * sigmas)
     last = run.estimates[-1]
@@ -278,7 +281,25 @@ def test_extrinsics_and_offset_are_found_beside_the_terms() -> None:
     error = se3_log(se3_inverse(last.T_cam0_imu) @ T_CAM0_IMU)
     assert error @ np.linalg.solve(last.T_cam0_imu_covariance, error) < 22.5  # chi-square, 0.999 of 6
     assert abs(last.time_offset_s - 0.004) < 1e-3
+    field = last.stereo_field
+    assert field is not None
+    assert field.coefficients @ np.linalg.solve(field.covariance, field.coefficients) < 26.1  # 0.999 of 8
     assert run.rms_m < 0.04
+
+
+def test_a_stereo_field_that_begins_later_finds_its_place_behind_the_terms() -> None:
+    filt = Msckf(replace(CAMERA, residual_px=1.0), T_CAM0_IMU, FULL, motion="imu")  # which starts it in a frame
+    flight, noise = Shaking(20), np.random.default_rng(0)
+    for sample in _samples(flight, np.zeros(15), FULL, noise)[:26]:
+        filt.propagate(sample)
+    for k in range(2):
+        filt.update(flight.observe(k, 0.5, noise, 40))
+    estimate = filt.estimate()
+    assert estimate.stereo_field is not None
+    assert estimate.imu_terms_sigma is not None
+    right = np.sqrt(np.diag(estimate.stereo_field.covariance))
+    assert right[0] == pytest.approx(np.radians(0.1), rel=0.2)  # not 1 %, of a scale
+    assert estimate.imu_terms_sigma[:2] == pytest.approx([0.01, 0.01], rel=0.1)
 
 
 # On and off
@@ -287,11 +308,11 @@ def test_extrinsics_and_offset_are_found_beside_the_terms() -> None:
 def test_terms_that_are_known_are_no_error_and_scales_alone_no_misalignment() -> None:
     """With priors of zero the flight is that without terms; `scale` leaves misalignments where they are."""
     known = replace(FULL, imu_scale_sigma=0.0, imu_misalignment_sigma_deg=0.0)
-    off, on = (_fly(Shaking(30), settings, np.zeros(15)) for settings in (OFF, known))
+    off, on = (_fly(Shaking(20), settings, np.zeros(15)) for settings in (OFF, known))
     np.testing.assert_allclose(on.estimates[-1].T_world_imu, off.estimates[-1].T_world_imu, atol=1e-6)
     np.testing.assert_allclose(on.estimates[-1].covariance, off.estimates[-1].covariance, rtol=1e-3, atol=1e-9)
     assert off.estimates[-1].imu_terms is None
-    scales, sigmas = _fly(Shaking(30), replace(OFF, calibrate_imu="scale"), OFF_BY_1_PERCENT).terms
+    scales, sigmas = _fly(Shaking(20), replace(OFF, calibrate_imu="scale"), OFF_BY_1_PERCENT).terms
     assert np.flatnonzero(sigmas).tolist() == CHOSEN["scale"].tolist() == np.flatnonzero(scales).tolist()
 
 
@@ -307,22 +328,28 @@ def test_says_what_it_needs(kind: CameraKind, motion: MotionSource | None, why: 
         build_backend(replace(CAMERA, kind=kind), T_CAM0_IMU, Config(msckf=FULL), motion)
 
 
-def test_survives_a_restart_a_gap_and_an_imu_that_begins_late() -> None:
-    """The terms stay after a restart, whose covariance is the first one; images alone stand in for a late IMU."""
+def test_survives_a_late_imu_a_gap_a_checkpoint_and_a_restart(tmp_path: Path) -> None:
+    """Images alone stand in for a late IMU; after a restart the terms stay, with the first covariance."""
     noise, flight = np.random.default_rng(0), Shaking(60)
-    filt = LateImuMsckf(CAMERA, T_CAM0_IMU, FULL)
     samples = [s for s in _samples(flight, OFF_BY_1_PERCENT, FULL, noise) if s.time_ns > 10 * STEP_NS]
     samples = [s for s in samples if not 25 * STEP_NS < s.time_ns < 29 * STEP_NS]
+    filters, dataset = [LateImuMsckf(CAMERA, T_CAM0_IMU, FULL)], cast("Dataset", SimpleNamespace(observations=None))
     for k in range(50):
-        while samples[0].time_ns <= k * STEP_NS:
-            filt.propagate(samples.pop(0))
-        filt.update(flight.observe(k, 0.5, noise, 40))
-        assert (filt.estimate().imu_terms is None) == (k <= 10)
-    before = filt.estimate()
-    while samples[0].time_ns <= 55 * STEP_NS:
-        filt.propagate(samples.pop(0))
-    filt.restart(flight.observe(55, 0.5, noise, 40))
-    after = filt.estimate()
+        if k == 45:
+            save_checkpoint(tmp_path / "state", filters[0], dataset)
+            filters.append(load_checkpoint(tmp_path / "state", dataset))
+        now = [s for s in samples if (k - 1) * STEP_NS < s.time_ns <= k * STEP_NS]
+        seen = flight.observe(k, 0.5, noise, 40)
+        for filt in filters:
+            for sample in now:
+                filt.propagate(sample)
+            filt.update(seen)
+            assert (filt.estimate().imu_terms is None) == (k <= 10)
+    before, resumed = (filt.estimate() for filt in filters)
+    np.testing.assert_array_equal(before.imu_terms, resumed.imu_terms)
+    np.testing.assert_array_equal(before.T_world_imu, resumed.T_world_imu)
+    filters[0].restart(flight.observe(50, 0.5, noise, 40))
+    after = filters[0].estimate()
     assert before.imu_terms_sigma is not None
     assert after.imu_terms_sigma is not None
     assert before.imu_terms_sigma[6:9].max() < 0.005 < after.imu_terms_sigma[6:9].min()
