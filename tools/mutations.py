@@ -1483,8 +1483,8 @@ MUTATIONS = (
     Mutation(
         "poses between frames: gravity left out",
         "vio/pose_prediction.py",
-        "force = R @ (sample.accel - self._bias[1]) + self._gravity",
-        "force = R @ (sample.accel - self._bias[1])",
+        "force = R @ accel + self._gravity",
+        "force = R @ accel",
         _ODOMETRY,
     ),
     Mutation(
