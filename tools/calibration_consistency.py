@@ -71,9 +71,12 @@ class FromStandstill(Flight):
 def settings_of(rig: Rig, pixel_sigma_px: float) -> MsckfSettings:
     """Return the filter's settings: the truth about all noise, and what is estimated of the rig."""
     known = replace(Scenario(pixel_sigma_px=pixel_sigma_px).settings(learn_noise=False), calibrate_stereo="off")
-    if rig in ("camera-IMU", "IMU", "camera-IMU and IMU"):
-        beside = "none" if rig == "IMU" else "both"
-        return replace(known, calibrate=beside, calibrate_imu="off" if rig == "camera-IMU" else "full")
+    if rig == "IMU":
+        return replace(known, calibrate_imu="full")
+    if rig == "camera-IMU and IMU":
+        return replace(known, calibrate="both", calibrate_imu="full")
+    if rig == "camera-IMU":
+        return replace(known, calibrate="both")
     if rig == "baseline":
         return replace(known, stereo_baseline_sigma=_BASELINE_SIGMA)
     return replace(known, calibrate_stereo="on")
@@ -151,7 +154,8 @@ def walked_terms(off: Off, count: int, settings: MsckfSettings, noise: np.random
 def _misread(sample: ImuSample, terms: FloatArray) -> ImuSample:
     """Return what an IMU of some terms (15,) reads in the place of a perfect one."""
     M_accel, M_gyro = imu_matrices(terms)
-    return ImuSample(sample.time_ns, np.linalg.solve(M_gyro, sample.gyro), np.linalg.solve(M_accel, sample.accel))
+    gyro, accel = np.linalg.solve(M_gyro, sample.gyro), np.linalg.solve(M_accel, sample.accel)
+    return ImuSample(sample.time_ns, np.asarray(gyro, dtype=np.float64), np.asarray(accel, dtype=np.float64))
 
 
 def _seen(expected: Observations, off: Off) -> Observations:

@@ -993,6 +993,13 @@ MUTATIONS = (
         _IMU_TERMS,
     ),
     Mutation(
+        "IMU terms: predictions are as certain as without",
+        "vio/filters/msckf.py",
+        "out[:DIM, DIM : DIM + calibration.imu_dim] = growth.Phi_imu",
+        "out[:DIM, DIM : DIM + calibration.imu_dim] = 0.0 * growth.Phi_imu",
+        _IMU_TERMS,
+    ),
+    Mutation(
         "IMU terms: readings as they are",
         "vio/filters/navigation.py",
         "calibrated(raw, nav.imu_terms) if len(self._chosen) else raw",
