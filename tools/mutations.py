@@ -1902,6 +1902,13 @@ MUTATIONS = (
         _GUIDED,
     ),
     Mutation(
+        "map: no keyframe where features are set to be few",
+        "vio/mapping/session.py",
+        "min(_LEAST_FEATURES, 0.5 * self._most_features)",
+        "_LEAST_FEATURES",
+        _MAP_RUN,
+    ),
+    Mutation(
         "map: places have the jumps of the filter's first poses",
         "vio/mapping/builder.py",
         "T = graph.T_map_cam[-1] @ motion.T_i_j",
