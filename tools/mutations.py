@@ -1897,8 +1897,8 @@ MUTATIONS = (
     Mutation(
         "guided search: a loop repeats how the map takes places to stand to each other",
         "vio/mapping/guided_search.py",
-        "return pairs.take(own), rows[own]",
-        "return pairs, rows",
+        "return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree",
+        "return agree",
         _GUIDED,
     ),
     Mutation(

@@ -175,50 +175,39 @@ def search(
             return None
         pairs = _pairs(place, target, T, None)
         points, rows = place.take(pairs.point), pairs.feature
-        terms = Terms(points.with_covariance(), camera, here, rows, inverse=True)
-        fitted = fit_terms([terms], T, prior=prior, least=LEAST_CORNERS)
+        stereo = points.with_covariance()
+        fitted = fit_terms([Terms(stereo, camera, here, rows, inverse=True)], T, prior=prior, least=LEAST_CORNERS)
         T = None if fitted is None else fitted.T_i_j
     if fitted is None:
         return None
-    found, rows = points.take(np.flatnonzero(fitted.fits)), rows[fitted.fits]
-    inliers = _corners(here.z[rows])
+    agree = np.flatnonzero(fitted.fits)
+    inliers = _corners(here.z[rows[agree]])
     if inliers < LEAST_CORNERS:
         return None
     chance = _chance(pairs, target)
     if inliers < min(_OVER_CHANCE * chance, LEAST_CORNERS + 0.5 * _OVER_CHANCE * chance):
         return None
-    found, rows = _of_one_stretch(found, here, rows)
-    measured = _measured(found, camera, here, rows, fitted.T_i_j, prior)
-    if measured is None:
-        return None
-    found, rows = found.take(np.flatnonzero(measured.fits)), rows[measured.fits]
-    depth = float(np.median(transform_points(se3_inverse(measured.T_i_j), found.p)[:, 2]))
-    return Guided(measured.motion(depth), inliers, chance, found.view, found.row, rows)
+    own = _of_one_stretch(points, here, rows, agree)
+    weak = None if prior is None else RelativePose(prior.T_i_j, prior.covariance / _PRIOR_SHARE)
+    terms = Terms(stereo.take(own), camera, here, rows[own], inverse=True)
+    measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_LEAST_SAMPLE)
+    return None if measured is None else _guided(measured, points.take(own), rows[own], inliers, chance)
 
 
-def _of_one_stretch(pairs: PlacePoints, here: KeyframeFeatures, rows: IntArray) -> tuple[PlacePoints, IntArray]:
-    """Return the pairs of the stretch that shows most of them, or all where those are too few corners.
+def _of_one_stretch(points: PlacePoints, here: KeyframeFeatures, rows: IntArray, agree: IntArray) -> IntArray:
+    """Return those of the pairs that `agree` which are of the stretch that shows most of them, or all if too few are.
 
     How stretches stand to each other is what the map says so far, which is not to come back as a measurement.
     """
-    own = pairs.main_stretch()
-    if _corners(here.z[rows[own]]) < LEAST_CORNERS:
-        return pairs, rows
-    return pairs.take(own), rows[own]
+    own = agree[points.take(agree).main_stretch()]
+    return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree
 
 
-def _measured(
-    pairs: PlacePoints,
-    camera: StereoCamera,
-    here: KeyframeFeatures,
-    rows: IntArray,
-    T_i_k: FloatArray,
-    prior: RelativePose | None,
-) -> Fitted | None:
-    """Fit the pose to pairs alone, beginning at (4, 4); the prior keeps a small share, since the map has it already."""
-    weak = None if prior is None else RelativePose(prior.T_i_j, prior.covariance / _PRIOR_SHARE)
-    terms = Terms(pairs.with_covariance(), camera, here, rows, inverse=True)
-    return fit_terms([terms], T_i_k, prior=weak, least=_LEAST_SAMPLE)
+def _guided(measured: Fitted, points: PlacePoints, rows: IntArray, inliers: int, chance: float) -> Guided:
+    """Return a place by the fit to pairs of its points and features `rows` (P,)."""
+    found, rows = points.take(np.flatnonzero(measured.fits)), rows[measured.fits]
+    depth = float(np.median(transform_points(se3_inverse(measured.T_i_j), found.p)[:, 2]))
+    return Guided(measured.motion(depth), inliers, chance, found.view, found.row, rows)
 
 
 def _in_reach(place: PlacePoints, camera: StereoCamera, T_i_k: FloatArray) -> IntArray:
