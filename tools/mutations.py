@@ -37,6 +37,7 @@ _FROZEN = ("tests/test_frozen_images.py",)
 _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
+_IMU_TERMS = ("tests/test_imu_terms.py",)
 _STEREO_FIELD = ("tests/test_stereo_calibration.py",)
 _SCALE = ("tests/test_scale_test.py",)
 _KEPT = ("tests/test_stereo_field.py",)
@@ -977,6 +978,48 @@ MUTATIONS = (
         "return frame.time_ns",
         ("tests/test_imu_gaps.py",),
     ),
+    Mutation(
+        "IMU terms: the noise of a reading is its lever",
+        "vio/filters/imu_terms.py",
+        "np.sqrt(max(1 - _CLEAR / max(squared, 1e-9), 0.0))",
+        "1.0",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: a turned gyro moves no velocity",
+        "vio/filters/imu_terms.py",
+        "swing @ by_gyro + by_accel",
+        "by_accel",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: the first tilt knows nothing of them",
+        "vio/filters/window.py",
+        "J[3:6, DIM : self.nav_dim] = phi_D_terms",
+        "J[3:6, DIM : self.nav_dim] = 0.0 * phi_D_terms",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: their effect of earlier steps stays where it was",
+        "vio/filters/navigation.py",
+        "Phi_imu = Phi @ self.Phi_imu + Phi_imu",
+        "Phi_imu = self.Phi_imu + Phi_imu",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: predictions are as certain as without",
+        "vio/filters/msckf.py",
+        "out[:DIM, DIM : DIM + calibration.imu_dim] = growth.Phi_imu",
+        "out[:DIM, DIM : DIM + calibration.imu_dim] = 0.0 * growth.Phi_imu",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: readings as they are",
+        "vio/filters/navigation.py",
+        "calibrated(raw, nav.imu_terms) if len(self._chosen) else raw",
+        "raw",
+        _IMU_TERMS,
+    ),
     # --- vio/filters: the paper's filter ---
     Mutation(
         "time offset: velocities of the past do not follow the accelerometer's bias",
@@ -1461,8 +1504,8 @@ MUTATIONS = (
     Mutation(
         "poses between frames: gravity left out",
         "vio/pose_prediction.py",
-        "force = R @ (sample.accel - self._bias[1]) + self._gravity",
-        "force = R @ (sample.accel - self._bias[1])",
+        "force = R @ accel + self._gravity",
+        "force = R @ accel",
         _ODOMETRY,
     ),
     Mutation(
