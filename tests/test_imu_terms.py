@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from vio.protocols import Dataset
 
 T_IMU_CAM0 = se3_inverse(T_CAM0_IMU)
-OFF = MsckfSettings()
+OFF = MsckfSettings(calibrate="none")
 FULL = MsckfSettings(calibrate="none", calibrate_imu="full")  # the terms alone
 GRAVITY = np.array([0.0, 0.0, -9.81])
 TERMS = np.random.default_rng(3).normal(0, 0.02, IMU_TERMS)
