@@ -943,6 +943,20 @@ MUTATIONS = (
         _CALIBRATE,
     ),
     Mutation(
+        "calibration: clocks are compared while the velocity is not known",
+        "vio/filters/msckf.py",
+        "moving = len(window.clones) >= self._settings.clones // 2",
+        "moving = len(window.clones) >= 1",
+        _CALIBRATE,
+    ),
+    Mutation(
+        "calibration: the velocity does not follow the offset",
+        "vio/filters/window.py",
+        "np.cross(moved[3:], self.nav.velocity) - acceleration",
+        "np.cross(moved[3:], self.nav.velocity)",
+        _CALIBRATE,
+    ),
+    Mutation(
         "calibration: the noise of the twist passes for motion",
         "vio/filters/online_calibration.py",
         "np.sqrt(max(1 - _NOISE_ONLY / max(squared, 1e-9), 0.0))",

@@ -53,6 +53,17 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_LEAST_WAIT_S = 1e-3  # a velocity carries the pose that far as well as the IMU does
+_CLEAR = 3.0  # standard deviations of a time offset that is waited for
+
+
+def _wait_ns(estimate: Estimate) -> int:
+    """How long after its stamp a frame is processed, ns, so that the IMU's samples reach its exposure."""
+    offset_s, sigma_s = estimate.time_offset_s, estimate.time_offset_sigma_s
+    if offset_s is None or sigma_s is None or offset_s < max(_LEAST_WAIT_S, _CLEAR * sigma_s):
+        return 0
+    return round(1e9 * offset_s)
+
 
 def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig | None:
     """Return a rectified pair with the pose (4, 4) of its IMU as a rig of two pinholes.
@@ -498,7 +509,7 @@ class Odometry:
                     result = self._in_map(event, result)
                     results.append(result)
                     self._estimate = result.estimate
-                    self._order.exposed_after_ns = max(round(1e9 * (result.estimate.time_offset_s or 0.0)), 0)
+                    self._order.exposed_after_ns = _wait_ns(result.estimate)
         return results
 
     def _opened(self, path: Path | str, *, localise: bool) -> MapSession:

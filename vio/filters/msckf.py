@@ -288,6 +288,10 @@ class Msckf:
         late_s, twist = self._late_s, self._twist(window.nav, self._since_frame)
         _, *camera_D_own = window.camera_D_own(late_s, twist)
         self._expected = self._expected_error(window.nav, self._since_frame, *camera_D_own)
+        # Half a window gives the velocity: before, its product with the offset's error would pass for knowledge of it.
+        moving = len(window.clones) >= self._settings.clones // 2
+        if window.calibration.timing and moving and not window.clocks_compared:
+            window.compare_clocks(observations.time_ns, late_s, twist)
         window.add_clone(observations.frame_index, observations.time_ns, late_s, twist)
         before = window.clones[len(window.clones) > self._settings.clones]  # the oldest that stays
         try:

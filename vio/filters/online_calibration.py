@@ -134,9 +134,8 @@ def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: M
 
     Of camera and IMU nothing is estimated without an IMU, and nothing metric without a metric sensor.
     """
-    extrinsics, timing = (
-        motion == "imu" and settings.calibrate in (kind, "both", "auto") for kind in ("extrinsics", "time_offset")
-    )
+    extrinsics = motion == "imu" and settings.calibrate in ("extrinsics", "both")
+    timing = motion == "imu" and settings.calibrate in ("auto", "time_offset", "both")
     return Calibration(
         np.asarray(T_cam0_imu, dtype=np.float64),
         extrinsics=extrinsics,

@@ -127,9 +127,9 @@ class MsckfSettings(Section):
         0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
     )
     calibrate: Literal["auto", "none", "extrinsics", "time_offset", "both"] = setting(
-        "none",
-        "what is estimated of camera and IMU besides the motion: T_cam0_imu, the time offset, or both; auto: both "
-        "where there is an IMU",
+        "auto",
+        "what is estimated of camera and IMU besides the motion: T_cam0_imu, the time offset, or both; auto: the time "
+        "offset, where a stereo pair has an IMU",
     )
     calibrate_stereo: Literal["auto", "on", "off"] = setting(
         "auto",

@@ -68,6 +68,7 @@ class Window:
         self.P = P
         self.prior_delta: FloatArray = np.zeros(len(P))
         self.scale_test: ScaleTest | None = None  # its vector is transformed with the errors
+        self.clocks_compared = False  # whether exposures follow the time offset's error, (C2)
 
     @property
     def P(self) -> FloatArray:
@@ -301,6 +302,31 @@ class Window:
         J[self.first_landmark :, 3:6] = so3_hat(self.landmarks).reshape(-1, 3)
         self.P = self.P + J @ extra @ J.T
 
+    def compare_clocks(self, time_ns: int, late_s: float, twist: Twist) -> None:
+        """Let exposures follow the error of the time offset from now on, equation (C2).
+
+        Until here the navigation state was that of an exposure by the offset believed, so it is the state that an error
+        of the offset has moved, and not the next exposure.
+
+        Args:
+            time_ns: stamp of the coming frame.
+            late_s: the navigation state's time on the IMU's clock minus that stamp.
+            twist: of the body, and how well it is known.
+        """
+        self.clocks_compared = True
+        _, camera_D_own, noise = self.camera_D_own(late_s, twist)
+        D, moved = len(self.P), camera_D_own[:, -1]
+        to_nav = np.eye(D)
+        to_nav[:6, self.first_clone - 1] = -moved
+        before = self.clones[-1]
+        acceleration = (self.nav.velocity - before.velocity) / (1e-9 * (time_ns - before.time_ns))
+        to_nav[6:9, self.first_clone - 1] = np.cross(moved[3:], self.nav.velocity) - acceleration
+        self.P = to_nav @ self.P @ to_nav.T
+        self.P[:6, :6] += noise
+        self.prior_delta = to_nav @ self.prior_delta
+        if self.scale_test is not None:
+            self.scale_test.error_D_scale = to_nav @ self.scale_test.error_D_scale
+
     def add_clone(self, frame_index: int, time_ns: int, late_s: float = 0.0, twist: Twist = NO_TWIST) -> None:
         """Add the pose at an exposure as the newest clone; landmarks are anchored to its rotation from now on.
 
@@ -312,20 +338,8 @@ class Window:
         """
         T, camera_D_own, noise = self.camera_D_own(late_s, twist)
         at, own, D = self.first_landmark, slice(0, self.first_clone), len(self.P)
-        if not self.clones and self.calibration.timing:
-            # The world begins at the first exposure, so it is the navigation state that the offset moves.
-            to_nav = np.eye(D)
-            to_nav[:6, self.first_clone - 1] = -camera_D_own[:, -1]
-            self.P = to_nav @ self.P @ to_nav.T
-            self.prior_delta = to_nav @ self.prior_delta
-            if self.scale_test is not None:
-                self.scale_test.error_D_scale = to_nav @ self.scale_test.error_D_scale
         added, beside = camera_D_own @ self.P[own], self.P[:, own] @ camera_D_own.T  # exact copies without calibration
-        block = added[:, own] @ camera_D_own.T
-        if self.clones:
-            block = block + noise
-        else:
-            self.P[:6, :6] += noise
+        block = added[:, own] @ camera_D_own.T + noise
         P = np.empty((D + 6, D + 6))
         new, end = slice(at, at + 6), slice(at + 6, D + 6)
         P[:at, :at], P[:at, end] = self.P[:at, :at], self.P[:at, at:]
@@ -370,7 +384,7 @@ class Window:
             exposed = T @ se3_exp(twist.mean * (calibration.time_offset_s - late_s))
         if calibration.extrinsics:
             J[:, calibration.extrinsic_rows + DIM] = -se3_adjoint(exposed @ se3_inverse(T))
-        if not calibration.timing:
+        if not calibration.timing or not self.clocks_compared:
             return exposed, J, np.zeros((6, 6))
         A, row = se3_adjoint(exposed), self.first_clone - 1
         J[:, row] = A @ twist.significant()
