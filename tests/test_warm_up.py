@@ -73,11 +73,18 @@ def test_it_starts_only_where_nothing_is_cached_and_a_processor_is_free(
         os.utime(index, ns=(later, later))
     monkeypatch.setattr(track_loops, "eliminate_tracks", Loop())
     monkeypatch.setattr(track_loops, "__file__", str(source))
-    monkeypatch.setattr(warm_up, "_processors", lambda: processors)
+    monkeypatch.setattr(warm_up, "_free_processors", lambda: processors)
     monkeypatch.setattr(_Process, "started", [], raising=False)
     monkeypatch.setattr(subprocess, "Popen", _Process)
     with warm_up.compiling_beside():
         assert len(_Process.started) == expected
+
+
+def test_processors_that_others_keep_busy_are_not_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
+    for load, free in ((0.2, 2.0), (1.0, 2.0), (2.5, 0.5)):
+        monkeypatch.setattr(os, "getloadavg", lambda load=load: (load, 9.0, 9.0), raising=False)
+        assert warm_up._free_processors() == free
 
 
 def test_a_run_goes_on_where_no_process_can_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -85,7 +92,7 @@ def test_a_run_goes_on_where_no_process_can_be_started(monkeypatch: pytest.Monke
         raise OSError("no more processes")
 
     monkeypatch.setattr(warm_up, "_is_cold", lambda: True)
-    monkeypatch.setattr(warm_up, "_processors", lambda: 2)
+    monkeypatch.setattr(warm_up, "_free_processors", lambda: 2.0)
     monkeypatch.setattr(subprocess, "Popen", refuse)
     with warm_up.compiling_beside():
         pass

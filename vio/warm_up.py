@@ -26,7 +26,7 @@ def compiling_beside() -> Iterator[None]:
 
     The process ends with the context at the latest. Results do not depend on it.
     """
-    if not (_is_cold() and _processors() > 1):
+    if not (_is_cold() and _free_processors() >= 2):
         yield
         return
     command, quiet = [sys.executable, "-m", "vio.warm_up"], subprocess.DEVNULL
@@ -46,9 +46,11 @@ def compiling_beside() -> Iterator[None]:
         helper.wait()
 
 
-def _processors() -> int:
-    """Number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def _free_processors() -> float:
+    """Number of processors that this process may use, less those that were busy over the last minute."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    busy = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    return usable - max(busy - 1.0, 0.0)  # what was busy may have been this process, or what installed it
 
 
 def _is_cold() -> bool:
