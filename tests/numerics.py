@@ -13,8 +13,12 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 # Every public function `*_D_*` of vio and frontend, as 'module.name'. Add a name here together with the test that
 # compares it with `numeric_jacobian`; tests/test_jacobian_registry.py holds this set complete and honest.
 TESTED_JACOBIANS = {
+    "vio.filters.imu_terms.accel_D_terms",
+    "vio.filters.imu_terms.gyro_D_terms",
     "vio.filters.multiview.point_D_clones",
     "vio.filters.multiview.point_D_pose",
+    "vio.filters.navigation.rate_D_error",
+    "vio.filters.navigation.tilt_D_terms",
     "vio.filters.window.body_D_error",
     "vio.filters.window.camera_D_own",
     "vio.filters.stereo_calibration.point_D_stereo",

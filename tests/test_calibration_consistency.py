@@ -4,8 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from tools.calibration_consistency import FromStandstill, Off, _seen, calibration_nees, fly, imu_samples
+from tools.calibration_consistency import (
+    FromStandstill,
+    Off,
+    _misread,
+    _seen,
+    calibration_nees,
+    fly,
+    imu_samples,
+    walked_terms,
+)
 from tools.consistency import CAMERA, T_CAM0_IMU, Flight
+from vio.filters.imu_terms import IMU_TERMS, calibrated
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import FIELD_TERMS
@@ -53,6 +63,17 @@ def test_a_rig_that_is_off_is_off_by_what_its_errors_say() -> None:
     seen = _seen(observations(0, 0, np.arange(20), z), Off(np.zeros(6), 0.0, np.zeros(3), 0.01)).z
     longer = np.exp(0.01) * CAMERA.baseline_m
     np.testing.assert_allclose(seen[:, 2], z[:, 0] - CAMERA.fu * longer / p[:, 2])
+
+
+def test_a_misread_sample_is_the_perfect_one_to_the_filter_that_knows_the_terms() -> None:
+    off = Off(np.zeros(6), 0.0, np.zeros(3), 0.0, np.linspace(-0.02, 0.02, IMU_TERMS))
+    walked = walked_terms(off, 50, QUIET, np.random.default_rng(0))
+    assert 0 < np.abs(walked[-1] - off.imu).max() < 1e-4  # 1 % times 0.005, over the root of a quarter of a second
+    perfect = imu_samples(Flight(), 2, QUIET, 0.0, np.random.default_rng(0))[40]
+    read = _misread(perfect, walked[40])
+    got = calibrated(np.concatenate([read.gyro, read.accel]), walked[40])
+    np.testing.assert_allclose(got, np.concatenate([perfect.gyro, perfect.accel]), atol=1e-12)
+    assert np.abs(read.accel - perfect.accel).max() > 0.05
 
 
 def test_the_baseline_is_estimated_consistently() -> None:

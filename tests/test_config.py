@@ -20,6 +20,16 @@ def _write(tmp_path: Path, text: str) -> Path:
     return path
 
 
+@pytest.mark.parametrize("word", ["on", "off", '"off"', "auto"])
+def test_on_and_off_need_no_quotes(word: str, tmp_path: Path) -> None:
+    for config in (
+        load_config(None, [f"msckf.calibrate_stereo={word}"]),
+        load_config(_write(tmp_path, f"msckf:\n  calibrate_stereo: {word}\n")),
+    ):
+        assert config.msckf.calibrate_stereo == word.strip('"')
+        assert load_config(_write(tmp_path, to_yaml(config))) == config
+
+
 def test_defaults_then_file_then_command_line(tmp_path: Path) -> None:
     path = _write(tmp_path, "vislam:\n  pixel_sigma_px: 2\n  iterations: 3\nselector:\n  name: information\n")
     config = load_config(path, ["vislam.iterations=5", "selector.keep_fraction=0.5"])

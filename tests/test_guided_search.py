@@ -85,6 +85,53 @@ def test_a_prior_decides_only_what_the_pixels_leave_open() -> None:
     assert errors[1] < 0.2 * errors[0]
 
 
+def test_a_loop_is_no_echo_of_the_odometry() -> None:
+    """Of a prior as good as the pixels, and two standard deviations off, it has little: the map has that already."""
+    pulls = []
+    for seed in range(6):
+        paper = Wallpaper(seed)
+        points, here = place_points(_place(paper)), paper.seen_from(T_I_K)
+        start = RelativePose(T_I_K, 0.01**2 * np.eye(6))
+        alone = search(points, CAMERA, here, start, None)
+        assert alone is not None
+        C = alone.pose.covariance / 4  # without the inflation that covariances of loops have
+        variance, V = np.linalg.eigh(C)
+        off = 2 * np.sqrt(variance[-1]) * V[:, -1]
+        seen = search(points, CAMERA, here, start, RelativePose(alone.pose.T_i_j @ se3_exp(off), C))
+        assert seen is not None
+        pulls.append(se3_log(se3_inverse(alone.pose.T_i_j) @ seen.pose.T_i_j) @ off / (off @ off))
+    assert np.mean(pulls) < 0.15
+
+
+def test_a_place_with_many_points_is_found_among_much_that_looks_alike() -> None:
+    """Fifty of the corners that agree are more than eleven of chance, as windows on blank walls have them."""
+    ratios = []
+    for seed in range(4):
+        paper = Wallpaper(seed, patterns=3)
+        views = _place(paper)
+        paper.p[70:] = np.random.default_rng(seed + 50).uniform((-4, -2, 3), (4, 2, 9), (330, 3))  # another time
+        start = RelativePose(T_I_K, 0.01**2 * np.eye(6))
+        seen = search(place_points(views), CAMERA, paper.seen_from(T_I_K), start, start)
+        assert seen is not None
+        assert np.linalg.norm(se3_log(se3_inverse(seen.pose.T_i_j) @ T_I_K)[:3]) < 0.03
+        ratios.append(seen.inliers / seen.chance)
+        assert seen.chance > 7
+    assert min(ratios) < 6
+
+
+def test_where_another_stretch_of_the_path_stands_is_no_measurement() -> None:
+    """What the map takes to be between two places is wrong by 4 cm; the loop with the first one is not."""
+    paper = Wallpaper(2)
+    views, here = _place(paper), paper.seen_from(T_I_K)
+    T = se3_exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+    wrong = RelativePose(T @ se3_exp([0.0, 0.04, 0.0, 0.0, 0.0, 0.0]), 0.01**2 * np.eye(6))
+    views.append(View(90, shown(CAMERA, paper.seen_from(T)), wrong, 90))
+    seen = search(place_points(views), CAMERA, here, _start(T_I_K), None)
+    assert seen is not None
+    assert np.linalg.norm(se3_log(se3_inverse(seen.pose.T_i_j) @ T_I_K)[:3]) < 0.01
+    assert set(seen.view) == {0, 1}
+
+
 @pytest.mark.parametrize("patterns", [400, PATTERNS, 1])
 def test_another_place_is_not_found_where_this_one_is_expected(patterns: int) -> None:
     """Of one pattern alone, each window holds something that looks right."""

@@ -8,7 +8,7 @@ import pytest
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.mapping.features import KeyframeFeatures, extract, no_features
+from vio.mapping.features import KeyframeFeatures, _most_alike, _near_rows, extract, no_features
 from vio.mapping.loop_geometry import LEAST_INLIERS, match, verify
 from vio.mapping.place_index import PlaceIndex, words_of
 
@@ -98,6 +98,22 @@ def test_too_few_features_do_not_verify() -> None:
     assert verify(CAMERA, i, CAMERA, no_features()) is None
     few = KeyframeFeatures(j.z[:15], j.has_right[:15], j.sigma_px[:15], j.descriptors[:15])
     assert verify(CAMERA, i, CAMERA, few) is None
+
+
+def test_the_best_of_near_rows_is_that_of_all_pairs() -> None:
+    """Against OpenCV's matcher with a mask; some descriptors are equal, so that the first of them counts."""
+    rng = np.random.default_rng(0)
+    v, there, reach = rng.uniform(0, 60, 50), rng.uniform(0, 60, 80).round(), rng.uniform(0.5, 5.0, 50)
+    b = _bits(80, rng)
+    b[40:] = b[:40]
+    a = _flipped(b[rng.integers(0, 80, 50)], 0.15, rng)
+    i, j = _near_rows(v, there, reach)
+    rows, best = _most_alike(i, j, a, b)
+    mask = (np.abs(v[:, None] - there[None, :]) <= reach[:, None]).astype(np.uint8)
+    assert len(i) == mask.sum()
+    expected = [m for m in cv2.BFMatcher(cv2.NORM_HAMMING).match(a, b, mask) if m.distance <= 64]
+    assert len(expected) > 5
+    assert [(m.queryIdx, m.trainIdx) for m in expected] == list(zip(rows.tolist(), best.tolist(), strict=True))
 
 
 def _pair(gain: float) -> list[np.ndarray]:

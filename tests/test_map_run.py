@@ -146,6 +146,11 @@ def test_maps_are_shown_and_merged(mapped: Path, tmp_path: Path, capsys: pytest.
     assert "exists; give another name" in capsys.readouterr().err
     assert main(["map", "merge", str(path), str(path), "--out", str(tmp_path / "twice.map")]) == 1
     assert "is the same map as" in capsys.readouterr().err
+    lost = tmp_path / "nowhere" / "both.map"
+    assert main(["map", "merge", str(path), str(tmp_path / "other.map"), "--out", str(lost)]) == 1
+    assert f"{lost}: its folder {lost.parent} does not exist" in capsys.readouterr().err
+    assert main(["map", "show", str(tmp_path)]) == 1
+    assert "is a folder; name a file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -326,6 +331,25 @@ def test_few_features_are_no_darkness(tmp_path: Path) -> None:
     session.close()
     ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
     assert np.sqrt(motion.covariance[0, 0]) < 1.0
+
+
+def test_an_odometry_of_few_features_has_keyframes_too(tmp_path: Path) -> None:
+    """Where the front end is set to 24 features, no frame has thirty."""
+    session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
+    gray = np.zeros((64, 64), dtype=np.uint8)
+    for k in range(6):
+        seen = observations(k, 10**8 * k, np.arange(24) + 12 * k, np.tile([9.0, 9, 5, 9], (24, 1)))
+        session.frame(
+            StereoFrame(k, 10**8 * k, gray, gray),
+            seen,
+            Estimate(k, np.eye(4), np.eye(6)),
+            lambda older, newer: RelativePose(np.eye(4), 1e-4 * (newer - older) * np.eye(6)),
+        )
+    session.finish()
+    session.close()
+    store = MapStore(tmp_path / "a.map", read_only=True)
+    assert len(store.keyframes()) == 6
+    store.close()
 
 
 def test_motions_have_errors_that_tracks_do_not_average_out(tmp_path: Path) -> None:

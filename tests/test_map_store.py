@@ -21,6 +21,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.builder import MapBuilder
 from vio.mapping.features import KeyframeFeatures
+from vio.mapping.files import merge_maps
 from vio.mapping.map_store import VERSION, KeyframeRow, LoopRow, MapStore, SessionRow
 
 CAMERA = StereoCamera(400.0, 401.0, 319.5, 179.5, 0.12, 640, 360)
@@ -186,6 +187,16 @@ def test_another_rig_is_warned_of(
     MapBuilder(store, "here", replace(CAMERA, **change), upright=True, localise=True)
     assert ("a.map: was made with another rig" in caplog.text) == warned
     store.close()
+
+
+def test_a_merge_of_two_rigs_names_files_that_the_user_knows(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    fill(tmp_path / "a.map").close()
+    store = MapStore(tmp_path / "b.map", create=True)
+    store.add_session(SessionRow("there", replace(CAMERA, baseline_m=0.5), True, 0))
+    store.close()
+    merge_maps(tmp_path / "a.map", tmp_path / "b.map", tmp_path / "both.map")
+    assert f"{tmp_path / 'both.map'}: was made with another rig" in caplog.text
+    assert "partial" not in caplog.text
 
 
 def test_a_map_in_use_is_refused(tmp_path: Path) -> None:

@@ -203,7 +203,7 @@ def test_a_run_in_memory_that_is_stopped_keeps_its_map(flight_log: Path) -> None
 def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
     rng = np.random.default_rng(0)
     shapes = {"T_world_imu": (4, 4), "covariance": (6, 6), "T_cam0_imu": (4, 4), "T_cam0_imu_covariance": (6, 6)}
-    shapes |= {"velocity_covariance": (3, 3)}
+    shapes |= {"velocity_covariance": (3, 3), "imu_terms": (15,), "imu_terms_sigma": (15,)}
     kept = [f.name for f in fields(Estimate) if not f.name.startswith("T_map")]  # those have a table of their own
     values: dict[str, Any] = {name: rng.normal(size=shapes.get(name, (3,))) for name in kept}
     rows, rows_P = rng.normal(size=7), rng.normal(size=(7, 7))

@@ -4,9 +4,10 @@
         [--pixel-sigma 0.5] [--jobs 2]
 
 Monte-Carlo flights as those of tools/consistency.py, each with a rig that is off by what the priors of the settings
-expect: the extrinsics of camera and IMU and their clocks, the right camera's attitude, or the length of the baseline.
-They begin in motion, at a velocity that the filter does not know, or at standstill. Prints NEES of what is estimated,
-halfway and at the end, in Markdown; docs/notes/consistency.md shows it.
+expect: the extrinsics of camera and IMU and their clocks, the IMU's scales and misalignments, all of these, the right
+camera's attitude, or the length of the baseline. They begin in motion, at a velocity that the filter does not know, or
+at standstill. Prints NEES of what is estimated, halfway and at the end, in Markdown; docs/notes/consistency.md shows
+it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Literal, get_args
 
@@ -27,14 +28,15 @@ import numpy as np
 from tools.consistency import CAMERA, T_CAM0_IMU, Flight, Scenario
 from vio.errors import VioError
 from vio.evaluation import nees, nees_bounds
+from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import left_rays
-from vio.records import RIGHT_TERMS, Estimate, ImuSample, Observations
+from vio.records import RIGHT_TERMS, Estimate, ImuSample, Observations, imu_matrices
 from vio.threads import one_blas_thread
 
-Rig = Literal["camera-IMU", "right camera turned", "baseline"]
+Rig = Literal["camera-IMU", "IMU", "camera-IMU and IMU", "right camera turned", "baseline"]
 RIGS: tuple[Rig, ...] = get_args(Rig)
 Start = Literal["motion", "standstill"]
 STARTS: tuple[Start, ...] = get_args(Start)
@@ -42,6 +44,7 @@ _STILL_S = 0.75
 _FRAME_NS, _IMU_NS = 50_000_000, 5_000_000
 _BEFORE, _AFTER = 10, 2  # frames of samples around the flight: for the first tilt, and for the offset of clocks
 _BASELINE_SIGMA = 0.01
+_ACCEL_TERMS = 6  # of the IMU's, the first
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +55,7 @@ class Off:
     offset_s: float  # a frame stamped t was exposed at t + offset of the IMU's clock
     turn: FloatArray  # (3,) rad: the right camera sees points p as exp(turn) p
     baseline: float  # logarithm of the true baseline over the calibrated one
+    imu: FloatArray = field(default_factory=lambda: np.zeros(IMU_TERMS))  # (15,) first terms of (A1) of docs/math.md
 
 
 class FromStandstill(Flight):
@@ -67,6 +71,10 @@ class FromStandstill(Flight):
 def settings_of(rig: Rig, pixel_sigma_px: float) -> MsckfSettings:
     """Return the filter's settings: the truth about all noise, and what is estimated of the rig."""
     known = replace(Scenario(pixel_sigma_px=pixel_sigma_px).settings(learn_noise=False), calibrate_stereo="off")
+    if rig == "IMU":
+        return replace(known, calibrate_imu="full")
+    if rig == "camera-IMU and IMU":
+        return replace(known, calibrate="both", calibrate_imu="full")
     if rig == "camera-IMU":
         return replace(known, calibrate="both")
     if rig == "baseline":
@@ -77,6 +85,10 @@ def settings_of(rig: Rig, pixel_sigma_px: float) -> MsckfSettings:
 def drawn(rig: Rig, settings: MsckfSettings, noise: np.random.Generator) -> Off:
     """Draw what a rig is off by from the priors of the settings; turns about all axes from that about the vertical."""
     s, right = settings, Off(np.zeros(6), 0.0, np.zeros(3), 0.0)
+    if rig == "IMU":
+        return replace(right, imu=noise.normal(0, term_sigmas(s)))
+    if rig == "camera-IMU and IMU":
+        return replace(drawn("camera-IMU", s, noise), imu=noise.normal(0, term_sigmas(s)))
     if rig == "camera-IMU":
         sigmas = np.repeat([s.extrinsic_translation_sigma_m, np.radians(s.extrinsic_rotation_sigma_deg)], 3)
         return replace(right, xi=noise.normal(0, sigmas), offset_s=float(noise.normal(0, s.time_offset_sigma_s)))
@@ -96,6 +108,8 @@ def fly(
     R, p, _ = flight.state(np.arange(scenario.frames, dtype=np.float64) * 1e-9 * _FRAME_NS)
     T = se3_from_parts(R, p)
     samples = imu_samples(flight, scenario.frames, settings, off.offset_s, noise)
+    terms = walked_terms(off, len(samples), settings, np.random.default_rng(20_000 + seed))
+    samples = [_misread(sample, own) for sample, own in zip(samples, terms, strict=True)]
     fed_ns, ahead_s = -1_000_000_000, 0.0
     halves: list[dict[str, float]] = []
     for k in range(scenario.frames):
@@ -107,7 +121,8 @@ def fly(
         estimate = filt.estimate()
         ahead_s = estimate.time_offset_s or 0.0
         if k + 1 in (scenario.frames // 2, scenario.frames):
-            halves.append(calibration_nees(estimate, off))
+            now = terms[min((k + _BEFORE) * (_FRAME_NS // _IMU_NS), len(terms) - 1)]
+            halves.append(calibration_nees(estimate, off) | imu_nees(filt, now))
     return halves
 
 
@@ -128,6 +143,19 @@ def imu_samples(
     read = exact + np.cumsum(steps, axis=0) + noise.normal(0, 1, (len(k), 6)) * white
     stamps = _IMU_NS * k + round(1e9 * offset_s)
     return [ImuSample(t, x[:3], x[3:]) for t, x in zip(stamps.tolist(), read, strict=True)]
+
+
+def walked_terms(off: Off, count: int, settings: MsckfSettings, noise: np.random.Generator) -> FloatArray:
+    """Return the IMU's terms (count, 15) at each sample, which walk as the filter has it where they are not zero."""
+    steps = noise.normal(0, 1, (count, IMU_TERMS)) * term_sigmas(settings) * IMU_WALK * np.sqrt(1e-9 * _IMU_NS)
+    return off.imu + np.cumsum(steps * (off.imu != 0), axis=0)
+
+
+def _misread(sample: ImuSample, terms: FloatArray) -> ImuSample:
+    """Return what an IMU of some terms (15,) reads in the place of a perfect one."""
+    M_accel, M_gyro = imu_matrices(terms)
+    gyro, accel = np.linalg.solve(M_gyro, sample.gyro), np.linalg.solve(M_accel, sample.accel)
+    return ImuSample(sample.time_ns, np.asarray(gyro, dtype=np.float64), np.asarray(accel, dtype=np.float64))
 
 
 def _seen(expected: Observations, off: Off) -> Observations:
@@ -161,6 +189,26 @@ def calibration_nees(estimate: Estimate, off: Off) -> dict[str, float]:
         error = estimate.stereo_scale.logs[:1] - off.baseline
         out["baseline (1)"] = float(error[0] ** 2 / estimate.stereo_scale.covariance[0, 0])
     return out
+
+
+def imu_nees(filt: Msckf, truth: FloatArray) -> dict[str, float]:
+    """Return NEES of the IMU's terms (15,), by sensor and kind; empty where they are not estimated."""
+    terms, P = filt.estimate().imu_terms, filt.imu_terms_covariance()
+    if terms is None:
+        return {}
+    error, index = terms - truth, np.arange(IMU_TERMS)
+    accel, scale = index < _ACCEL_TERMS, np.isin(index, CHOSEN["scale"])
+    parts = {
+        "accelerometer scale": accel & scale,
+        "its misalignment": accel & ~scale,
+        "gyro scale": ~accel & scale,
+        "gyro misalignment": ~accel & ~scale,
+        "IMU": np.ones(IMU_TERMS, dtype=np.bool_),
+    }
+    return {
+        f"{name} ({own.sum()})": float(nees(error[None, own], P[np.ix_(own, own)][None])[0])
+        for name, own in parts.items()
+    }
 
 
 def table(results: dict[tuple[Rig, Start], list[list[dict[str, float]]]]) -> str:

@@ -37,6 +37,7 @@ _FROZEN = ("tests/test_frozen_images.py",)
 _IMU_START = ("tests/test_imu_start.py",)
 _TRUTH = ("tests/test_landmark_gate.py", "tests/test_window_posterior.py", "tests/test_filter_truth.py")
 _CALIBRATE = ("tests/test_online_calibration.py",)
+_IMU_TERMS = ("tests/test_imu_terms.py",)
 _STEREO_FIELD = ("tests/test_stereo_calibration.py",)
 _SCALE = ("tests/test_scale_test.py",)
 _KEPT = ("tests/test_stereo_field.py",)
@@ -977,6 +978,48 @@ MUTATIONS = (
         "return frame.time_ns",
         ("tests/test_imu_gaps.py",),
     ),
+    Mutation(
+        "IMU terms: the noise of a reading is its lever",
+        "vio/filters/imu_terms.py",
+        "np.sqrt(max(1 - _CLEAR / max(squared, 1e-9), 0.0))",
+        "1.0",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: a turned gyro moves no velocity",
+        "vio/filters/imu_terms.py",
+        "swing @ by_gyro + by_accel",
+        "by_accel",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: the first tilt knows nothing of them",
+        "vio/filters/window.py",
+        "J[3:6, DIM : self.nav_dim] = phi_D_terms",
+        "J[3:6, DIM : self.nav_dim] = 0.0 * phi_D_terms",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: their effect of earlier steps stays where it was",
+        "vio/filters/navigation.py",
+        "Phi_imu = Phi @ self.Phi_imu + Phi_imu",
+        "Phi_imu = self.Phi_imu + Phi_imu",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: predictions are as certain as without",
+        "vio/filters/msckf.py",
+        "out[:DIM, DIM : DIM + calibration.imu_dim] = growth.Phi_imu",
+        "out[:DIM, DIM : DIM + calibration.imu_dim] = 0.0 * growth.Phi_imu",
+        _IMU_TERMS,
+    ),
+    Mutation(
+        "IMU terms: readings as they are",
+        "vio/filters/navigation.py",
+        "calibrated(raw, nav.imu_terms) if len(self._chosen) else raw",
+        "raw",
+        _IMU_TERMS,
+    ),
     # --- vio/filters: the paper's filter ---
     Mutation(
         "time offset: velocities of the past do not follow the accelerometer's bias",
@@ -984,6 +1027,13 @@ MUTATIONS = (
         "ages[n] * (by_bias - ",
         "ages[n] * (0.0 * by_bias - ",
         _CALIBRATE,
+    ),
+    Mutation(
+        "stereo field: learned at standstill",
+        "vio/filters/msckf.py",
+        "if field is not None and not self._is_at_rest:",
+        "if field is not None:",
+        ("tests/test_stereo_calibration.py",),
     ),
     Mutation(
         "stereo field: linearised at the pixels that were seen",
@@ -1461,8 +1511,8 @@ MUTATIONS = (
     Mutation(
         "poses between frames: gravity left out",
         "vio/pose_prediction.py",
-        "force = R @ (sample.accel - self._bias[1]) + self._gravity",
-        "force = R @ (sample.accel - self._bias[1])",
+        "force = R @ accel + self._gravity",
+        "force = R @ accel",
         _ODOMETRY,
     ),
     Mutation(
@@ -1825,13 +1875,6 @@ MUTATIONS = (
         _PLACES,
     ),
     Mutation(
-        "map: moves with the jumps of the odometry",
-        "vio/mapping/builder.py",
-        "if motion is not None and self._last is None:",
-        "if motion is not None:",
-        _MAPS,
-    ),
-    Mutation(
         "map: covariance stays in the dark",
         "vio/mapping/session.py",
         "if self._dark is not None:",
@@ -1897,9 +1940,51 @@ MUTATIONS = (
     Mutation(
         "guided search: what agrees by chance not counted",
         "vio/mapping/guided_search.py",
-        "if inliers < _OVER_CHANCE * chance:",
+        "if inliers < min(_OVER_CHANCE * chance, LEAST_CORNERS + 0.5 * _OVER_CHANCE * chance):",
         "if inliers < 0 * chance:",
         _GUIDED,
+    ),
+    Mutation(
+        "guided search: many corners among much chance refused",
+        "vio/mapping/guided_search.py",
+        "min(_OVER_CHANCE * chance, LEAST_CORNERS + 0.5 * _OVER_CHANCE * chance)",
+        "_OVER_CHANCE * chance",
+        _GUIDED,
+    ),
+    Mutation(
+        "guided search: a loop repeats what the odometry says",
+        "vio/mapping/guided_search.py",
+        "_PRIOR_SHARE = 0.1",
+        "_PRIOR_SHARE = 1.0",
+        _GUIDED,
+    ),
+    Mutation(
+        "guided search: a loop repeats how the map takes places to stand to each other",
+        "vio/mapping/guided_search.py",
+        "return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree",
+        "return agree",
+        _GUIDED,
+    ),
+    Mutation(
+        "map: no keyframe where features are set to be few",
+        "vio/mapping/session.py",
+        "min(_LEAST_FEATURES, 0.5 * self._most_features)",
+        "_LEAST_FEATURES",
+        _MAP_RUN,
+    ),
+    Mutation(
+        "map: places have the jumps of the filter's first poses",
+        "vio/mapping/builder.py",
+        "T = graph.T_map_cam[-1] @ motion.T_i_j",
+        "T = graph.T_map_cam[-1] @ se3_inverse(graph.T_odom_cam[-1]) @ T",
+        _MAPS,
+    ),
+    Mutation(
+        "map: every loop makes the odometry less sure",
+        "vio/mapping/builder.py",
+        "excess = _squared(r, drift + pose.covariance) / _GATE",
+        "excess = _squared(r, drift + pose.covariance) / 6",
+        _MAPS,
     ),
     Mutation(
         "guided search: windows as if the pose were known",

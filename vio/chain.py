@@ -155,6 +155,11 @@ def _mono_backend(
             "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu; --motion none leaves it out), depth "
             "images or a second camera"
         )
+    if config.msckf.calibrate_imu != "off":
+        raise ConfigError(
+            f"msckf.calibrate_imu: {config.msckf.calibrate_imu} needs a stereo pair, as the scale of one camera is the "
+            "accelerometer's; set it to off"
+        )
     return MonoMsckf(camera, T_cam0_body, config.msckf)
 
 

@@ -246,6 +246,8 @@ def _checked(value: Any, hint: Any, path: str, where: str) -> Any:
         return _checked(value, members[0], path, where)
     if origin is Literal:
         choices = get_args(hint)
+        if isinstance(value, bool) and {"on", "off"} <= set(choices):  # YAML reads the bare words as truth values
+            value = "on" if value else "off"
         if value in choices and type(value) in {type(c) for c in choices}:
             return value
         near = difflib.get_close_matches(_short(str(value)), choices, 1)

@@ -9,7 +9,7 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
-from vio.records import Estimate, MotionSample, VelocitySample
+from vio.records import Estimate, ImuSample, MotionSample, VelocitySample, imu_matrices
 
 _NS = 1e-9
 _KEPT_NS = 2_000_000_000  # samples that a late estimate can be carried over
@@ -50,6 +50,7 @@ class PosePredictor:
         self._gravity = np.array([0.0, 0.0, -gravity_mps2])
         self._samples: deque[MotionSample] = deque()
         self._bias: tuple[FloatArray, FloatArray] = (_ZERO, _ZERO)
+        self._matrices: tuple[FloatArray, FloatArray] | None = None  # accelerometer and gyro, equation (A1)
         self._last: Estimate | None = None
         self._states: list[_State] = []  # at the newest estimate and at the samples after it
 
@@ -69,6 +70,7 @@ class PosePredictor:
         gyro_bias = _ZERO if estimate.gyro_bias is None else estimate.gyro_bias
         accel_bias = _ZERO if estimate.accel_bias is None else estimate.accel_bias
         self._bias = gyro_bias, accel_bias
+        self._matrices = None if estimate.imu_terms is None else imu_matrices(estimate.imu_terms)
         self._gravity = self._gravity if estimate.gravity_world is None else estimate.gravity_world
         omega, v = self._motion_of(estimate)
         state = _State(estimate.time_ns, estimate.T_world_imu[:3, :3], estimate.T_world_imu[:3, 3], v, omega, _ZERO)
@@ -108,9 +110,16 @@ class PosePredictor:
         """The state with the motion of a sample, which holds from there on."""
         if isinstance(sample, VelocitySample):
             return _State(state.time_ns, state.R, state.p, state.R @ sample.linear, sample.angular, _ZERO)
-        gyro_bias, accel_bias = self._bias
-        force = state.R @ (sample.accel - accel_bias) + self._gravity
-        return _State(state.time_ns, state.R, state.p, state.v, sample.gyro - gyro_bias, force)
+        gyro, accel = self._unbiased(sample)
+        return _State(state.time_ns, state.R, state.p, state.v, gyro, state.R @ accel + self._gravity)
+
+    def _unbiased(self, sample: ImuSample) -> tuple[FloatArray, FloatArray]:
+        """Rate and specific force (3,) of a sample without biases, and without scale and misalignment if estimated."""
+        gyro, accel = sample.gyro, sample.accel
+        if self._matrices is not None:
+            M_accel, M_gyro = self._matrices
+            gyro, accel = M_gyro @ gyro, M_accel @ accel
+        return gyro - self._bias[0], accel - self._bias[1]
 
     def _carried(self, state: _State, sample: MotionSample) -> _State:
         """The state at a later sample; with an IMU by the mean of its readings at both ends."""
@@ -118,9 +127,9 @@ class PosePredictor:
         if isinstance(sample, VelocitySample):
             R, p, v = _moved(state, dt)
             return self._held(_State(sample.time_ns, R, p, v, state.gyro, state.accel), sample)
-        gyro = sample.gyro - self._bias[0]
+        gyro, accel = self._unbiased(sample)
         R = state.R @ so3_exp(0.5 * (state.gyro + gyro) * dt)
-        force = R @ (sample.accel - self._bias[1]) + self._gravity
+        force = R @ accel + self._gravity
         a = 0.5 * (state.accel + force)
         return _State(sample.time_ns, R, state.p + state.v * dt + 0.5 * a * dt**2, state.v + a * dt, gyro, force)
 

@@ -337,6 +337,19 @@ class StereoScaleEstimate:
         }
 
 
+# Entries (sensor, row, column) of the matrices of equation (A1) that are terms: accelerometer, then gyro.
+_UPPER = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+IMU_ENTRIES = (*((0, *at) for at in _UPPER), *((1, *at) for at in (*_UPPER, (1, 0), (2, 0), (2, 1))))
+_SENSORS, _ROWS, _COLUMNS = np.array(IMU_ENTRIES).T
+
+
+def imu_matrices(terms: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return `M_a` and `M_g` (3, 3) of equation (A1), which take readings to truth plus bias, from 15 terms."""
+    M = np.tile(np.eye(3), (2, 1, 1))
+    M[_SENSORS, _ROWS, _COLUMNS] += terms
+    return M[0], M[1]
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """The filter's belief at one time."""
@@ -358,6 +371,8 @@ class Estimate:
     time_offset_sigma_s: float | None = None
     stereo_field: StereoFieldEstimate | None = None
     stereo_scale: StereoScaleEstimate | None = None
+    imu_terms: FloatArray | None = None  # (15,) scale and misalignment of accelerometer and gyro, as IMU_ENTRIES
+    imu_terms_sigma: FloatArray | None = None  # (15,) standard deviations; zero where a term is not estimated
     scale_sigma: float | None = None  # one camera: standard deviation of the scale of the last frames' motion, over it
     # The pose in a map; None without one, or without a place in it yet.
     T_map_body: FloatArray | None = None  # (4, 4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import platform
 import shutil
 from collections.abc import Mapping, Sequence
@@ -29,7 +30,7 @@ from vio.mapped_run import MappedRun
 from vio.pipeline import STAGES, FrameLog, RunResult
 from vio.printable import json_text, printable
 from vio.protocols import Dataset
-from vio.records import Landmarks, Trajectory
+from vio.records import IMU_ENTRIES, Landmarks, Trajectory
 from vio.run_recorder import UNFINISHED, GrowingFolder
 from vio.run_tables import frames_csv
 from vio.tables import Records
@@ -295,6 +296,7 @@ def metrics_of(
         "stereo_scale": stereo_scale(result),
         "scale_sigma": scale_sigma(result),
         "camera_imu": camera_imu(result),
+        "imu": imu_calibration(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
         "camera": asdict(result.recording.camera),
     }
@@ -364,6 +366,27 @@ def camera_imu(result: RunResult) -> dict[str, Any] | None:
             "translation_sigma_mm": (1e3 * sigma[:3]).tolist(),
         }
     return out or None
+
+
+def imu_calibration(result: RunResult) -> dict[str, Any] | None:
+    """Return scale and misalignment of the IMU as estimated at the end of the run; None: they were not.
+
+    Entries of `M - I` of equation (A1) of docs/math.md, which multiply the readings: by sensor, the scales of x, y, z
+    in %, and the others by row and column in degrees, with their standard deviations.
+    """
+    estimate = result.estimates[-1]
+    terms, sigmas = estimate.imu_terms, estimate.imu_terms_sigma
+    if terms is None or sigmas is None:
+        return None
+    out: dict[str, Any] = {}
+    for (sensor, row, column), value, sigma in zip(IMU_ENTRIES, terms.tolist(), sigmas.tolist(), strict=True):
+        own = out.setdefault(("accelerometer", "gyro")[sensor], {})
+        kind, factor = ("scale_percent", 100.0) if row == column else ("misalignment_deg", math.degrees(1.0))
+        axes = "xyz"[row] if row == column else "xyz"[row] + "xyz"[column]
+        if sigma > 0:
+            own.setdefault(kind, {})[axes] = factor * value
+            own.setdefault(f"{kind}_sigma", {})[axes] = factor * sigma
+    return out
 
 
 def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str, Any] | None:

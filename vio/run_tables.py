@@ -41,6 +41,8 @@ ESTIMATE = np.dtype(
         ("gravity_world", "<f8", (3,)),
         ("T_cam0_imu", "<f8", (4, 4)),
         ("T_cam0_imu_covariance", "<f8", (6, 6)),
+        ("imu_terms", "<f8", (15,)),
+        ("imu_terms_sigma", "<f8", (15,)),
         ("time_offset_s", "<f8"),
         ("time_offset_sigma_s", "<f8"),
         ("scale_sigma", "<f8"),
@@ -56,7 +58,7 @@ ESTIMATE = np.dtype(
 _OPTIONAL_ARRAYS = (
     *("velocity_world", "velocity_covariance"),
     *("gyro_bias", "gyro_bias_sigma", "accel_bias", "accel_bias_sigma", "gravity_world"),
-    *("T_cam0_imu", "T_cam0_imu_covariance"),
+    *("T_cam0_imu", "T_cam0_imu_covariance", "imu_terms", "imu_terms_sigma"),
 )
 _OPTIONAL_NUMBERS = ("time_offset_s", "time_offset_sigma_s", "scale_sigma")
 

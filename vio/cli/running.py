@@ -345,6 +345,16 @@ def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         if "time_offset_ms" in found_imu:
             words.append(f"time {found_imu['time_offset_ms']:+.2f} ± {found_imu['time_offset_sigma_ms']:.2f} ms")
         rows.append(("camera-IMU", "off by " + ", ".join(words)))
+    for sensor, own in (metrics.get("imu") or {}).items():
+        words = [
+            f"{axis} {value:+.2f} ± {own['scale_percent_sigma'][axis]:.2f}"
+            for axis, value in own.get("scale_percent", {}).items()
+        ]
+        if words:
+            rows.append(("IMU", f"{sensor} scale {', '.join(words)} %"))
+        if "misalignment_deg" in own:
+            size, sigma = (math.hypot(*own[key].values()) for key in ("misalignment_deg", "misalignment_deg_sigma"))
+            rows.append(("", f"{sensor} misalignment {size:.2f} ± {sigma:.2f} deg"))
     return rows
 
 

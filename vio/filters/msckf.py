@@ -18,6 +18,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from vio.errors import ConfigError, DivergedError, EstimationError
+from vio.filters.imu_terms import CHOSEN, IMU_TERMS
 from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
@@ -125,6 +126,8 @@ class Msckf:
             raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
         if settings.calibrate not in ("auto", "none") and motion != "imu":
             raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to auto or none")
+        if settings.calibrate_imu != "off" and motion != "imu":
+            raise ConfigError(f"msckf.calibrate_imu: {settings.calibrate_imu} needs --motion imu; set it to off")
         if camera.is_cylinder:  # equation (R4) is a pinhole's
             settings = replace(settings, stereo_focal_sigma=0.0, stereo_baseline_sigma=0.0)
         self._camera, self._settings = camera, settings
@@ -208,7 +211,8 @@ class Msckf:
             camera_D_own: how the camera's pose at the present frame follows them, equation (C2).
             noise: and what that leaves open.
         """
-        if not self._started().calibration.moves_camera:
+        calibration = self._started().calibration
+        if not calibration.moves_camera and not calibration.imu_dim:
             M = growth.Phi[:6] - np.eye(6, DIM)
             out: FloatArray = M @ self._output[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
             return out
@@ -222,6 +226,8 @@ class Msckf:
         out = np.eye(len(self._output))
         out[:DIM, :DIM] = growth.Phi
         calibration = self._started().calibration
+        if growth.Phi_imu is not None:
+            out[:DIM, DIM : DIM + calibration.imu_dim] = growth.Phi_imu
         if calibration.extrinsics:
             rows = calibration.extrinsic_rows + DIM
             out[np.ix_(rows, rows)] = se3_adjoint(nav.T_world_imu @ se3_inverse(self._frame_pose))
@@ -232,10 +238,14 @@ class Msckf:
         if not isinstance(self._motion, ImuMotion) or not self._started().calibration.timing:
             return NO_TWIST
         R = nav.T_world_imu[:3, :3]
-        P = growth.Phi @ self._output[:DIM, :DIM] @ growth.Phi.T + growth.Q
+        own, rate_D_error = slice(0, self._started().nav_dim), self._motion.rate_D_error(nav)
+        Phi = growth.Phi if own.stop == DIM else self._grown(nav, growth)[own, own]
+        P = Phi @ self._output[own, own] @ Phi.T
+        P[:DIM, :DIM] += growth.Q
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = R.T @ P[6:9, 6:9] @ R  # v = exp(phi) v_hat + xi_v, seen from the body turned by phi
-        covariance[3:, 3:] = P[9:12, 9:12] + np.eye(3) * self._motion.rate_variance(self._noise.factors)
+        by_gyro = np.eye(3) * self._motion.rate_variance(self._noise.factors)
+        covariance[3:, 3:] = rate_D_error @ P @ rate_D_error.T + by_gyro
         return Twist(body_twist(nav.T_world_imu, nav.velocity, nav.rate), covariance)
 
     def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
@@ -272,6 +282,8 @@ class Msckf:
                 self._noise = self._first_noise(P)
             calibration = self._calibration
             self._window = self._first_window(nav, P, calibration)
+            if calibration.imu_dim and isinstance(self._motion, ImuMotion):
+                self._window.correlate_first_tilt(self._motion.tilt_D_terms(nav))
             self._time_ns = self._body_ns = self._began_ns = observations.time_ns
             self._begin_output(self._window)
             self._measure()
@@ -396,6 +408,9 @@ class Msckf:
             accel_bias_sigma=known.accel_bias_sigma,
         )
         estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:], window.nav.T_world_imu)
+        if window.calibration.imu_dim:
+            sigmas = np.sqrt(np.diag(self.imu_terms_covariance()))
+            estimate = replace(estimate, imu_terms=window.nav.imu_terms, imu_terms_sigma=sigmas)
         if self._scale_log is not None and window.scale_test is not None:
             covariance = np.diag([window.scale_test.estimate()[1] ** 2, 0.0])
             estimate = replace(estimate, stereo_scale=StereoScaleEstimate(np.array([self._scale_log, 0.0]), covariance))
@@ -405,6 +420,14 @@ class Msckf:
             field = replace(field, rows_rms_px=self._rows.rms_px, rows=own, rows_covariance=P)
             estimate = replace(estimate, stereo_field=field)
         return estimate
+
+    def imu_terms_covariance(self) -> FloatArray:
+        """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`; zero where a term is not estimated."""
+        out = np.zeros((IMU_TERMS, IMU_TERMS))
+        if self._window is not None:
+            chosen, own = CHOSEN[self._window.calibration.imu], slice(DIM, self._window.nav_dim)
+            out[np.ix_(chosen, chosen)] = self._grown_output()[own, own]
+        return out
 
     def _current_pose(self, window: Window, output: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pose (4, 4) of the body at the newest exposure and its covariance (6, 6)."""
@@ -628,6 +651,16 @@ class Msckf:
         weight = pixels.weight * used[:, None]
         return Views(pixels.z[~dropped], weight[~dropped]), int((~used).sum())
 
+    @property
+    def _is_at_rest(self) -> bool:
+        """Whether the last window's motion is indistinguishable from none; False until there is one.
+
+        The field is taken as known then: every point has a depth that explains its disparity, but the scatter of the
+        estimated poses would pass for parallax.
+        """
+        limits = self._settings.zero_velocity_sigma_mps, self._settings.zero_rate_sigma_radps
+        return self._smoothed is not None and self._smoothed.is_stationary(*limits)
+
     def _apply_zero_velocity(self, window: Window) -> None:
         """Absorb a zero-velocity measurement where the whole window is indistinguishable from standstill.
 
@@ -637,8 +670,7 @@ class Msckf:
             return
         if window.clones[0].time_ns <= self._stationary_ns:
             return
-        limits = self._settings.zero_velocity_sigma_mps, self._settings.zero_rate_sigma_radps
-        if self._smoothed is None or not self._smoothed.is_stationary(*limits):
+        if not self._is_at_rest:
             return
         measurement = self._motion.zero_velocity(window.nav, self._gyro)
         if measurement is not None:
@@ -654,7 +686,8 @@ class Msckf:
         if not window.calibration.stereo_field and (known_off or self._rows.is_significant):
             calibration = replace(window.calibration, stereo_field=True)
             P, _ = calibration_covariance(calibration, self._settings)
-            window.start_stereo_field(calibration, P[:FIELD_TERMS, :FIELD_TERMS])
+            own = slice(calibration.imu_dim, calibration.imu_dim + FIELD_TERMS)
+            window.start_stereo_field(calibration, P[own, own])
 
     def _test_scale(self, window: Window, seen: Observations) -> None:
         """Take the scale of IMU or velocities, from the frame on at which they contradict that of the baseline."""
@@ -744,7 +777,7 @@ class Msckf:
         """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
         poses, variance, field = 6 * len(window.clones), self._tracks.variance, self._field(window)
         A, b, stereo = np.zeros((poses, poses)), np.zeros(poses), None
-        if field is not None:
+        if field is not None and not self._is_at_rest:
             stereo = StereoInformation.none(len(field.terms), poses + 3 * len(window.landmarks))
         if chosen.any():
             A, b = eliminate_points(tracks.information, chosen)

@@ -10,7 +10,7 @@ Contact-aided invariant extended Kalman filtering for robot state estimation (20
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,6 +19,18 @@ from vio.errors import EstimationError
 from vio.filters import pose_loops as loops
 from vio.filters.imu_gaps import Hidden, ImuHistory
 from vio.filters.imu_start import imu_start
+from vio.filters.imu_terms import (
+    CHOSEN,
+    IMU_TERMS,
+    accel_D_terms,
+    calibrated,
+    gyro_D_terms,
+    raw_rate,
+    significant,
+    term_columns,
+    tilt_columns,
+    usual_reading,
+)
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import (
     FloatArray,
@@ -37,6 +49,7 @@ _BIASES: IntArray = np.arange(9, DIM)
 UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
 _SAMPLE_S = 0.005  # between two samples of a usual IMU, where only one has come
+_NO_TERMS: FloatArray = np.zeros(IMU_TERMS)
 _START_RATE_SIGMA_RADPS = 1.0  # initial standard deviation of the angular rate without an IMU
 
 
@@ -49,6 +62,7 @@ class NavState:
     rate: FloatArray  # (3,) body frame, rad/s; IMU model: what the gyro reads now less its bias, no state of its own
     gyro_bias: FloatArray  # (3,) rad/s
     accel_bias: FloatArray  # (3,) m/s^2; twist model: unused, zero
+    imu_terms: FloatArray = field(default_factory=lambda: _NO_TERMS)  # (15,) scale and misalignment, equation (A1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +84,7 @@ class Transition:
     Q_parts: FloatArray  # (2, 15, 15) of Q, what the translation's and what the rotation's noise brought
     gyro: FloatArray | None = None  # (3,) mean rate that the gyro measured over the step, rad/s; None: it did not
     bridged: bool = False  # whether IMU samples were missing, so that Q says nothing of the sensors' noise
+    Phi_imu: FloatArray | None = None  # (15, I) by the IMU's terms; None: they are known
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,12 +95,16 @@ class Growth:
     Q: FloatArray  # (15, 15)
     Q_parts: FloatArray  # (2, 15, 15) as in Transition
     bridged: bool = False  # in one of the steps
+    Phi_imu: FloatArray | None = None  # (15, I) as in Transition
 
     def then(self, step: Transition) -> Growth:
         """Append a step."""
         Phi = step.Phi
         Q, Q_parts = Phi @ self.Q @ Phi.T + step.Q, Phi @ self.Q_parts @ Phi.T + step.Q_parts
-        return Growth(Phi @ self.Phi, Q, Q_parts, self.bridged or step.bridged)
+        Phi_imu = step.Phi_imu
+        if Phi_imu is not None and self.Phi_imu is not None:
+            Phi_imu = Phi @ self.Phi_imu + Phi_imu
+        return Growth(Phi @ self.Phi, Q, Q_parts, self.bridged or step.bridged, Phi_imu)
 
 
 NO_STEP = Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
@@ -93,9 +112,9 @@ NO_STEP = Growth(np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM)))
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """A linear measurement of the navigation state's error: residual = H error + noise."""
+    """A linear measurement of the errors of navigation state and IMU terms: residual = H error + noise."""
 
-    H: FloatArray  # (k, 15)
+    H: FloatArray  # (k, 15 + I)
     residual: FloatArray  # (k,)
     R: FloatArray  # (k, k)
     metric: bool = False  # whether it is a velocity in m/s; standstill is standstill whatever the scale
@@ -106,6 +125,10 @@ class ImuMotion:
 
     def __init__(self, settings: MsckfSettings) -> None:
         self._settings = settings
+        self._chosen = CHOSEN[settings.calibrate_imu]  # the IMU's terms that are estimated
+        self._usual: FloatArray | None = (
+            None  # (6,) mean reading `[gyro, accel]` of the last second; kept for the terms
+        )
         self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
         self._new: list[ImuSample] = []  # not checked yet
         self._kept: list[ImuSample] = []
@@ -180,7 +203,8 @@ class ImuMotion:
         Raises:
             EstimationError: there is no sample at all.
         """
-        times, readings, hidden = self._interval(start_ns, end_ns)
+        times, raw, hidden = self._interval(start_ns, end_ns)
+        readings = calibrated(raw, nav.imu_terms) if len(self._chosen) else raw
         s, steps = self._settings, len(times) - 1
         densities = factors * [s.accel_noise_density, s.gyro_noise_density]
         variance = np.zeros((2, steps)) if hidden is None else hidden.variance
@@ -192,16 +216,37 @@ class ImuMotion:
         loops.integrate(times, readings, bias, self._gravity, densities, variance, T, v, turned, Phi, Q_parts)
         Q = Q_parts[0] + Q_parts[1]
         Q[_BIASES, _BIASES] = np.repeat([s.gyro_bias_walk**2 * total, s.accel_bias_walk**2 * total], 3)
-        moved = NavState(T, v, readings[-1, :3] - nav.gyro_bias, nav.gyro_bias, nav.accel_bias)
+        moved = NavState(T, v, readings[-1, :3] - nav.gyro_bias, nav.gyro_bias, nav.accel_bias, nav.imu_terms)
+        Phi_imu = None
+        if len(self._chosen):
+            own = readings - bias
+            levers = raw if self._usual is None else significant(raw, self._usual, total, densities)
+            by_terms = term_columns(times, levers, own, nav.T_world_imu, nav.velocity, self._gravity)
+            Phi_imu = by_terms[:, self._chosen]
         if hidden is not None and hidden.gap:
-            return Transition(moved, Phi, Q, Q_parts, bridged=True)
-        return Transition(moved, Phi, Q, Q_parts, turned / max(total, 1e-9) + nav.gyro_bias)
+            return Transition(moved, Phi, Q, Q_parts, bridged=True, Phi_imu=Phi_imu)
+        return Transition(moved, Phi, Q, Q_parts, turned / max(total, 1e-9) + nav.gyro_bias, Phi_imu=Phi_imu)
+
+    def tilt_D_terms(self, nav: NavState) -> FloatArray:
+        """How errors of the IMU's terms move the attitude's error (3, I) of a state that `start` has returned: (A4)."""
+        return tilt_columns(nav.T_world_imu, self._gravity)[:, self._chosen]
+
+    def rate_D_error(self, nav: NavState) -> FloatArray:
+        """Jacobian (3, 15 + I) of the present rate by the errors of navigation state and IMU terms."""
+        out = np.zeros((3, DIM + len(self._chosen)))
+        out[:, 9:12] = -np.eye(3)
+        if len(self._chosen):
+            out[:, DIM:] = gyro_D_terms(raw_rate(nav.rate + nav.gyro_bias, nav.imu_terms))[:, self._chosen]
+        return out
 
     def forget_before(self, time_ns: int) -> None:
         """Drop the samples that no interval from this time on needs."""
         samples, keep = self.samples, 0
         while keep + 1 < len(samples) and samples[keep + 1].time_ns <= time_ns:
             keep += 1
+        if keep and len(self._chosen):
+            seconds = (samples[keep].time_ns - samples[0].time_ns) * 1e-9
+            self._usual = usual_reading(self._usual, readings_of(samples[:keep]), seconds)
         self._kept = self._kept[keep:]
 
     def measurement(self, nav: NavState) -> Measurement | None:
@@ -209,7 +254,7 @@ class ImuMotion:
         return None
 
     def zero_velocity(self, nav: NavState, gyro: FloatArray | None) -> Measurement | None:
-        """Rest as a measurement, equation (N7): no velocity, and the gyro reads its bias.
+        """Rest as a measurement, equation (N7): no velocity, and the gyro, calibrated, reads its bias.
 
         None where the gyro contradicts.
         """
@@ -219,10 +264,12 @@ class ImuMotion:
         turn = gyro - nav.gyro_bias
         if np.abs(turn).max() > 3 * (s.zero_rate_sigma_radps + s.gyro_bias_sigma_radps):
             return None
-        H = np.zeros((6, DIM))
+        H = np.zeros((6, DIM + len(self._chosen)))
         H[:3, 3:6] = -so3_hat(nav.velocity)
         H[:3, 6:9] = np.eye(3)
         H[3:, 9:12] = np.eye(3)
+        if len(self._chosen):
+            H[3:, DIM:] = -gyro_D_terms(raw_rate(gyro, nav.imu_terms))[:, self._chosen]
         sigmas = np.repeat([s.zero_velocity_sigma_mps, s.zero_rate_sigma_radps], 3)
         return Measurement(H, np.concatenate([-nav.velocity, turn]), np.diag(sigmas**2))
 
@@ -237,31 +284,36 @@ class ImuMotion:
         return MotionUncertainty(velocity_D_error @ P[3:9, 3:9] @ velocity_D_error.T, sigmas[:3], sigmas[3:])
 
     def corrected(self, nav: NavState, error: FloatArray) -> NavState:
-        """Return the state moved by an error (15,)."""
+        """Return the state moved by an error (15 + I,)."""
         T, v = nav.T_world_imu.copy(), nav.velocity.copy()
         move_by_twist(error[:6], T)
         loops.move_points(error[3:6], error[None, 6:9], v[None])
-        return NavState(
-            T,
-            v,
-            nav.rate - error[9:12],
-            nav.gyro_bias + error[9:12],
-            nav.accel_bias + error[12:15],
-        )
+        rate, terms = nav.rate - error[9:12], nav.imu_terms
+        if len(self._chosen):
+            by_terms = error[DIM : DIM + len(self._chosen)]
+            rate = rate + self.rate_D_error(nav)[:, DIM:] @ by_terms  # exact, as the rate is linear in the terms
+            terms = terms.copy()
+            terms[self._chosen] += by_terms
+        return NavState(T, v, rate, nav.gyro_bias + error[9:12], nav.accel_bias + error[12:15], terms)
 
     def corrected_earlier(
         self, velocities: FloatArray, R_world_imu: FloatArray, ages_s: FloatArray, error: FloatArray
     ) -> FloatArray:
-        """Return velocities as a present error (15,) moves them: (N2) back, with the accelerometer's bias.
+        """Return velocities as a present error moves them: (N2) back, with the accelerometer's bias and terms.
 
         Args:
-            velocities: (N, 3) of the past, world.
+            velocities: (N, 3) of the past, world, the present one last.
             R_world_imu: (N, 3, 3) mean attitudes from then to now.
             ages_s: (N,) seconds from then to now.
-            error: (15,) of the present state.
+            error: (15 + I,) of the present state.
         """
         out: FloatArray = velocities.copy()
         loops.move_earlier_velocities(self._gravity, ages_s, np.ascontiguousarray(R_world_imu), error, out)
+        if len(self._chosen):  # the mean force over the time since, times that time
+            force = velocities[-1] - velocities - ages_s[:, None] * self._gravity
+            by_terms = accel_D_terms(np.einsum("nji,nj->ni", R_world_imu, force))[..., self._chosen]
+            by_terms = by_terms @ error[DIM : DIM + len(self._chosen)]
+            out -= np.einsum("nij,nj->ni", R_world_imu, by_terms)
         return out
 
     def rate_variance(self, factors: FloatArray) -> float:

@@ -12,15 +12,17 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, ImuTerms, term_sigmas
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import METRIC_TERMS, TERMS
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
 from vio.records import FIELD_TERMS, Estimate, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
 from vio.statistics import chi_square_quantile
 
-# Columns of the full error [stereo field; baseline and focal length; eta; time offset].
-_STEREO, _ETA, _OFFSET = np.arange(TERMS), TERMS + np.arange(6), np.array([TERMS + 6])
-_FULL = TERMS + 7
+# Columns of the full error [IMU terms; stereo field; baseline and focal length; eta; time offset].
+_IMU, _STEREO = np.arange(IMU_TERMS), IMU_TERMS + np.arange(TERMS)
+_ETA, _OFFSET = IMU_TERMS + TERMS + np.arange(6), np.array([IMU_TERMS + TERMS + 6])
+_FULL = IMU_TERMS + TERMS + 7
 _PARTS = slice(0, 3), slice(3, 6)  # of a twist
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
@@ -44,15 +46,21 @@ class Calibration:
     stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))  # (10,) coefficients of (R3) and (R4)
     stereo_field: bool = False  # whether those of (R3) are estimated
     metric: bool = False  # whether those of (R4) are
+    imu: ImuTerms = "off"  # which of the IMU's terms are estimated; the navigation state has their means
 
     @property
     def dim(self) -> int:
-        """Error dimensions C, 0 to 15."""
-        return self.stereo_dim + 6 * self.extrinsics + self.timing
+        """Error dimensions C, 0 to 32."""
+        return self.imu_dim + self.stereo_dim + 6 * self.extrinsics + self.timing
+
+    @property
+    def imu_dim(self) -> int:
+        """How many of the error's dimensions, the first, belong to the IMU's terms: 0, 6 or 15."""
+        return len(CHOSEN[self.imu])
 
     @property
     def stereo_dim(self) -> int:
-        """How many of the error's dimensions, the first, belong to the stereo calibration: 0, 2, 6 or 8."""
+        """How many of the error's dimensions, after those of the IMU, belong to the stereo calibration: 0, 2, 8, 10."""
         return FIELD_TERMS * self.stereo_field + (TERMS - FIELD_TERMS) * self.metric
 
     @property
@@ -67,13 +75,19 @@ class Calibration:
 
     @property
     def columns(self) -> IntArray:
-        """Which entries (C,) of the full error `[stereo; eta; time offset]`, m, rad and s, are estimated."""
-        return np.concatenate([_STEREO[self.stereo_terms], _ETA[: 6 * self.extrinsics], _OFFSET[: 1 * self.timing]])
+        """Which entries (C,) of the full error `[IMU; stereo; eta; time offset]`, m, rad and s, are estimated."""
+        camera = _STEREO[self.stereo_terms], _ETA[: 6 * self.extrinsics], _OFFSET[: 1 * self.timing]
+        return np.concatenate([_IMU[CHOSEN[self.imu]], *camera])
+
+    @property
+    def stereo_rows(self) -> slice:
+        """Which of the error's dimensions belong to the stereo calibration."""
+        return slice(self.imu_dim, self.imu_dim + self.stereo_dim)
 
     @property
     def extrinsic_rows(self) -> IntArray:
         """Which of the error's dimensions belong to the extrinsics, 6 or none."""
-        return self.stereo_dim + np.arange(6 * self.extrinsics)
+        return self.stereo_rows.stop + np.arange(6 * self.extrinsics)
 
     def corrected(self, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
         """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of the error."""
@@ -89,7 +103,7 @@ class Calibration:
         )
 
     def in_world(self, covariance: FloatArray, T_world_imu: FloatArray) -> FloatArray:
-        """Turn the covariance (C, C) of `[stereo; delta; time offset]` into that of the error, with eta."""
+        """Turn the covariance (C, C) of `[IMU; stereo; delta; time offset]` into that of the error, with eta."""
         out, rows = covariance.copy(), self.extrinsic_rows
         if self.extrinsics:
             A = se3_adjoint(T_world_imu)
@@ -106,10 +120,11 @@ class Calibration:
             T_world_imu: the body's pose (4, 4) of these errors.
         """
         if self.stereo_field:
-            own = slice(0, FIELD_TERMS)
-            estimate = replace(estimate, stereo_field=StereoFieldEstimate(self.stereo[own], covariance[own, own]))
+            own = slice(self.imu_dim, self.imu_dim + FIELD_TERMS)
+            field = StereoFieldEstimate(self.stereo[:FIELD_TERMS], covariance[own, own])
+            estimate = replace(estimate, stereo_field=field)
         if self.metric:
-            own = slice(self.stereo_dim - METRIC_TERMS, self.stereo_dim)
+            own = slice(self.stereo_rows.stop - METRIC_TERMS, self.stereo_rows.stop)
             scale = StereoScaleEstimate(self.stereo[FIELD_TERMS:], covariance[own, own])
             estimate = replace(estimate, stereo_scale=scale)
         if self.extrinsics:
@@ -123,7 +138,7 @@ class Calibration:
         return estimate
 
     def full(self, error: FloatArray) -> FloatArray:
-        """Fill an error (..., C) up to (..., 17) with zeros."""
+        """Fill an error (..., C) up to (..., 32) with zeros."""
         out = np.zeros((*error.shape[:-1], _FULL))
         out[..., self.columns] = error
         return out
@@ -142,13 +157,14 @@ def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: M
         timing=timing,
         stereo_field=settings.calibrate_stereo == "on",
         metric=motion is not None and max(settings.stereo_focal_sigma, settings.stereo_baseline_sigma) > 0,
+        imu=settings.calibrate_imu if motion == "imu" else "off",
     )
 
 
 def calibration_covariance(calibration: Calibration, settings: MsckfSettings) -> tuple[FloatArray, FloatArray]:
     """Return the initial covariance (C, C) of what is estimated, and what a second of random walk adds to it (C, C).
 
-    Both of `[stereo; delta; time offset]`.
+    Both of `[IMU; stereo; delta; time offset]`.
     """
     s = settings
     yaw, other = np.radians(s.stereo_yaw_sigma_deg), s.stereo_field_sigma
@@ -158,7 +174,9 @@ def calibration_covariance(calibration: Calibration, settings: MsckfSettings) ->
     rotation, rotation_walk = np.radians([s.extrinsic_rotation_sigma_deg, s.extrinsic_rotation_walk])
     pose = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
     pose_walk = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])
-    sigmas, walks = np.concatenate([stereo, pose]), np.concatenate([stereo * _STEREO_WALK, pose_walk])
+    imu = term_sigmas(s)
+    sigmas = np.concatenate([imu, stereo, pose])
+    walks = np.concatenate([imu * IMU_WALK, stereo * _STEREO_WALK, pose_walk])
     return np.diag(sigmas[calibration.columns] ** 2), np.diag(walks[calibration.columns] ** 2)
 
 

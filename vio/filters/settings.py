@@ -131,6 +131,11 @@ class MsckfSettings(Section):
         "what is estimated of camera and IMU besides the motion: T_cam0_imu, the time offset, or both; auto: the time "
         "offset, where a stereo pair has an IMU",
     )
+    calibrate_imu: Literal["off", "scale", "full"] = setting(
+        "off",
+        "what is estimated of the IMU's own calibration besides the biases: nothing; the scales of accelerometer and "
+        "gyro; or these, the misalignment of their axes, and the gyro's rotation against the accelerometer",
+    )
     calibrate_stereo: Literal["auto", "on", "off"] = setting(
         "auto",
         "estimate what the stereo calibration is off by, a low-order field over the image: always, never, or where the "
@@ -157,6 +162,14 @@ class MsckfSettings(Section):
     )
     time_offset_sigma_s: float = setting(
         5.0e-3, "calibrate: initial standard deviation of the time offset", unit="s", at_least=0
+    )
+    imu_scale_sigma: float = setting(
+        0.01,
+        "calibrate_imu: initial standard deviation of a scale, over it; 1/200 of it walks per root second",
+        at_least=0,
+    )
+    imu_misalignment_sigma_deg: float = setting(
+        0.5, "calibrate_imu: initial standard deviation of a misalignment, likewise", unit="deg", at_least=0
     )
     extrinsic_rotation_walk: float = setting(
         2.0e-3, "calibrate: random walk, of a mount that gives", unit="deg/sqrt(s)", at_least=0

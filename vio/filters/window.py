@@ -1,10 +1,10 @@
 """The window: navigation state, clones and landmarks, and the one covariance over all their errors.
 
-Layout of an error vector of length D: navigation state (15), calibration (C), clones (6 each, oldest first), landmarks
-(3 each). Only this module knows it. The error of a clone is that of the camera's pose, equation (C2), so the
-calibration of camera and IMU enters where a clone is made and nowhere else. The means are the newest estimates, at
-which everything is linearised; `P` and `prior_delta` describe the prior: by all absorbed measurements, the true error
-of the means has mean `-prior_delta` and covariance `P`.
+Layout of an error vector of length D: navigation state (15), calibration (C, the IMU's terms first), clones (6 each,
+oldest first), landmarks (3 each). Only this module knows it. The error of a clone is that of the camera's pose,
+equation (C2), so the calibration of camera and IMU enters where a clone is made and nowhere else. The means are the
+newest estimates, at which everything is linearised; `P` and `prior_delta` describe the prior: by all absorbed
+measurements, the true error of the means has mean `-prior_delta` and covariance `P`.
 """
 
 from __future__ import annotations
@@ -88,6 +88,7 @@ class Window:
     def calibration(self, calibration: Calibration) -> None:
         self._calibration = calibration
         self.first_clone = DIM + calibration.dim  # row of the first clone, the one after the calibration's
+        self.nav_dim = DIM + calibration.imu_dim  # errors of the navigation state and, after them, of the IMU's terms
 
     @property
     def first_landmark(self) -> int:
@@ -125,7 +126,7 @@ class Window:
     @property
     def stereo_rows(self) -> slice:
         """Rows of the stereo field's coefficients, empty where they are not estimated."""
-        return slice(DIM, DIM + self.calibration.stereo_dim)
+        return slice(self.nav_dim, self.nav_dim + self.calibration.stereo_dim)
 
     def chain(self, out_D_exposures: FloatArray, out_D_stereo: FloatArray | None = None) -> FloatArray:
         """Turn Jacobians into Jacobians (..., D) by the error vector.
@@ -176,7 +177,7 @@ class Window:
         """The larger one of the standard deviations of baseline and focal length, over them; 0 where they are known."""
         if not self.calibration.metric:
             return 0.0
-        end = DIM + self.calibration.stereo_dim
+        end = self.stereo_rows.stop
         return float(np.sqrt(self.P.diagonal()[end - METRIC_TERMS : end].max(initial=0.0)))
 
     def camera_move_since(self, index: int) -> FloatArray:
@@ -218,6 +219,8 @@ class Window:
         """
         Phi = np.eye(self.first_clone)
         Phi[:DIM, :DIM] = step.Phi
+        if step.Phi_imu is not None:
+            Phi[:DIM, DIM : self.nav_dim] = step.Phi_imu
         if self.calibration.extrinsics:
             rows = self.calibration.extrinsic_rows + DIM
             Phi[np.ix_(rows, rows)] = se3_adjoint(step.nav.T_world_imu @ se3_inverse(self.nav.T_world_imu))
@@ -235,6 +238,12 @@ class Window:
             P[DIM : len(Phi), DIM : len(Phi)] += self.calibration.in_world(walk, self.nav.T_world_imu)
         self.prior_delta[own] = Phi @ self.prior_delta[own]
 
+    def correlate_first_tilt(self, phi_D_terms: FloatArray) -> None:
+        """Let the first attitude's error follow those of the IMU's terms (3, I), as equation (A4) has it."""
+        J = np.eye(len(self.P))
+        J[3:6, DIM : self.nav_dim] = phi_D_terms
+        self.P = J @ self.P @ J.T
+
     def _scaled_nav(self, nav: NavState) -> FloatArray:
         """How the navigation state's error (15,) moves with the logarithm of the world's scale, equation (S1)."""
         T_world_cam0 = nav.T_world_imu @ se3_inverse(self.calibration.T_cam0_imu)
@@ -247,11 +256,11 @@ class Window:
             calibration: with the coefficients' first estimate.
             covariance: of their errors (S, S).
         """
-        D, S = len(self.P), len(covariance)
-        old = np.concatenate([np.arange(DIM), np.arange(DIM + S, D + S)])
+        D, S, first = len(self.P), len(covariance), self.nav_dim
+        old = np.concatenate([np.arange(first), np.arange(first + S, D + S)])
         P, prior_delta = np.zeros((D + S, D + S)), np.zeros(D + S)
         P[np.ix_(old, old)], prior_delta[old] = self.P, self.prior_delta
-        P[DIM : DIM + S, DIM : DIM + S] = covariance
+        P[first : first + S, first : first + S] = covariance
         self.P, self.prior_delta, self.calibration = P, prior_delta, calibration
         if self.scale_test is not None:
             V, self.scale_test.error_D_scale = self.scale_test.error_D_scale, np.zeros(D + S)
@@ -470,7 +479,7 @@ class Window:
         Pixels depend on no error of navigation state and extrinsics: then it is that of the errors after them, unless
         these are singular beyond rounding. It is computed once for all fits to one covariance.
         """
-        first = DIM if self.calibration.stereo_dim else self.first_clone
+        first = self.nav_dim if self.calibration.stereo_dim else self.first_clone
         if information[:first].any():
             first = 0
         if (first, size) not in self._factors:
@@ -500,11 +509,11 @@ class Window:
 
     def absorb_measurement(self, measurement: Measurement) -> None:
         """Absorb a measurement of the navigation state; the means stay where they are."""
-        RiH = np.linalg.solve(measurement.R, measurement.H)
+        RiH, own = np.linalg.solve(measurement.R, measurement.H), slice(0, measurement.H.shape[1])
         information = np.zeros_like(self.P)
-        information[:DIM, :DIM] = measurement.H.T @ RiH
+        information[own, own] = measurement.H.T @ RiH
         vector = np.zeros(len(self.P))
-        vector[:DIM] = RiH.T @ measurement.residual
+        vector[own] = RiH.T @ measurement.residual
         scaled = None
         if measurement.metric and self.scale_test is not None and is_clear(self.nav.velocity, self.P[6:9, 6:9]):
             scaled = np.zeros(len(self.P))
@@ -524,7 +533,7 @@ class Window:
             loops.move_points(self.exposure_errors(error)[-3:], xi_f, self.landmarks)
         velocities = [c.velocity for c in self.clones]
         if isinstance(self.motion, ImuMotion):
-            velocities = self._corrected_velocities(self.motion, T, error[:DIM])
+            velocities = self._corrected_velocities(self.motion, T, error[: self.nav_dim])
         self.clones = [
             Clone(c.frame_index, c.time_ns, pose, velocity)
             for c, pose, velocity in zip(self.clones, T, velocities, strict=True)
@@ -532,7 +541,7 @@ class Window:
         if self.calibration.dim:
             own = error[DIM : self.first_clone]
             self.calibration = self.calibration.corrected(own, self.nav.T_world_imu)
-        self.nav = self.motion.corrected(self.nav, error[:DIM])
+        self.nav = self.motion.corrected(self.nav, error[: self.nav_dim])
         self.prior_delta = self.prior_delta + error
 
     def turn_world(self, yaw: float, yaw_D_tilt: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -566,7 +575,7 @@ class Window:
         return R, M
 
     def _corrected_velocities(self, motion: ImuMotion, T_world_imu: FloatArray, error: FloatArray) -> list[FloatArray]:
-        """The clones' velocities (3,), moved by the navigation state's error (15,), at corrected poses (N, 4, 4)."""
+        """The clones' velocities (3,), moved by the present error (15 + I,), at corrected poses (N, 4, 4)."""
         ages = np.array([self.clones[-1].time_ns - c.time_ns for c in self.clones]) * 1e-9
         R, earlier = T_world_imu[:, :3, :3], np.array([c.velocity for c in self.clones])
         return list(motion.corrected_earlier(earlier, 0.5 * (R + R[-1]), ages, error))

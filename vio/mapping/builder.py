@@ -165,6 +165,7 @@ class MapBuilder:
         self._pending: list[FoundPlace] = []
         self._last: FoundPlace | None = None  # newest accepted loop
         self._waiting = 0  # loops since the last optimisation
+        self._optimised = False  # whether loops hold this session: until then it is reported as the odometry has it
         self._moved = False  # poses since the last commit
 
     @property
@@ -196,9 +197,7 @@ class MapBuilder:
         graph, number, motion = self.graph, len(self.graph), keyframe.motion
         drift, path = graph.gathered(keyframe.T_odom_cam, motion)
         T = keyframe.T_odom_cam
-        if motion is not None and self._last is None:  # until a loop says otherwise, the map moves with the odometry
-            T = graph.T_map_cam[-1] @ (se3_inverse(graph.T_odom_cam[-1]) @ T)
-        elif motion is not None:  # whose poses jump where the filter learns what it was off by; this motion does not
+        if motion is not None:  # the filter's poses jump where it learns what it was off by; this motion does not
             T = graph.T_map_cam[-1] @ motion.T_i_j
         up, sigma = keyframe.up_cam, keyframe.up_sigma_rad
         row = KeyframeRow(self._own, keyframe.frame, keyframe.time_ns, T, keyframe.T_odom_cam, drift, path, up, sigma)
@@ -220,6 +219,10 @@ class MapBuilder:
         """Optimise once more, write everything, and return the last correction."""
         if self._waiting:
             self._optimise()
+        if not self._optimised:
+            own = slice(self.first, None)
+            self.graph.T_map_cam.rows[own] = self.graph.T_odom_cam.rows[own]
+            self._moved = True
         self.commit()
         return self._update(())
 
@@ -263,7 +266,7 @@ class MapBuilder:
         if not self.is_joined:
             return MapUpdate(None, None, None, events)
         graph, k = self.graph, len(self.graph) - 1
-        T_map_odom = graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k])
+        T_map_odom = graph.T_map_cam[k] @ se3_inverse(graph.T_odom_cam[k]) if self._optimised else np.eye(4)
         since = self._drift_since(np.array([self.first if self._last is None else self._last.first]), k)
         T_map_cam = None if self._last is None else graph.T_map_cam[k].copy()
         return MapUpdate(T_map_odom, T_map_cam, since[0], events)
@@ -378,7 +381,7 @@ class MapBuilder:
         near = np.array(sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)), dtype=np.int64)
         covariance = graph.drift(np.full(len(near), origin), near, systematic=0.0)
         motion = se3_inverse(graph.T_map_cam[origin]) @ graph.T_map_cam[near]
-        return [View(m, self._shown(m), RelativePose(motion[n], covariance[n])) for n, m in enumerate(near.tolist())]
+        return [View(m, self._shown(m), RelativePose(motion[n], covariance[n]), i) for n, m in enumerate(near.tolist())]
 
     def _read_shown(self, keyframe: int) -> Shown:
         graph = self.graph
@@ -468,7 +471,7 @@ class MapBuilder:
         r = se3_log(se3_inverse(graph.T_map_cam[k]) @ graph.T_map_cam[i] @ pose.T_i_j)
         if not joined and graph.session[i] == graph.session[k]:
             drift = graph.drift(np.array([i]), np.array([k]), systematic=0.0)[0]
-            excess = _squared(r, drift + pose.covariance) / 6
+            excess = _squared(r, drift + pose.covariance) / _GATE
             graph.odometry_scale = max(graph.odometry_scale, excess)
         row = LoopRow(i, k, pose, loop.seen.inliers, kept=True)
         graph.loops.append(row)
@@ -476,7 +479,8 @@ class MapBuilder:
             self._store.add_loop(row)
         self._last, self._moved = loop, True
         self._waiting += 1
-        if joined or _squared(r, pose.covariance) > _SETTLED or self._waiting >= _PATIENCE:
+        settled = self._optimised and _squared(r, pose.covariance) <= _SETTLED
+        if joined or not settled or self._waiting >= _PATIENCE:
             self._optimise()
         return LoopEvent(
             frame=graph.frame(k),
@@ -506,16 +510,19 @@ class MapBuilder:
             self.graph.optimise_part(self.graph.sessions[self._own].part)
         if self._last is not None and not self.graph.loops[-1].kept:
             self._last = None
-        self._waiting, self._moved = 0, True
+        self._waiting, self._moved, self._optimised = 0, True, True
 
 
 def _as_place(views: list[View], number: int, seen: Guided, features: KeyframeFeatures, needed: int) -> FoundPlace:
-    """Return a place found by search as a motion from the keyframe that shows most of what was found."""
+    """Return a place found by search as a motion from the keyframe that shows most of what was found.
+
+    Where that keyframe stands among the others enters the covariance by their points alone.
+    """
     most = int(np.argmax(np.bincount(seen.view)))
     best, own = views[most], seen.view == most
     a, b, f = seen.row[own], seen.row_here[own], views[most].shown.features
     matches = LoopMatches(f.z[a], features.z[b], f.has_right[a], features.has_right[b])
-    pose = best.place.inverse().then(seen.pose)
+    pose = RelativePose(se3_inverse(best.place.T_i_j) @ seen.pose.T_i_j, seen.pose.covariance)
     return FoundPlace(best.keyframe, number, Verified(pose, seen.inliers, len(seen.row), a, b, matches), needed)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
-from vio.records import BoolArray, Image
+from vio.records import BoolArray, Image, IntArray
 
 Bits: TypeAlias = npt.NDArray[np.uint8]
 
@@ -29,6 +29,7 @@ _ROWS_PX = 2.0  # of a left and a right key point, at the scale of the detector'
 _MOST_DISPARITY = 0.4  # of the width
 _LEAST_DISPARITY_PX = 0.5
 _MOST_BITS = 64  # in which the descriptors of one point differ: a quarter
+_ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(axis=1, dtype=np.uint16)  # bits of a byte
 _LK_WINDOW = 11  # pixels
 _LK_CONTRAST = 15  # pixels; the images are brought to one brightness and contrast over squares of this size
 _LK_GRAY, _LK_DEVIATION, _LK_LEAST = 128.0, 40.0, 6.0  # mean and standard deviation then; below 6 gray levels less
@@ -101,17 +102,14 @@ def _right_pixels(
         return out, valid
     at = np.array([p.pt for p in there])
     size = np.array([_SCALE**p.octave for p in there])
-    shift = uv[:, None, 0] - at[None, :, 0]
-    allowed = (np.abs(uv[:, None, 1] - at[None, :, 1]) <= _ROWS_PX * scale[:, None]) & (
-        (shift > -1.0) & (shift < _MOST_DISPARITY * left.shape[1])
-    )
-    allowed &= np.abs(np.log(scale[:, None] / size[None])) < 1.5 * np.log(_SCALE)
-    pairs = cv2.BFMatcher(cv2.NORM_HAMMING).match(bits, there_bits, allowed.astype(np.uint8))
-    pairs = [m for m in pairs if m.distance <= _MOST_BITS]
-    if not pairs:
+    i, j = _near_rows(uv[:, 1], at[:, 1], _ROWS_PX * scale)
+    shift = uv[i, 0] - at[j, 0]
+    allowed = (shift > -1.0) & (shift < _MOST_DISPARITY * left.shape[1])
+    allowed &= np.abs(np.log(scale[i] / size[j])) < 1.5 * np.log(_SCALE)
+    rows, best = _most_alike(i[allowed], j[allowed], bits, np.asarray(there_bits, dtype=np.uint8))
+    if not len(rows):
         return out, valid
-    rows = np.array([m.queryIdx for m in pairs])
-    start = at[[m.trainIdx for m in pairs]].astype(np.float32)[:, None]
+    start = at[best].astype(np.float32)[:, None]
     refined, status, _ = cv2.calcOpticalFlowPyrLK(
         _equal_contrast(left),
         _equal_contrast(right),
@@ -127,6 +125,25 @@ def _right_pixels(
     good &= uv[rows, 0] - found[:, 0] >= _LEAST_DISPARITY_PX
     out[rows[good]], valid[rows[good]] = found[good], True
     return out, valid
+
+
+def _near_rows(v: FloatArray, there: FloatArray, reach: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return all pairs (P,) of rows v (N,) and rows `there` (M,) that differ by at most `reach` (N,)."""
+    order = np.argsort(there, kind="stable")
+    begin = np.searchsorted(there[order], v - reach, side="left")
+    counts = np.searchsorted(there[order], v + reach, side="right") - begin
+    i = np.repeat(np.arange(len(v)), counts)
+    return i, order[np.arange(len(i)) + np.repeat(begin - np.cumsum(counts) + counts, counts)]
+
+
+def _most_alike(i: IntArray, j: IntArray, a: Bits, b: Bits) -> tuple[IntArray, IntArray]:
+    """Of pairs (P,) of descriptors a (N, 32) and b (M, 32), return the best of each i, if it is good enough."""
+    differing = _ONES[a[i] ^ b[j]].sum(axis=1)
+    order = np.lexsort((j, differing, i))
+    rows, first = np.unique(i[order], return_index=True)
+    best = order[first]
+    good = differing[best] <= _MOST_BITS
+    return rows[good], j[best[good]]
 
 
 def _equal_contrast(image: Image) -> Image:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vio.errors import DataError
 from vio.mapping.builder import Keyframe, MapBuilder
-from vio.mapping.map_store import MapStore
+from vio.mapping.map_store import MapStore, check_path
 
 
 def describe_map(path: Path) -> dict[str, Any]:
@@ -61,14 +61,15 @@ def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
     """
     if out.exists():
         raise DataError(f"{out}: exists; give another name for the merged map")
+    check_path(out)
     if first.exists() and second.exists() and first.samefile(second):
         raise DataError(f"{second}: is the same map as {first}; give two different ones")
     partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:12]}.partial")
     try:
         source = MapStore(first, read_only=True)
-        source.copy_to(partial)
+        source.copy_to(partial, known_as=out)
         source.close()
-        other, store = MapStore(second, read_only=True), MapStore(partial)
+        other, store = MapStore(second, read_only=True), MapStore(partial, known_as=out)
         with contextlib.closing(other), contextlib.closing(store):
             for number in range(len(other.sessions())):
                 _take_up(other, number, store)

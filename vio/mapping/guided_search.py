@@ -22,7 +22,15 @@ from vio.geometry.lie import FloatArray, se3_inverse, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, StereoPoints, Terms, fit_terms, points_of, pose_of_most
+from vio.mapping.loop_geometry import (
+    LEAST_DISPARITY_PX,
+    Fitted,
+    StereoPoints,
+    Terms,
+    fit_terms,
+    points_of,
+    pose_of_most,
+)
 from vio.mapping.overlap import LEAST_DEPTH_M, SCALES, VIEW_COS
 from vio.records import IntArray
 
@@ -38,7 +46,12 @@ _ROWS = 1 << 20  # more than an image has
 _ASIDE_PX = 25.0  # by which all points are moved to find the pairs of chance: more than a window of the last search
 _ASIDE = 8  # directions
 LEAST_CORNERS = 12
-_OVER_CHANCE = 6.0  # times the mean number of pairs of chance
+# Times the mean number of corners of chance; or half as many times beside LEAST_CORNERS, which is less where chance is
+# above 4: large means scatter less. Of searches at wrong poses none had more than 1.9 times beside LEAST_CORNERS there.
+_OVER_CHANCE = 6.0
+# Share of the odometry's information in the measurement, since the map has it already: enough to hold what the pixels
+# leave open to where the covariance is linear.
+_PRIOR_SHARE = 0.1
 
 
 class Shown(NamedTuple):
@@ -58,6 +71,7 @@ class View(NamedTuple):
     keyframe: int
     shown: Shown
     place: RelativePose  # in the frame of the place's first keyframe
+    middle: int = 0  # keyframe in the middle of its stretch of the path, along which the odometry knows the motions
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +91,17 @@ class PlacePoints:
         a = self.p[rows], self.eye[rows], self.size_px[rows], self.descriptors[rows]
         return PlacePoints(self.views, *a, self.view[rows], self.row[rows])
 
+    def main_stretch(self) -> IntArray:
+        """Return the points (K,) of the stretch of the path that shows most of them."""
+        middle = np.array([view.middle for view in self.views])[self.view]
+        values, counts = np.unique(middle, return_counts=True)
+        return np.flatnonzero(middle == values[np.argmax(counts)])
+
     def with_covariance(self) -> StereoPoints:
         """Return the points with their covariance; errors of the keyframes' poses count as those of their points."""
         P = np.zeros((len(self.p), 3, 3))
         for n in np.unique(self.view).tolist():
-            _, source, place = self.views[n]
+            source, place = self.views[n].shown, self.views[n].place
             own = self.view == n
             seen = points_of(source.camera, source.features, self.row[own])
             D = np.concatenate([np.broadcast_to(np.eye(3), (len(seen.p), 3, 3)), -so3_hat(seen.p)], axis=2)
@@ -139,8 +159,8 @@ def search(
         camera: of the keyframe.
         here: its features.
         start: about where it stands; the covariance gives the windows of the first search.
-        prior: where it stands by the odometry: it decides what the pixels leave open, and the covariance of the result
-            is that of the pixels alone; None: not known.
+        prior: where it stands by the odometry: it decides which pairs agree, and what the pixels leave open; pose and
+            covariance of the result are those of the pixels; None: not known.
     """
     if len(here) < LEAST_CORNERS:
         return None
@@ -155,20 +175,39 @@ def search(
             return None
         pairs = _pairs(place, target, T, None)
         points, rows = place.take(pairs.point), pairs.feature
-        terms = Terms(points.with_covariance(), camera, here, rows, inverse=True)
-        fitted = fit_terms([terms], T, prior=prior, least=LEAST_CORNERS)
+        stereo = points.with_covariance()
+        fitted = fit_terms([Terms(stereo, camera, here, rows, inverse=True)], T, prior=prior, least=LEAST_CORNERS)
         T = None if fitted is None else fitted.T_i_j
     if fitted is None:
         return None
-    found, rows = points.take(np.flatnonzero(fitted.fits)), rows[fitted.fits]
-    inliers = _corners(here.z[rows])
+    agree = np.flatnonzero(fitted.fits)
+    inliers = _corners(here.z[rows[agree]])
     if inliers < LEAST_CORNERS:
         return None
     chance = _chance(pairs, target)
-    if inliers < _OVER_CHANCE * chance:
+    if inliers < min(_OVER_CHANCE * chance, LEAST_CORNERS + 0.5 * _OVER_CHANCE * chance):
         return None
-    depth = float(np.median(transform_points(se3_inverse(fitted.T_i_j), found.p)[:, 2]))
-    return Guided(fitted.motion(depth), inliers, chance, found.view, found.row, rows)
+    own = _of_one_stretch(points, here, rows, agree)
+    weak = None if prior is None else RelativePose(prior.T_i_j, prior.covariance / _PRIOR_SHARE)
+    terms = Terms(stereo.take(own), camera, here, rows[own], inverse=True)
+    measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_LEAST_SAMPLE)
+    return None if measured is None else _guided(measured, points.take(own), rows[own], inliers, chance)
+
+
+def _of_one_stretch(points: PlacePoints, here: KeyframeFeatures, rows: IntArray, agree: IntArray) -> IntArray:
+    """Return those of the pairs that `agree` which are of the stretch that shows most of them, or all if too few are.
+
+    How stretches stand to each other is what the map says so far, which is not to come back as a measurement.
+    """
+    own = agree[points.take(agree).main_stretch()]
+    return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree
+
+
+def _guided(measured: Fitted, points: PlacePoints, rows: IntArray, inliers: int, chance: float) -> Guided:
+    """Return a place by the fit to pairs of its points and features `rows` (P,)."""
+    found, rows = points.take(np.flatnonzero(measured.fits)), rows[measured.fits]
+    depth = float(np.median(transform_points(se3_inverse(measured.T_i_j), found.p)[:, 2]))
+    return Guided(measured.motion(depth), inliers, chance, found.view, found.row, rows)
 
 
 def _in_reach(place: PlacePoints, camera: StereoCamera, T_i_k: FloatArray) -> IntArray:

@@ -267,6 +267,10 @@ class StereoPoints:
     covariance: FloatArray  # (K, 3, 3) m^2
     valid: BoolArray  # (K,)
 
+    def take(self, rows: IntArray) -> StereoPoints:
+        """Return some of the points."""
+        return StereoPoints(self.p[rows], self.covariance[rows], self.valid[rows])
+
 
 def points_of(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> StereoPoints:
     """Return the points that features (rows, (K,)) of a keyframe show, in the frame of its left camera."""

@@ -75,26 +75,45 @@ class LoopRow:
     kept: bool  # False: it contradicts the others
 
 
+def check_path(path: Path) -> None:
+    """Raise DataError where a map's file can neither be nor be made."""
+    if path.is_dir() or not path.absolute().parent.is_dir():
+        fault = "is a folder" if path.is_dir() else f"its folder {path.parent} does not exist"
+        raise DataError(f"{path}: {fault}; name a file in a folder that exists")
+
+
+@contextlib.contextmanager
+def _errors_of(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        remedy = "wait for the run that uses it" if "locked" in str(error) else "check the path and the free space"
+        raise DataError(f"{path}: the map cannot be used ({error}); {remedy}") from error
+    except sqlite3.DatabaseError as error:
+        raise DataError(f"{path}: is damaged or no map ({error}); restore a copy or build it again") from error
+
+
 class MapStore:
     """A map's file, open."""
 
-    def __init__(self, path: Path, *, create: bool = False, read_only: bool = False) -> None:
+    def __init__(
+        self, path: Path, *, create: bool = False, read_only: bool = False, known_as: Path | None = None
+    ) -> None:
         """Open a map.
 
         Args:
             path: the file.
             create: make it where it does not exist.
             read_only: change nothing.
+            known_as: what messages call it; None: its path.
 
         Raises:
             DataError: there is no such map, it is damaged, of another version, or in use by another process.
         """
-        self.path = path
+        self.path = path if known_as is None else known_as
+        check_path(path)
         if not create and not path.is_file():
             raise DataError(f"{path}: there is no such map; vio run --map {path} makes one")
-        if path.is_dir() or not path.absolute().parent.is_dir():
-            fault = "is a folder" if path.is_dir() else f"its folder {path.parent} does not exist"
-            raise DataError(f"{path}: {fault}; name a file in a folder that exists")
         with self._errors():
             if read_only:
                 uri = f"{path.absolute().as_uri()}?mode=ro"
@@ -136,15 +155,8 @@ class MapStore:
     def _pragma(self, name: str) -> int:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
 
-    @contextlib.contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.OperationalError as error:
-            remedy = "wait for the run that uses it" if "locked" in str(error) else "check the path and the free space"
-            raise DataError(f"{self.path}: the map cannot be used ({error}); {remedy}") from error
-        except sqlite3.DatabaseError as error:
-            raise DataError(f"{self.path}: is damaged or no map ({error}); restore a copy or build it again") from error
+    def _errors(self) -> contextlib.AbstractContextManager[None]:
+        return _errors_of(self.path)
 
     # Writing
 
@@ -161,13 +173,17 @@ class MapStore:
                 self._db.execute("COMMIT")
             self._db.close()
 
-    def copy_to(self, path: Path) -> None:
+    def copy_to(self, path: Path, *, known_as: Path) -> None:
         """Write a copy of the whole map.
+
+        Args:
+            path: the copy.
+            known_as: what messages call it.
 
         Raises:
             DataError: it cannot be written.
         """
-        with self._errors(), contextlib.closing(sqlite3.connect(path)) as target:
+        with _errors_of(known_as), contextlib.closing(sqlite3.connect(path)) as target:
             self._db.backup(target)
 
     def add_session(self, row: SessionRow) -> int:

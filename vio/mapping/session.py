@@ -26,7 +26,7 @@ from vio.records import Estimate, Image, IntArray, Observations, StereoFrame
 Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 
 _SHARED = 0.6  # of the last keyframe's features that are still seen: below it, a new keyframe
-_LEAST_FEATURES = 30  # with a right pixel
+_LEAST_FEATURES = 30  # with a right pixel; or half of the most that a frame had, where features are set to be few
 _LEAST_TRACKED = 6  # likewise, by which the odometry can still follow
 _LOCALISE_STEP = 5  # frames between keyframes of a session that is localised, where nothing is stored
 _LOST_STEP = 3  # likewise while it has no place
@@ -89,6 +89,7 @@ class MapSession:
         self._newest: tuple[int, RelativePose, FloatArray] | None = None
         self._since = 0  # frames since the last keyframe
         self._last_keyframe: int | None = None  # its frame
+        self._most_features = 0  # with a right pixel, of a frame
         self._seen_ns: int | None = None  # newest frame with features
         self._seen: Estimate | None = None  # likewise
         self._dark: RelativePose | None = (
@@ -125,7 +126,8 @@ class MapSession:
             self._dark = RelativePose(self._dark.T_i_j, np.diag(_BROKEN))
         if seen_now:
             self._seen_ns, self._seen = frame.time_ns, estimate
-        if len(fresh) < _LEAST_FEATURES or frame.left is None or frame.right is None:
+        self._most_features = max(self._most_features, len(fresh))
+        if len(fresh) < min(_LEAST_FEATURES, 0.5 * self._most_features) or frame.left is None or frame.right is None:
             return events
         self._since += 1
         if motion is None and self._newest is not None:
