@@ -257,7 +257,9 @@ def _refine(
     """Refine the warps (N, 2, 3) in place, and write the correlations (N,) into `score`."""
     size, parameters = patch.shape[1], inverse.shape[1]
     at, part, view = np.empty(size, np.int32), np.empty((2, size), np.float32), np.empty(size, np.float32)
-    moments, fit = np.empty(_PARAMETERS, np.float32), np.zeros(_PARAMETERS)
+    moments, fit = np.empty(_PARAMETERS, np.float32), np.empty(_PARAMETERS)
+    for i in range(_PARAMETERS):
+        fit[i] = 0.0
     for n, slot in enumerate(slots):
         for _ in range(iterations):
             _sample(image, warp[n], xy, at, part, view)

@@ -100,7 +100,7 @@ def _gauss_newton(
     """
     T = np.array(T, order="C")  # of one layout, so that one version is compiled
     points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
-    _iterate(lens_of(camera), T, points, seen, w, iterations, free.stop)
+    _iterate(lens_of(camera), T, points, seen, w, np.inf, iterations, free.stop, 0.0)
     return T
 
 
@@ -111,17 +111,25 @@ def _iterate(
     points: FloatArray,
     pixels: FloatArray,
     weight: FloatArray,
+    scale_px: float,
     iterations: int,
     free: int,
+    converged: float,
 ) -> None:
-    """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see `_gauss_newton`."""
+    """Gauss-Newton on the first entries of the twists of motions (H, 4, 4), in place; see `_gauss_newton`.
+
+    Weights (H, K) are multiplied by those of Geman and McClure at a scale; infinite: by none. A motion is done when no
+    entry of it changes by `converged`.
+    """
     fu, fv, cu, cv, cylinder = lens
     azimuth, s, c = 0.0, 0.0, 1.0  # of a point about the baseline: a cylinder is a pinhole turned to it
-    A, xi, u_D_xi, v_D_xi = np.empty((free, free)), np.zeros(6), np.empty(6), np.empty(6)
+    A, xi, u_D_xi, v_D_xi = np.empty((free, free)), np.empty(6), np.empty(6), np.empty(6)
+    before = np.empty((4, 4))
     for h in range(len(T)):
         for _ in range(iterations):
-            for i in range(free):
+            for i in range(6):
                 xi[i] = 0.0
+            for i in range(free):
                 for j in range(i + 1):
                     A[i, j] = 0.0
             for n in range(points.shape[1]):
@@ -138,8 +146,15 @@ def _iterate(
                     continue
                 a, b = x / z, y / z
                 du, dv = pixels[h, n, 0] - fu * a - cu, pixels[h, n, 1] - fv * b - cv
+                u, v = fu * x / z + cu, fv * y / z + cv
                 if cylinder:
                     dv -= fv * azimuth
+                    v = fv * azimuth + cv
+                error = np.sqrt((u - pixels[h, n, 0]) ** 2 + (v - pixels[h, n, 1]) ** 2)  # as `_distances`
+                if not error < 3.0 * scale_px:
+                    continue
+                robust = 1.0 / (1.0 + (error / scale_px) ** 2)
+                w2 *= robust * robust
                 # pixel_D_point circledot(point)
                 u_D_xi[0], u_D_xi[1], u_D_xi[2] = fu / z, 0.0, -fu * a / z
                 u_D_xi[3], u_D_xi[4], u_D_xi[5] = -fu * a * b, fu * (1.0 + a * a), -fu * b
@@ -158,10 +173,19 @@ def _iterate(
                 trace += A[i, i]
             for i in range(free):
                 A[i, i] += _DAMPING * trace / free + 1e-9
-            solve_positive(A, xi[:free])
+            solve_positive(A, xi)
             for i in range(free):
                 xi[i] = min(max(xi[i], -5.0), 5.0)
+            for i in range(4):
+                for j in range(4):
+                    before[i, j] = T[h, i, j]
             move_by_twist(xi, T[h])
+            change = 0.0
+            for i in range(4):
+                for j in range(4):
+                    change = max(change, abs(T[h, i, j] - before[i, j]))
+            if change < converged:
+                break
 
 
 def _refine(
@@ -175,39 +199,9 @@ def _refine(
 ) -> FloatArray:
     """Refine one motion (4, 4) on all points, with Geman-McClure weights."""
     T = np.array(T[None], order="C")
-    points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
-    _refine_on_all(lens_of(camera), T, points, seen, scale_px, free.stop, converged)
+    points, seen, equal = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ones((1, len(p_prev)))
+    _iterate(lens_of(camera), T, points[None], seen[None], equal, scale_px, _REFINE_ITERATIONS, free.stop, converged)
     return T[0]
-
-
-@compiled
-def _refine_on_all(
-    lens: Lens,
-    T: FloatArray,
-    points: FloatArray,
-    pixels: FloatArray,
-    scale_px: float,
-    free: int,
-    converged: float,
-) -> None:
-    """Refine one motion (1, 4, 4) in place on points (N, 3) and pixels (N, 2); see `_refine`."""
-    weight, before = np.empty((1, len(points))), np.empty((4, 4))
-    once = int(np.int64(1))  # no literal: see `vio.compiled`
-    for _ in range(_REFINE_ITERATIONS):
-        _distances(lens, T, points, pixels, weight)
-        for n in range(len(points)):
-            error = weight[0, n]
-            weight[0, n] = 1.0 / (1.0 + (error / scale_px) ** 2) if error < 3.0 * scale_px else 0.0
-        for i in range(4):
-            for j in range(4):
-                before[i, j] = T[0, i, j]
-        _iterate(lens, T, points.reshape(1, -1, 3), pixels.reshape(1, -1, 2), weight, once, free)
-        change = 0.0
-        for i in range(4):
-            for j in range(4):
-                change = max(change, abs(T[0, i, j] - before[i, j]))
-        if change < converged:
-            break
 
 
 def _ransac(

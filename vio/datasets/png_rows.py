@@ -67,8 +67,10 @@ def _paeth(left: np.int16, above: np.int16, corner: np.int16) -> np.int16:
 def _side_by_side(rows: Image, out: Image, y: int) -> None:
     """Write 16 rows from y > 0 on, each one pixel behind the row above it, so that all neighbours are there."""
     width, last = out.shape[1], _SIDE_BY_SIDE - 1
-    left, above = np.zeros(_SIDE_BY_SIDE, np.int16), np.zeros(_SIDE_BY_SIDE, np.int16)
-    corner, change = np.zeros(_SIDE_BY_SIDE, np.int16), np.zeros(_SIDE_BY_SIDE, np.int16)
+    left, above = np.empty(_SIDE_BY_SIDE, np.int16), np.empty(_SIDE_BY_SIDE, np.int16)
+    corner, change = np.empty(_SIDE_BY_SIDE, np.int16), np.empty(_SIDE_BY_SIDE, np.int16)
+    for k in range(_SIDE_BY_SIDE):
+        left[k] = corner[k] = 0
     for step in range(width + last):
         whole = last <= step < width  # each row has a pixel in this step
         for k in range(last, 0, -1):

@@ -126,7 +126,7 @@ def _add_noise(
     `gyro2` and `accel2` are the variances of the integrals of gyro and accelerometer over it.
     """
     # How noise and bias errors of gyro and accelerometer enter [rho phi xi_v] (9, 6) there, carried to the end.
-    out, lever, swing = np.zeros((9, 6)), np.empty(3), np.empty(3)
+    out, lever, swing = np.empty((9, 6)), np.empty(3), np.empty(3)
     for i in range(3):
         swing[i] = v[i] + left * gravity[i]
         lever[i] = p[i] + left * (v[i] + 0.5 * left * gravity[i])
@@ -136,7 +136,7 @@ def _add_noise(
             out[i, c] = lever[k] * R[j, c] - lever[j] * R[k, c]
             out[3 + i, c] = -R[i, c]
             out[6 + i, c] = swing[k] * R[j, c] - swing[j] * R[k, c]
-            out[i, 3 + c], out[6 + i, 3 + c] = -left * R[i, c], -R[i, c]
+            out[i, 3 + c], out[3 + i, 3 + c], out[6 + i, 3 + c] = -left * R[i, c], 0.0, -R[i, c]
     for i in range(9):
         for j in range(6):
             Phi[i, 9 + j] += out[i, j] * dt
