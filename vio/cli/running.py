@@ -33,7 +33,6 @@ from vio.run_folder import (
 )
 from vio.run_recorder import CHECKPOINT, UNFINISHED
 from vio.trajectory_io import read_trajectory
-from vio.warm_up import compiling_beside
 
 if TYPE_CHECKING:
     from vio.view.live import RerunViewer
@@ -167,7 +166,7 @@ def _process(
     shown = None if view is None else _open_view(view, dataset, config, truth)
     if shown is not None:
         viewers.append(shown)
-    with locked_folder(folder), StopRequest() as asked, compiling_beside():
+    with locked_folder(folder), StopRequest() as asked:
         try:
             result = run(
                 dataset,
