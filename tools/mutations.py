@@ -1029,6 +1029,13 @@ MUTATIONS = (
         _CALIBRATE,
     ),
     Mutation(
+        "filter: views that contradict the IMU and one another are believed",
+        "vio/filters/window_tracks.py",
+        "wrong: BoolArray = squared > chi_square_table(_VIEW_PROBABILITY)[used.sum(axis=1)]",
+        "wrong: BoolArray = squared < 0",
+        ("tests/test_msckf.py",),
+    ),
+    Mutation(
         "stereo field: learned at standstill",
         "vio/filters/msckf.py",
         "if field is not None and not self._is_at_rest:",

@@ -601,15 +601,21 @@ class Msckf:
 
         predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
         tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _FIRST_STEPS)
-        innovation = tracks.newest_innovation()
+        at_prediction, innovation = tracks, tracks.newest_innovation()
         tracks, fitted = self._fit(window, tracks, pixels, innovation)
         step = self._step_errors(window, tracks, predicted, fitted)
         if step is not None:
-            missing = step.missing_noise()
+            missing, doubted = step.missing_noise(), False
             if missing.any() and self._tracks.agree(tracks.at):
                 window.inflate_process_noise(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
                 tracks, fitted = self._fit(window, tracks, pixels, innovation)
-            if not self._since_frame.bridged:
+            elif missing.any() and self._source == "imu" and not self._since_frame.bridged:
+                # Views that contradict the IMU and one another: a person who covers the view, not a shock.
+                doubted = bool(self._tracks.drop_unpredicted(at_prediction, self._expected).any())
+                pixels = Views(pixels.z, 0.0 * pixels.weight)
+                tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _LATER_STEPS)
+                tracks, fitted = self._fit(window, tracks, pixels, tracks.newest_innovation())
+            if not (self._since_frame.bridged or doubted):
                 self._noise.update(step)
         self._since_frame = NO_STEP
 

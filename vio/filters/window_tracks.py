@@ -26,7 +26,7 @@ from vio.filters.multiview import (
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import StereoColumns, StereoField, stereo_columns
 from vio.filters.tracks import TrackTable
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray
 from vio.robust import median
@@ -126,6 +126,26 @@ class WindowTracks:
         rows = tracks.rows[enough]
         z = self._views(rows, len(T), tracks.field).z
         return self._linear(T, rows, tracks.p_world[enough], at.take(enough), tracks.field, z)
+
+    def drop_unpredicted(self, predicted: LinearTracks, moved: FloatArray) -> BoolArray:
+        """Drop views of the newest clone that contradict the predicted motion permanently.
+
+        Args:
+            predicted: tracks linearised where the motion model has the newest clone.
+            moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the world's side.
+
+        Returns:
+            Which of the tracks (F,) have lost their view.
+        """
+        at, used = predicted.at, measured_pixels(predicted.at)[:, -1]
+        J = at.z_D_p[:, -1] @ circledot(predicted.p_world)[:, :3]
+        S = J @ moved @ np.swapaxes(J, 1, 2) + self.variance * np.eye(4)
+        squared = np.einsum("fi,fi->f", at.r[:, -1], np.linalg.solve(S, at.r[:, -1, :, None])[..., 0])
+        wrong: BoolArray = squared > chi_square_table(_VIEW_PROBABILITY)[used.sum(axis=1)]
+        views = np.zeros((len(wrong), at.r.shape[1]), dtype=np.bool_)
+        views[:, -1] = wrong
+        self.table.drop_views(predicted.rows, views)
+        return wrong
 
     def _linear(
         self,
