@@ -1036,13 +1036,6 @@ MUTATIONS = (
         ("tests/test_msckf.py",),
     ),
     Mutation(
-        "stereo field: learned at standstill",
-        "vio/filters/msckf.py",
-        "if field is not None and not self._is_at_rest:",
-        "if field is not None:",
-        ("tests/test_stereo_calibration.py",),
-    ),
-    Mutation(
         "stereo field: linearised at the pixels that were seen",
         "vio/filters/window_tracks.py",
         "field.jacobian(z - at.r)",

@@ -657,16 +657,6 @@ class Msckf:
         weight = pixels.weight * used[:, None]
         return Views(pixels.z[~dropped], weight[~dropped]), int((~used).sum())
 
-    @property
-    def _is_at_rest(self) -> bool:
-        """Whether the last window's motion is indistinguishable from none; False until there is one.
-
-        The field is taken as known then: every point has a depth that explains its disparity, but the scatter of the
-        estimated poses would pass for parallax.
-        """
-        limits = self._settings.zero_velocity_sigma_mps, self._settings.zero_rate_sigma_radps
-        return self._smoothed is not None and self._smoothed.is_stationary(*limits)
-
     def _apply_zero_velocity(self, window: Window) -> None:
         """Absorb a zero-velocity measurement where the whole window is indistinguishable from standstill.
 
@@ -676,7 +666,8 @@ class Msckf:
             return
         if window.clones[0].time_ns <= self._stationary_ns:
             return
-        if not self._is_at_rest:
+        limits = self._settings.zero_velocity_sigma_mps, self._settings.zero_rate_sigma_radps
+        if self._smoothed is None or not self._smoothed.is_stationary(*limits):
             return
         measurement = self._motion.zero_velocity(window.nav, self._gyro)
         if measurement is not None:
@@ -783,7 +774,7 @@ class Msckf:
         """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
         poses, variance, field = 6 * len(window.clones), self._tracks.variance, self._field(window)
         A, b, stereo = np.zeros((poses, poses)), np.zeros(poses), None
-        if field is not None and not self._is_at_rest:
+        if field is not None:
             stereo = StereoInformation.none(len(field.terms), poses + 3 * len(window.landmarks))
         if chosen.any():
             A, b = eliminate_points(tracks.information, chosen)
