@@ -12,7 +12,8 @@ import pytest
 
 from tests.numerics import numeric_jacobian
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
-from tests.test_online_calibration import Shaking
+from tests.test_navigation import MOVING as WITHOUT_TERMS
+from tests.test_online_calibration import Shaking, fly_with
 from vio.chain import build_backend
 from vio.checkpoint import load_checkpoint, save_checkpoint
 from vio.cli.running import _calibration_rows
@@ -23,7 +24,7 @@ from vio.filters.late_imu import LateImuMsckf
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState, rotation_to_up
 from vio.filters.settings import MsckfSettings
-from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp, so3_log
+from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_log
 from vio.geometry.stereo import CameraKind
 from vio.pose_prediction import PosePredictor
 from vio.records import Estimate, ImuSample, MotionSource, imu_matrices
@@ -38,14 +39,7 @@ OFF = MsckfSettings(calibrate="none")
 FULL = MsckfSettings(calibrate="none", calibrate_imu="full")  # the terms alone
 GRAVITY = np.array([0.0, 0.0, -9.81])
 TERMS = np.random.default_rng(3).normal(0, 0.02, IMU_TERMS)
-MOVING = NavState(
-    se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1]),
-    np.array([1.0, -0.5, 0.3]),
-    np.array([0.2, 0.1, -0.3]),
-    np.array([0.01, -0.02, 0.03]),
-    np.array([0.1, 0.05, -0.1]),
-    TERMS,
-)
+MOVING = replace(WITHOUT_TERMS, imu_terms=TERMS)
 OFF_BY_1_PERCENT = np.array([1, -1, 0.7, 0.87, -0.6, 0.8, -1, 0.8, 1, 0.87, 0.6, -0.87, 0.5, -0.8, 0.7]) * 0.01
 
 
@@ -206,22 +200,9 @@ def _fly(
 ) -> Run:
     noise = np.random.default_rng(0)
     filt = Msckf(CAMERA, T_cam0_imu, settings, motion="imu")
-    samples, fed = [replace(s, time_ns=s.time_ns + offset_ns) for s in _samples(flight, terms, settings, noise)], 0
-    estimates, errors = [], []
-    for k in range(flight.frames):
-        exposed_ns = k * STEP_NS + round(1e9 * max((estimates[-1].time_offset_s or 0.0) if estimates else 0.0, 0.0))
-        while fed == 0 or samples[fed - 1].time_ns < exposed_ns:
-            filt.propagate(samples[fed])
-            fed += 1
-        filt.update(flight.observe(k, sigma, noise, 40))
-        estimates.append(filt.estimate())
-        if k == 0:
-            R, p, *_ = flight.state(0.0)
-            turn = R @ estimates[0].T_world_imu[:3, :3].T
-            yaw = np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
-            T_shift = se3_from_parts(so3_exp([0, 0, yaw]), p)
-        errors.append((T_shift @ estimates[-1].T_world_imu)[:3, 3] - flight.T_world_imu(k)[:3, 3])
-    rms = float(np.sqrt(np.mean(np.sum(np.array(errors)[flight.frames // 5 :] ** 2, axis=1))))
+    samples = [replace(s, time_ns=s.time_ns + offset_ns) for s in _samples(flight, terms, settings, noise)]
+    estimates, errors = fly_with(filt, flight, samples, noise, sigma)
+    rms = float(np.sqrt(np.mean(np.sum(errors[flight.frames // 5 :] ** 2, axis=1))))
     return Run(rms, estimates)
 
 

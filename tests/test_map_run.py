@@ -29,7 +29,7 @@ from vio.mapping.builder import MapBuilder, MapUpdate
 from vio.mapping.map_store import MapStore
 from vio.mapping.session import HANDOVER_FRAMES, MapSession
 from vio.pipeline import run
-from vio.records import Estimate, StereoFrame, observations
+from vio.records import Estimate, Observations, StereoFrame, observations
 from vio.run_recorder import GrowingFolder
 from vio.trajectory_io import read_trajectory
 
@@ -314,19 +314,24 @@ def test_a_place_does_not_follow_a_jump_of_the_filter(tmp_path: Path, monkeypatc
     session.close()
 
 
+def _stand(session: MapSession, seen: Observations) -> None:
+    """Give a session a frame of a rig that stands."""
+    gray, k = np.zeros((64, 64), dtype=np.uint8), seen.frame_index
+    session.frame(
+        StereoFrame(k, seen.time_ns, gray, gray),
+        seen,
+        Estimate(k, np.eye(4), np.eye(6)),
+        lambda older, newer: RelativePose(np.eye(4), 1e-4 * (newer - older) * np.eye(6)),
+    )
+
+
 def test_few_features_are_no_darkness(tmp_path: Path) -> None:
     """Ten features for a second are too few for a keyframe, and enough for images alone to follow."""
     session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False, alone=True)
-    gray = np.zeros((64, 64), dtype=np.uint8)
     for k in range(24):
         count = 10 if 12 <= k < 22 else 40
         seen = observations(k, 10**8 * k, np.arange(count) + 1000 * (k == 23), np.tile([9.0, 9, 5, 9], (count, 1)))
-        session.frame(
-            StereoFrame(k, 10**8 * k, gray, gray),
-            seen,
-            Estimate(k, np.eye(4), np.eye(6)),
-            lambda older, newer: RelativePose(np.eye(4), 1e-4 * (newer - older) * np.eye(6)),
-        )
+        _stand(session, seen)
     session.finish()
     session.close()
     ((_, _, motion),) = MapStore(tmp_path / "a.map", read_only=True).odometry()
@@ -336,15 +341,9 @@ def test_few_features_are_no_darkness(tmp_path: Path) -> None:
 def test_an_odometry_of_few_features_has_keyframes_too(tmp_path: Path) -> None:
     """Where the front end is set to 24 features, no frame has thirty."""
     session = MapSession(tmp_path / "a.map", CAMERA, np.eye(4), source="made up", imu=False, localise=False)
-    gray = np.zeros((64, 64), dtype=np.uint8)
     for k in range(6):
         seen = observations(k, 10**8 * k, np.arange(24) + 12 * k, np.tile([9.0, 9, 5, 9], (24, 1)))
-        session.frame(
-            StereoFrame(k, 10**8 * k, gray, gray),
-            seen,
-            Estimate(k, np.eye(4), np.eye(6)),
-            lambda older, newer: RelativePose(np.eye(4), 1e-4 * (newer - older) * np.eye(6)),
-        )
+        _stand(session, seen)
     session.finish()
     session.close()
     store = MapStore(tmp_path / "a.map", read_only=True)

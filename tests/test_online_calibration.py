@@ -99,21 +99,12 @@ def _samples(flight: Flight, settings: MsckfSettings, offset_s: float, noise: np
     return out
 
 
-def _fly(
-    flight: Flight,
-    settings: MsckfSettings,
-    seed: int,
-    *,
-    xi: FloatArray,
-    offset_s: float,
-    sigma: float = 0.5,
-    camera: StereoCamera = CAMERA,
-) -> Run:
-    """Run the filter with extrinsics off by xi, clocks off by a time, and another camera than the one that sees."""
-    noise = np.random.default_rng(seed)
-    filt = Msckf(camera, T_CAM0_IMU @ se3_exp(xi), settings, motion="imu")
-    samples, fed = _samples(flight, settings, offset_s, noise), 0
-    estimates, positions = [], []
+def fly_with(
+    filt: Msckf, flight: Flight, samples: list[ImuSample], noise: np.random.Generator, sigma: float
+) -> tuple[list[Estimate], FloatArray]:
+    """Feed a filter with a flight; return its estimates and the errors of their positions (frames, 3), m."""
+    estimates: list[Estimate] = []
+    positions, fed = [], 0
     for k in range(flight.frames):
         # As in the pipeline: with the sample at or after the exposure, by the offset estimated so far.
         exposed_ns = k * STEP_NS + round(1e9 * max((estimates[-1].time_offset_s or 0.0) if estimates else 0.0, 0.0))
@@ -129,10 +120,27 @@ def _fly(
             T_shift = se3_from_parts(so3_exp([0, 0, yaw]), p)
         estimates.append(e)
         positions.append((T_shift @ e.T_world_imu)[:3, 3] - flight.T_world_imu(k)[:3, 3])
+    return estimates, np.array(positions)
+
+
+def _fly(
+    flight: Flight,
+    settings: MsckfSettings,
+    seed: int,
+    *,
+    xi: FloatArray,
+    offset_s: float,
+    sigma: float = 0.5,
+    camera: StereoCamera = CAMERA,
+) -> Run:
+    """Run the filter with extrinsics off by xi, clocks off by a time, and another camera than the one that sees."""
+    noise = np.random.default_rng(seed)
+    filt = Msckf(camera, T_CAM0_IMU @ se3_exp(xi), settings, motion="imu")
+    estimates, positions = fly_with(filt, flight, _samples(flight, settings, offset_s, noise), noise, sigma)
     found = [T_CAM0_IMU if e.T_cam0_imu is None else e.T_cam0_imu for e in estimates]
     offsets = np.array([e.time_offset_s or 0.0 for e in estimates])
     return Run(
-        np.array(positions),
+        positions,
         estimates,
         np.array([se3_log(se3_inverse(T) @ T_CAM0_IMU) for T in found]),
         offsets - offset_s,

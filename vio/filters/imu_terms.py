@@ -1,6 +1,6 @@
 """Scale and misalignment of accelerometer and gyro as states: how readings and the motion depend on them.
 
-Equations (A1) to (A4) of docs/math.md. The IMU's frame is the accelerometer's: its z axis, and the plane of its y and z
+Equations (A1) to (A5) of docs/math.md. The IMU's frame is the accelerometer's: its z axis, and the plane of its y and z
 axes. So the accelerometer has six terms, and the gyro, whose axes may be turned against it, nine.
 Reference: Rehder et al., Extending kalibr: calibrating the extrinsics of multiple IMUs and of individual axes (2016),
 for the model; the columns are those of the biases in (N1), times the readings.

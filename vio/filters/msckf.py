@@ -51,7 +51,6 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, depth_of, project
 from vio.records import (
-    FIELD_TERMS,
     ROW_TERMS,
     BoolArray,
     Estimate,
@@ -409,7 +408,7 @@ class Msckf:
         )
         estimate = window.calibration.add_to_estimate(estimate, output[DIM:, DIM:], window.nav.T_world_imu)
         if window.calibration.imu_dim:
-            sigmas = np.sqrt(np.diag(self.imu_terms_covariance()))
+            sigmas = np.sqrt(np.diag(_imu_terms_covariance(window, output)))
             estimate = replace(estimate, imu_terms=window.nav.imu_terms, imu_terms_sigma=sigmas)
         if self._scale_log is not None and window.scale_test is not None:
             covariance = np.diag([window.scale_test.estimate()[1] ** 2, 0.0])
@@ -423,11 +422,9 @@ class Msckf:
 
     def imu_terms_covariance(self) -> FloatArray:
         """Return the covariance (15, 15) of the errors of `Estimate.imu_terms`; zero where a term is not estimated."""
-        out = np.zeros((IMU_TERMS, IMU_TERMS))
-        if self._window is not None:
-            chosen, own = CHOSEN[self._window.calibration.imu], slice(DIM, self._window.nav_dim)
-            out[np.ix_(chosen, chosen)] = self._grown_output()[own, own]
-        return out
+        if self._window is None:
+            return np.zeros((IMU_TERMS, IMU_TERMS))
+        return _imu_terms_covariance(self._window, self._grown_output())
 
     def _current_pose(self, window: Window, output: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pose (4, 4) of the body at the newest exposure and its covariance (6, 6)."""
@@ -610,11 +607,9 @@ class Msckf:
                 window.inflate_process_noise(np.einsum("k,kij->ij", missing, self._since_frame.Q_parts))
                 tracks, fitted = self._fit(window, tracks, pixels, innovation)
             elif missing.any() and self._source == "imu" and not self._since_frame.bridged:
-                # Views that contradict the IMU and one another: a person who covers the view, not a shock.
-                doubted = bool(self._tracks.drop_unpredicted(at_prediction, self._expected).any())
-                pixels = Views(pixels.z, 0.0 * pixels.weight)
-                tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _LATER_STEPS)
-                tracks, fitted = self._fit(window, tracks, pixels, tracks.newest_innovation())
+                doubted = self._tracks.drop_unpredicted(at_prediction, self._expected)
+                pixels = Views(pixels.z, np.zeros_like(pixels.weight))
+                tracks, fitted = self._fit_again(window, pixels)
             if not (self._since_frame.bridged or doubted):
                 self._noise.update(step)
         self._since_frame = NO_STEP
@@ -683,7 +678,7 @@ class Msckf:
         if not window.calibration.stereo_field and (known_off or self._rows.is_significant):
             calibration = replace(window.calibration, stereo_field=True)
             P, _ = calibration_covariance(calibration, self._settings)
-            own = slice(calibration.imu_dim, calibration.imu_dim + FIELD_TERMS)
+            own = calibration.field_rows
             window.start_stereo_field(calibration, P[own, own])
 
     def _test_scale(self, window: Window, seen: Observations) -> None:
@@ -727,6 +722,11 @@ class Msckf:
                 break
             innovation = residual
         return tracks, fitted
+
+    def _fit_again(self, window: Window, pixels: Views) -> tuple[LinearTracks, Fit]:
+        """Fit to what is left of views that contradict the IMU and one another: a person in the view, not a shock."""
+        tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _LATER_STEPS)
+        return self._fit(window, tracks, pixels, tracks.newest_innovation())
 
     def _move_to_optimum(self, window: Window, tracks: LinearTracks, A: FloatArray, b: FloatArray, size: int) -> Fit:
         """Move the means, and the tracks' points with them, to the optimum of the prior and of given information.
@@ -888,3 +888,10 @@ def _newest(parts: list[Landmarks]) -> Landmarks:
     covariances = np.concatenate([part.covariance for part in parts])[::-1]
     kept, last = np.unique(ids, return_index=True)
     return Landmarks(kept, points[last], covariances[last])
+
+
+def _imu_terms_covariance(window: Window, output: FloatArray) -> FloatArray:
+    """Covariance (15, 15) of the IMU's terms out of that of navigation state and calibration; zero where known."""
+    out, chosen, own = np.zeros((IMU_TERMS, IMU_TERMS)), CHOSEN[window.calibration.imu], slice(DIM, window.nav_dim)
+    out[np.ix_(chosen, chosen)] = output[own, own]
+    return out

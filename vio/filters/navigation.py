@@ -126,9 +126,8 @@ class ImuMotion:
     def __init__(self, settings: MsckfSettings) -> None:
         self._settings = settings
         self._chosen = CHOSEN[settings.calibrate_imu]  # the IMU's terms that are estimated
-        self._usual: FloatArray | None = (
-            None  # (6,) mean reading `[gyro, accel]` of the last second; kept for the terms
-        )
+        # (6,) mean reading `[gyro, accel]` of the last second; kept where terms are estimated.
+        self._usual: FloatArray | None = None
         self._gravity = np.array([0.0, 0.0, -settings.gravity_mps2])
         self._new: list[ImuSample] = []  # not checked yet
         self._kept: list[ImuSample] = []

@@ -2,7 +2,7 @@
 
 A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error `delta`, with
 `T_cam0_imu = T_hat exp(delta)`, is kept on the world's side, `eta = Ad(T_world_imu) delta`, and moves with the body.
-Both errors enter where the camera's pose is cloned from the body's, equations (C1) to (C4) of docs/math.md.
+Both errors enter where the camera's pose is cloned from the body's, equations (C1) to (C5) of docs/math.md.
 Reference: Li & Mourikis, Online temporal calibration for camera-IMU systems (2014).
 """
 
@@ -85,6 +85,11 @@ class Calibration:
         return slice(self.imu_dim, self.imu_dim + self.stereo_dim)
 
     @property
+    def field_rows(self) -> slice:
+        """Which of the error's dimensions belong to the coefficients of (R3), where they are estimated."""
+        return slice(self.imu_dim, self.imu_dim + FIELD_TERMS)
+
+    @property
     def extrinsic_rows(self) -> IntArray:
         """Which of the error's dimensions belong to the extrinsics, 6 or none."""
         return self.stereo_rows.stop + np.arange(6 * self.extrinsics)
@@ -120,7 +125,7 @@ class Calibration:
             T_world_imu: the body's pose (4, 4) of these errors.
         """
         if self.stereo_field:
-            own = slice(self.imu_dim, self.imu_dim + FIELD_TERMS)
+            own = self.field_rows
             field = StereoFieldEstimate(self.stereo[:FIELD_TERMS], covariance[own, own])
             estimate = replace(estimate, stereo_field=field)
         if self.metric:

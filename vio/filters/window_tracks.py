@@ -127,7 +127,7 @@ class WindowTracks:
         z = self._views(rows, len(T), tracks.field).z
         return self._linear(T, rows, tracks.p_world[enough], at.take(enough), tracks.field, z)
 
-    def drop_unpredicted(self, predicted: LinearTracks, moved: FloatArray) -> BoolArray:
+    def drop_unpredicted(self, predicted: LinearTracks, moved: FloatArray) -> bool:
         """Drop views of the newest clone that contradict the predicted motion permanently.
 
         Args:
@@ -135,7 +135,7 @@ class WindowTracks:
             moved: covariance (6, 6) of its motion since the clone before, `[rho; phi]` on the world's side.
 
         Returns:
-            Which of the tracks (F,) have lost their view.
+            Whether there were any.
         """
         at, used = predicted.at, measured_pixels(predicted.at)[:, -1]
         J = at.z_D_p[:, -1] @ circledot(predicted.p_world)[:, :3]
@@ -145,7 +145,7 @@ class WindowTracks:
         views = np.zeros((len(wrong), at.r.shape[1]), dtype=np.bool_)
         views[:, -1] = wrong
         self.table.drop_views(predicted.rows, views)
-        return wrong
+        return bool(wrong.any())
 
     def _linear(
         self,
