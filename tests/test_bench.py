@@ -196,7 +196,17 @@ def test_all_code_of_a_render_is_in_its_key() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     names = {Path(name).relative_to(ROOT).as_posix() for name in done.stdout.split()}
-    helpers = {"__init__", "_version", "atomic", "errors", "frame_result", "input_files", "loops", "printable"}
+    helpers = {
+        "__init__",
+        "_version",
+        "atomic",
+        "errors",
+        "frame_rate",
+        "frame_result",
+        "input_files",
+        "loops",
+        "printable",
+    }
     helpers |= {"protocols", "unused", "yaml_text"}
     left = {n for n in names if not n.startswith(RENDER_CODE) and Path(n).stem not in helpers}
     assert not {n for n in left if not n.startswith("vio/cli/")}

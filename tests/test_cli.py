@@ -489,7 +489,14 @@ def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: py
     found = [f"right camera turned by +0.{k} deg about axis {k}" for k in range(5)]
     field = {"rows_rms_px": 0.4, "coefficients_px": [0.2], "sigma_px": [0.01], "rig": {"lines": found}}
     absent = ("stereo_scale", "camera_imu", "ate_m", "t_err_percent", "landmark_error")
-    metrics: dict[str, Any] = {"frames": 30, "path_length_m": 9.0, "stages_ms": {}, "ms_per_frame": 20.0}
+    metrics: dict[str, Any] = {
+        "frames": 30,
+        "first_frame": 0,
+        "last_frame": 29,
+        "path_length_m": 9.0,
+        "stages_ms": {},
+        "ms_per_frame": 20.0,
+    }
     metrics |= {"backend": "msckf", "motion": None, "camera": {}, "stereo_field": field, "out": "runs/drive"}
     print_result({}, rows_of(metrics | dict.fromkeys(absent)), as_json=False)
     lines = capsys.readouterr().out.splitlines()

@@ -17,7 +17,7 @@ from vio.atomic import atomic_folder, atomic_write_bytes, atomic_write_text
 from vio.errors import DataError, VioError
 from vio.geometry.lie import so3_exp
 from vio.records import Trajectory
-from vio.trajectory_io import read_trajectory, write_kitti, write_tum
+from vio.trajectory_io import is_trajectory_file, read_trajectory, write_kitti, write_tum
 
 EUROC_HEADER = "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z [],v_x,v_y,v_z\n"
 TUM_ROW = "0 0 0 0 0 0 1"
@@ -153,6 +153,25 @@ def test_kitti_form_warns_when_rows_are_not_frames(tmp_path: Path, caplog: pytes
     assert not caplog.records
     write_kitti(tmp_path / "b", replace(make(3, body="cam0"), frame_indices=np.array([10, 11, 13])))
     assert "frames 10-11 13-13" in caplog.text
+    caplog.clear()
+    write_kitti(tmp_path / "c", replace(make(3, body="cam0"), frame_indices=np.array([0, 2, 4])))
+    assert "the frames 0-4/2;" in caplog.text
+    caplog.clear()
+    irregular = np.cumsum(np.tile([1, 1, 2], 30))
+    write_kitti(tmp_path / "d", replace(make(90, body="cam0"), frame_indices=irregular))
+    assert "the frames 1 to 120 with gaps, 90 in all;" in caplog.text
+
+
+@pytest.mark.parametrize("steps", [[2], [1], [3, 3, 2], [1, 2, 1, 5], [2, 2, 1]])
+def test_frame_numbers_come_back(steps: list[int], tmp_path: Path) -> None:
+    """As comments of any length before the first row, and such a file is told from others by its first row."""
+    frames = np.cumsum(np.resize(steps, 4000))
+    trajectory = replace(make(4000), frame_indices=frames)
+    write_tum(tmp_path / "t.tum", trajectory)
+    assert is_trajectory_file(tmp_path / "t.tum")
+    again = read_trajectory(tmp_path / "t.tum").frame_indices
+    assert again is not None
+    np.testing.assert_array_equal(again, frames)
 
 
 def test_tum_form_needs_times(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from tests.test_pipeline import FakeDrive
 from vio.checkpoint import load_checkpoint, save_checkpoint
 from vio.cli import main
 from vio.config import Config
-from vio.datasets import open_dataset
+from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import write_observation_log
 from vio.errors import DataError, EstimationError
 from vio.filters.msckf import Msckf
@@ -144,10 +144,11 @@ def _assert_same(a: RunResult, b: RunResult) -> None:
     [
         (lambda log: open_dataset(log), Config(), 300),
         (lambda log: open_dataset(log), replace(Config(), lag_frames=4), 411),
+        (lambda log: open_dataset(log), replace(Config(), dataset=DatasetSettings(max_frame_rate=10.0)), 300),
         (lambda log: FakeDrive(), Config(), 29),
         (lambda log: _rendered(), Config(), 150),
     ],
-    ids=["features and imu", "lag", "velocities", "images"],
+    ids=["features and imu", "lag", "frame rate", "velocities", "images"],
 )
 def test_a_run_goes_on_to_the_same_bits(
     flight_log: Path, tmp_path: Path, make: Callable[[Path], Dataset], config: Config, events: int

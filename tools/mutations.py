@@ -126,7 +126,7 @@ MUTATIONS = (
     Mutation(
         "bags of one camera: images in the order in which they were recorded",
         "vio/datasets/bags/one_camera.py",
-        "while early and early[0][0] == due:",
+        "while early and early[0][0] == due[0]:",
         "while early:",
         ("tests/test_bags_one_camera.py",),
     ),
@@ -1544,6 +1544,13 @@ MUTATIONS = (
         _UNFINISHED,
     ),
     # --- input ---
+    Mutation(
+        "a limit on the frame rate leaves out a frame that is on time",
+        "vio/frame_rate.py",
+        "self._last_ns is not None and time_ns - self._last_ns < self._least_ns",
+        "self._last_ns is not None and time_ns - self._last_ns < 1.2 * self._least_ns",
+        ("tests/test_frame_rate.py",),
+    ),
     Mutation(
         "input: a doubled sample accepted",
         "vio/filters/inputs.py",

@@ -23,8 +23,8 @@ from vio.protocols import Dataset
 _FORMAT = "stereo-vio checkpoint"
 _PACKAGES = ("vio.filters.", "vio.geometry.", "vio.mapping.", "vio.watch.", "frontend.", "vio._frontend.")
 _MODULES = (
-    *("vio.chain", "vio.config", "vio.datasets.settings", "vio.event_order", "vio.imu_faults", "vio.loops"),
-    *("vio.odometry", "vio.pipeline", "vio.pose_prediction", "vio.records", "vio.selectors"),
+    *("vio.chain", "vio.config", "vio.datasets.settings", "vio.event_order", "vio.frame_rate", "vio.imu_faults"),
+    *("vio.loops", "vio.odometry", "vio.pipeline", "vio.pose_prediction", "vio.records", "vio.selectors"),
 )
 _OTHERS = {
     ("collections", "deque"),

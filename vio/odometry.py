@@ -21,6 +21,7 @@ from vio.config import Config
 from vio.errors import ConfigError, DataError
 from vio.event_order import EventOrder
 from vio.filters.msckf import Msckf
+from vio.frame_rate import FrameRateLimit
 from vio.frame_result import FrameResult
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray
@@ -164,6 +165,7 @@ class Odometry:
         self._given: dict[int, Observations] = {}  # observations of frames that wait
         self._kind: str | None = None  # of frames: images or observations
         self._frames = 0
+        self._limit = FrameRateLimit(self._config.dataset.max_frame_rate)
         self._last_ns: dict[str, int] = {}  # newest time of each kind of event
         self._estimate: Estimate | None = None
 
@@ -204,7 +206,8 @@ class Odometry:
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> Estimate | None:
         """Take a pair of images and return the newest estimate that it brought; None: it waits for IMU samples.
 
-        A pair that the front end refuses (of swapped cameras, for instance) gives a warning and no estimate.
+        A pair that the front end refuses (of swapped cameras, for instance) gives a warning and no estimate. None is
+        also returned for a frame that comes sooner than `dataset.max_frame_rate` allows, which is left out.
 
         Args:
             t_ns: time of the exposure in nanoseconds.
@@ -228,6 +231,8 @@ class Odometry:
             elif self.camera.width is not None and self.camera.height is not None:
                 _check_size(images[0], (self.camera.height, self.camera.width), "left")
             time_ns = self._new_time("frame", t_ns, kind="images")
+            if not self._is_used(time_ns):
+                return None
             left_image, right_image = images
             if self._rectifier is not None:
                 left_image, right_image = self._rectifier(left_image, right_image)
@@ -273,6 +278,8 @@ class Odometry:
                 _check_size(image, (self.camera.height, self.camera.width), "left")
             depth = None if depth_m is None else _depths(depth_m, image.shape)
             time_ns = self._new_time("frame", t_ns, kind="images")
+            if not self._is_used(time_ns):
+                return None
             if made is not None:
                 image, depth = made(image), None if depth is None else made.depth(depth)
             return self._add_frame(StereoFrame(self._frames, time_ns, image, None, depth))
@@ -300,6 +307,8 @@ class Odometry:
             if not np.isfinite(used).all():
                 raise DataError(f"observations at {t_ns} ns: {int((~np.isfinite(used)).sum())} pixels are not finite")
             time_ns = self._new_time("frame", t_ns, kind="observations")
+            if not self._is_used(time_ns):
+                return None
             self._given[self._frames] = observations(self._frames, time_ns, seen.ids, seen.z, seen.has_right)
             return self._add_frame(StereoFrame(self._frames, time_ns, None, None))
 
@@ -310,6 +319,8 @@ class Odometry:
             the results of the frames that it completed.
         """
         with self._lock:
+            if isinstance(event, StereoFrame) and not self._limit.takes(event.time_ns):
+                return []
             return self._add(event)
 
     def finish(self) -> list[FrameResult]:
@@ -459,6 +470,12 @@ class Odometry:
         self._kind = kind
         self._last_ns[of] = time_ns
         return time_ns
+
+    def _is_used(self, time_ns: int) -> bool:
+        """Whether the limit on the frame rate lets a frame through; one that it leaves out keeps its number."""
+        used = self._limit.takes(time_ns)
+        self._frames += not used
+        return used
 
     def _add_samples(self, samples: list[Any]) -> None:
         with self._lock:

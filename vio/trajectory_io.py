@@ -44,7 +44,8 @@ _COLUMNS: dict[TrajectoryFormat, str] = {
 }
 _EUROC_HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
 _STAMP = re.compile(r"[+-]?\d{1,19}")
-_HEAD_BYTES = 4096  # that hold the comments and the first row
+_LONGEST_LINE = 2**20  # bytes: the frames of a day with gaps are numbered in a comment of less
+_LONGEST_LIST = 100  # characters of frame numbers in a warning
 _DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
 
 
@@ -148,10 +149,11 @@ def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
         raise DataError(f"cannot write {path}: KITTI form describes cam0; convert with Trajectory.in_cam0 first")
     frames = trajectory.frame_indices
     if frames is not None and not np.array_equal(frames, np.arange(len(trajectory))):
+        text = _format_frames(frames)
+        if len(text) > _LONGEST_LIST:
+            text = f"{frames[0]} to {frames[-1]} with gaps, {len(frames)} in all"
         logger.warning(
-            "%s: its rows are the frames %s; tools that number rows from 0 will misread them",
-            Path(path).name,
-            _format_frames(frames),
+            "%s: its rows are the frames %s; tools that number rows from 0 will misread them", Path(path).name, text
         )
     rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12)
     atomic_write_text(path, "".join(f"{exact_text(row)}\n" for row in rows))
@@ -178,9 +180,8 @@ def is_trajectory_file(path: Path) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as stream:
-        start = stream.read(_HEAD_BYTES)
-    lines = start.decode("utf-8", errors="replace").splitlines()
-    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+        lines = iter(lambda: stream.readline(_LONGEST_LINE).decode("utf-8", errors="replace"), "")
+        first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     fields = first.split("," if "," in first else None)
     try:
         [float(field) for field in fields]
@@ -318,19 +319,27 @@ def _body(table: _Table, header_body: str | None, requested: BodyFrame | None) -
 
 
 def _format_frames(frames: IntArray) -> str:
-    """Format frame numbers as ranges: [0 1 2 5] becomes '0-2 5-5'."""
-    starts = np.flatnonzero(np.diff(frames, prepend=frames[0] - 2) != 1)
-    ends = np.append(starts[1:], len(frames)) - 1
-    return " ".join(f"{frames[a]}-{frames[b]}" for a, b in zip(starts, ends, strict=True))
+    """Format frame numbers as ranges: [0 1 2 5] becomes '0-2 5-5', and [0 2 4], every second frame, '0-4/2'."""
+    numbers, runs, first = frames.tolist(), [], 0
+    while first < len(numbers):
+        last = min(first + 1, len(numbers) - 1)
+        step = max(numbers[last] - numbers[first], 1)
+        while last + 1 < len(numbers) and numbers[last + 1] - numbers[last] == step:
+            last += 1
+        if step > 1 and last == first + 1:  # two frames apart are no rhythm
+            last = first
+        runs.append(f"{numbers[first]}-{numbers[last]}" + (f"/{step}" if step > 1 and last > first else ""))
+        first = last + 1
+    return " ".join(runs)
 
 
 def _parse_frames(table: _Table, text: str) -> IntArray:
-    runs = [re.fullmatch(r"(\d{1,9})-(\d{1,9})", run) for run in text.split()]
-    spans = [range(int(run.group(1)), int(run.group(2)) + 1) for run in runs if run]
-    ordered = all(a.stop <= b.start for a, b in pairwise(spans))
+    runs = [re.fullmatch(r"(\d{1,9})-(\d{1,9})(?:/([1-9]\d{0,8}))?", run) for run in text.split()]
+    spans = [range(int(run.group(1)), int(run.group(2)) + 1, int(run.group(3) or 1)) for run in runs if run]
+    ordered = all(len(a) and len(b) and a[-1] < b[0] for a, b in pairwise(spans))
     if not all(runs) or not ordered or sum(map(len, spans)) != len(table.rows):
         raise DataError(
             f"{table.path}: its comment '# frames: {text[:60]}' does not number its {len(table.rows)} poses; "
             "remove the comment or correct it"
         )
-    return np.concatenate([np.arange(span.start, span.stop, dtype=np.int64) for span in spans])
+    return np.concatenate([np.arange(span.start, span.stop, span.step, dtype=np.int64) for span in spans])

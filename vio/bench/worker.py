@@ -27,9 +27,10 @@ from vio.datasets import open_dataset
 from vio.datasets.span import frames_between
 from vio.errors import DataError, VioError
 from vio.evaluation import Evaluation, evaluate
+from vio.frame_rate import FrameRateLimit
 from vio.printable import json_text
 from vio.protocols import Dataset
-from vio.records import Trajectory
+from vio.records import IntArray, Trajectory
 from vio.trajectory_io import read_trajectory, tum_text
 
 if TYPE_CHECKING:
@@ -138,6 +139,12 @@ def _stop(job: dict[str, Any]) -> Any:
     return None if job["stop"] is None else bound(job["stop"])
 
 
+def _used(frame_times_ns: IntArray, config: Config) -> IntArray:
+    """Times (G,) of the frames (F,) that the limit on the frame rate lets through."""
+    limit = FrameRateLimit(config.dataset.max_frame_rate)
+    return np.array([t for t in frame_times_ns.tolist() if limit.takes(t)], dtype=np.int64)
+
+
 def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -> dict[str, Any]:
     """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
     import cv2
@@ -153,7 +160,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         figures: dict[str, Any] = {
             "frames": len(result.frames),
             "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
-            "coverage": coverage(truth.frame_times_ns, trajectory),
+            "coverage": coverage(_used(truth.frame_times_ns, config), trajectory),
         }
         record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}
         if truth.reference is not None:

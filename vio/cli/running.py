@@ -18,6 +18,7 @@ from vio.datasets import open_dataset
 from vio.datasets.span import Seconds, frames_between
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.evaluation import lengths_text, rotation_drift_text
+from vio.frame_rate import FrameRateLimit
 from vio.frame_result import FrameResult
 from vio.pipeline import given_rig, resolve_motion, run
 from vio.protocols import Dataset, Viewer
@@ -160,8 +161,8 @@ def _process(
     recording, reference = dataset.recording, request["reference"]
     truth = recording.reference if reference is None else read_trajectory(Path(reference))
     start, stop, save_observations = request["start"], request["stop"], request["save_observations"]
-    total = len(recording.frame_times_ns)
-    frames = max(min(total, total if stop is None else stop) - start, 0)
+    limit = FrameRateLimit(config.dataset.max_frame_rate)
+    frames = sum([limit.takes(t) for t in recording.frame_times_ns[:stop].tolist()][start:])
     viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
     shown = None if view is None else _open_view(view, dataset, config, truth)
     if shown is not None:
@@ -283,8 +284,9 @@ def free_folder(source: Path, root: Path = Path("runs")) -> Path:
 def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """Return a run's metrics as a few table rows."""
     stages = ", ".join(f"{name} {ms:.1f}" for name, ms in metrics["stages_ms"].items())
+    frames, span = metrics["frames"], metrics["last_frame"] - metrics["first_frame"] + 1
     rows = [
-        ("frames", f"{metrics['frames']}, path {metrics['path_length_m']:.2f} m"),
+        ("frames", f"{frames}{f' of {span}' if span > frames else ''}, path {metrics['path_length_m']:.2f} m"),
         ("time", f"{metrics['ms_per_frame']:.1f} ms a frame ({stages})"),
         ("back end", f"{metrics['backend']}, motion {metrics['motion']}"),
     ]

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import CalibrationError, DataError
+from vio.frame_rate import FrameRateLimit
 from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
 from vio.input_files import check_regular
 from vio.records import (
@@ -188,23 +189,50 @@ def frame_range(recording: Recording, start: int, stop: int | None) -> range:
     return range(start, end)
 
 
-def blank_frames(recording: Recording, chosen: range) -> Generator[StereoFrame]:
-    """Yield the frames of a range without their images."""
+def chosen_frames(recording: Recording, start: int, stop: int | None, most_hz: float | None) -> Sequence[int]:
+    """Return the frames `start <= index < stop` that a limit on the frame rate lets through, increasing.
+
+    Which ones does not depend on `start`, so that a run that goes on takes the frames that it would have taken.
+
+    Args:
+        recording: the frame times.
+        start: first frame number.
+        stop: after the last one; None: the end.
+        most_hz: frames a second; None: no limit.
+
+    Raises:
+        DataError: the range is empty or begins after the last frame, or the limit lets none of it through.
+    """
+    chosen = frame_range(recording, start, stop)
+    if most_hz is None:
+        return chosen
+    limit = FrameRateLimit(most_hz)
+    taken = [k for k, t in enumerate(recording.frame_times_ns[: chosen.stop].tolist()) if limit.takes(t) and k >= start]
+    if not taken:
+        raise DataError(
+            f"{recording.path}: dataset.max_frame_rate {most_hz:g} leaves no frame of {start} to {chosen.stop}; take "
+            "more frames, or raise it"
+        )
+    return taken
+
+
+def blank_frames(recording: Recording, chosen: Sequence[int]) -> Generator[StereoFrame]:
+    """Yield chosen frames without their images."""
     for index in chosen:
         yield StereoFrame(index, int(recording.frame_times_ns[index]), None, None)
 
 
 def merge_events(
-    recording: Recording, chosen: range, motion: Sequence[MotionSample], frames: Generator[StereoFrame]
+    recording: Recording, chosen: Sequence[int], motion: Sequence[MotionSample], frames: Generator[StereoFrame]
 ) -> Iterator[Event]:
-    """Yield the motion samples and frames of a range in time order, a sample before a frame of the same time.
+    """Yield the motion samples and chosen frames in time order, a sample before a frame of the same time.
 
     Raw IMU begins a second before the first frame, so that an estimator can determine gravity before the first image,
     and ends with the first sample at or after the last frame, so that readings can be interpolated to its exposure.
 
     Args:
         recording: the frame times.
-        chosen: frame numbers.
+        chosen: frame numbers, increasing.
         motion: samples of the whole recording, in time order.
         frames: the frames of the range, in time order; some may be missing. The generator is closed at the end.
     """

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from vio.datasets.common import blank_frames, frame_range, merge_events
+from vio.datasets.common import blank_frames, chosen_frames, merge_events
 from vio.datasets.images import WHITE_16, UnreadableImageError, list_images, load_gray, prefetch, white_level
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
@@ -138,7 +138,7 @@ class ImageDataset:
         Raises:
             DataError: the range holds no frame, or none that can be used, or more are unusable than the settings allow.
         """
-        chosen = frame_range(self.recording, start, stop)
+        chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
         frames = readable_frames(self._load, chosen, self.settings) if images else blank_frames(self.recording, chosen)
         return merge_events(self.recording, chosen, self.motion, frames)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.camera_rig import CameraRig, Undistorter
-from vio.datasets.common import blank_frames, frame_range, merge_events, naming
+from vio.datasets.common import blank_frames, chosen_frames, merge_events, naming
 from vio.datasets.companions import calibration_beside, read_motion, read_reference, sources_of, with_extrinsics
 from vio.datasets.image_pairs import BadFrame, ImageSize, first_readable, full_scale, readable_frames
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_depth, load_gray
@@ -66,7 +66,7 @@ class OneCameraDataset:
         Raises:
             DataError: the range holds no frame, or none that can be used, or more are unusable than the settings allow.
         """
-        chosen = frame_range(self.recording, start, stop)
+        chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
         frames = readable_frames(self._load, chosen, self.settings) if images else blank_frames(self.recording, chosen)
         return merge_events(self.recording, chosen, self.motion, frames)
 

@@ -69,6 +69,13 @@ class DatasetSettings(Section):
         "reader stops with an error; null: all but the last usable one",
         at_least=0,
     )
+    max_frame_rate: float | None = setting(
+        None,
+        "frames that come sooner are left out, unread where images are files, so that a slow computer follows a fast "
+        "camera; a tenth of an interval does not count; null: all are used",
+        unit="Hz",
+        above=0,
+    )
     prefetch_frames: int = setting(
         4, "image folders: stereo frames decoded ahead in a thread; 0: no thread", at_least=0, at_most=1000
     )

@@ -7,14 +7,14 @@ in compressed video is not exact. Times come from `times.txt`, else from the fra
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vio.datasets.common import frame_range, merge_events, naming
+from vio.datasets.common import chosen_frames, merge_events, naming
 from vio.datasets.companions import (
     find_calibration_of,
     read_motion,
@@ -150,7 +150,7 @@ class VideoDataset:
         Raises:
             DataError: the range holds no frame, or a frame cannot be decoded.
         """
-        chosen = frame_range(self.recording, start, stop)
+        chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
         times = self.recording.frame_times_ns
         if images:
             frames = self._frames(chosen)
@@ -162,17 +162,18 @@ class VideoDataset:
         """Return None: the recording holds images only."""
         return None
 
-    def _frames(self, chosen: range) -> Generator[StereoFrame]:
+    def _frames(self, chosen: Sequence[int]) -> Generator[StereoFrame]:
         """Decode in order; the prefetch thread is the only one that uses the decoders."""
         import cv2
 
         captures = [cv2.VideoCapture(str(file)) for file in self.files[: self.settings.cameras]]
 
+        after = dict(zip(chosen, [0, *(k + 1 for k in chosen)], strict=False))  # where the decoders are before a frame
+
         def load(index: int) -> StereoFrame:
-            if index == chosen.start:
-                for capture in captures:
-                    for _ in range(index):
-                        capture.grab()
+            for capture in captures:
+                for _ in range(after[index], index):
+                    capture.grab()
             images = [self._gray(capture, side, index) for side, capture in enumerate(captures)]
             time_ns = int(self.recording.frame_times_ns[index])
             if len(images) == 1:

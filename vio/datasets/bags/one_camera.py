@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Generator, Iterator
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -15,7 +16,7 @@ from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.pictures import gray_of
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import COMPRESSED
-from vio.datasets.common import blank_frames, frame_range, merge_events, naming
+from vio.datasets.common import blank_frames, chosen_frames, merge_events, naming
 from vio.datasets.image_pairs import BadFrame, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError
 from vio.datasets.overlap import reference_of_body
@@ -49,7 +50,7 @@ class OneCameraBag:
         Raises:
             DataError: the range holds no frame, or none that can be used, or the bag is damaged.
         """
-        chosen = frame_range(self.recording, start, stop)
+        chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
         frames = (
             readable_frames(self._load, self._messages(chosen), self.settings)
             if images
@@ -61,23 +62,23 @@ class OneCameraBag:
         """Return None: the recording holds images only."""
         return None
 
-    def _messages(self, chosen: range) -> Generator[tuple[int, Any]]:
+    def _messages(self, chosen: Sequence[int]) -> Generator[tuple[int, Any]]:
         """Yield frame numbers and image messages in the order of frames, however they were recorded."""
         times_ns = self.recording.frame_times_ns
         frame_of = {int(times_ns[k]): k for k in chosen}  # each entry is taken once
         early: list[tuple[int, Any]] = []
-        due = chosen.start
+        due = deque(chosen)
         with Bag(self.recording.path) as bag:
-            for message in bag.messages([self.topic.name], int(self.logged_ns[chosen.start : chosen.stop].min())):
+            for message in bag.messages([self.topic.name], int(self.logged_ns[chosen].min())):
                 fields = bag.decoded(message)
                 k = frame_of.pop(message.logged_ns if self.unstamped else stamp_of(fields), None)
                 if k is None:
                     continue
                 heapq.heappush(early, (k, fields))
-                while early and early[0][0] == due:
+                while early and early[0][0] == due[0]:
                     yield heapq.heappop(early)
-                    due += 1
-                if due == chosen.stop:
+                    due.popleft()
+                if not due:
                     return
 
     def _load(self, item: tuple[int, Any]) -> StereoFrame | BadFrame:

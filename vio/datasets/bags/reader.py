@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Generator, Iterator
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -18,7 +19,7 @@ from vio.datasets.bags.one_camera import OneCameraBag, read_one_camera
 from vio.datasets.bags.pictures import gray_of
 from vio.datasets.bags.store import Bag
 from vio.datasets.bags.topics import COMPRESSED, Roles
-from vio.datasets.common import blank_frames, frame_range, merge_events, naming
+from vio.datasets.common import blank_frames, chosen_frames, merge_events, naming
 from vio.datasets.image_pairs import BadFrame, ImageSize, readable_frames
 from vio.datasets.images import UnreadableImageError
 from vio.datasets.overlap import reference_of_body
@@ -65,7 +66,7 @@ class BagDataset:
         Raises:
             DataError: the range holds no frame, an image has another size, or the bag is damaged.
         """
-        chosen = frame_range(self.recording, start, stop)
+        chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
         frames = (
             readable_frames(self._load, self._pairs(chosen), self.settings)
             if images
@@ -77,17 +78,17 @@ class BagDataset:
         """Return None: the recording holds images only."""
         return None
 
-    def _pairs(self, chosen: range) -> Generator[_Pair]:
-        """Yield the pairs of a range in the order of frames, however their messages were recorded."""
+    def _pairs(self, chosen: Sequence[int]) -> Generator[_Pair]:
+        """Yield chosen pairs in the order of frames, however their messages were recorded."""
         frame_of = [
             {int(stamps[k]): k for k in chosen} for stamps in (self.left_ns, self.right_ns)
         ]  # each entry is taken once
         names = [topic.name for topic in self.roles.cameras]
         waiting: dict[int, Any] = {}
         complete: list[tuple[int, Any, Any]] = []
-        due = chosen.start
+        due = deque(chosen)
         with Bag(self.recording.path) as bag:
-            for message in bag.messages(names, int(self.logged_ns[chosen.start : chosen.stop].min())):
+            for message in bag.messages(names, int(self.logged_ns[chosen].min())):
                 side = names.index(message.topic)
                 fields = bag.decoded(message)
                 stamp_ns = message.logged_ns if self.unstamped[side] else stamp_of(fields)
@@ -99,10 +100,10 @@ class BagDataset:
                     continue
                 first = waiting.pop(k)
                 heapq.heappush(complete, (k, *((first, fields) if side == 1 else (fields, first))))
-                while complete and complete[0][0] == due:
+                while complete and complete[0][0] == due[0]:
                     yield _Pair(*heapq.heappop(complete))
-                    due += 1
-                if due == chosen.stop:
+                    due.popleft()
+                if not due:
                     return
 
     def _load(self, pair: _Pair) -> StereoFrame | BadFrame:
