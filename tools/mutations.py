@@ -1020,6 +1020,27 @@ MUTATIONS = (
         "raw",
         _IMU_TERMS,
     ),
+    Mutation(
+        "the baseline is judged before the turns are compared",
+        "vio/filters/msckf.py",
+        "(self._turns is None or not self._turns.agree)",
+        "(self._turns is not None and not self._turns.agree)",
+        ("tests/test_focal_length.py",),
+    ),
+    Mutation(
+        "a gyro of a wrong scale passes for a focal length that is off",
+        "vio/watch/turns.py",
+        "agrees = abs(optical - 1) < abs(excess) / 2 and optical_sigma < abs(excess) / 4",
+        "agrees = optical_sigma < abs(excess) / 4",
+        ("tests/test_focal_length.py",),
+    ),
+    Mutation(
+        "a focal length that is freed stays known",
+        "vio/filters/msckf.py",
+        "self._settings = replace(self._settings, stereo_focal_sigma=_FREED_FOCAL_SIGMA)",
+        "self._settings = replace(self._settings, stereo_focal_sigma=1e-9)",
+        ("tests/test_focal_length.py",),
+    ),
     # --- vio/filters: the paper's filter ---
     Mutation(
         "time offset: velocities of the past do not follow the accelerometer's bias",

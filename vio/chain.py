@@ -94,6 +94,8 @@ class Chain:
             seen = seen.take(seen.has_right)
         selection = self.selector.select(seen, expected.motion if expected else None)
         timer.end("select")
+        if self._motion == "imu" and isinstance(self.backend, Msckf):
+            self.backend.take_turns(self.watch.turns)
         report = self._update(seen.take(selection.chosen))
         if not self._has_started(frame, report):
             return None

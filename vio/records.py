@@ -26,6 +26,9 @@ BodyFrame: TypeAlias = Literal["imu", "cam0"]
 MotionSource: TypeAlias = Literal["imu", "velocity"]
 RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
 
+# Rigs are calibrated to 1 % of a focal length, and gyros to 1 or 2 % of their scale.
+_TURNS_OFF, _TURNS_SIGMAS, _TURNS_SIGMA = 0.03, 5.0, 0.01
+_KNOWN = 1e-8  # a standard deviation below it is rounding
 _INT64, _FLOAT64, _BOOL = np.dtype(np.int64), np.dtype(np.float64), np.dtype(np.bool_)
 
 
@@ -321,6 +324,28 @@ class StereoFieldEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class TurnComparison:
+    """How the camera's turns about the axes of its image compare with the gyro's; (I5) of docs/inertial.md."""
+
+    excess: float  # by what share the camera turns more than the gyro says
+    sigma: float  # its standard deviation; inf: there are no turns
+    gyro_agrees: bool  # about the optical axis, where no focal length matters: the gyro's scale is not the cause
+
+    @property
+    def differ(self) -> bool:
+        """Whether they differ beyond doubt, and beyond what calibrations leave."""
+        return self.sigma < _TURNS_SIGMA and abs(self.excess) > max(_TURNS_OFF, _TURNS_SIGMAS * self.sigma)
+
+    @property
+    def agree(self) -> bool:
+        """Whether no focal length that is off shows in them, be it that there are none."""
+        return self.sigma == np.inf or (self.sigma < 2 * _TURNS_SIGMA and abs(self.excess) < _TURNS_OFF)
+
+
+TURNS_NOT_SHOWN = TurnComparison(0.0, np.inf, False)
+
+
+@dataclass(frozen=True, slots=True)
 class StereoScaleEstimate:
     """By what baseline and focal length differ from the calibration, equation (R4) of docs/math.md."""
 
@@ -333,7 +358,7 @@ class StereoScaleEstimate:
         return {
             name: (100 * float(np.expm1(log)), 100 * float(sigma))
             for name, log, sigma in zip(("baseline", "focal length"), self.logs, sigmas, strict=True)
-            if sigma > 0
+            if sigma > _KNOWN
         }
 
 

@@ -52,6 +52,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, depth_of, project
 from vio.records import (
     ROW_TERMS,
+    TURNS_NOT_SHOWN,
     BoolArray,
     Estimate,
     ImuSample,
@@ -64,6 +65,7 @@ from vio.records import (
     Prediction,
     StereoScaleEstimate,
     TrackPrior,
+    TurnComparison,
     UpdateReport,
     VelocitySample,
     no_landmarks,
@@ -89,6 +91,7 @@ _SCALE_SIGMA = 0.001
 _MAP_DEPTH_SIGMA = 0.2  # by all views; a point of the map is reported with its covariance, and not used
 _LEAST_MERGE = 1000  # stored points up to which the map is not merged
 _USELESS_RAD = 0.2  # standard deviation of a predicted rotation beyond which its pixels start no search
+_FREED_FOCAL_SIGMA = 0.05  # over it, once the turns of camera and gyro differ
 _FAR = 0.5  # pixels by which the predicted pose may be off before one step over the window is too few
 _MOST_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
 _MOST_STEPS = 4  # over the window in a frame: one is the rule, two bring in a start in motion, a third is an exception
@@ -147,6 +150,7 @@ class Msckf:
         self._noise = MotionNoise(*IMU_FACTORS) if motion == "imu" else MotionNoise(*_TWIST_FACTORS)
         self._rows = RowField(camera)
         self._scale_log: float | None = None  # of the baseline over the calibrated one; None: nothing contradicts it
+        self._turns: TurnComparison | None = TURNS_NOT_SHOWN  # as others compared them; None: they will
         self._landmark_gate = LandmarkGate(settings.gate_probability)
         self._smoothed: WindowPosterior | None = None  # after the last frame
         self._stationary_ns = -(2**62)  # newest frame of the last zero-velocity measurement
@@ -174,6 +178,14 @@ class Msckf:
         if isinstance(sample, VelocitySample) and self._window is not None:
             self._advance(sample.time_ns)
             self._measure()
+
+    def take_turns(self, turns: TurnComparison | None) -> None:
+        """Take how the camera's turns compare with the gyro's; None: they were not compared yet.
+
+        Until they are, nothing is concluded of the baseline, for which a wrong focal length passes. Where they differ
+        for another reason than the gyro, the focal length becomes a state: the window begins anew in the next frame.
+        """
+        self._turns = turns
 
     def predict(self, time_ns: int) -> Prediction | None:
         """Predict a coming frame: the pixels of all tracks with a point, and the camera's motion."""
@@ -286,6 +298,8 @@ class Msckf:
             self._time_ns = self._body_ns = self._began_ns = observations.time_ns
             self._begin_output(self._window)
             self._measure()
+        elif self._must_free_focal_length():
+            return self._free_focal_length(observations)
         else:
             self._advance(observations.time_ns)
         window = self._window
@@ -328,6 +342,26 @@ class Msckf:
         start = min(IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MOST_START_FACTOR)
         return MotionNoise(start, *IMU_FACTORS[1:])
 
+    def _must_free_focal_length(self) -> bool:
+        """Whether the focal length is doubted, and is no state yet."""
+        turns, pinhole_pair = self._turns, self._camera.kind == "stereo" and not self._camera.is_cylinder
+        if turns is None or self._good is None or not pinhole_pair or self._started().calibration.metric:
+            return False
+        return turns.differ and turns.gyro_agrees
+
+    def _free_focal_length(self, observations: Observations) -> UpdateReport:
+        """Start again with the focal length as a state, and nothing known that was learned with a wrong one.
+
+        Raises:
+            DivergedError: the filter diverges at once.
+        """
+        assert self._good is not None
+        self._settings = replace(self._settings, stereo_focal_sigma=_FREED_FOCAL_SIGMA)
+        old = self._good.calibration
+        calibration = first_calibration(old.T_cam0_imu, self._settings, self._source)
+        self._good = replace(self._good, calibration=replace(calibration, time_offset_s=old.time_offset_s))
+        return self.restart(observations)
+
     def restart(self, observations: Observations) -> UpdateReport:
         """Start again at a frame after a divergence, from the state after the last good update.
 
@@ -347,7 +381,7 @@ class Msckf:
         nav, P = restarted(good, observations.time_ns, self._motion, self._settings)
         scale_test = None if self._window is None else self._window.scale_test
         self._window = self._first_window(nav, P, good.calibration)
-        if scale_test is not None:
+        if scale_test is not None and not good.calibration.metric:
             self._window.scale_test = ScaleTest(len(self._window.P), scale_test.estimate()[1])
         self._calibration = good.calibration
         self._time_ns, self._body_ns = observations.time_ns, self._body_time(observations.time_ns)
@@ -690,6 +724,8 @@ class Msckf:
             test.frames += 1
         if test is None or (self._scale_log is None and not test.contradicted):
             return
+        if self._scale_log is None and (self._turns is None or not self._turns.agree):
+            return  # a wrong focal length passes for it
         factor = window.adopt_scale()
         self._scale_log = (self._scale_log or 0.0) + float(np.log(factor))
         self._camera = replace(self._camera, baseline_m=self._camera.baseline_m * factor)

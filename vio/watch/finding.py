@@ -24,6 +24,7 @@ InertialFault: TypeAlias = Literal[
     "saturation",
     "IMU gap",
     "camera stamps",
+    "camera turns",
 ]
 
 # A second finding of a group would repeat the first.

@@ -15,17 +15,18 @@ import numpy as np
 from vio.calibration.inertial import Rates
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import ImuSample, Observations
+from vio.records import TURNS_NOT_SHOWN, ImuSample, Observations, TurnComparison
 from vio.watch.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
 from vio.watch.clocks import Coverage
 from vio.watch.evidence import FIRST_EVALUATION, Evidence
 from vio.watch.finding import InertialFault, InertialFinding
 from vio.watch.force_fit import fit_force
 from vio.watch.gyro import judge_gyro
-from vio.watch.gyro_fit import AGREES, fit_gyro, judge_offset
+from vio.watch.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset
 from vio.watch.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
 from vio.watch.samples import Samples, Size, judge_size
 from vio.watch.stamps import judge_stamps
+from vio.watch.turns import compare_turns, judge_turns
 
 _LEAST_AT_END = 20  # intervals needed to judge at the end of a run
 _LATER_EVALUATIONS = 150  # intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
@@ -65,6 +66,7 @@ class InertialCheck:
         self._since_evaluation = self._seen = 0
         self._suspected: set[InertialFault] = set()
         self._done = False
+        self.turns: TurnComparison | None = None  # the newest comparison; None: too few frames yet
 
     def imu(self, sample: ImuSample) -> None:
         """Add one sample."""
@@ -105,6 +107,8 @@ class InertialCheck:
         self._since_evaluation += len(motion)
         self._seen += len(motion)
         if self._since_evaluation < (FIRST_EVALUATION if self._seen < _ENOUGH else _LATER_EVALUATIONS):
+            if self.turns is None:
+                self._compare_first_turns()
             return found
         self._since_evaluation = 0
         judged = self._judge(last=False)
@@ -124,6 +128,8 @@ class InertialCheck:
         record = record_of(motion, times_ns, values)
         gyro_fit = fit_gyro(record, _LEAST_AT_END)
         if gyro_fit is None:
+            if self._seen >= _ENOUGH:
+                self.turns = self.turns or TURNS_NOT_SHOWN
             return self._judge_stationary(size, record, last=last)
         force = None if size.unit is None else fit_force(record, gyro_fit, self._T[:3, 3])
         evidence = Evidence(
@@ -154,6 +160,7 @@ class InertialCheck:
         found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
         rotation = judge_gyro(evidence, size.unit or 1.0)
         found += rotation
+        found += self._compare_turns(record, gyro_fit) if not rotation else []
         agrees, measured = gyro_fit.unexplained < AGREES, False
         if size.unit is not None and agrees and all(f.fault == "gyro units" for f in rotation):
             forces, measured = judge_force(evidence, size.unit)
@@ -165,6 +172,26 @@ class InertialCheck:
                 self._suspected |= {f.fault for f in found}  # at this stage, one evaluation suffices
         self._done = enough and all(f.fault in self._suspected for f in found)
         return found
+
+    def _compare_first_turns(self) -> None:
+        """Find before the first evaluation that the turns agree: the filter waits for it. To differ takes more of them."""
+        times_ns, values = self._samples.table()
+        motion = self._motion.joined()
+        if len(times_ns) < 2 or motion is None:
+            return
+        record = record_of(motion, times_ns, values)
+        gyro_fit = fit_gyro(record, _LEAST_AT_END)
+        turns = None if gyro_fit is None else compare_turns(record, gyro_fit, self._T[:3, :3])
+        if turns is not None and np.isfinite(turns.sigma) and turns.agree:
+            self.turns = turns
+
+    def _compare_turns(self, record: Record, gyro_fit: GyroFit) -> list[InertialFinding]:
+        """Compare the camera's turns with the gyro's until the filter has been told that the focal length is off."""
+        known = self.turns
+        if known is not None and known.differ and known.gyro_agrees:
+            return []
+        self.turns = compare_turns(record, gyro_fit, self._T[:3, :3])
+        return judge_turns(self.turns)
 
     def _unreported(self, found: Sequence[InertialFinding]) -> tuple[InertialFinding, ...]:
         """Return the findings of groups that were not reported before."""

@@ -11,7 +11,16 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import Estimate, ImuSample, MotionSample, Observations, Prediction, StereoFrame, UpdateReport
+from vio.records import (
+    Estimate,
+    ImuSample,
+    MotionSample,
+    Observations,
+    Prediction,
+    StereoFrame,
+    TurnComparison,
+    UpdateReport,
+)
 from vio.watch.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.watch.health import RunHealth
 from vio.watch.imu_faults import ImuFaultReport
@@ -122,6 +131,11 @@ class RunWatch:
         self._frozen.observations(seen)
         if self._inertial is not None:
             self._report_findings(self._inertial.frame(seen))
+
+    @property
+    def turns(self) -> TurnComparison | None:
+        """How the camera's turns compare with the gyro's so far; None: not compared yet, or no IMU."""
+        return None if self._inertial is None else self._inertial.turns
 
     def refused(self, index: int, reason: str) -> None:
         """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
