@@ -97,16 +97,20 @@ class _Told(Msckf):
 
     found: TurnComparison = TURNS_NOT_SHOWN
 
+    told_in = 40
+
     def update(self, observations: Observations) -> UpdateReport:
-        self.take_turns(None if observations.frame_index < 40 else self.found)
+        self.take_turns(None if observations.frame_index < self.told_in else self.found)
         return super().update(observations)
 
 
-def _fly(camera: StereoCamera, found: TurnComparison) -> tuple[_Told, list[tuple[float, float] | None], FloatArray]:
+def _fly(
+    camera: StereoCamera, found: TurnComparison, told_in: int = 40
+) -> tuple[_Told, list[tuple[float, float] | None], FloatArray]:
     """Fly with a camera as calibrated; return the filter, what it says in each frame, and its errors (frames, 3), m."""
     noise, flight = np.random.default_rng(0), Shaking(120)
     filt = _Told(camera, T_CAM0_IMU, OFF, motion="imu")
-    filt.found = found
+    filt.found, filt.told_in = found, told_in
     estimates, errors = fly_with(filt, flight, _samples(flight, OFF, 0.0, noise), noise, 0.5)
     scales = [e.stereo_scale for e in estimates]
     said = [None if s is None else next(iter(s.percent().values())) for s in scales]
@@ -132,9 +136,11 @@ def test_what_is_not_beyond_doubt_changes_nothing() -> None:
     np.testing.assert_array_equal(given[2], plain[2])
 
 
-def test_a_baseline_is_judged_once_the_focal_length_is_compared() -> None:
+def test_a_baseline_is_judged_once_the_turns_are_compared() -> None:
     short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.1)
-    _, said, _ = _fly(short, TURNS_NOT_SHOWN)
-    assert said[:40] == [None] * 40
+    told = _fly(short, TURNS_NOT_SHOWN, 0)[1]
+    found_in = told.index(next(x for x in told if x is not None))
+    _, said, _ = _fly(short, TURNS_NOT_SHOWN, found_in + 10)
+    assert said[: found_in + 10] == [None] * (found_in + 10)
     assert said[-1] is not None
     assert abs(said[-1][0] - 10.0) < 3 * said[-1][1]

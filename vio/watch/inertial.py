@@ -174,7 +174,7 @@ class InertialCheck:
         return found
 
     def _compare_first_turns(self) -> None:
-        """Find before the first evaluation that the turns agree: the filter waits for it. To differ takes more of them."""
+        """Find before the first evaluation that the turns agree, for which the filter waits; to differ takes more."""
         times_ns, values = self._samples.table()
         motion = self._motion.joined()
         if len(times_ns) < 2 or motion is None:
