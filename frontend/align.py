@@ -35,6 +35,7 @@ _SUBPIXELS = 32  # anchors are cut at multiples of this fraction of a pixel, whe
 FLAT_RMS = 1.0  # gray levels; a patch with less contrast matches anything
 
 Pixels = npt.NDArray[np.float32]  # gray levels and what is computed from them
+Pairs = npt.NDArray[np.uint16]  # of neighbouring pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,20 +67,34 @@ def offsets(radius: int) -> Pixels:
 def warped_patches(image: Image, warp: FloatArray, radius: int) -> Pixels:
     """Gray levels (N, S) at `warp @ [x, y, 1]` (N, 2, 3), interpolated linearly; the image's border is repeated."""
     out = np.empty((len(warp), (2 * radius + 1) ** 2), dtype=np.float32)
-    _sample_all(np.ascontiguousarray(image), warp, offsets(radius), out)
+    image = np.ascontiguousarray(image)
+    _sample_all(image, _pairs(image), warp, offsets(radius), out)
     return out
 
 
+def _pairs(image: Image) -> Pairs:
+    """Each pixel of an image (H, W), row by row, and the next one, as one number; shares the image's memory."""
+    return np.ndarray(image.size - 1, np.dtype("<u2"), image, strides=(1,))
+
+
 @compiled
-def _sample_all(image: Image, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
+def _sample_all(image: Image, pairs: Pairs, warp: FloatArray, xy: Pixels, out: Pixels) -> None:
     size = xy.shape[1]
     at, part = np.empty(size, np.int32), np.empty((2, size), np.float32)
     for n in range(len(warp)):
-        _sample(image, warp[n], xy, at, part, out[n])
+        _sample(image, pairs, warp[n], xy, at, part, out[n])
 
 
 @compiled
-def _sample(image: Image, warp: FloatArray, xy: Pixels, at: npt.NDArray[np.int32], part: Pixels, out: Pixels) -> None:
+def _sample(
+    image: Image,
+    pairs: Pairs,
+    warp: FloatArray,
+    xy: Pixels,
+    at: npt.NDArray[np.int32],
+    part: Pixels,
+    out: Pixels,
+) -> None:
     """Write the gray levels (S,) under one warp (2, 3) into `out`; `at` (S,) and `part` (2, S) are overwritten."""
     height, width = image.shape
     radius = -xy[0, 0]
@@ -100,13 +115,10 @@ def _sample(image: Image, warp: FloatArray, xy: Pixels, at: npt.NDArray[np.int32
         part[0, k], part[1, k] = u - np.float32(i), v - np.float32(j)
         at[k] = np.int32(j * row) + i
     # Unsigned indices are not checked for being negative.
-    pixels, one, down = image.reshape(-1)[first_v * width + first_u :], np.uint32(1), np.uint32(width)
+    pixels, down = pairs[first_v * width + first_u :], np.uint32(width)
     for k in range(len(at)):  # the four pixels in one number
         p = np.uint32(at[k])
-        q = np.uint32(p + down)
-        above = np.int32(pixels[p]) | np.int32(pixels[np.uint32(p + one)]) << np.int32(8)
-        below = np.int32(pixels[q]) | np.int32(pixels[np.uint32(q + one)]) << np.int32(8)
-        at[k] = above | below << np.int32(16)
+        at[k] = np.int32(pixels[p]) | np.int32(pixels[np.uint32(p + down)]) << np.int32(16)
     byte = np.int32(255)
     for k in range(len(at)):
         four = at[k]
@@ -151,28 +163,40 @@ def rounded(centres: FloatArray) -> FloatArray:
 def templates(wide: Patches) -> Templates:
     """Prepare templates from patches (N, 2r+3, 2r+3) cut by `cut_patches`."""
     out = empty_templates(len(wide), wide.shape[1] // 2 - 1)
-    _prepare(wide, out.patch, out.gradient, out.energy, out.inverse, out.row_inverse)
+    replace_templates(out, np.arange(len(wide)), wide)
     return out
+
+
+def replace_templates(store: Templates, slots: IntArray, wide: Patches) -> None:
+    """Prepare templates from patches (N, 2r+3, 2r+3) in rows (N,) of others."""
+    _prepare(wide, slots, store.patch, store.gradient, store.energy, store.inverse, store.row_inverse)
 
 
 @compiled
 def _prepare(
-    wide: Patches, patch: Pixels, gradient: Pixels, energy: Pixels, inverse: Pixels, row_inverse: Pixels
+    wide: Patches,
+    slots: IntArray,
+    patch: Pixels,
+    gradient: Pixels,
+    energy: Pixels,
+    inverse: Pixels,
+    row_inverse: Pixels,
 ) -> None:
-    """Fill the columns of templates."""
+    """Write rows (N,) of the columns of templates."""
     side = wide.shape[1] - 2
     size, radius = side * side, side // 2
     basis, normal = np.empty((_PARAMETERS, size)), np.empty((_PARAMETERS, _PARAMETERS))
     on_row = np.empty((_ROW_PARAMETERS, _ROW_PARAMETERS))
-    for n in range(len(wide)):
+    for n, slot in enumerate(slots):
         mean = _mean_inside(wide[n])
+        energy[slot] = 0.0
         for y in range(side):
             above, here, below = wide[n, y], wide[n, y + 1], wide[n, y + 2]
             for x in range(side):
                 k, centred = y * side + x, here[x + 1] - mean
                 gu, gv = (here[x + 2] - here[x]) / np.float32(2.0), (below[x + 1] - above[x + 1]) / np.float32(2.0)
-                patch[n, k], gradient[n, 0, k], gradient[n, 1, k] = centred, gu, gv
-                energy[n] += centred * centred
+                patch[slot, k], gradient[slot, 0, k], gradient[slot, 1, k] = centred, gu, gv
+                energy[slot] += centred * centred
                 basis[0, k], basis[1, k], basis[2, k], basis[3, k] = gu, gv, centred, 1.0
                 basis[4, k], basis[5, k] = gu * (x - radius), gu * (y - radius)
                 basis[6, k], basis[7, k] = gv * (x - radius), gv * (y - radius)
@@ -180,12 +204,12 @@ def _prepare(
             for j in range(i + 1):
                 normal[i, j] = _product(basis[i], basis[j])
             normal[i, i] += _DAMPING * normal[i, i] + 1e-6
-        invert_positive(normal, inverse[n])
+        invert_positive(normal, inverse[slot])
         for i in range(_ROW_PARAMETERS):
             for j in range(i + 1):
                 on_row[i, j] = normal[i, j]
         on_row[1, 1] += _ROW_WEIGHT
-        invert_positive(on_row, row_inverse[n])
+        invert_positive(on_row, row_inverse[slot])
 
 
 @compiled
@@ -235,7 +259,8 @@ def align(
     inverse, row_weight = (store.inverse, 0.0) if rows is None else (store.row_inverse, _ROW_WEIGHT)
     expected = np.zeros(len(warp)) if rows is None else np.ascontiguousarray(rows)
     columns = store.patch, store.gradient, store.energy, inverse, offsets(radius)
-    _refine(*columns, slots, np.ascontiguousarray(image), warp, expected, row_weight, iterations, score)
+    image = np.ascontiguousarray(image)
+    _refine(*columns, slots, image, _pairs(image), warp, expected, row_weight, iterations, score)
     return warp, np.where(inside(image, warp[:, :, 2], radius + 1), score, -1.0)
 
 
@@ -248,6 +273,7 @@ def _refine(
     xy: Pixels,
     slots: IntArray,
     image: Image,
+    pairs: Pairs,
     warp: FloatArray,
     rows: FloatArray,
     row_weight: float,
@@ -262,7 +288,7 @@ def _refine(
         fit[i] = 0.0
     for n, slot in enumerate(slots):
         for _ in range(iterations):
-            _sample(image, warp[n], xy, at, part, view)
+            _sample(image, pairs, warp[n], xy, at, part, view)
             square = _moments(patch[slot], gradient[slot], view, xy, moments)
             score[n] = _correlation(energy[slot], moments[2], square - moments[3] ** 2 / size, size)
             if row_weight > 0.0:
@@ -338,7 +364,8 @@ def shift_warps(centres: FloatArray) -> FloatArray:
 
 def on_peak(pixels: FloatArray, start: FloatArray) -> BoolArray:
     """Mask (N,) of fitted pixels (N, 2) near their start (N, 2); others have left the correlation peak."""
-    return np.asarray(np.abs(pixels - start).max(axis=1) <= _MAX_MOVE_PX)
+    moved = np.abs(pixels - start) <= _MAX_MOVE_PX
+    return moved[:, 0] & moved[:, 1]
 
 
 def template_points(warp: FloatArray, offset: FloatArray) -> FloatArray:

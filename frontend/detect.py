@@ -57,8 +57,9 @@ def corner_response(image: Image) -> Response:
 
     Unit: squared gray levels per squared pixel. Reference: Shi & Tomasi, Good features to track, CVPR (1994).
     """
-    response = cv2.cornerMinEigenVal(image, _BLOCK_PX, ksize=_GRADIENT_PX)
-    return np.asarray(response, dtype=np.float32) / np.float32(_EIGENVALUE_OF_UNIT_GRADIENT)
+    response = np.asarray(cv2.cornerMinEigenVal(image, _BLOCK_PX, ksize=_GRADIENT_PX), dtype=np.float32)
+    response /= np.float32(_EIGENVALUE_OF_UNIT_GRADIENT)
+    return response
 
 
 def noise_gradient(image: Image) -> float:
@@ -149,7 +150,8 @@ def detect_corners(
     if wanted <= 0 or min(height, width) <= 4 * _border(settings):
         return np.zeros((0, 2))
     # A gradient per pixel of the full image is half of one per pixel of the half image.
-    response = corner_response(half) / np.float32(4.0)
+    response = corner_response(half)
+    response /= np.float32(4.0)
     if allowed is not None:
         response = np.where(allowed, response, np.float32(0.0))
     corners = _candidates(half, response, occupied, grid, settings)

@@ -44,10 +44,10 @@ class BandRemoval:
         rows_left, rows_right = _row_means(left), _row_means(right)
         contrast = sorted(mean_and_contrast(image, _STRIDE)[1] for image in (left, right))
         if not self._active and contrast[0] > _LEAST_CONTRAST * contrast[1]:
-            self._detect(index, rows_left - rows_right)
+            self._detect(index, _smoothed(rows_left - rows_right))
         if not self._active:
             return left, right
-        return _flattened(left, rows_left), _flattened(right, rows_right)
+        return _flattened(left, _smoothed(rows_left)), _flattened(right, _smoothed(rows_right))
 
     def _detect(self, index: int, difference: FloatArray) -> None:
         centred = difference - difference.mean()
@@ -64,10 +64,15 @@ class BandRemoval:
 
 
 def _row_means(image: Image) -> FloatArray:
-    """Mean gray level (H,) of each row, smoothed over a few rows."""
+    """Mean gray level (H, 1) of each row."""
     # Sums of integers are vectorised: a twentieth of the time of means, which OpenCV takes as these, times 1 / width.
-    means = cv2.reduce(image, 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S) * (1.0 / image.shape[1])
-    return np.asarray(cv2.GaussianBlur(means, (1, 0), sigmaX=1.0, sigmaY=_SMOOTH_ROWS), dtype=np.float64)[:, 0]
+    sums = np.asarray(cv2.reduce(image, 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S))
+    return sums * (1.0 / image.shape[1])
+
+
+def _smoothed(rows: FloatArray) -> FloatArray:
+    """Values (H,) of rows (H, 1), smoothed over a few rows."""
+    return np.asarray(cv2.GaussianBlur(rows, (1, 0), sigmaX=1.0, sigmaY=_SMOOTH_ROWS), dtype=np.float64)[:, 0]
 
 
 def _flattened(image: Image, rows: FloatArray) -> Image:

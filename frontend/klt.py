@@ -176,10 +176,10 @@ class KltFrontend:
         return lines
 
     def _view(self, image: Image) -> View:
-        """Equalise and convert an image; the result does not share memory with it."""
+        """Equalise and convert an image; the result may share memory with it."""
         if self._clahe is not None:
             image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
-        return View(image.copy(), half_image(image))
+        return View(image, half_image(image))
 
     def _set_up(self, left: View) -> tuple[StereoFit, BoolArray | None]:
         """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame."""
@@ -224,6 +224,7 @@ class KltFrontend:
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
+        left = View(left.full.copy(), left.half)  # a reader may reuse its buffer
         self._previous = PreviousFrame(frame.time_ns, left, right_half, tracks, twist, motion is not None)
 
     def _track(

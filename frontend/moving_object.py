@@ -78,8 +78,10 @@ def choose_motion(
     reported = share if large and share >= _LARGE_SHARE else 0.0
     if predicted is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
-    first_agrees = _agrees(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
     second_agrees = large and _agrees(problem.camera, second, p_prev[others[support]], predicted)
+    if not (second_agrees or in_event or reported):
+        return TwoMotions(found, 0.0, None)  # whether the first agrees or not
+    first_agrees = _agrees(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
     if first_agrees or not (second_agrees or in_event):
         return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
     T = second if second_agrees else predicted.T_curr_prev

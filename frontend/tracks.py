@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
-from .align import Templates, cut_patches, empty_templates, shift_warps, templates
+from .align import cut_patches, empty_templates, replace_templates, shift_warps
 from .columns import joined
-
-_TEMPLATE_COLUMNS = tuple(column.name for column in fields(Templates))
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,9 +78,7 @@ class AnchorBank:
 
     def replace(self, slots: IntArray, image: Image, centres: FloatArray) -> None:
         """Replace the anchors in slots (N,) by the patches around pixels (N, 2) of an image."""
-        new = templates(cut_patches(image, centres, self._radius_px))
-        for name in _TEMPLATE_COLUMNS:
-            getattr(self.store, name)[slots] = getattr(new, name)
+        replace_templates(self.store, slots, cut_patches(image, centres, self._radius_px))
 
     def keep_only(self, slots: IntArray) -> None:
         """Free all slots but these."""

@@ -325,7 +325,8 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
     by_point = np.asarray(sum(J[:, :, a, :, None] * WH[:, :, a, None, :] for a in range(3)))
     by_q = np.swapaxes(p_D_q, 1, 2) @ np.swapaxes(by_point, 1, 2).reshape(F, 3, N * S)
     A, b = np.einsum("fnas,fnat->fst", WH, H), np.einsum("fnas,fna->fs", WH, at.r)
-    return StereoColumns(np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2), A, b)
+    by_view = np.swapaxes(by_q.reshape(F, 3, N, S), 1, 2)
+    return StereoColumns(by_view, by_view.sum(axis=1), A, b)
 
 
 def eliminate_points_from_columns(

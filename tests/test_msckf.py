@@ -24,7 +24,7 @@ from vio.filters.multiview import (
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.restart import restarted
 from vio.filters.settings import MsckfSettings
-from vio.filters.tracks import TrackTable, latest_pixels
+from vio.filters.tracks import TrackTable, rows_of
 from vio.filters.window import Window, posterior
 from vio.geometry.lie import (
     FloatArray,
@@ -396,13 +396,15 @@ def test_track_table_keeps_rows_apart_and_grows() -> None:
     assert len(table.rows()) == 0
 
 
-def test_latest_pixels_finds_ids_in_any_order() -> None:
+def test_rows_of_a_frame_are_found_by_ids_in_any_order() -> None:
     seen = observations(0, 0, [9, 2, 5], np.arange(12.0).reshape(3, 4), has_right=[True, False, True])
-    z, weight, found = latest_pixels(seen, np.array([5, 7, 2]))
+    rows, found = rows_of(seen, np.array([5, 7, 2]))
     assert found.tolist() == [True, False, True]
-    np.testing.assert_array_equal(z[0], [8, 9, 10, 11])
-    assert weight.tolist() == [[1, 1, 1, 0], [0, 0, 0, 0], [1, 1, 0, 0]]
-    assert latest_pixels(seen.take(np.zeros(3, dtype=np.bool_)), np.array([5]))[2].tolist() == [False]
+    assert rows.tolist() == [2, 1]
+    empty = seen.take(np.zeros(3, dtype=np.bool_))
+    for of, ids in ((empty, [5]), (seen, []), (seen, [7])):
+        rows, found = rows_of(of, np.array(ids, dtype=np.int64))
+        assert (rows.tolist(), found.tolist()) == ([], [False] * len(ids))
 
 
 # The whole filter on an exact world

@@ -179,7 +179,7 @@ def _window(clones: int = 5, late_s: float = 0.0) -> Window:
 def _add_clone(window: Window, k: int, late_s: float = 0.0) -> None:
     R, p, v, _, omega = Shaking().state(0.3 + 0.05 * k)
     window.nav = NavState(se3_from_parts(R, p), v, omega, np.zeros(3), np.zeros(3))
-    window.add_clone(k, k * STEP_NS, late_s, _twist(window.nav))
+    window.add_clone(k, k * STEP_NS, window.camera_D_own(late_s, _twist(window.nav)))
 
 
 def _twist(nav: NavState) -> Twist:
@@ -262,7 +262,7 @@ def test_exposures_are_where_the_images_saw_them_when_the_clocks_are_first_compa
     own, (_, J, _) = slice(0, window.first_clone), window.camera_D_own(0.0, twist)
     without_offset = J @ window.P[own, own] @ J.T
     window.compare_clocks(STEP_NS, 0.0, twist)
-    window.add_clone(1, STEP_NS, 0.0, twist)
+    window.add_clone(1, STEP_NS, window.camera_D_own(0.0, twist))
     new = window.clone_rows(1)
     np.testing.assert_allclose(window.P[new, row], 0.0, atol=1e-12)
     np.testing.assert_allclose(window.P[new, new], without_offset, atol=1e-12)

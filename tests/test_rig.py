@@ -23,7 +23,7 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, s
 from vio.geometry.rectify import rectify
 from vio.geometry.sphere_models import double_sphere, double_sphere_D_p, unified, unified_D_p
 from vio.records import ImuDensities
-from vio.rig import Rig
+from vio.rig import Rig, remap
 
 LENSES = {
     "unified": CameraModel(660.0, 661.0, 320.0, 240.0, 640, 480, "unified", (1.4, -0.2, 0.05, 1e-3, -2e-3)),
@@ -159,8 +159,12 @@ def test_raw_rig_from_matrices_is_rectified_as_a_recording_of_these_cameras() ->
     assert rectifier.camera == rig.camera
     expected = rectify(StereoRig(a, b, np.eye(4), se3_inverse(T_CAM1_CAM0)))
     assert rectifier.maps is not None
-    np.testing.assert_allclose(rectifier.maps, (expected.map0, expected.map1), atol=1e-3)
     assert rig.T_rect0_imu is None
+    raw = np.random.default_rng(0).integers(0, 256, (2, 480, 640)).astype(np.uint8)
+    for interpolation in ("linear", "cubic", "lanczos4"):
+        rectified = replace(rectifier, interpolation=interpolation)(*raw)
+        for image, done, maps in zip(raw, rectified, (expected.map0, expected.map1), strict=True):
+            np.testing.assert_array_equal(done, remap(image, maps, interpolation), "maps of floats")
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,13 @@ def test_a_window_that_knows_its_motion_badly_is_never_stationary(part: slice, l
         assert _posterior(np.zeros(6), sigma).is_stationary(*_LIMITS) is expected
 
 
+def test_displacement_is_no_longer_than_the_translation_of_the_twist() -> None:
+    """`|J_l(phi) rho| <= |rho|`: a displacement that alone is too long for a standstill decides."""
+    rho, phi = np.random.default_rng(0).normal(size=(2, 200, 3))
+    for twist in np.concatenate([rho, phi * np.linspace(0.0, 1.5, 200)[:, None]], axis=1):
+        assert np.linalg.norm(se3_exp(twist)[:3, 3]) <= np.linalg.norm(twist[:3]) * (1 + 1e-12)
+
+
 def test_a_single_clone_tells_no_standstill() -> None:
     window = _window(np.zeros(6), n=2)
     window.drop_oldest_clone()
@@ -101,7 +108,8 @@ def test_without_imu_the_velocity_is_that_of_the_poses_around() -> None:
         for c, q in zip(window.clones, p, strict=True)
     ]
     posterior = WindowPosterior.of(window, window.P)
-    velocities = np.array([c.velocity for c in posterior.clones])
+    smoothed = [posterior.estimate(c.frame_index) for c in posterior.clones]
+    velocities = np.array([estimate.velocity_world for estimate in smoothed if estimate is not None])
     exact = np.column_stack([6 * t, np.full(5, -2.0), 0 * t])
     np.testing.assert_allclose(velocities[1:-1], exact[1:-1], atol=1e-12)
     np.testing.assert_allclose(velocities[[0, -1]], exact[[0, -1]] + [[0.3, 0, 0], [-0.3, 0, 0]], atol=1e-12)

@@ -238,8 +238,8 @@ MUTATIONS = (
     Mutation(
         "projection: right camera on the left",
         "vio/geometry/stereo.py",
-        "ul - camera.fu * camera.baseline_m / depth",
-        "ul + camera.fu * camera.baseline_m / depth",
+        "out[..., 0] - camera.fu * camera.baseline_m / depth",
+        "out[..., 0] + camera.fu * camera.baseline_m / depth",
         _STEREO,
     ),
     Mutation(
@@ -575,15 +575,15 @@ MUTATIONS = (
     Mutation(
         "frozen images: a rig at standstill is taken for a frozen camera",
         "vio/watch/frozen.py",
-        "or self._at_standstill():",
-        "or False:",
+        "moving) and not self._at_standstill()",
+        "moving)",
         _FROZEN,
     ),
     Mutation(
         "frozen images: what the prediction may be off by does not count",
         "vio/watch/frozen.py",
-        "if not self._contradicts(expected.motion) or",
-        "if",
+        " or not self._contradicts(expected.motion):",
+        ":",
         _FROZEN,
     ),
     Mutation(
@@ -909,6 +909,13 @@ MUTATIONS = (
         _TRUTH,
     ),
     Mutation(
+        "standstill: a displacement within its uncertainty decides",
+        "vio/filters/window_posterior.py",
+        "float(moved @ moved) > limit * most:",
+        "float(moved @ moved) > most:",
+        _TRUTH,
+    ),
+    Mutation(
         "smoothed estimates: covariance of the wrong rows",
         "vio/filters/window_posterior.py",
         "slice(6 * index, 6 * index + 6)",
@@ -918,8 +925,8 @@ MUTATIONS = (
     Mutation(
         "smoothed estimates: velocity of the newest clone",
         "vio/filters/window_posterior.py",
-        "Clone(c.frame_index, c.time_ns, c.T_world_imu, v[k])",
-        "Clone(c.frame_index, c.time_ns, c.T_world_imu, v[-1])",
+        "self._velocities()[index]",
+        "self._velocities()[-1]",
         _TRUTH,
     ),
     Mutation(
@@ -960,7 +967,7 @@ MUTATIONS = (
     Mutation(
         "calibration: the noise of the twist passes for motion",
         "vio/filters/online_calibration.py",
-        "np.sqrt(max(1 - _NOISE_ONLY / max(squared, 1e-9), 0.0))",
+        "math.sqrt(max(1 - _NOISE_ONLY / max(squared, 1e-9), 0.0))",
         "1.0",
         _CALIBRATE,
     ),
@@ -1073,8 +1080,8 @@ MUTATIONS = (
     Mutation(
         "stereo field: landmarks enter while it is estimated",
         "vio/filters/msckf.py",
-        "if window.calibration.stereo_field or window.scale_sigma()",
-        "if window.scale_sigma()",
+        "unsure = window.calibration.stereo_field or window.scale_sigma()",
+        "unsure = window.scale_sigma()",
         _STEREO_FIELD,
     ),
     Mutation(
@@ -1094,8 +1101,8 @@ MUTATIONS = (
     Mutation(
         "stereo field: eliminated points still count",
         "vio/filters/track_loops.py",
-        "own_A[f, s, t] - own[0, s] * CG[0, t]",
-        "own_A[f, s, t] - 0.0 * own[0, s] * CG[0, t]",
+        "own_A[f, s, t] - g0 * CG[0, t]",
+        "own_A[f, s, t] - 0.0 * g0 * CG[0, t]",
         _STEREO_FIELD,
     ),
     Mutation(

@@ -23,7 +23,7 @@ import numpy as np
 from vio.compiled import compiled
 from vio.geometry.lie import FloatArray
 from vio.records import ImuSample, IntArray
-from vio.robust import robust_sigmas
+from vio.robust import median, robust_sigmas
 
 ImuFaultKind: TypeAlias = Literal["gyro spike", "accelerometer spike", "stuck IMU", "stuck gyro", "stuck accelerometer"]
 
@@ -278,7 +278,7 @@ class _SpikeCheck:
         self._until_refresh -= count
         if self._until_refresh <= 0 and len(self._times) >= _LEAST_HISTORY:
             self._until_refresh = max(_REFRESH, len(self._times) // _REFRESH_SHARE)
-            self._period_ns = float(np.median(np.diff(self._times)))
+            self._period_ns = median(np.diff(self._times))
             least = np.array(_SPIKE_IMPULSE) / max(self._period_ns * _NS, 1e-6)
             self._limit = np.maximum(_SPIKE_SIGMAS * robust_sigmas(self._changes), least).tolist()
 

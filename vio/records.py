@@ -151,14 +151,11 @@ class Observations:
         return len(self.ids)
 
     def take(self, index: npt.NDArray[np.bool_] | npt.NDArray[np.int64]) -> Observations:
-        """Return the rows named by a mask (N,) or by indices (K,)."""
-        return replace(
-            self,
-            ids=self.ids[index],
-            z=self.z[index],
-            has_right=self.has_right[index],
-            stale=self.stale[index],
-        )
+        """Return the rows named by a mask (N,) or by indices (K,); the record itself where a mask names all."""
+        if index.dtype == np.bool_ and index.all():
+            return self
+        ids, z, has_right, stale = self.ids[index], self.z[index], self.has_right[index], self.stale[index]
+        return Observations(self.frame_index, self.time_ns, ids, z, has_right, stale)
 
 
 def observations(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -24,6 +25,8 @@ from vio.records import Image, ImuDensities
 
 _ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
+_PARTS = 32  # of a pixel, in which OpenCV's remap counts
+LookUp: TypeAlias = tuple[npt.NDArray[Any], npt.NDArray[Any]]  # maps for cv2.remap: u and v, or those of `fixed_point`
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +36,7 @@ class Rectifier:
     rig: StereoRig
     camera: StereoCamera  # rectified
     T_rect0_imu: FloatArray  # (4, 4)
-    maps: tuple[tuple[MapArray, MapArray], tuple[MapArray, MapArray]] | None  # left, right; None: nothing to do
+    maps: tuple[LookUp, LookUp] | None  # left, right; None: nothing to do
     interpolation: Interpolation
     time_offset_s: float = 0.0  # of the calibration; readers take it out of the IMU's stamps
 
@@ -73,10 +76,21 @@ def rectifier_of(
     if (pair := rectified_pair(rig)) is not None:
         return Rectifier(rig, pair, se3_inverse(rig.T_imu_cam0), None, interpolation)
     done = rectify(rig, projection)
-    return Rectifier(rig, done.camera, done.T_rect0_imu, (done.map0, done.map1), interpolation)
+    maps = fixed_point(done.map0), fixed_point(done.map1)
+    return Rectifier(rig, done.camera, done.T_rect0_imu, maps, interpolation)
 
 
-def remap(image: Image, maps: tuple[MapArray, MapArray], interpolation: Interpolation) -> Image:
+def fixed_point(maps: tuple[MapArray, MapArray]) -> LookUp:
+    """Return source u and v (H, W) as cv2.remap makes them of floats for each image, in three quarters of the memory.
+
+    That is whole pixels (H, W, 2) int16, and the rest (H, W) uint16 in parts of a pixel, `32 v + u`.
+    """
+    u, v = (np.rint(m * np.float32(_PARTS)).astype(np.int32) for m in maps)
+    whole = np.stack([u // _PARTS, v // _PARTS], axis=-1).astype(np.int16)
+    return whole, (v % _PARTS * _PARTS + u % _PARTS).astype(np.uint16)
+
+
+def remap(image: Image, maps: LookUp, interpolation: Interpolation) -> Image:
     """Return an image (H, W) looked up at the source pixels of a map."""
     import cv2
 

@@ -17,6 +17,7 @@ import numpy as np
 from vio.filters.pose_loops import lacks_samples
 from vio.geometry.lie import FloatArray
 from vio.records import ImuSample, IntArray
+from vio.robust import median
 
 _NS = 1e-9
 _MEMORY_S = 2.0  # samples that the structure function is learned from
@@ -80,7 +81,7 @@ class ImuHistory:
         """Median distance of the samples, up to a few of them ago; 0 where there are not two."""
         if self._unmeasured >= len(self._samples) // _MEASURED_SHARE:
             times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
-            self._period = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+            self._period = median(np.diff(times)) if len(times) > 1 else 0.0
             self._unmeasured = 0
         return self._period
 

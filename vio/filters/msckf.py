@@ -31,7 +31,14 @@ from vio.filters.multiview import (
 )
 from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, NavState, Transition, TwistMotion
 from vio.filters.noise import MotionNoise, StepErrors
-from vio.filters.online_calibration import Calibration, Twist, body_twist, calibration_covariance, first_calibration
+from vio.filters.online_calibration import (
+    Calibration,
+    Twist,
+    body_twist,
+    calibration_covariance,
+    calibration_walk,
+    first_calibration,
+)
 from vio.filters.restart import GoodState, restarted
 from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
@@ -43,7 +50,7 @@ from vio.filters.stereo_calibration import (
     eliminate_points_from_columns,
     landmark_columns,
 )
-from vio.filters.tracks import latest_pixels
+from vio.filters.tracks import measured, rows_of
 from vio.filters.window import NO_TWIST, Clone, Fit, Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
@@ -134,6 +141,7 @@ class Msckf:
             settings = replace(settings, stereo_focal_sigma=0.0, stereo_baseline_sigma=0.0)
         self._camera, self._settings = camera, settings
         self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings, motion)
+        self._walk = calibration_walk(settings)  # (32,) variances a second
         self._order = InputOrder("msckf")
         self._source = motion
         self._motion: ImuMotion | TwistMotion = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
@@ -209,7 +217,8 @@ class Msckf:
         A = se3_adjoint(T_cam0_world)
         expected = self._expected_error(nav, growth, *camera_D_own)
         motion = MotionPrior(T_curr_prev, A @ expected @ A.T)
-        if np.linalg.eigvalsh(motion.covariance[3:, 3:])[-1] > _USELESS_RAD**2:
+        of_rotation = motion.covariance[3:, 3:]  # no eigenvalue is larger than its trace
+        if of_rotation.trace() > _USELESS_RAD**2 and np.linalg.eigvalsh(of_rotation)[-1] > _USELESS_RAD**2:
             return None
         return Prediction(self._expected_tracks(window, T_cam0_world, motion), motion)
 
@@ -311,13 +320,14 @@ class Msckf:
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         self._blind = False
         late_s, twist = self._late_s, self._twist(window.nav, self._since_frame)
-        _, *camera_D_own = window.camera_D_own(late_s, twist)
-        self._expected = self._expected_error(window.nav, self._since_frame, *camera_D_own)
+        exposure = window.camera_D_own(late_s, twist)
+        self._expected = self._expected_error(window.nav, self._since_frame, *exposure[1:])
         # Half a window gives the velocity: before, its product with the offset's error would pass for knowledge of it.
         moving = len(window.clones) >= self._settings.clones // 2
         if window.calibration.timing and moving and not window.clocks_compared:
             window.compare_clocks(observations.time_ns, late_s, twist)
-        window.add_clone(observations.frame_index, observations.time_ns, late_s, twist)
+            exposure = window.camera_D_own(late_s, twist)
+        window.add_clone(observations.frame_index, observations.time_ns, exposure)
         before = window.clones[len(window.clones) > self._settings.clones]  # the oldest that stays
         try:
             report = self._use(window, seen)
@@ -407,8 +417,7 @@ class Msckf:
 
     def _first_window(self, nav: NavState, P: FloatArray, calibration: Calibration) -> Window:
         """A window without clones; P (15, 15) is the covariance of the navigation state."""
-        P_calibration, _ = calibration_covariance(calibration, self._settings)
-        own = calibration.in_world(P_calibration, nav.T_world_imu)
+        own = calibration.in_world(calibration_covariance(calibration, self._settings), nav.T_world_imu)
         window = Window(self._motion, nav, np.asarray(block_diag(P, own)), calibration)
         if self._source is not None and not calibration.metric:
             window.scale_test = ScaleTest(len(window.P))
@@ -523,6 +532,8 @@ class Msckf:
 
     def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
+        if kept.all():
+            return
         first, gone = window.first_landmark, ~kept
         rows = [slice(first + 3 * k, first + 3 * k + 3) for k in np.flatnonzero(gone).tolist()]
         blocks = np.array([window.P[r, r] for r in rows]).reshape(-1, 3, 3)
@@ -557,8 +568,8 @@ class Msckf:
             window = self._started()
             step = self._step_to(body_ns)
             self._motion.forget_before(body_ns)
-            walk = calibration_covariance(window.calibration, self._settings)[1]
-            window.propagate(step, walk * ((body_ns - self._body_ns) * 1e-9))
+            walk = self._walk[window.calibration.columns] * ((body_ns - self._body_ns) * 1e-9)
+            window.propagate(step, np.diag(walk))
             self._since_frame = self._since_frame.then(step)
             self._gyro = step.gyro
             self._body_ns = body_ns
@@ -625,10 +636,12 @@ class Msckf:
         """Update with everything that a frame shows."""
         self._calibrate_stereo(window, seen)
         self._test_scale(window, seen)
-        z, weight, found = latest_pixels(seen, window.landmark_ids)
+        rows, found = rows_of(seen, window.landmark_ids)
         self._keep_landmarks(window, found)
-        pixels = Views(z[found], weight[found])
-        self._tracks.table.add_frame(len(window.clones) - 1, seen.take(~np.isin(seen.ids, window.landmark_ids)))
+        pixels = Views(seen.z[rows], measured(seen.has_right[rows]))
+        of_tracks = np.ones(len(seen), dtype=np.bool_)
+        of_tracks[rows] = False
+        self._tracks.table.add_frame(len(window.clones) - 1, seen.take(of_tracks))
 
         predicted = window.camera_move_since(-2) if len(window.clones) > 1 else None
         tracks = self._linearise(window, self._tracks.choose(len(window.clones)), _FIRST_STEPS)
@@ -711,7 +724,7 @@ class Msckf:
         known_off = self._camera.residual_px > LEAST_FIELD_PX
         if not window.calibration.stereo_field and (known_off or self._rows.is_significant):
             calibration = replace(window.calibration, stereo_field=True)
-            P, _ = calibration_covariance(calibration, self._settings)
+            P = calibration_covariance(calibration, self._settings)
             own = calibration.field_rows
             window.start_stereo_field(calibration, P[own, own])
 
@@ -831,7 +844,7 @@ class Msckf:
         field = self._field(window)
         if field is not None:
             pixels = field.corrected(pixels)
-        T = window.T_cam0_world()[-1]
+        T = window.T_cam0_world(-1)[0]
         return landmark_residuals(self._camera, T, window.landmarks, pixels, self._tracks.variance)
 
     def _marginalise(self, window: Window, tracks: LinearTracks, good: BoolArray, pixels: Views) -> int:
@@ -885,14 +898,15 @@ class Msckf:
             candidates: mask (F,) of the tracks that may become landmarks.
             depth_sigma: (F,) standard deviation of each inverse depth, over itself.
         """
-        if window.calibration.stereo_field or window.scale_sigma() > _SCALE_SIGMA:
-            return np.zeros(0, dtype=np.int64)
         room = self._settings.max_landmarks - len(window.landmarks)
+        unsure = window.calibration.stereo_field or window.scale_sigma() > _SCALE_SIGMA
+        if room <= 0 or unsure or not candidates.any():
+            return np.zeros(0, dtype=np.int64)
         by_stereo = np.sqrt(self._tracks.variance) * relative_stereo_sigma(tracks.at, tracks.information.q)
         has_depth = (depth_sigma < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
         chosen = np.flatnonzero(candidates & has_depth)
-        if room <= 0 or not len(chosen):
-            return np.zeros(0, dtype=np.int64)
+        if not len(chosen):
+            return chosen
         covariance = self._tracks.variance * tracks.information.point_covariance(chosen)
         # The best known points first: smallest largest standard deviation.
         worst = np.linalg.eigvalsh(covariance)[:, 2]

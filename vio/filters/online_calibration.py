@@ -8,6 +8,7 @@ Reference: Li & Mourikis, Online temporal calibration for camera-IMU systems (20
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -166,23 +167,31 @@ def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: M
     )
 
 
-def calibration_covariance(calibration: Calibration, settings: MsckfSettings) -> tuple[FloatArray, FloatArray]:
-    """Return the initial covariance (C, C) of what is estimated, and what a second of random walk adds to it (C, C).
+def calibration_covariance(calibration: Calibration, settings: MsckfSettings) -> FloatArray:
+    """Return the initial covariance (C, C) of what is estimated of `[IMU; stereo; delta; time offset]`."""
+    s = settings
+    rotation = np.radians(s.extrinsic_rotation_sigma_deg)
+    pose = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
+    sigmas = np.concatenate([term_sigmas(s), _stereo_sigmas(s), pose])
+    return np.diag(sigmas[calibration.columns] ** 2)
 
-    Both of `[IMU; stereo; delta; time offset]`.
-    """
+
+def calibration_walk(settings: MsckfSettings) -> FloatArray:
+    """Return the variances (32,) that a second of random walk adds to `[IMU; stereo; delta; time offset]`."""
+    s = settings
+    rotation = np.radians(s.extrinsic_rotation_walk)
+    pose = np.repeat([s.extrinsic_translation_walk, rotation, s.time_offset_walk], [3, 3, 1])
+    walks: FloatArray = np.concatenate([term_sigmas(s) * IMU_WALK, _stereo_sigmas(s) * _STEREO_WALK, pose])
+    return walks**2
+
+
+def _stereo_sigmas(settings: MsckfSettings) -> FloatArray:
+    """Initial standard deviations (10,) of the coefficients of (R3) and (R4)."""
     s = settings
     yaw, other = np.radians(s.stereo_yaw_sigma_deg), s.stereo_field_sigma
     metric = [s.stereo_baseline_sigma, s.stereo_focal_sigma]
     right, both = [yaw, other, other, other], [_RADIAL * other, _RADIAL * other, other, other]
-    stereo = np.array([*right, *both, *metric])
-    rotation, rotation_walk = np.radians([s.extrinsic_rotation_sigma_deg, s.extrinsic_rotation_walk])
-    pose = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
-    pose_walk = np.repeat([s.extrinsic_translation_walk, rotation_walk, s.time_offset_walk], [3, 3, 1])
-    imu = term_sigmas(s)
-    sigmas = np.concatenate([imu, stereo, pose])
-    walks = np.concatenate([imu * IMU_WALK, stereo * _STEREO_WALK, pose_walk])
-    return np.diag(sigmas[calibration.columns] ** 2), np.diag(walks[calibration.columns] ** 2)
+    return np.array([*right, *both, *metric])
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,11 +206,12 @@ class Twist:
 
         An estimated twist that is noise alone would pass for a motion, from which the time offset is learned.
         """
-        out = self.mean.copy()
-        for part in _PARTS:
-            squared = float(out[part] @ np.linalg.solve(self.covariance[part, part] + 1e-18 * np.eye(3), out[part]))
-            out[part] *= np.sqrt(max(1 - _NOISE_ONLY / max(squared, 1e-9), 0.0))
-        return out
+        halves, out = self.mean.reshape(2, 3), np.empty((2, 3))
+        covariances = np.array([self.covariance[part, part] for part in _PARTS]) + 1e-18 * np.eye(3)
+        for k, whitened in enumerate(np.linalg.solve(covariances, halves[..., None])[..., 0]):
+            squared = float(halves[k] @ whitened)
+            out[k] = halves[k] * math.sqrt(max(1 - _NOISE_ONLY / max(squared, 1e-9), 0.0))
+        return out.reshape(6)
 
 
 def body_twist(T_world_imu: FloatArray, velocity_world: FloatArray, rate: FloatArray) -> FloatArray:

@@ -83,9 +83,10 @@ class RowField:
         residual = _centred(rows - camera.fv * (basis @ self.coefficients))
         scale = max(1.48 * median(np.abs(residual)), 1e-3)
         weight: FloatArray = 1 / (1 + (residual / (CAUCHY * scale)) ** 2)
-        self._A = _ROW_MEMORY * self._A + (basis * weight[:, None]).T @ basis
-        self._b = _ROW_MEMORY * self._b + (basis * weight[:, None]).T @ rows
-        self._common = _ROW_MEMORY * self._common + (basis * weight[:, None]).T @ common
+        weighted = (basis * weight[:, None]).T
+        self._A = _ROW_MEMORY * self._A + weighted @ basis
+        self._b = _ROW_MEMORY * self._b + weighted @ rows
+        self._common = _ROW_MEMORY * self._common + weighted @ common
         prior = (1 - _ROW_MEMORY) * np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
         solution = np.asarray(np.linalg.solve(self._A + prior, self._b), dtype=np.float64)
         self.coefficients = solution / camera.fv
@@ -169,14 +170,9 @@ class StereoColumns:
     """The part of the tracks' normal equations that concerns the field's S coefficients; pixel noise is one pixel."""
 
     by_point: FloatArray  # (F, N, 3, S) `J' W H` of each view, the point in the coordinates (M5)
+    G: FloatArray  # (F, 3, S) its sum over the views, the cross information of point and coefficients
     A: FloatArray  # (F, S, S) information about the coefficients before the points are eliminated
     b: FloatArray  # (F, S) its vector
-
-    @property
-    def G(self) -> FloatArray:
-        """Cross information (F, 3, S) of point and coefficients."""
-        out: FloatArray = self.by_point.sum(axis=1)
-        return out
 
     def point_D_stereo(self, info: TrackInformation) -> FloatArray:
         """How the estimated points follow errors of the coefficients (F, 3, S), world: `-C^-1 G`."""
@@ -194,8 +190,8 @@ def stereo_columns(at: Residuals, H: FloatArray, p_D_q: FloatArray, weight: Floa
         weight: robust weights (F, N).
     """
     F, N, _, S = H.shape
-    columns = StereoColumns(np.empty((F, N, 3, S)), np.empty((F, S, S)), np.empty((F, S)))
-    loops.collect_columns(at.r, at.z_D_p, H, weight, p_D_q, columns.by_point, columns.A, columns.b)
+    columns = StereoColumns(np.empty((F, N, 3, S)), np.empty((F, 3, S)), np.empty((F, S, S)), np.empty((F, S)))
+    loops.collect_columns(at.r, at.z_D_p, H, weight, p_D_q, columns.by_point, columns.G, columns.A, columns.b)
     return columns
 
 
@@ -230,7 +226,7 @@ def eliminate_points_from_columns(
     size, S = info.G.shape[1], columns.A.shape[2]
     A, cross, b = np.zeros((S, S)), np.zeros((size, S)), np.zeros(S)
     points = info.G, info.C, info.q_D_clone, info.point_gradient
-    own = columns.by_point, columns.A, columns.b
+    own = columns.by_point, columns.G, columns.A, columns.b
     loops.eliminate_columns(np.flatnonzero(chosen), *own, *points, A, cross, b)
     return StereoInformation(A, cross.T, b)
 

@@ -400,10 +400,13 @@ def substitute_back(
     """Write points (F, 3) that solve their own equations once the clones (6N,) have moved; see `TrackInformation`."""
     dq, factor = np.empty(3), np.empty((3, 3))
     for f in range(len(p)):
+        d0, d1, d2 = gradient[f, 0], gradient[f, 1], gradient[f, 2]
+        for k in range(len(clone_errors)):
+            d0 -= G[f, k, 0] * clone_errors[k]
+            d1 -= G[f, k, 1] * clone_errors[k]
+            d2 -= G[f, k, 2] * clone_errors[k]
+        dq[0], dq[1], dq[2] = d0, d1, d2
         for i in range(3):
-            dq[i] = gradient[f, i]
-            for k in range(len(clone_errors)):
-                dq[i] -= G[f, k, i] * clone_errors[k]
             for j in range(3):
                 factor[i, j] = C[f, i, j]
         solve_positive(factor, dq)
@@ -486,6 +489,17 @@ def _has_part(G: FloatArray, f: int, n: int) -> bool:
 
 
 @compiled
+def _factor(C: FloatArray, L: FloatArray) -> None:
+    """Write the lower triangle L (3, 3) of `C = L L'`, Cholesky's factor."""
+    for i in range(3):
+        for j in range(i + 1):
+            total = C[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+
+
+@compiled
 def eliminate_tracks(
     chosen: IntArray,
     G: FloatArray,
@@ -504,12 +518,7 @@ def eliminate_tracks(
     L, y = np.empty((3, 3)), np.empty(3)
     size, takes_part = G.shape[1], True
     for c, f in enumerate(chosen):
-        for i in range(3):
-            for j in range(i + 1):
-                total = C[f, i, j]
-                for k in range(j):
-                    total -= L[i, k] * L[j, k]
-                L[i, j] = np.sqrt(total) if i == j else total / L[j, j]
+        _factor(C[f], L)
         y[0] = point_gradient[f, 0] / L[0, 0]
         y[1] = (point_gradient[f, 1] - L[1, 0] * y[0]) / L[1, 1]
         y[2] = (point_gradient[f, 2] - L[2, 0] * y[0] - L[2, 1] * y[1]) / L[2, 2]
@@ -690,17 +699,19 @@ def collect_columns(
     weight: FloatArray,
     p_D_q: FloatArray,
     by_point: FloatArray,
+    G: FloatArray,
     A: FloatArray,
     b: FloatArray,
 ) -> None:
-    """Write `J' W H` (F, N, 3, S) of each view, and `H' W H` (F, S, S) and `H' W r` (F, S) of each track.
+    """Write `J' W H` (F, N, 3, S) of each view, and G (F, 3, S), its sum over the views of each track.
 
-    H (F, N, 4, S) are the derivatives of the pixels, of which those count that were measured.
+    And `H' W H` (F, S, S) and `H' W r` (F, S) of each track. H (F, N, 4, S) are the derivatives of the pixels, of which
+    those count that were measured.
     """
     terms, wH = H.shape[3], np.empty(H.shape[3])
     for f in range(len(J)):
         for s in range(terms):
-            b[f, s] = 0.0
+            b[f, s] = G[f, 0, s] = G[f, 1, s] = G[f, 2, s] = 0.0
             for t in range(terms):
                 A[f, s, t] = 0.0
         for n in range(J.shape[1]):
@@ -723,6 +734,9 @@ def collect_columns(
                     by_q = row[0] * p_D_q[f, 0, i] + row[1] * p_D_q[f, 1, i] + row[2] * p_D_q[f, 2, i]
                     for s in range(terms):
                         by_point[f, n, i, s] += by_q * wH[s]
+            for i in range(3):
+                for s in range(terms):
+                    G[f, i, s] += by_point[f, n, i, s]
         for s in range(terms):
             for t in range(s):
                 A[f, t, s] = A[f, s, t]
@@ -732,6 +746,7 @@ def collect_columns(
 def eliminate_columns(
     chosen: IntArray,
     by_point: FloatArray,
+    own: FloatArray,
     own_A: FloatArray,
     own_b: FloatArray,
     G: FloatArray,
@@ -744,24 +759,23 @@ def eliminate_columns(
 ) -> None:
     """Add to A (S, S), cross (6N, S) and b (S,) what is left of the chosen tracks once their points are eliminated."""
     clones, terms = by_point.shape[1], by_point.shape[3]
-    own, X, CG, factor = np.empty((3, terms)), np.empty(3), np.empty((3, terms)), np.empty((3, 3))
+    L, CG = np.empty((3, 3)), np.empty((3, terms))
     for f in chosen:
-        for s in range(terms):
-            for i in range(3):
-                own[i, s] = 0.0
-                for n in range(clones):
-                    own[i, s] += by_point[f, n, i, s]
-                X[i] = own[i, s]
-                for j in range(3):
-                    factor[i, j] = C[f, i, j]
-            solve_positive(factor, X)
+        _factor(C[f], L)
+        for s in range(terms):  # CG = C^-1 own
+            y0 = own[f, 0, s] / L[0, 0]
+            y1 = (own[f, 1, s] - L[1, 0] * y0) / L[1, 1]
+            y2 = (own[f, 2, s] - L[2, 0] * y0 - L[2, 1] * y1) / L[2, 2]
+            CG[2, s] = y2 / L[2, 2]
+            CG[1, s] = (y1 - L[2, 1] * CG[2, s]) / L[1, 1]
+            CG[0, s] = (y0 - L[1, 0] * CG[1, s] - L[2, 0] * CG[2, s]) / L[0, 0]
             b[s] += own_b[f, s]
             for i in range(3):
-                CG[i, s] = X[i]
-                b[s] -= X[i] * point_gradient[f, i]
+                b[s] -= CG[i, s] * point_gradient[f, i]
         for s in range(terms):
+            g0, g1, g2 = own[f, 0, s], own[f, 1, s], own[f, 2, s]
             for t in range(terms):
-                A[s, t] += own_A[f, s, t] - own[0, s] * CG[0, t] - own[1, s] * CG[1, t] - own[2, s] * CG[2, t]
+                A[s, t] += own_A[f, s, t] - g0 * CG[0, t] - g1 * CG[1, t] - g2 * CG[2, t]
         for n in range(clones):
             if not _has_part(G, f, n):
                 continue

@@ -69,6 +69,8 @@ class TrackTable:
 
     def remove(self, rows: IntArray) -> None:
         """Remove tracks."""
+        if not len(rows):
+            return
         self._rows = None
         for row in rows.tolist():
             del self._row_of[int(self._ids[row])]
@@ -107,13 +109,12 @@ def measured(has_right: BoolArray) -> FloatArray:
     return weight
 
 
-def latest_pixels(seen: Observations, ids: IntArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Pixels (K, 4), weights (K, 4) and a mask (K,) of given ids in one frame; the mask marks those that are there."""
+def rows_of(seen: Observations, ids: IntArray) -> tuple[IntArray, BoolArray]:
+    """Return the rows (K,) of given ids (M,) in one frame, in their order, and a mask (M,) of those that are there."""
+    if not len(seen) or not len(ids):
+        return np.zeros(0, dtype=np.int64), np.zeros(len(ids), dtype=np.bool_)
     order = np.argsort(seen.ids)
-    at = np.searchsorted(seen.ids[order], ids)
-    at = np.minimum(at, max(len(order) - 1, 0))
-    if len(order) == 0:
-        return np.zeros((len(ids), 4)), np.zeros((len(ids), 4)), np.zeros(len(ids), dtype=np.bool_)
+    at = np.minimum(np.searchsorted(seen.ids, ids, sorter=order), len(order) - 1)
     rows = order[at]
     found = seen.ids[rows] == ids
-    return seen.z[rows], measured(seen.has_right[rows]) * found[:, None], found
+    return rows[found], found

@@ -104,9 +104,9 @@ class Window:
         """Poses (N, 4, 4) of the body when the frames were exposed."""
         return np.array([c.T_world_imu for c in self.clones])
 
-    def T_cam0_world(self) -> FloatArray:
-        """Camera poses (N, 4, 4) at all exposures."""
-        T = self.exposures()
+    def T_cam0_world(self, first: int = 0) -> FloatArray:
+        """Camera poses (N, 4, 4) at the exposures from one on."""
+        T = np.array([c.T_world_imu for c in self.clones[first:]])
         out: FloatArray = np.empty(T.shape)
         loops.camera_poses(self.calibration.T_cam0_imu, T, out)
         return out
@@ -336,16 +336,17 @@ class Window:
         if self.scale_test is not None:
             self.scale_test.error_D_scale = to_nav @ self.scale_test.error_D_scale
 
-    def add_clone(self, frame_index: int, time_ns: int, late_s: float = 0.0, twist: Twist = NO_TWIST) -> None:
+    def add_clone(
+        self, frame_index: int, time_ns: int, exposure: tuple[FloatArray, FloatArray, FloatArray] | None = None
+    ) -> None:
         """Add the pose at an exposure as the newest clone; landmarks are anchored to its rotation from now on.
 
         Args:
             frame_index: the frame's number.
             time_ns: the frame's stamp.
-            late_s: the navigation state's time on the IMU's clock minus that stamp.
-            twist: of the body, and how well it is known; used where the time offset is estimated.
+            exposure: what `camera_D_own` has returned for it; None: the navigation state is that of the exposure.
         """
-        T, camera_D_own, noise = self.camera_D_own(late_s, twist)
+        T, camera_D_own, noise = self.camera_D_own(0.0, NO_TWIST) if exposure is None else exposure
         at, own, D = self.first_landmark, slice(0, self.first_clone), len(self.P)
         added, beside = camera_D_own @ self.P[own], self.P[:, own] @ camera_D_own.T  # exact copies without calibration
         block = added[:, own] @ camera_D_own.T + noise

@@ -25,18 +25,18 @@ class WindowPosterior:
     P: FloatArray  # (6N, 6N) covariance of their right-invariant errors
     gyro_bias: FloatArray  # (3,) rad/s, of the newest frame
     accel_bias: FloatArray  # (3,) m/s^2, of the newest frame
+    has_imu: bool  # whether the clones' velocities are smoothed, too
 
     @classmethod
     def of(cls, window: Window, P: FloatArray) -> WindowPosterior:
         """Take over the body's poses at the window's exposures, with the covariance P (k, k) up to theirs."""
         rows = slice(window.first_clone, window.first_landmark)
-        clones, own = tuple(window.clones), P[rows, rows]
+        own = P[rows, rows]
         if window.calibration.extrinsics:
             body_D_error = window.body_D_error()
             own = body_D_error @ P @ body_D_error.T
-        if not isinstance(window.motion, ImuMotion):
-            clones = _with_velocities(clones)
-        return cls(clones, own, window.nav.gyro_bias, window.nav.accel_bias)
+        has_imu = isinstance(window.motion, ImuMotion)
+        return cls(tuple(window.clones), own, window.nav.gyro_bias, window.nav.accel_bias, has_imu)
 
     def rotated(self, R: FloatArray) -> WindowPosterior:
         """Return the same in a world that is turned by R (3, 3)."""
@@ -56,10 +56,18 @@ class WindowPosterior:
             clone.time_ns,
             clone.T_world_imu,
             A @ self.P[rows, rows] @ A.T,
-            velocity_world=clone.velocity,
+            velocity_world=clone.velocity if self.has_imu else self._velocities()[index],
             gyro_bias=self.gyro_bias,
             accel_bias=self.accel_bias,
         )
+
+    def _velocities(self) -> FloatArray:
+        """World velocities (N, 3) by the smoothed poses around each: a drifting twist keeps only its newest."""
+        p = np.array([c.T_world_imu[:3, 3] for c in self.clones])
+        if len(p) < 2:
+            return np.array([c.velocity for c in self.clones])
+        t = np.array([c.time_ns - self.clones[0].time_ns for c in self.clones]) * 1e-9
+        return np.asarray(np.gradient(p, t, axis=0), dtype=np.float64)
 
     def motion(self, older: int, newer: int) -> RelativePose | None:
         """Return the body's motion between two frames of the window; None where one of them is not in it.
@@ -87,11 +95,15 @@ class WindowPosterior:
         if seconds <= 0:
             return False
         a, b = slice(0, 6), slice(len(self.P) - 6, None)
-        A = se3_adjoint(se3_inverse(old.T_world_imu))
+        T_old_world = se3_inverse(old.T_world_imu)
+        A = se3_adjoint(T_old_world)
         C = A @ (self.P[a, a] + self.P[b, b] - self.P[a, b] - self.P[b, a]) @ A.T
-        xi = se3_log(se3_inverse(old.T_world_imu) @ new.T_world_imu)
-        limit = _STATIONARY_LIMIT
-        if float(xi @ xi) > limit * (float(np.trace(C)) + 6e-18):  # no eigenvalue of C is larger than its trace
+        limit, most = _STATIONARY_LIMIT, float(np.trace(C)) + 6e-18  # no eigenvalue of C is larger than its trace
+        moved = new.T_world_imu[:3, 3] - old.T_world_imu[:3, 3]
+        if float(moved @ moved) > limit * most:  # rho is no shorter, as |J_l(phi) rho| <= |rho|
+            return False
+        xi = se3_log(T_old_world @ new.T_world_imu)
+        if float(xi @ xi) > limit * most:
             return False
         largest = np.sqrt([np.linalg.eigvalsh(C[p, p])[-1] for p in (slice(0, 3), slice(3, 6))]) / seconds
         if largest[0] > velocity_sigma_mps or largest[1] > rate_sigma_radps:
@@ -116,13 +128,3 @@ def scale_sigma(posterior: WindowPosterior) -> float | None:
     row[0] -= p.sum(axis=0) @ moves[0]
     row = row.ravel() / length2
     return float(np.sqrt(max(row @ posterior.P @ row, 0.0)))
-
-
-def _with_velocities(clones: tuple[Clone, ...]) -> tuple[Clone, ...]:
-    """Give clones world velocities from the smoothed poses around each: a drifting twist keeps only its newest."""
-    if len(clones) < 2:
-        return clones
-    t = np.array([c.time_ns - clones[0].time_ns for c in clones]) * 1e-9
-    p = np.array([c.T_world_imu[:3, 3] for c in clones])
-    v = np.gradient(p, t, axis=0)
-    return tuple(Clone(c.frame_index, c.time_ns, c.T_world_imu, v[k]) for k, c in enumerate(clones))

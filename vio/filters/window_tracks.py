@@ -197,10 +197,9 @@ class WindowTracks:
         if len(squares) < MIN_TRACKS_FOR_NOISE:
             return
         s = self._settings
-        ratio = float(np.clip(median(squares / chi_square_table(0.5)[dof]), 0.25, 4.0))
-        self.variance = float(
-            np.clip(self.variance * ratio**_NOISE_GAIN, s.pixel_sigma_min_px**2, s.pixel_sigma_max_px**2)
-        )
+        ratio = min(max(median(squares / chi_square_table(0.5)[dof]), 0.25), 4.0)
+        variance = max(self.variance * ratio**_NOISE_GAIN, s.pixel_sigma_min_px**2)
+        self.variance = min(variance, s.pixel_sigma_max_px**2)
 
     def end_frame(self, *, spent: IntArray, promoted: IntArray, newest: int) -> None:
         """Remove what has been absorbed and what has ended.

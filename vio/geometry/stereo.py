@@ -139,17 +139,23 @@ def project(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
         v = camera.fv * np.arctan2(y, p[..., 2]) + camera.cv
     else:
         v = camera.fv * y / depth + camera.cv
-    ul = camera.fu * x / depth + camera.cu
-    return np.stack([ul, v, ul - camera.fu * camera.baseline_m / depth, v], axis=-1)
+    out = np.empty((*p.shape[:-1], 4))
+    out[..., 0] = camera.fu * x / depth + camera.cu
+    out[..., 2] = out[..., 0] - camera.fu * camera.baseline_m / depth
+    out[..., 1] = out[..., 3] = v
+    return out
 
 
 def left_rays(camera: StereoCamera, pixels: npt.ArrayLike) -> FloatArray:
     """Rays (..., 3) of unit depth (`depth_of`) in the cam0 frame through left pixels (..., 2)."""
     uv = np.asarray(pixels, dtype=np.float64)
-    x, y = (uv[..., 0] - camera.cu) / camera.fu, (uv[..., 1] - camera.cv) / camera.fv
+    out = np.ones((*uv.shape[:-1], 3))
+    out[..., 0], y = (uv[..., 0] - camera.cu) / camera.fu, (uv[..., 1] - camera.cv) / camera.fv
     if camera.is_cylinder:
-        return np.stack([x, np.sin(y), np.cos(y)], axis=-1)
-    return np.stack([x, y, np.ones_like(x)], axis=-1)
+        out[..., 1], out[..., 2] = np.sin(y), np.cos(y)
+    else:
+        out[..., 1] = y
+    return out
 
 
 def z_D_p_cam(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:

@@ -111,12 +111,12 @@ class FrozenImages:
             return None
         if again:
             return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
-        if not self._contradicts(expected.motion) or self._at_standstill():
-            return None
-        if len(self._errors_px) < _LEAST_RECENT:
+        if len(self._errors_px) < _LEAST_RECENT or not self._contradicts(expected.motion):
             return None
         moving = _predicted_to_move(self._seen, expected, max(_PREDICTED_PX, _ERRORS * max(self._errors_px)))
-        return Repeated(shown.index, False) if _unmoved(shown, frame, moving) else None
+        # The IMU comes last, as nearly every new frame has moved.
+        frozen = _unmoved(shown, frame, moving) and not self._at_standstill()
+        return Repeated(shown.index, False) if frozen else None
 
     def _moves(self, expected: Prediction | None) -> bool:
         """Whether the rig moves: by the IMU's samples, else by the prediction."""

@@ -75,7 +75,9 @@ class RunHealth:
         if last is None:
             return []
         step_s = (estimate.time_ns - last[0]) * 1e-9
-        usual_s = median(self._steps_s) if len(self._steps_s) >= _LEAST_STEPS else np.inf
+        usual_s = np.inf
+        if step_s > _GAP_S and len(self._steps_s) >= _LEAST_STEPS:  # a shorter one is no gap, whatever is usual
+            usual_s = median(self._steps_s)
         self._steps_s.append(step_s)
         if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
             return []

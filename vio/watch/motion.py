@@ -11,6 +11,7 @@ from vio.calibration.egomotion import stereo_twists
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, IntArray, Observations, feature_tracks
+from vio.robust import median
 from vio.watch.samples import GAP_S, MEMORY_S
 
 BATCH = 20  # frames whose motion is computed at once
@@ -63,7 +64,7 @@ class CameraTwists:
         out = np.zeros(6)
         dt = (kept.time_ns - last.time_ns) * _NS
         if len(flow) and dt > 0:
-            du, dv = np.median(flow, axis=0)
+            du, dv = median(flow[:, 0]), median(flow[:, 1])
             out[3], out[4] = dv / self._camera.fv / dt, -du / self._camera.fu / dt
         return out
 
