@@ -367,6 +367,7 @@ class Msckf:
         """
         assert self._good is not None
         self._settings = replace(self._settings, stereo_focal_sigma=_FREED_FOCAL_SIGMA)
+        self._walk = calibration_walk(self._settings)
         old = self._good.calibration
         calibration = first_calibration(old.T_cam0_imu, self._settings, self._source)
         self._good = replace(self._good, calibration=replace(calibration, time_offset_s=old.time_offset_s))
