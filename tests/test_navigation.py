@@ -176,3 +176,14 @@ def test_old_samples_are_dropped_but_not_the_one_that_the_next_interval_begins_w
     assert motion.covered(150_000_000) == 150_000_000
     assert motion.covered(210_000_000) == 200_000_000  # a little late: as far as the samples go
     assert motion.covered(300_000_000) == 300_000_000  # for too long
+
+
+@pytest.mark.parametrize("hz", [100, 200, 1000])
+def test_the_noise_of_one_reading_is_that_of_the_imus_own_period(hz: int) -> None:
+    """Also where old samples are dropped, and one is left."""
+    motion = _imu(hz, 1.0)
+    density = SETTINGS.gyro_noise_density
+    assert motion.rate_variance(np.ones(2)) == pytest.approx(density**2 * hz)
+    motion.forget_before(motion.samples[-1].time_ns)
+    assert len(motion.samples) == 1
+    assert motion.rate_variance(np.ones(2)) == pytest.approx(density**2 * hz)

@@ -1028,6 +1028,13 @@ MUTATIONS = (
         _IMU_TERMS,
     ),
     Mutation(
+        "the gyro's noise in one reading is that of 200 readings a second",
+        "vio/filters/navigation.py",
+        "period_s = period_s if period_s > 0 else _SAMPLE_S",
+        "period_s = _SAMPLE_S",
+        ("tests/test_navigation.py",),
+    ),
+    Mutation(
         "the baseline is judged before the turns are compared",
         "vio/filters/msckf.py",
         "(self._turns is None or not self._turns.agree)",

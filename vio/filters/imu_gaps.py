@@ -52,6 +52,14 @@ class ImuHistory:
         while self._samples and self._samples[-1].time_ns - self._samples[0].time_ns > _MEMORY_S / _NS:
             self._samples.popleft()
 
+    def period_ns(self) -> float:
+        """Median distance of the samples, up to a few of them ago; 0 where there are not two."""
+        if self._unmeasured >= len(self._samples) // _MEASURED_SHARE:
+            times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
+            self._period = median(np.diff(times)) if len(times) > 1 else 0.0
+            self._unmeasured = 0
+        return self._period
+
     def hidden(self, cuts_ns: FloatArray, times_ns: FloatArray) -> Hidden | None:
         """Cut the parts of an interval that lack samples finely, and say what they hide; None: none are missing.
 
@@ -59,7 +67,7 @@ class ImuHistory:
             cuts_ns: (K,) where an integration would step: its ends and the samples between.
             times_ns: (S,) of the samples at hand, on the same scale, increasing.
         """
-        period_ns = self._period_ns()
+        period_ns = self.period_ns()
         if not lacks_samples(cuts_ns, times_ns, _LONG_PERIODS * period_ns):
             return None
         after = np.searchsorted(times_ns, 0.5 * (cuts_ns[1:] + cuts_ns[:-1]))
@@ -76,14 +84,6 @@ class ImuHistory:
         left, right, uncertain = (np.repeat(x, parts) for x in (left, right, uncertain))
         variance = np.where(uncertain, self._hidden_variance(cuts * _NS, left * _NS, right * _NS), 0.0)
         return Hidden(cuts, variance, bool(gap.any()))
-
-    def _period_ns(self) -> float:
-        """Median distance of the samples, up to a few of them ago; 0 where there are not two."""
-        if self._unmeasured >= len(self._samples) // _MEASURED_SHARE:
-            times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
-            self._period = median(np.diff(times)) if len(times) > 1 else 0.0
-            self._unmeasured = 0
-        return self._period
 
     def _hidden_variance(self, cuts: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
         """Variance (2, K - 1) that each step adds to the integrals, equations (N11) and (N12), by Simpson's rule."""
@@ -112,7 +112,7 @@ class ImuHistory:
         if len(self._samples) < _LEAST_SAMPLES:
             return np.array([0.0, 1.0]), np.stack([_UNKNOWN, _UNKNOWN], axis=1)
         times = np.array([x.time_ns for x in self._samples], dtype=np.int64)
-        period = self._period_ns()
+        period = self.period_ns()
         lags, change = [0.0], [np.zeros(2)]
         lag = period
         while lag <= _LONGEST_LAG_S / _NS and times[-1] - times[0] >= lag:
