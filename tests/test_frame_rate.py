@@ -12,13 +12,16 @@ import pytest
 
 from tests.test_datasets_videos import make_videos
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
+from vio.bench.worker import _Truth, _used
 from vio.cli import main
-from vio.config import Config
+from vio.config import Config, load_config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.errors import DataError
 from vio.frame_rate import FrameRateLimit
 from vio.odometry import Odometry
+from vio.pipeline import run
 from vio.records import StereoFrame
+from vio.watch.run import RunWatch
 
 TEN = DatasetSettings(max_frame_rate=10.0)
 
@@ -112,3 +115,34 @@ def test_the_summary_says_how_many_frames_were_used(
 ) -> None:
     assert main(["run", str(flight), "--config", "fast", "--out", str(tmp_path / "r"), "--quiet"]) == 0
     assert "8 of 15, path" in capsys.readouterr().out
+
+
+def test_any_dataset_of_a_run_takes_the_frames_counted_from_the_first(flight: Path) -> None:
+    """Also one that was opened without the limit, and from a frame on that is left out."""
+    config = replace(load_config("fast"), motion="none")
+    result = run(open_dataset(flight), config, start=3, stop=12)
+    assert [f.index for f in result.frames] == [4, 6, 8, 10]
+
+
+def test_an_inspection_may_look_at_any_frame(flight: Path) -> None:
+    assert main(["inspect", str(flight), "--config", "fast", "--json"]) in (0, 1)
+
+
+def test_refused_frames_in_a_row_are_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    watch = RunWatch(CAMERA, T_CAM0_IMU, imu=False)
+    for index in (0, 2, 4, 6):
+        watch.repeats(StereoFrame(index, index * STEP_NS, None, None), None)
+        if index > 0:
+            watch.refused(index, "left and right look swapped")
+    assert len(watch.lines) == 1
+    watch.repeats(StereoFrame(8, 8 * STEP_NS, None, None), None)
+    watch.repeats(StereoFrame(10, 10 * STEP_NS, None, None), None)
+    watch.refused(10, "left and right look swapped")
+    assert len(watch.lines) == 2
+
+
+def test_coverage_is_of_the_frames_that_are_used(flight: Path) -> None:
+    dataset = open_dataset(flight)
+    times_ns = dataset.recording.frame_times_ns
+    used = _used(_Truth(dataset, None, 3, 12), replace(Config(), dataset=TEN))
+    np.testing.assert_array_equal(used, times_ns[[4, 6, 8, 10]])

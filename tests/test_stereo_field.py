@@ -32,12 +32,12 @@ from vio.config import load_config
 from vio.datasets.observation_log import write_observation_log
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError
-from vio.geometry.distortion import StereoRig
+from vio.geometry.distortion import StereoRig, project_point
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.geometry.rectify import rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera
 from vio.plotting import has_calibration_panel
-from vio.records import Estimate, Observations, Recording, StereoFieldEstimate
+from vio.records import Estimate, Observations, Recording, StereoFieldEstimate, StereoScaleEstimate
 from vio.rig import Rig
 from vio.saved_run import read_saved_run, stereo_frames
 
@@ -102,6 +102,21 @@ def test_what_a_lens_model_cannot_express_is_said() -> None:
     assert found.left_px > 0.1
     estimate = _estimate(_Frame.of(radtan).coefficients(off))
     assert calibrated_rig(radtan, estimate).left_px < 0.02, "the other model expresses it"
+
+
+@pytest.mark.parametrize("given", [RECTIFIED, _of_raw(RADTAN_RIG)], ids=["rectified", "raw"])
+def test_baseline_and_focal_length_found_go_into_the_rig(given: Rig) -> None:
+    """A pixel's ray comes nearer to the axis by the focal length's factor, whatever the lens."""
+    scale = StereoScaleEstimate(np.log([1.03, 0.95]), np.diag([4e-6, 1e-6]))
+    found = calibrated_rig(given, replace(_estimate(np.zeros(15)), stereo_field=None, stereo_scale=scale))
+    np.testing.assert_allclose(found.rig.T_cam1_cam0[:3, 3], 1.03 * given.T_cam1_cam0[:3, 3])
+    np.testing.assert_array_equal(found.rig.T_cam1_cam0[:3, :3], given.T_cam1_cam0[:3, :3])
+    rays = np.stack([*np.random.default_rng(0).uniform(-0.3, 0.3, (2, 50)), np.ones(50)], axis=1)
+    for lens, before in ((found.rig.cam0, given.cam0), (found.rig.cam1, given.cam1)):
+        np.testing.assert_allclose(
+            project_point(lens, rays / [0.95, 0.95, 1.0])[0], project_point(before, rays)[0], atol=1e-9
+        )
+    assert found.lines() == ("baseline off by +3.00 ± 0.20 %", "focal length off by -5.00 ± 0.10 %")
 
 
 def test_without_an_estimate_the_rig_stays_as_given() -> None:

@@ -91,7 +91,7 @@ class Config(Section):
     msckf: MsckfSettings = field(default_factory=MsckfSettings)
 
 
-def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Config:
+def load_config(path: Path | str | None = None, overrides: Sequence[str] = ()) -> Config:
     """Build the configuration from the defaults, a YAML file and `a.b=value` overrides, in that order.
 
     A bare name of which there is no file, such as `fast`, is that of a preset in `vio/presets`.
@@ -101,7 +101,7 @@ def load_config(path: Path | None = None, overrides: Sequence[str] = ()) -> Conf
     """
     config = Config()
     if path is not None:
-        config = merge(config, _read_yaml(_preset_or(path)), where=str(path))
+        config = merge(config, _read_yaml(_preset_or(Path(path))), where=str(path))
     for override in overrides:
         config = merge_override(config, override, example="selector.budget=40")
     return config
@@ -113,7 +113,7 @@ def _preset_or(path: Path) -> Path:
     Raises:
         ConfigError: a bare name is neither a file's nor a preset's.
     """
-    if path.suffix or path.name != str(path) or path.exists():
+    if path.suffix or path.name != str(path) or path.is_file():
         return path
     preset = _PRESETS / f"{path}.yaml"
     if not preset.is_file():

@@ -16,6 +16,7 @@ import numpy as np
 from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
 from vio.chain import BACKENDS, build_backend
 from vio.config import BackendName, Config
+from vio.datasets.common import chosen_frames
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
 from vio.frame_result import STAGES, FrameLog, FrameResult
@@ -178,7 +179,7 @@ def run(
         try:
             with _opencv_threads(dataset, config, frontend):
                 images = _needs_images(dataset, config) or state.odometry.map_session is not None
-                events = dataset.events(state.next_frame, stop, images=images)
+                events = _limited(dataset.events(state.next_frame, stop, images=images), recording, config)
                 stopped = loop.run(events, features, should_stop)
         except VioError as error:
             if folder is None or not len(recorder):
@@ -398,6 +399,15 @@ def _auto_motion(recording: Recording, backend: BackendName) -> MotionSource | N
             found,
         )
     return found
+
+
+def _limited(events: Iterable[Event], recording: Recording, config: Config) -> Iterable[Event]:
+    """The events without the frames that the limit on the frame rate leaves out, counted from the first of all."""
+    most_hz = config.dataset.max_frame_rate
+    if most_hz is None:
+        return events
+    used = set(chosen_frames(recording, 0, None, most_hz))
+    return (event for event in events if not isinstance(event, StereoFrame) or event.index in used)
 
 
 class _ReadTimer:

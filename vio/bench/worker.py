@@ -139,10 +139,11 @@ def _stop(job: dict[str, Any]) -> Any:
     return None if job["stop"] is None else bound(job["stop"])
 
 
-def _used(frame_times_ns: IntArray, config: Config) -> IntArray:
-    """Times (G,) of the frames (F,) that the limit on the frame rate lets through."""
-    limit = FrameRateLimit(config.dataset.max_frame_rate)
-    return np.array([t for t in frame_times_ns.tolist() if limit.takes(t)], dtype=np.int64)
+def _used(truth: _Truth, config: Config) -> IntArray:
+    """Times (G,) of the frames of the sequence that the limit on the frame rate lets through."""
+    limit, times_ns = FrameRateLimit(config.dataset.max_frame_rate), truth.dataset.recording.frame_times_ns
+    taken = [t for t in times_ns[: truth.end].tolist() if limit.takes(t)]
+    return np.array([t for t in taken if t >= times_ns[truth.first]], dtype=np.int64)
 
 
 def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -> dict[str, Any]:
@@ -160,7 +161,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
         figures: dict[str, Any] = {
             "frames": len(result.frames),
             "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
-            "coverage": coverage(_used(truth.frame_times_ns, config), trajectory),
+            "coverage": coverage(_used(truth, config), trajectory),
         }
         record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}
         if truth.reference is not None:

@@ -10,6 +10,7 @@ decides between them. The term of the fourth order of the right columns has no p
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +19,15 @@ from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
-from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, Estimate, StereoFieldEstimate
+from vio.records import (
+    FIELD_TERMS,
+    RIGHT_TERMS,
+    ROW_TERMS,
+    BoolArray,
+    Estimate,
+    StereoFieldEstimate,
+    StereoScaleEstimate,
+)
 from vio.rig import Rig
 
 # Parameters of a rig's correction: rotation of the right camera (rad, in the rectified frame: its points p are seen as
@@ -125,6 +134,7 @@ class CalibratedRig:
     parameters: FloatArray  # (14,) what the given rig was off by, in the order and units of `PARAMETERS`
     covariance: FloatArray  # (14, 14)
     left_px: float  # root mean square over the images of the field that the rig cannot express
+    scale: StereoScaleEstimate | None = None  # what baseline and focal length were off by, where they were estimated
 
     @property
     def sigmas(self) -> FloatArray:
@@ -146,11 +156,15 @@ class CalibratedRig:
             if name in _TEXT and value * value > _NAMED_SIGMAS**2 * variance:
                 text, scale, form = _TEXT[name]
                 out.append(text.format(f"{scale * value:+{form}} ± {scale * variance**0.5:{form}}"))
+        found = {} if self.scale is None else self.scale.percent()
+        out += [f"{name} off by {percent:+.2f} ± {sigma:.2f} %" for name, (percent, sigma) in found.items()]
         return tuple(out)
 
 
 def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
-    """Return a given rig with all that a run estimated of it: stereo field, extrinsics and time offset of the IMU.
+    """Return a given rig with all that a run estimated of it.
+
+    That is the stereo field, baseline and focal length, extrinsics and time offset of the IMU.
 
     What the run did not estimate stays as given, with its prior standard deviations.
 
@@ -174,7 +188,27 @@ def calibrated_rig(given: Rig, estimate: Estimate) -> CalibratedRig:
         rig = replace(rig, T_cam0_imu=se3_from_parts(R_cam0_rect, np.zeros(3)) @ estimate.T_cam0_imu)
     if estimate.time_offset_s is not None:
         rig = replace(rig, time_offset_s=given.time_offset_s + estimate.time_offset_s)
-    return replace(out, rig=rig)
+    if estimate.stereo_scale is not None:
+        rig = _scaled(rig, *estimate.stereo_scale.logs.tolist())
+    return replace(out, rig=rig, scale=estimate.stereo_scale)
+
+
+def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
+    """Return a rig whose baseline and focal lengths are longer by factors exp(baseline) and exp(focal), (R4).
+
+    A pixel's ray is nearer to the axis by exp(focal), which the coefficients of the radial-tangential model follow,
+    each by the power of the radius that it belongs to. Other models keep theirs: the same near the axis.
+    """
+
+    def lens(camera: CameraModel) -> CameraModel:
+        powers = (2, 4, 1, 1, 6, 2, 4, 6) if camera.model == "radtan" else (0,) * len(camera.coefficients)
+        coefficients = tuple(c * math.exp(n * focal) for c, n in zip(camera.coefficients, powers, strict=False))
+        factor = math.exp(focal)
+        return replace(camera, fu=factor * camera.fu, fv=factor * camera.fv, coefficients=coefficients)
+
+    T = rig.T_cam1_cam0.copy()
+    T[:3, 3] *= math.exp(baseline)
+    return replace(rig, cam0=lens(rig.cam0), cam1=lens(rig.cam1), T_cam1_cam0=T)
 
 
 def field_of(camera: StereoCamera, parameters: FloatArray) -> PixelField:

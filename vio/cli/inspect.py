@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.arguments import add_config_arguments, config_from
@@ -41,7 +42,8 @@ def execute(args: argparse.Namespace) -> int:
     if args.pairs < 1 or args.frames < 0:
         raise ConfigError("--pairs must be at least 1, and --frames at least 0")
     config = config_from(args)
-    dataset = open_dataset(args.source, config.dataset)
+    # A limit on the frame rate is a run's: here any frame may be looked at.
+    dataset = open_dataset(args.source, replace(config.dataset, max_frame_rate=None))
     recording = dataset.recording
     with one_blas_thread(), ProgressBar(f"inspect {recording.path.name}") as bar:
         report = inspect_recording(

@@ -191,7 +191,7 @@ class InertialCheck:
         if known is not None and known.differ and known.gyro_agrees:
             return []
         self.turns = compare_turns(record, gyro_fit, self._T[:3, :3])
-        return judge_turns(self.turns)
+        return judge_turns(self.turns, self._stereo)
 
     def _unreported(self, found: Sequence[InertialFinding]) -> tuple[InertialFinding, ...]:
         """Return the findings of groups that were not reported before."""

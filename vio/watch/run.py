@@ -58,6 +58,7 @@ class RunWatch:
             self._inertial = InertialCheck(camera, T_cam0_body)
         self._new: list[ImuSample] = []  # since the last frame
         self._frames = self._features = 0
+        self._index, self._index_before = -1, -1  # of the present frame, and of the one before it
         self._refused_last = -2
         self.frames_refused = 0
         self.frames_waiting = 0  # that have no pose, as the back end had not begun
@@ -102,6 +103,7 @@ class RunWatch:
             frame: in time order.
             expected: the back end's prediction of it.
         """
+        self._index, self._index_before = frame.index, self._index
         self._take_new()
         repeated = self._frozen.check(frame, expected)
         self._repeated = repeated is not None
@@ -139,7 +141,7 @@ class RunWatch:
 
     def refused(self, index: int, reason: str) -> None:
         """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
-        if index != self._refused_last + 1:
+        if self._refused_last != self._index_before:
             self._report([f"frame skipped: {reason}"])
         self._refused_last = index
         self.frames_refused += 1

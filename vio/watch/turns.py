@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
 from vio.records import TURNS_NOT_SHOWN, TurnComparison
 from vio.robust import robust_sigma
 from vio.watch.finding import InertialFinding
@@ -53,17 +54,18 @@ def _factor(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[f
     return float(factors[0]), float(np.sqrt((_BLOCKS - 1) / _BLOCKS * spread))
 
 
-def judge_turns(compared: TurnComparison) -> list[InertialFinding]:
-    """Report turns that differ where the gyro's scale may be the cause; else the filter finds the focal length."""
-    if not compared.differ or compared.gyro_agrees:
+def judge_turns(compared: TurnComparison, camera: StereoCamera) -> list[InertialFinding]:
+    """Report turns that differ where the gyro's scale may be the cause, or the filter cannot find the focal length."""
+    if not compared.differ or (compared.gyro_agrees and not camera.is_cylinder):
         return []
+    estimate = "" if camera.is_cylinder else ", or have the focal length estimated (msckf.stereo_focal_sigma: 0.05)"
     return [
         InertialFinding(
             "camera turns",
             f"about the axes of the image the camera turns {100 * abs(compared.excess):.1f} ± "
             f"{100 * compared.sigma:.1f} % {'more' if compared.excess > 0 else 'less'} than the gyro says",
-            "the focal length or the lens is not as calibrated, or the gyro's scale is off; calibrate the cameras "
-            "anew, or have the focal length estimated (msckf.stereo_focal_sigma: 0.05)",
+            f"the focal length or the lens is not as calibrated, or the gyro's scale is off; calibrate the cameras anew"
+            f"{estimate}",
             certain=False,
         )
     ]
