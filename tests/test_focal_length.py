@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.test_inertial_check import Watched, _gyro, _observe, _real, _recording
+from tests.test_inertial_check import Watched, _checked, _gyro, _observe, _real, _recording
 from tests.test_online_calibration import CAMERA, OFF, T_CAM0_IMU, Shaking, _samples, fly_with
 from vio.filters.msckf import Msckf
 from vio.geometry.lie import FloatArray
@@ -17,7 +17,6 @@ from vio.records import TURNS_NOT_SHOWN, ImuSample, Observations, TurnComparison
 from vio.sim.motion import evaluate, hand_held, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU
 from vio.watch.finding import InertialFinding
-from vio.watch.inertial import InertialCheck
 
 
 def _longer(camera: StereoCamera) -> StereoCamera:
@@ -27,15 +26,8 @@ def _longer(camera: StereoCamera) -> StereoCamera:
 def _compared(
     it: Watched, camera: StereoCamera, samples: list[ImuSample] | None = None
 ) -> tuple[TurnComparison | None, list[InertialFinding]]:
-    check = InertialCheck(camera, it.T_cam0_imu)
-    events: list[ImuSample | Observations] = [*(it.samples if samples is None else samples), *it.frames]
-    found: list[InertialFinding] = []
-    for event in sorted(events, key=lambda e: e.time_ns):
-        if isinstance(event, ImuSample):
-            check.imu(event)
-        else:
-            found += check.frame(event)
-    return check.turns, [*found, *check.finish()]
+    check, found = _checked(replace(it, camera=camera), samples=samples)
+    return check.turns, found
 
 
 @pytest.mark.parametrize("seed", [0, 1])

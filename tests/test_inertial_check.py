@@ -115,13 +115,13 @@ def _real(folder: Path, seconds: float) -> Watched:
     return Watched(camera, T_cam0_imu, samples, [], frames)
 
 
-def _watch(
+def _checked(
     it: Watched,
     *,
     samples: list[ImuSample] | None = None,
     T_cam0_imu: FloatArray | None = None,
     frames: list[Observations] | None = None,
-) -> list[InertialFinding]:
+) -> tuple[InertialCheck, list[InertialFinding]]:
     """Run the check over samples and frames in time order."""
     check = InertialCheck(it.camera, it.T_cam0_imu if T_cam0_imu is None else T_cam0_imu)
     events: list[ImuSample | Observations] = [*(it.samples if samples is None else samples)]
@@ -132,7 +132,18 @@ def _watch(
             check.imu(event)
         else:
             found += check.frame(event)
-    return [*found, *check.finish()]
+    return check, [*found, *check.finish()]
+
+
+def _watch(
+    it: Watched,
+    *,
+    samples: list[ImuSample] | None = None,
+    T_cam0_imu: FloatArray | None = None,
+    frames: list[Observations] | None = None,
+) -> list[InertialFinding]:
+    """What the check finds in samples and frames."""
+    return _checked(it, samples=samples, T_cam0_imu=T_cam0_imu, frames=frames)[1]
 
 
 def _faults(found: list[InertialFinding]) -> list[str]:

@@ -1030,7 +1030,7 @@ MUTATIONS = (
     Mutation(
         "the gyro's noise in one reading is that of 200 readings a second",
         "vio/filters/navigation.py",
-        "period_s = period_s if period_s > 0 else _SAMPLE_S",
+        "period_s = period_ns * 1e-9 if period_ns > 0 else _SAMPLE_S",
         "period_s = _SAMPLE_S",
         ("tests/test_navigation.py",),
     ),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from vio.records import NS_PER_S
+import numpy as np
+
+from vio.records import NS_PER_S, IntArray
 
 _EARLY = 0.1  # of an interval that a frame may come early: cameras jitter, and 30 frames/s are rarely exactly 30
 
@@ -28,3 +30,14 @@ class FrameRateLimit:
             return False
         self._last_ns = time_ns
         return True
+
+
+def used_frames(times_ns: IntArray, most_hz: float | None) -> IntArray:
+    """Return the numbers (G,) of the frames of a recording that a limit lets through, counted from the first of all.
+
+    Args:
+        times_ns: of all frames (F,), increasing.
+        most_hz: frames a second; None: no limit.
+    """
+    limit = FrameRateLimit(most_hz)
+    return np.flatnonzero([limit.takes(t) for t in times_ns.tolist()])

@@ -16,9 +16,9 @@ import numpy as np
 from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
 from vio.chain import BACKENDS, build_backend
 from vio.config import BackendName, Config
-from vio.datasets.common import chosen_frames
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.filters.vislam import Vislam
+from vio.frame_rate import used_frames
 from vio.frame_result import STAGES, FrameLog, FrameResult
 from vio.frontend_package import frontend_module
 from vio.geometry.lie import FloatArray, se3_inverse
@@ -406,7 +406,7 @@ def _limited(events: Iterable[Event], recording: Recording, config: Config) -> I
     most_hz = config.dataset.max_frame_rate
     if most_hz is None:
         return events
-    used = set(chosen_frames(recording, 0, None, most_hz))
+    used = set(used_frames(recording.frame_times_ns, most_hz).tolist())
     return (event for event in events if not isinstance(event, StereoFrame) or event.index in used)
 
 

@@ -27,7 +27,7 @@ from vio.datasets import open_dataset
 from vio.datasets.span import frames_between
 from vio.errors import DataError, VioError
 from vio.evaluation import Evaluation, evaluate
-from vio.frame_rate import FrameRateLimit
+from vio.frame_rate import used_frames
 from vio.printable import json_text
 from vio.protocols import Dataset
 from vio.records import IntArray, Trajectory
@@ -141,9 +141,9 @@ def _stop(job: dict[str, Any]) -> Any:
 
 def _used(truth: _Truth, config: Config) -> IntArray:
     """Times (G,) of the frames of the sequence that the limit on the frame rate lets through."""
-    limit, times_ns = FrameRateLimit(config.dataset.max_frame_rate), truth.dataset.recording.frame_times_ns
-    taken = [t for t in times_ns[: truth.end].tolist() if limit.takes(t)]
-    return np.array([t for t in taken if t >= times_ns[truth.first]], dtype=np.int64)
+    times_ns = truth.dataset.recording.frame_times_ns
+    used = used_frames(times_ns[: truth.end], config.dataset.max_frame_rate)
+    return times_ns[used[used >= truth.first]]
 
 
 def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -> dict[str, Any]:

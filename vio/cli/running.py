@@ -18,7 +18,7 @@ from vio.datasets import open_dataset
 from vio.datasets.span import Seconds, frames_between
 from vio.errors import ConfigError, DataError, StoppedError, VioError
 from vio.evaluation import lengths_text, rotation_drift_text
-from vio.frame_rate import FrameRateLimit
+from vio.frame_rate import used_frames
 from vio.frame_result import FrameResult
 from vio.pipeline import given_rig, resolve_motion, run
 from vio.protocols import Dataset, Viewer
@@ -161,8 +161,7 @@ def _process(
     recording, reference = dataset.recording, request["reference"]
     truth = recording.reference if reference is None else read_trajectory(Path(reference))
     start, stop, save_observations = request["start"], request["stop"], request["save_observations"]
-    limit = FrameRateLimit(config.dataset.max_frame_rate)
-    frames = sum([limit.takes(t) for t in recording.frame_times_ns[:stop].tolist()][start:])
+    frames = int((used_frames(recording.frame_times_ns[:stop], config.dataset.max_frame_rate) >= start).sum())
     viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
     shown = None if view is None else _open_view(view, dataset, config, truth)
     if shown is not None:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import CalibrationError, DataError
-from vio.frame_rate import FrameRateLimit
+from vio.frame_rate import used_frames
 from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
 from vio.input_files import check_regular
 from vio.records import (
@@ -206,8 +206,7 @@ def chosen_frames(recording: Recording, start: int, stop: int | None, most_hz: f
     chosen = frame_range(recording, start, stop)
     if most_hz is None:
         return chosen
-    limit = FrameRateLimit(most_hz)
-    taken = [k for k, t in enumerate(recording.frame_times_ns[: chosen.stop].tolist()) if limit.takes(t) and k >= start]
+    taken = [k for k in used_frames(recording.frame_times_ns, most_hz).tolist() if k in chosen]
     if not taken:
         raise DataError(
             f"{recording.path}: dataset.max_frame_rate {most_hz:g} leaves no frame of {start} to {chosen.stop}; take "

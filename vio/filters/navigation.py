@@ -317,9 +317,8 @@ class ImuMotion:
 
     def rate_variance(self, factors: FloatArray) -> float:
         """Variance (rad/s)^2 of the rate that the gyro reads in one sample; factors (2,) as in `advance`."""
-        known = bool(self.samples)  # new ones are checked, and come into the history
-        period_s = self._history.period_ns() * 1e-9 if known else 0.0
-        period_s = period_s if period_s > 0 else _SAMPLE_S
+        period_ns = self._history.period_ns() if self.samples else 0.0  # new samples come into the history here
+        period_s = period_ns * 1e-9 if period_ns > 0 else _SAMPLE_S
         return float((factors[1] * self._settings.gyro_noise_density) ** 2 / period_s)
 
     def covered(self, time_ns: int) -> int:

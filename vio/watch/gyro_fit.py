@@ -40,6 +40,7 @@ class GyroFit:
     gyro: FloatArray  # (K, 3) mean rates of each interval, rad/s
     force: FloatArray  # (K, 3) mean specific forces, unit of the readings
     covered: BoolArray  # (K,) samples cover the interval
+    weight: FloatArray  # (K,) robust weights at the best map, zero where not covered
 
     @property
     def rms_rates_radps(self) -> FloatArray:
@@ -118,6 +119,7 @@ def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, no
         gyro=gyro[k],
         force=means[k, :, 3:],
         covered=covered[k],
+        weight=weight,
     )
 
 

@@ -7,7 +7,6 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import TURNS_NOT_SHOWN, TurnComparison
-from vio.robust import robust_sigma
 from vio.watch.finding import InertialFinding
 from vio.watch.gyro_fit import AGREES, GyroFit
 from vio.watch.motion import Record
@@ -27,12 +26,9 @@ def compare_turns(record: Record, fit: GyroFit, R_cam0_imu: FloatArray) -> TurnC
     used = fit.covered
     if fit.unexplained > AGREES or not fit.fits(R_cam0_imu) or not used.any():
         return TURNS_NOT_SHOWN
-    camera, gyro = record.twists[used, 3:], fit.gyro[used]
-    misfit = np.linalg.norm(camera - gyro @ fit.A.T - fit.b, axis=1)
-    weight = 1 / (1 + (misfit / max(2 * robust_sigma(misfit), 1e-6)) ** 2) ** 2
-    gyro = gyro @ R_cam0_imu.T
+    camera, gyro = record.twists[used, 3:], fit.gyro[used] @ R_cam0_imu.T
     (image, sigma), (optical, optical_sigma) = (
-        _factor(camera[:, axes], gyro[:, axes], weight) for axes in (_IMAGE, _OPTICAL)
+        _factor(camera[:, axes], gyro[:, axes], fit.weight[used]) for axes in (_IMAGE, _OPTICAL)
     )
     excess = image - 1
     agrees = abs(optical - 1) < abs(excess) / 2 and optical_sigma < abs(excess) / 4
