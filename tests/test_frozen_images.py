@@ -33,7 +33,7 @@ from vio.sim.motion import hand_held
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate
 from vio.sim.world import room
-from vio.watch.frozen import FrozenImages, corner_flow
+from vio.watch.frozen import IMAGES, FrozenImages, Repeated, RepeatReport, corner_flow
 
 STEP_NS = 50_000_000
 FRAMES, FIRST, LAST = 32, 14, 23  # frames of the flight, of which 10 are repeated: 0.5 s
@@ -153,6 +153,13 @@ def test_without_an_imu_the_prediction_alone_decides() -> None:
     frozen.observations(observations(0, 0, IDS, Z))
     assert frozen.check(_frame(1, LEFT, RIGHT), _expected(sigma_m=0.05)) is None
     assert frozen.check(_frame(2, LEFT, RIGHT), _expected()) is not None
+
+
+@pytest.mark.parametrize(("gray", "words"), [(0, "have one gray value everywhere"), (None, "gave them again")])
+def test_black_images_are_not_laid_on_a_driver_that_repeats(gray: int | None, words: str) -> None:
+    left, right = (LEFT, RIGHT) if gray is None else (np.full_like(LEFT, gray), np.full_like(RIGHT, gray))
+    (line,) = RepeatReport(IMAGES).frame(_frame(2, left, right), Repeated(1, True))
+    assert words in line
 
 
 def test_corner_flow_measures_small_motions_and_leaves_out_the_border() -> None:

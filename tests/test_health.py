@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vio.records import Estimate, StereoScaleEstimate, UpdateReport
+from vio.records import Estimate, StereoFieldEstimate, StereoScaleEstimate, UpdateReport
 from vio.watch.health import RunHealth
 
 GOOD = UpdateReport(50, 2, 1, 30, 0.3, 1.0)
@@ -55,6 +55,15 @@ def test_a_scale_that_is_off_is_laid_on_baseline_or_focal_length_where_nothing_t
     scale = StereoScaleEstimate(np.array([np.log(1.1), 0.0]), np.diag([0.01**2, 0.0]))
     (line,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_scale=scale))
     assert "the baseline, or the focal length, is 10.0 % longer than calibrated" in line
+    assert "unless the sensor is wrong (check its unit, axes and clock), calibrate the cameras anew" in line
+
+
+@pytest.mark.parametrize(("rows_px", "words"), [(4.3, "in a smooth pattern"), (26.0, "left and right are exchanged")])
+def test_rows_that_no_rig_comes_to_are_not_laid_on_the_calibration_alone(rows_px: float, words: str) -> None:
+    field = StereoFieldEstimate(np.zeros(8), np.eye(8), rows_px)
+    (line,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_field=field))
+    assert f"frame 0: the rows of left and right images differ by {rows_px:.2f} px (rms)" in line
+    assert words in line
 
 
 def test_a_restart_is_one_event_and_its_jump_is_not_reported_as_a_speed() -> None:

@@ -25,6 +25,7 @@ from vio.trajectory_io import read_trajectory
 from vio.watch.clocks import judge_clocks
 from vio.watch.finding import InertialFinding
 from vio.watch.inertial import InertialCheck
+from vio.watch.run import RunWatch
 
 _FRAME_NS = 50_000_000
 
@@ -265,6 +266,24 @@ def test_slow_motion_is_enough(name: str) -> None:
 def test_reports_degrees_when_the_run_ends_after_two_seconds() -> None:
     it = _recording("room")
     assert _faults(_watch(it, samples=_gyro(it, np.degrees), frames=it.frames[:40])) == ["gyro units"]
+
+
+@pytest.mark.parametrize(
+    ("name", "at"), [("", 20), ("g", 0), ("no gravity", 0), ("cycled gyro", 60), ("inverted accelerometer", 240)]
+)
+def test_the_filter_judges_no_baseline_by_an_imu_that_looks_faulty(name: str, at: int) -> None:
+    """From the frame on in which the fault shows; units show at once, axes and signs with motion."""
+    it = _recording("room")
+    samples = _CORRUPTED[name][0](it) if name else it.samples
+    watch = RunWatch(it.camera, it.T_cam0_imu, imu=True)
+    agree = []
+    for event in sorted([*samples, *it.frames[: at + 60]], key=lambda e: e.time_ns):
+        if isinstance(event, ImuSample):
+            watch.sample(event)
+        else:
+            watch.observations(event)
+            agree.append(watch.turns is not None and watch.turns.agree)
+    assert any(agree[at + 20 :]) == (name == "")
 
 
 def test_standstill_gives_no_finding_about_motion() -> None:

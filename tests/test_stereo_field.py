@@ -19,6 +19,7 @@ from tests import test_filter_truth
 from tests.euroc_maker import EQUIDISTANT_RIG, RADTAN_RIG
 from tests.test_filter_truth import Course
 from tests.test_stereo_calibration import _turned_right
+from vio.calibration.found_rig import found_rig
 from vio.calibration.stereo_field import (
     PARAMETERS,
     PixelField,
@@ -322,6 +323,32 @@ def test_features_without_an_image_size_have_no_calibration_to_save(
     assert main(["run", str(tmp_path / "log.npz"), "--save-calibration", "--out", str(tmp_path / "out")]) == 1
     assert "states no image size, which a calibration needs; leave --save-calibration out" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("bend", [-0.5, -1.0])
+def test_a_field_that_no_rig_has_is_refused(bend: float) -> None:
+    """Half or all of a radian over the image: the fit leaves the possible rigs, or misses the field by 1e5 px."""
+    field = np.array([0.0] * 4 + [bend] + [0.0] * 10)
+    with pytest.raises(CalibrationError, match=r"^made: no rig .* \(rows by 0\.30 px rms\); .* calibrate the cameras"):
+        found_rig(RECTIFIED, _estimate(field), is_cylinder=False, where="made")
+
+
+def test_results_are_written_where_no_rig_has_the_field_that_was_found(
+    ran: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def without_rig(*_: object) -> None:
+        raise CalibrationError("focal lengths and image size must be positive, got fu=-4e10, fv=-4e11, 752x480")
+
+    monkeypatch.setattr("vio.calibration.stereo_field._with_field", without_rig)
+    out = tmp_path / "out"
+    arguments = ["run", str(ran / "observations.npz"), "--stop", "20", "--save-calibration", "--out", str(out)]
+    assert main([*arguments, "--quiet"]) == 1
+    assert "no calibration was saved, all other results were" in capsys.readouterr().err
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["complete"]
+    assert metrics["stereo_field"]["rows_rms_px"] > 0.2
+    assert metrics["stereo_field"]["rig"] is None
+    assert not (out / "camchain-imucam.yaml").exists()
 
 
 def test_pixel_field_of_an_estimate_without_rows_has_none() -> None:

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
+from vio.calibration.found_rig import found_rig
+from vio.calibration.stereo_field import CalibratedRig
 from vio.camera_rig import CameraRig
 from vio.chain import BACKENDS, Chain, build_backend
 from vio.config import Config
@@ -353,6 +354,7 @@ class Odometry:
         Raises:
             DataError: there is no estimate yet, the size of the rectified images is not known, or they are a cylinder's
                 and the rig of the raw cameras was not given.
+            CalibrationError: no rig of the given lens models is off as the estimate says.
         """
         estimate = self._estimate
         if estimate is None:
@@ -362,8 +364,7 @@ class Odometry:
             if self.camera.is_cylinder:
                 raise DataError("no lens model holds a cylinder; give Odometry the rig of the raw cameras")
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
-        # A stereo field on a cylinder is not expressed as a rig.
-        return calibrated_rig(rig, replace(estimate, stereo_field=None) if self.camera.is_cylinder else estimate)
+        return found_rig(rig, estimate, is_cylinder=self.camera.is_cylinder, where="live images")
 
     @property
     def map_session(self) -> MapSession | None:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
-from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
+from vio.calibration.found_rig import found_rig
+from vio.calibration.stereo_field import CalibratedRig
 from vio.chain import BACKENDS, build_backend
 from vio.config import BackendName, Config
 from vio.errors import ConfigError, DataError, StoppedError, VioError
@@ -79,11 +80,16 @@ class RunResult:
         """Return the calibration with what the run found it to be off by; None: features without an image size.
 
         On a cylinder left and right stay as given: its stereo field is not expressed as a rig.
+
+        Raises:
+            CalibrationError: no rig of the given lens models is off as the run found it.
         """
         if self.rig is None:
             return None
-        last = self.estimates[-1]
-        return calibrated_rig(self.rig, replace(last, stereo_field=None) if self.recording.camera.is_cylinder else last)
+        recording = self.recording
+        return found_rig(
+            self.rig, self.estimates[-1], is_cylinder=recording.camera.is_cylinder, where=str(recording.path)
+        )
 
     @property
     def trajectory(self) -> Trajectory:

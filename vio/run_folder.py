@@ -21,7 +21,7 @@ from vio.calibration.stereo_field import PARAMETERS
 from vio.config import Config, to_yaml
 from vio.datasets.common import checked_transform
 from vio.datasets.rigs.kalibr import kalibr_text
-from vio.errors import DataError, EvaluationError
+from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation import Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.input_files import read_input
@@ -306,13 +306,18 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
     """Return what the stereo calibration was found to be off by at the end of the run; None: it was not estimated.
 
     Coefficients of equations (R3) and (R2) of docs/math.md and their standard deviations, times the focal length; and
-    what the rig is off by, as `vio.calibration.stereo_field` names it.
+    what the rig is off by, as `vio.calibration.stereo_field` names it; None where no rig of the given lens models is.
     """
     field = result.estimates[-1].stereo_field
     if field is None:
         return None
     f = result.recording.camera.fu
-    found = None if result.recording.camera.is_cylinder else result.calibrated_rig()
+    found = None
+    if not result.recording.camera.is_cylinder:
+        try:
+            found = result.calibrated_rig()
+        except CalibrationError as error:  # the results of the run do not depend on it
+            log.warning("%s", error)
     rig = None
     if found is not None:
         sigmas = found.sigmas.tolist()
@@ -411,6 +416,7 @@ def calibration_text(result: RunResult) -> str:
 
     Raises:
         DataError: the recording holds features without an image size.
+        CalibrationError: no rig of the given lens models is off as the run found it.
     """
     found = result.calibrated_rig()
     if found is None:

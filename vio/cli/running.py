@@ -16,11 +16,11 @@ from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
 from vio.datasets.span import Seconds, frames_between
-from vio.errors import ConfigError, DataError, StoppedError, VioError
+from vio.errors import CalibrationError, ConfigError, DataError, StoppedError, VioError
 from vio.evaluation import lengths_text, rotation_drift_text
 from vio.frame_rate import used_frames
 from vio.frame_result import FrameResult
-from vio.pipeline import given_rig, resolve_motion, run
+from vio.pipeline import RunResult, given_rig, resolve_motion, run
 from vio.protocols import Dataset, Viewer
 from vio.records import Trajectory
 from vio.run_folder import (
@@ -182,7 +182,7 @@ def _process(
                 localise=request.get("localise", False),
             )
             file = request.get("save_calibration")  # unfinished runs of earlier versions have none
-            calibration = None if file is None else calibration_text(result)
+            calibration = None if file is None else _calibration_or_fault(result)
             metrics = finish_run_folder(
                 folder,
                 result,
@@ -190,6 +190,8 @@ def _process(
                 lengths_m=request["lengths_m"],
                 save_observations=save_observations,
             )
+            if isinstance(calibration, CalibrationError):  # on which the results do not depend
+                raise calibration
             if calibration is not None and file is not None:
                 atomic_write_text(file, calibration)
                 metrics["calibration"] = file
@@ -211,6 +213,14 @@ def _process(
             raise StoppedError(f"error: {text}", status=1)
         raise StoppedError(f"{text}; go on with: vio run --resume {folder}", status=128 + asked.number)
     return metrics
+
+
+def _calibration_or_fault(result: RunResult) -> str | CalibrationError:
+    """Return what `--save-calibration` writes, or why there is none; read before the unfinished folder goes."""
+    try:
+        return calibration_text(result)
+    except CalibrationError as error:
+        return CalibrationError(f"no calibration was saved, all other results were: {error}")
 
 
 def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Path | None:

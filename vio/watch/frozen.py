@@ -164,6 +164,11 @@ def _images(frame: StereoFrame) -> list[Image]:
     return [image for image in (frame.left, frame.right) if image is not None]
 
 
+def _is_blank(frame: StereoFrame) -> bool:
+    """Whether the images of a frame are of one gray value: black, or blown out."""
+    return all(image.min() == image.max() for image in _images(frame))
+
+
 def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
     """Whether features have not moved since they were seen, in both images."""
     of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
@@ -221,6 +226,12 @@ class RepeatReport:
         if len(self._row) > 1 or self._reported >= _MOST_LINES:
             return lines
         self._reported += 1
+        if _is_blank(frame):
+            return [
+                f"frame {frame.index}: the {self._words.what} have one gray value everywhere, as those of frame "
+                f"{repeated.of_index}: the lens is covered, the exposure failed, or the images were not delivered; "
+                f"left out, {self._words.effect}"
+            ]
         seen = self._words.exact if repeated.exact else "both images show nothing that has moved"
         cause = self._words.cause if repeated.exact else f"{self._words.cause}, or it sees only what moves with it"
         return [

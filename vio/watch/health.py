@@ -15,6 +15,9 @@ _GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many ti
 _LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
 _REJECTING_FRAMES = 20
 _ROWS_OFF_PX = 0.2
+# No rig comes to this by itself: a camera that is turned by one degree in its mount shows 8 px at a focal length of
+# 430 px. EuRoC's two cameras show 26 px where they are exchanged, and where their images are turned by 180 degrees.
+_OTHER_PAIR_PX = 10.0
 _SCALE_OFF_PERCENT, _SCALE_SIGMAS = 1.0, 3.0  # of baseline or focal length, both to be exceeded
 _RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
 _MAX_SPEED_MPS = 100.0
@@ -93,9 +96,15 @@ class RunHealth:
         if field is None or field.rows_rms_px < _ROWS_OFF_PX or "stereo" in self._reported:
             return []
         self._reported.add("stereo")
+        seen = f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms)"
+        if field.rows_rms_px > _OTHER_PAIR_PX:
+            return [
+                f"{seen}: the calibration is not that of these images, left and right are exchanged, or a camera was "
+                "moved; see what vio inspect says; what the calibration is off by is estimated while running, which "
+                "may not suffice (msckf.calibrate_stereo)"
+            ]
         return [
-            f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms) in a smooth "
-            "pattern: the stereo calibration is off; what it is off by is estimated while running "
+            f"{seen} in a smooth pattern: the stereo calibration is off; what it is off by is estimated while running "
             "(msckf.calibrate_stereo)"
         ]
 
@@ -112,8 +121,8 @@ class RunHealth:
             lines.append(
                 f"frame {index}: the {named} is {abs(percent):.1f} % {'longer' if percent > 0 else 'shorter'} than "
                 f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor measures, and is taken "
-                "as that; calibrate the cameras anew, or check that images and calibration have one size; of depth "
-                "images, check dataset.depth_factor"
+                "as that; unless the sensor is wrong (check its unit, axes and clock), calibrate the cameras anew, or "
+                "check that images and calibration have one size; of depth images, check dataset.depth_factor"
             )
         return lines
 

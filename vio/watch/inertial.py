@@ -67,6 +67,7 @@ class InertialCheck:
         self._suspected: set[InertialFault] = set()
         self._done = False
         self.turns: TurnComparison | None = None  # the newest comparison; None: too few frames yet
+        self.imu_at_fault = False  # by the newest judgement of units, axes, signs and clocks, reported yet or not
 
     def imu(self, sample: ImuSample) -> None:
         """Add one sample."""
@@ -122,6 +123,7 @@ class InertialCheck:
         if len(times_ns) < 2:
             return []
         size = judge_size(times_ns, values[:, 3:])
+        self.imu_at_fault = size.finding is not None
         motion = self._motion.joined()
         if motion is None:
             return [] if size.finding is None else [size.finding]
@@ -165,6 +167,8 @@ class InertialCheck:
         if size.unit is not None and agrees and all(f.fault == "gyro units" for f in rotation):
             forces, measured = judge_force(evidence, size.unit)
             found += forces
+        self.imu_at_fault |= any(f.certain and f.fault != "camera stamps" for f in found)
+        self.imu_at_fault |= agrees and not gyro_fit.fits(evidence.R_cam0_imu)  # whatever turns out to be the cause
         enough = gyro_fit.count >= _ENOUGH and gyro_fit.axes == 3 and (measured or size.unit is None or bool(rotation))
         if not found and (last or enough) and agrees and measured:
             found = judge_lever_arm(record, gyro_fit, self._T, rates)
@@ -179,6 +183,7 @@ class InertialCheck:
         motion = self._motion.joined()
         if len(times_ns) < 2 or motion is None:
             return
+        self.imu_at_fault = judge_size(times_ns, values[:, 3:]).finding is not None
         record = record_of(motion, times_ns, values)
         gyro_fit = fit_gyro(record, _LEAST_AT_END)
         turns = None if gyro_fit is None else compare_turns(record, gyro_fit, self._T[:3, :3])

@@ -136,8 +136,15 @@ class RunWatch:
 
     @property
     def turns(self) -> TurnComparison | None:
-        """How the camera's turns compare with the gyro's so far; None: not compared yet, or no IMU."""
-        return None if self._inertial is None else self._inertial.turns
+        """How the camera's turns compare with the gyro's so far; None: not compared yet, or no IMU.
+
+        While the IMU looks faulty, turns that agree count as not compared: the filter, which waits for them to judge
+        the baseline by the IMU, then takes no wrong unit or axis for a wrong baseline.
+        """
+        check = self._inertial
+        if check is None or check.turns is None:
+            return None
+        return None if check.imu_at_fault and check.turns.agree else check.turns
 
     def refused(self, index: int, reason: str) -> None:
         """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
