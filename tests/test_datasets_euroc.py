@@ -389,6 +389,16 @@ BAD: dict[str, tuple[Corruption, type[DataError], str]] = {
     "clock repeats": (_line("cam0/data.csv", 3, f"{_T0},{_T0}.png"), DataError, r"line 3: the clock repeats"),
     "clock backwards": (_line("cam0/data.csv", 3, f"12,{_T0}.png"), DataError, r"line 3: the clock runs backwards"),
     "float stamp": (_line("cam0/data.csv", 3, f"1.4e18,{_T1}.png"), DataError, "'1.4e18' is no time in whole nano"),
+    "stamps in seconds": (
+        _line("imu0/data.csv", 4, "1403715273.257142976,0,0,0,0,0,9.8"),
+        DataError,
+        r"line 4: '1403715273.257142976' is no time .*; write seconds times 1e9, without a point or exponent",
+    ),
+    "gravity among the gyro's columns": (
+        lambda mav: (mav / "imu0/data.csv").write_text("".join(f"{_T0 + k},0,0,9.8,0,0,0.1\n" for k in range(9))),
+        DataError,
+        r"imu0/data.csv: gravity is in the columns 2 to 4 \(median 9.80\).*; exchange these columns with 5 to 7",
+    ),
     "three columns": (_line("cam0/data.csv", 3, f"{_T1},a,b"), DataError, r"line 3: 3 values instead of 2"),
     "empty list": (
         lambda mav: (mav / "cam0/data.csv").write_text("#timestamp [ns],filename\n"),

@@ -61,7 +61,8 @@ def message_of(module: str, case: Any, folder: Path) -> str:
         elif module in _MAKERS:
             whole = getattr(importlib.import_module("tests.euroc_maker"), _MAKERS[module])(folder)
             case[0](whole / "mav0" if (whole / "mav0").is_dir() else whole)
-            list(open_dataset(folder).events())
+            # Of itself, an EuRoC folder without cam1 is a recording of one camera.
+            list(open_dataset(f"euroc:{folder}" if (whole / "mav0").is_dir() else folder).events())
         else:
             settings = DatasetSettings(topics=case[1]) if len(case) == 3 else DatasetSettings()
             list(open_dataset(case[0](folder / "r"), settings).events())

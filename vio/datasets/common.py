@@ -32,11 +32,28 @@ from vio.records import (
 )
 from vio.text_files import check_increasing
 
+_GRAVITY, _GRAVITY_OFF = 9.81, 1.5  # m/s^2; by what accelerations and biases move the median of a motion's readings
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _MOST_ARRAY_BYTES = 2**31  # the largest published course file takes 140 MB; a bomb of kilobytes claims terabytes
 # What a damaged or encrypted archive also raises: an unknown compression, a header that is no literal.
 _DAMAGE = (NotImplementedError, RuntimeError, MemoryError, TypeError, SyntaxError, lzma.LZMAError, struct.error)
 _EXACT_ENTRY = 1e-8  # tolerance of the zeros and the one of an intrinsic matrix
+
+
+def check_gravity_column(values: FloatArray, where: str, form: str, remedy: str) -> None:
+    """Raise DataError where gravity is among the gyro's columns of readings (N, 6) and not among the accelerometer's.
+
+    Args:
+        values: in the order of `form`, rad/s and m/s^2.
+        where: the file.
+        form: what its columns are, for the message.
+        remedy: what to do.
+    """
+    first, second = (float(np.median(np.linalg.norm(values[:, k : k + 3], axis=1))) for k in (0, 3))
+    if abs(first - _GRAVITY) < _GRAVITY_OFF < abs(second - _GRAVITY):
+        raise DataError(
+            f"{where}: gravity is in the columns 2 to 4 (median {first:.2f}), where {form} has the gyro; {remedy}"
+        )
 
 
 def seconds_to_ns(seconds: npt.ArrayLike) -> IntArray:

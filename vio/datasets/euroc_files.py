@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import checked_transform, image_size, naming
+from vio.datasets.common import check_gravity_column, checked_transform, image_size, naming
 from vio.datasets.yaml_files import as_number, numbers, read_yaml
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
@@ -208,9 +208,11 @@ def read_imu_csv(path: Path) -> ImuRecord:
     """Read `timestamp [ns], gyro x y z [rad/s], accel x y z [m/s^2]`.
 
     Raises:
-        DataError: a line lacks seven finite numbers, or the clock does not increase; the message names the line.
+        DataError: a line lacks seven finite numbers, or the clock does not increase; the message names the line. Or
+            gravity is in the gyro's columns.
     """
-    times_ns, rows, lines = stamped_rows(path, 7, "timestamp [ns], gyro x y z, accel x y z")
+    form = "timestamp [ns], gyro x y z, accel x y z"
+    times_ns, rows, lines = stamped_rows(path, 7, form)
     try:
         values = np.array([list(map(float, row.split(","))) for row in rows])
     except ValueError:
@@ -222,6 +224,7 @@ def read_imu_csv(path: Path) -> ImuRecord:
             f"{path}, line {lines[k]}: a reading is not a finite number ({rows[k]}; {int(bad.sum())} lines "
             "in all); remove such lines"
         )
+    check_gravity_column(values, str(path), form, "exchange these columns with 5 to 7")
     return ImuRecord(times_ns, values[:, :3], values[:, 3:])
 
 
@@ -267,7 +270,10 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[st
         stamp, _, rest = line.partition(",")
         stamp = stamp.strip()
         if not _STAMP.fullmatch(stamp) or int(stamp) > INT64_MAX:
-            raise DataError(f"{path}, line {number}: {stamp!r} is no time in whole nanoseconds ({form})")
+            raise DataError(
+                f"{path}, line {number}: {stamp!r} is no time in whole nanoseconds ({form}); write seconds times 1e9, without a "
+                "point or exponent"
+            )
         times.append(int(stamp))
         rows.append(rest.strip())
         lines.append(number)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.datasets.common import check_gravity_column
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.records import ImuRecord, IntArray, VelocitySample
@@ -19,7 +20,6 @@ _UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanos
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)
 _IMU_FORM = "timestamp, gyro x y z [rad/s], accel x y z [m/s^2]"
 _VELOCITY_FORM = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
-_GRAVITY = 9.81
 _LEAST_IMU_HZ = 50.0  # below, rotation between samples is no longer small; usual rates are 100 to 400 Hz
 
 
@@ -136,7 +136,8 @@ def read_imu_table(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     values = _finite(table)
     order = _imu_order(table)
     if order is None:
-        _check_order(values, path)
+        remedy = "add a header such as 'timestamp [ns],ax,ay,az,wx,wy,wz'"
+        check_gravity_column(values, str(path), _IMU_FORM, remedy)
         gyro, accel = values[:, :3], values[:, 3:]
         return ImuRecord(times_ns, gyro, accel), imu_notes(times_ns, str(path))
     gyro, accel = values[:, order[:3]], values[:, order[3:]]
@@ -173,16 +174,6 @@ def _imu_order(table: Table) -> list[int] | None:
             "'timestamp [ns],wx,wy,wz,ax,ay,az', or no header for that order"
         )
     return [found[key] for key in wanted]
-
-
-def _check_order(values: FloatArray, path: Path) -> None:
-    """Raise DataError where, without a header, gravity is in the first three columns."""
-    first, second = (float(np.median(np.linalg.norm(values[:, k : k + 3], axis=1))) for k in (0, 3))
-    if abs(first - _GRAVITY) < 1.5 < abs(second - _GRAVITY):
-        raise DataError(
-            f"{path}: gravity is in the columns 2 to 4 (median {first:.2f}), where {_IMU_FORM} has the gyro; add a "
-            "header such as 'timestamp [ns],ax,ay,az,wx,wy,wz'"
-        )
 
 
 def imu_notes(times_ns: IntArray, where: str) -> tuple[str, ...]:
