@@ -16,11 +16,13 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.images import load_gray
 from vio.datasets.kitti_raw import KittiRawCalibration, read_cam_to_cam, read_kitti_raw
 from vio.datasets.rectified import RectifiedDataset
+from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point
 from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_log
 from vio.geometry.rectify import rectify, rectifying_rotations
 from vio.records import StereoFrame
+from vio.rig import Rig
 
 
 def _read(path: Path) -> RectifiedDataset:
@@ -45,6 +47,19 @@ def test_calibration_is_read(above: bool, tmp_path: Path) -> None:
     assert recording.T_cam0_imu is not None
     np.testing.assert_allclose(recording.T_cam0_imu, expected.T_rect0_imu @ T_CAM0_VELO @ T_VELO_IMU, atol=1e-9)
     assert open_dataset(f"kitti_raw:{path}").recording.camera == recording.camera
+
+
+@pytest.mark.parametrize("lines", [4, 110], ids=["a line an image", "a line a frame of the drive"])
+def test_a_drive_keeps_its_clock_with_a_calibration_that_a_run_saved(lines: int, tmp_path: Path) -> None:
+    path = make_kitti_raw(tmp_path)
+    rig = _read(path).rectifier.rig
+    kept = tmp_path / "camchain.yaml"
+    kept.write_text(kalibr_text(Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1))))
+    for name in ("image_00", "image_01"):
+        stamps = "".join(f"2011-09-26 14:02:{k / 7:012.9f}\n" for k in range(lines))
+        (path / name / "timestamps.txt").write_text(stamps)
+    again = open_dataset(path, DatasetSettings(calibration=kept)).recording
+    assert again.frame_times_ns.tolist() == open_dataset(path).recording.frame_times_ns.tolist()
 
 
 def test_frames_are_rectified_as_opencv_would(tmp_path: Path) -> None:

@@ -271,8 +271,8 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[st
         stamp = stamp.strip()
         if not _STAMP.fullmatch(stamp) or int(stamp) > INT64_MAX:
             raise DataError(
-                f"{path}, line {number}: {stamp!r} is no time in whole nanoseconds ({form}); write seconds times 1e9, without a "
-                "point or exponent"
+                f"{path}, line {number}: {stamp!r} is no time in whole nanoseconds ({form}); write seconds times 1e9, "
+                "without a point or exponent"
             )
         times.append(int(stamp))
         rows.append(rest.strip())

@@ -15,12 +15,12 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
 
 from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
+from vio.datasets.dates import drive_times
 from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pair_images
 from vio.datasets.kitti import write_calibration, write_times
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
@@ -30,17 +30,15 @@ from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.protocols import Progress
-from vio.records import NS_PER_S, IntArray, Recording, StereoFrame
+from vio.records import IntArray, Recording, StereoFrame
 from vio.rig import Rectifier
-from vio.text_files import check_increasing, text_lines
+from vio.text_files import text_lines
 
 CAMERAS = "calib_cam_to_cam.txt"
 VELO = "calib_velo_to_cam.txt"
 IMU = "calib_imu_to_velo.txt"
 _FRAME_NS = 100_000_000
 _MAX_PARENTS = 3
-_EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
-_MAX_SINCE = timedelta(days=100_000)  # so that nanoseconds fit 64 bits
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,32 +256,7 @@ def _read_times(path: Path, numbers: IntArray) -> tuple[IntArray, tuple[str, ...
     if not path.is_file():
         note = f"{path} is missing; times follow from the frame numbers at 10 Hz"
         return numbers * _FRAME_NS, (note,)
-    lines = text_lines(path)
-    if len(lines) == len(numbers):
-        rows = list(range(len(numbers)))
-    elif numbers[-1] < len(lines):
-        rows = numbers.tolist()
-    else:
-        raise DataError(
-            f"{path} holds {len(lines)} times for {len(numbers)} images up to number {numbers[-1]}; there must be one "
-            "line an image, or one for each frame of the drive"
-        )
-    times = [_parse_time(lines[row][1], path, lines[row][0]) for row in rows]
-    return check_increasing(times, lambda k: f"{path}, line {lines[rows[k]][0]}"), ()
-
-
-def _parse_time(text: str, path: Path, number: int) -> int:
-    """Parse '2011-09-26 14:02:25.951199337' as UTC, to nanoseconds since 1970."""
-    whole, _, fraction = text.strip().partition(".")
-    try:
-        since = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc) - _EPOCH
-        if not re.fullmatch(r"\d{0,9}", fraction) or abs(since) > _MAX_SINCE:
-            raise ValueError(text)
-    except ValueError as error:
-        raise DataError(
-            f"{path}, line {number}: {text.strip()[:40]!r} is no time of the form '2011-09-26 14:02:25.951199337'"
-        ) from error
-    return since // timedelta(seconds=1) * NS_PER_S + int(fraction.ljust(9, "0") or 0)
+    return drive_times(path, numbers), ()
 
 
 # --- writing --------------------------------------------------------------------------------------------------------

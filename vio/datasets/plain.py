@@ -24,6 +24,7 @@ from vio.datasets.companions import (
     sources_of,
     with_extrinsics,
 )
+from vio.datasets.dates import drive_times, is_date
 from vio.datasets.euroc_files import stamped_rows
 from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable, full_scale
 from vio.datasets.images import SUFFIXES, list_images
@@ -226,9 +227,14 @@ def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:
 def times_of(file: Path, pairs: ImagePairs) -> IntArray:
     """Read the times (F,) of image pairs: one a line, or `name time` where the first column names the images.
 
+    Dates are those of a KITTI raw drive, which is a plain folder where it is run with another calibration.
+
     Raises:
         DataError: the file does not fit the images, or the times do not increase.
     """
+    numbers = [_last_number(left) for left, _ in pairs]
+    if is_date(next((line for _, line in text_lines(file)), "")) and all(isinstance(n, int) for n in numbers):
+        return drive_times(file, np.array(numbers, dtype=np.int64))
     rows = [(n, line.replace(",", " ").split()) for n, line in text_lines(file) if line.strip()[:1] not in ("#", "")]
     by_name = {Path(fields[0]).stem: (n, fields[1]) for n, fields in rows if len(fields) > 1}
     if by_name and all(left.stem in by_name for left, _ in pairs):
