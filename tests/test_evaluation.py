@@ -742,6 +742,8 @@ def test_conventions_of_a_references_orientations_are_named() -> None:
         assert found.ate_m.rmse < 0.5
         (note,) = found.notes
         assert re.search(words, note), note
+        explained = "no exchange" not in words
+        assert ("attitude, RPE and drift, which use them, say nothing of the error" in note) == explained
 
 
 def test_a_rotation_that_straight_paths_leave_open_is_no_convention() -> None:

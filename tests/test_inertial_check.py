@@ -286,6 +286,16 @@ def test_the_filter_judges_no_baseline_by_an_imu_that_looks_faulty(name: str, at
     assert any(agree[at + 20 :]) == (name == "")
 
 
+@pytest.mark.parametrize("factor", [1.0, 1000.0])
+def test_a_run_says_once_that_its_baseline_is_in_another_unit(factor: float) -> None:
+    it = _recording("room")
+    watch = RunWatch(replace(it.camera, baseline_m=factor * it.camera.baseline_m), it.T_cam0_imu, imu=False)
+    for seen in it.frames[:3]:
+        watch.observations(seen)
+    said = [line for line in watch.lines if "m is implausible; translations are metres: check the unit" in line]
+    assert len(said) == (factor > 1)
+
+
 def test_standstill_gives_no_finding_about_motion() -> None:
     it = _recording("still", 4)
     standstill = [f for f in it.frames if f.time_ns < 9_900_000_000]

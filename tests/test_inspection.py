@@ -136,7 +136,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "black images": (_black, "images: .* are black, white or without content; mend the exposure"),
     "exchanged cameras": (_swapped, "stereo: .* left and right images are exchanged; exchange the folders"),
     "one camera twice": (_same, "images: left and right are the same images"),
-    "rows shifted": (_shifted_rows, r"stereo: rows differ by -6\.. px .*; run `vio calibrate`"),
+    "rows shifted": (_shifted_rows, r"stereo: rows differ by -6\.. px .* exchanged, .*; run `vio calibrate`"),
 }
 
 

@@ -10,6 +10,7 @@ _LARGE_DEG = 20.0  # median attitude error that no odometry has whose positions 
 _CONSTANT = 0.2  # of that error may vary where one rotation explains it
 _BETTER = 3.0  # by which another order of the numbers must explain it better than other axes of the body do
 _SIGMAS = 5.0  # of the rotation about the path, where the positions leave it uncertain
+_NO_MEASURE = ", so attitude, RPE and drift, which use them, say nothing of the error"
 _AXES_DEG = 5.0  # a rotation so near one of the 24 that exchange axes is called by its whole degrees
 
 
@@ -26,7 +27,7 @@ def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str
         return None
     head = f"the attitudes differ by {off_deg:.0f} deg (median)"
     if _varies_deg(R_ref) < 1.0 and _varies_deg(R_est) > _LARGE_DEG:
-        return f"{head}: the reference's never change; its orientations are placeholders, and say nothing of the error"
+        return f"{head}: the reference's never change; its orientations are placeholders{_NO_MEASURE}"
     x, y, z, w = quat_xyzw_from_rotation(R_ref).T
     w_last = rotation_from_quat_xyzw(np.stack([y, z, w, x], axis=1))
     body = np.swapaxes(R_ref, 1, 2) @ R_est
@@ -41,10 +42,10 @@ def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str
     if min(of_body, left[words]) > _CONSTANT * off_deg:
         return f"{head}, and no exchange of axes explains it; check what the reference's orientations mean"
     if _BETTER * left[words] < of_body:
-        return f"{head}: the reference's orientations are {words}; mend the file that it was written from"
+        return f"{head}: the reference's orientations are {words}{_NO_MEASURE}; mend the file that it was written from"
     return (
-        f"{head}, always by the same rotation ({_name(_mean(body))}): the reference describes a body with other axes; "
-        "compare positions, or turn the reference's poses by it"
+        f"{head}, always by the same rotation ({_name(_mean(body))}): the reference describes a body with other axes"
+        f"{_NO_MEASURE}; compare positions, or turn the reference's poses by it"
     )
 
 

@@ -57,10 +57,12 @@ def readable_frames(
         DataError: every frame is unusable, more are than the settings allow, or whatever `load` raises.
     """
     good, first_bad, bad = 0, "", 0
+    unsaid: list[BadFrame] = []  # until a frame can be used: if none can, the error alone says why
     with contextlib.closing(prefetch(load, chosen, settings.prefetch_frames)) as loaded:
         for frame in loaded:
             if isinstance(frame, StereoFrame):
                 good += 1
+                _say_skipped(unsaid)
                 yield frame
                 continue
             bad, first_bad = bad + 1, first_bad or frame.why
@@ -69,11 +71,20 @@ def readable_frames(
                     f"{frame.why} ({bad} unusable frames, dataset.max_bad_frames allows {settings.max_bad_frames})"
                 )
             if bad <= _NAMED:
-                logger.warning("frame %d is skipped: %s", frame.index, frame.why)
+                unsaid.append(frame)
+            if good:
+                _say_skipped(unsaid)
     if bad and not good:
         raise DataError(f"none of {bad} frames can be used; the first: {first_bad}")
     if bad > _NAMED:
         logger.warning("%d of %d frames were skipped; the first %d are named above", bad, bad + good, _NAMED)
+
+
+def _say_skipped(unsaid: list[BadFrame]) -> None:
+    """Log frames that are skipped, and empty their list."""
+    for frame in unsaid:
+        logger.warning("frame %d is skipped: %s", frame.index, frame.why)
+    unsaid.clear()
 
 
 _WHITE_FRAMES = 8  # that tell the level of white, spread over the recording: the first may be dark

@@ -28,6 +28,7 @@ CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
 # Of one camera, metres: no distance in the world, but the unit of length of inverse depths. Half of it is the nearest
 # depth, and a track enters the estimate once its inverse depth is known as well as by a stereo pair of this baseline.
 MONO_UNIT_M = 0.1
+_SHORT_M, _LONG_M = 0.005, 5.0  # baselines outside are those of another unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +66,19 @@ class StereoCamera:
                 f"stereo baseline must be positive, got {self.baseline_m:g} m; a zero or negative baseline "
                 "means that both projection matrices are the same or that the cameras are swapped"
             )
+
+    @property
+    def baseline_fault(self) -> str | None:
+        """What is said of a baseline that no rig has, as that of a calibration in millimetres; None: it is plausible.
+
+        Of stereo pairs; those of one camera and of depth images are made up.
+        """
+        if self.kind != "stereo" or _SHORT_M <= self.baseline_m <= _LONG_M:
+            return None
+        return (
+            f"a baseline of {self.baseline_m:g} m is implausible; translations are metres: check the unit of the "
+            "calibration"
+        )
 
     @property
     def is_cylinder(self) -> bool:

@@ -19,7 +19,6 @@ from vio.watch.inertial import InertialCheck
 PAIRS = 12  # or single images looked at, spread over the recording
 TRACKED = 60  # frames tracked to compare the IMU with the images' motion
 _VIDEO_FRAMES = 300  # of a video, which can only be decoded in order
-_SHORT_M, _LONG_M = 0.005, 5.0  # baselines outside are another unit
 
 
 def inspect_recording(
@@ -67,8 +66,8 @@ def camera_part(recording: Recording) -> Part:
     wide = " x ".join(f"{angle:.0f}" for angle in np.degrees(field_of_view(c))) if known else ""
     wide = f", {wide} deg" if known else ""
     faults = []
-    if stereo and not _SHORT_M <= c.baseline_m <= _LONG_M:
-        faults.append(f"a baseline of {c.baseline_m:g} m is implausible; translations are metres: check the unit")
+    if c.baseline_fault is not None:
+        faults.append(c.baseline_fault)
     if c.width is not None and c.height is not None and not (0 < c.cu < c.width and 0 < c.cv < c.height):
         faults.append(f"the principal point {c.cu:.0f}, {c.cv:.0f} lies outside the image; check its size")
     if stereo:

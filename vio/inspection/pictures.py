@@ -139,8 +139,8 @@ def _rows_faults(found: RowResiduals) -> list[str]:
     if abs(found.median_px) + found.spread_px > _ROWS_FAULT_PX:
         return [
             f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: a camera has been turned "
-            "since the calibration, the calibration is not that of these images, or they are not rectified; run `vio "
-            "calibrate`, and give its file with --calibration"
+            "since the calibration, left and right images are exchanged, the calibration is not that of these images, "
+            "or they are not rectified; run `vio calibrate`, which tells which, and give its file with --calibration"
         ]
     return []
 

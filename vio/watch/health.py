@@ -99,8 +99,8 @@ class RunHealth:
         seen = f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms)"
         if field.rows_rms_px > _OTHER_PAIR_PX:
             return [
-                f"{seen}: the calibration is not that of these images, left and right are exchanged, or a camera was "
-                "moved; see what vio inspect says; what the calibration is off by is estimated while running, which "
+                f"{seen}: left and right are exchanged, the calibration is not that of these images, or a camera was "
+                "moved; `vio calibrate` tells which; what the calibration is off by is estimated while running, which "
                 "may not suffice (msckf.calibrate_stereo)"
             ]
         return [

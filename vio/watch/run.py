@@ -47,6 +47,7 @@ class RunWatch:
             imu: whether the run propagates with raw IMU samples.
         """
         self._health = RunHealth()
+        self._baseline_fault = camera.baseline_fault
         self._inertial: InertialCheck | None = None
         self._silence = ImuSilence() if imu else None
         self._faults = ImuFaultReport() if imu else None
@@ -121,6 +122,8 @@ class RunWatch:
     def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
         """Add the front end's observations, before feature selection, and what it says of the images."""
         self._take_new()
+        if self._baseline_fault is not None and not self._frames:
+            self._report([f"{self._baseline_fault}, or the path has another unit"])
         self._report(warnings)
         self._frames += 1
         self._features += len(seen)
