@@ -2063,4 +2063,25 @@ MUTATIONS = (
         "if True or now is None or self._T_map_cam is None:",
         _MAP_RUN,
     ),
+    Mutation(
+        "filter judges the baseline by an IMU that looks faulty",
+        "vio/watch/run.py",
+        "return None if check.imu_at_fault and check.turns.agree else check.turns",
+        "return check.turns",
+        ("tests/test_inertial_check.py",),
+    ),
+    Mutation(
+        "filter judges the baseline by an IMU whose axes contradict the images",
+        "vio/watch/inertial.py",
+        "self.imu_at_fault |= agrees and not gyro_fit.fits(evidence.R_cam0_imu)",
+        "self.imu_at_fault |= False",
+        ("tests/test_inertial_check.py",),
+    ),
+    Mutation(
+        "a rig that misses the field it was fitted to is saved",
+        "vio/calibration/found_rig.py",
+        "if found.left_px <= _MOST_LEFT_PX:",
+        "if found.left_px >= 0.0:",
+        _KEPT,
+    ),
 )
