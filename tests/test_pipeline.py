@@ -354,6 +354,28 @@ def test_surveyed_landmarks_are_compared_after_the_alignment_of_the_trajectory(t
     assert score["median_m"] <= score["max_m"]
 
 
+def test_velocities_that_begin_after_the_images_end_no_run(tmp_path: Path) -> None:
+    """Nothing is reckoned before the first one; from it on, as the velocities say."""
+
+    class Late(FakeDrive):
+        def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+            for event in super().events(start, stop, images=images):
+                if isinstance(event, StereoFrame) or event.time_ns >= 10 * STEP_NS:
+                    yield event
+
+    drive = Late()
+    result = run(drive, Config())
+    assert result.stopped is None
+    assert result.dead_reckoning is not None
+    reckoned = result.dead_reckoning.T_world_body
+    assert len(reckoned) == len(result.estimates) == 30
+    np.testing.assert_array_equal(reckoned[:10], np.tile(np.eye(4), (10, 1, 1)))
+    np.testing.assert_allclose(
+        se3_inverse(reckoned[12]) @ reckoned[29], se3_inverse(drive.poses[12]) @ drive.poses[29], atol=1e-6
+    )
+    assert write_run_folder(tmp_path / "out", result, drive.recording.reference)["ate_m"] < 0.05
+
+
 def test_without_reference_the_scores_are_null(tmp_path: Path) -> None:
     metrics = write_run_folder(tmp_path / "out", run(FakeDrive(reference=False), Config()), None)
     assert metrics["ate_m"] is None

@@ -445,14 +445,18 @@ class _DeadReckoning:
     def __init__(self, recording: Recording, config: Config, T_cam0_body: FloatArray) -> None:
         settings = replace(config.vislam, mode="dead_reckoning", motion_model="input")
         self._filter = Vislam(recording.camera, T_cam0_body, settings, motion_sensor=True)
+        self._begun = False
 
     def add(self, event: Event) -> None:
         """Take a motion sample."""
         if not isinstance(event, StereoFrame):
             self._filter.propagate(event)
+            self._begun = True
 
     def pose_at(self, time_ns: int) -> FloatArray:
         """The pose (4, 4) of the body at a frame, which may not be older than the last one."""
+        if not self._begun:  # at its start, as velocities may begin after the images
+            return np.eye(4)
         self._filter.advance(time_ns)
         return self._filter.estimate().T_world_imu
 
@@ -510,5 +514,6 @@ def _needs_images(dataset: Dataset, config: Config) -> bool:
 
 
 def _trajectory(T_world_body: FloatArray, rows: RunRecorder, body: BodyFrame) -> Trajectory:
-    times_ns, indices = (np.asarray(rows.estimates.column(name)) for name in ("time_ns", "index"))
+    """Return poses (N, 4, 4) of the first N frames with an estimate; a run that an error ends may have one less."""
+    times_ns, indices = (np.asarray(rows.estimates.column(name))[: len(T_world_body)] for name in ("time_ns", "index"))
     return Trajectory(T_world_body=T_world_body, times_ns=times_ns, body=body, frame_indices=indices)
