@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import imu_samples
 from vio.datasets.euroc_files import (
     STATE_CSV,
     TUM_FILE,
@@ -36,6 +35,7 @@ from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import list_images
 from vio.datasets.pairing import PAIRED_NS, pair_stamps
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
+from vio.datasets.samples import MotionSamples, imu_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
@@ -66,7 +66,7 @@ class _Imu:
 
     T_body_imu: FloatArray  # (4, 4)
     noise: ImuDensities | None
-    samples: tuple[ImuSample, ...]
+    samples: MotionSamples[ImuSample] | tuple[()]
     notes: tuple[str, ...]
 
 
@@ -91,7 +91,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
     if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
-        (finding,) = judge_clocks(times_ns, np.array([x.time_ns for x in imu.samples], dtype=np.int64))
+        (finding,) = judge_clocks(times_ns, imu.samples.times_ns)
         raise DataError(
             f"{mav / 'imu0' / 'data.csv'}: no IMU sample is within the time of the images; {finding.message}; or "
             "remove imu0"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -125,7 +125,7 @@ class ImageDataset:
 
     recording: Recording
     pairs: ImagePairs
-    motion: tuple[MotionSample, ...]  # in time order
+    motion: Sequence[MotionSample]  # in time order
     sizes: tuple[ImageSize, ImageSize]  # of the left and the right files
     settings: DatasetSettings
     white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`

@@ -9,7 +9,7 @@ Reference: Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, I
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -52,7 +52,7 @@ class OneCameraDataset:
     recording: Recording
     files: tuple[Path, ...]
     depth_files: tuple[Path, ...] | None  # None: there are none
-    motion: tuple[MotionSample, ...] = field(repr=False)  # in time order
+    motion: Sequence[MotionSample] = field(repr=False)  # in time order
     size: ImageSize
     settings: DatasetSettings
     undistorter: Undistorter
