@@ -27,7 +27,7 @@ class CalibrationSource:
 
     path: Path
     rig: StereoRig | None  # as calibrated; None: features without an image size
-    raw_pairs: tuple[tuple[Path, Path], ...]  # image files, unrectified where the cameras are; empty: features only
+    raw_pairs: Sequence[tuple[Path, Path]]  # image files, unrectified where the cameras are; empty: features only
     dataset: Dataset | None  # None: images cannot be rectified with this calibration
     rejection: str | None  # the reader's error, if the images cannot be rectified
 
