@@ -1051,8 +1051,29 @@ MUTATIONS = (
     Mutation(
         "a focal length that is freed stays known",
         "vio/filters/msckf.py",
-        "self._settings = replace(self._settings, stereo_focal_sigma=_FREED_FOCAL_SIGMA)",
-        "self._settings = replace(self._settings, stereo_focal_sigma=1e-9)",
+        "np.array([self._settings.stereo_baseline_sigma, _FREED_FOCAL_SIGMA])",
+        "np.array([self._settings.stereo_baseline_sigma, 1e-9])",
+        ("tests/test_focal_length.py",),
+    ),
+    Mutation(
+        "a focal length that is freed leaves the other states where they are",
+        "vio/filters/window.py",
+        "J[np.delete(np.arange(len(J)), terms), -1] = V",
+        "J[np.delete(np.arange(len(J)), terms), -1] = 0 * V",
+        ("tests/test_focal_length.py",),
+    ),
+    Mutation(
+        "focal length beside the state: pixels do not depend on it",
+        "vio/filters/separate_bias.py",
+        "W = W + cross",
+        "W = W + 0 * cross",
+        ("tests/test_focal_length.py",),
+    ),
+    Mutation(
+        "focal length beside the state: new landmarks do not depend on it",
+        "vio/filters/window.py",
+        "added = added + point_D_focal",
+        "added = added + 0 * point_D_focal",
         ("tests/test_focal_length.py",),
     ),
     # --- vio/filters: the paper's filter ---

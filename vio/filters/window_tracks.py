@@ -24,7 +24,7 @@ from vio.filters.multiview import (
     usable_points,
 )
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import StereoColumns, StereoField, stereo_columns
+from vio.filters.stereo_calibration import TERMS, StereoColumns, StereoField, field_jacobian, stereo_columns
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import StereoCamera
@@ -47,6 +47,7 @@ class LinearTracks:
     rows: IntArray  # (F,) in the table
     p_world: FloatArray  # (F, 3)
     at: Residuals
+    weight: FloatArray  # (F, N) robust weight of each view
     information: TrackInformation
     stereo: StereoColumns | None  # where the stereo field is estimated
     field: StereoField | None  # what was taken out of the pixels
@@ -163,7 +164,20 @@ class WindowTracks:
             # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
             H = field.jacobian(z - at.r)
             columns = stereo_columns(at, H, information.q.p_D_q, weight)
-        return LinearTracks(T_cam0_world, rows, p_world, at, information, columns, field)
+        return LinearTracks(T_cam0_world, rows, p_world, at, weight, information, columns, field)
+
+    def focal_columns(self, tracks: LinearTracks, chosen: IntArray) -> tuple[StereoColumns, TrackInformation]:
+        """Linearise tracks (K,) by a focal length that is no state, as the last term beside those of (R3) that are.
+
+        Returns:
+            Their columns, and their part of what all tracks say.
+        """
+        first = TERMS - 1 if tracks.field is None else 0
+        z = self._views(tracks.rows[chosen], len(tracks.T_cam0_world), tracks.field).z
+        information = tracks.information.take(chosen)
+        at = Residuals(tracks.at.r[chosen], tracks.at.z_D_p[chosen], tracks.at.ahead[chosen])
+        H = field_jacobian(self._camera, z - at.r, first, TERMS - first)
+        return stereo_columns(at, H, information.q.p_D_q, tracks.weight[chosen]), information
 
     def _views(self, rows: IntArray, clones: int, field: StereoField | None) -> Views:
         """What rows showed, without the stereo field."""
