@@ -1063,6 +1063,20 @@ MUTATIONS = (
         ("tests/test_focal_length.py",),
     ),
     Mutation(
+        "stereo field: distortion of both lenses passes for the right camera's rows",
+        "vio/filters/msckf.py",
+        "rows, rows_D_common = self._rows.without_common(calibration.stereo), self._rows.rows_D_common",
+        "rows, rows_D_common = self._rows.coefficients, None",
+        _STEREO_FIELD,
+    ),
+    Mutation(
+        "stereo field: columns of the rows do not move with what both lenses take off them",
+        "vio/filters/stereo_calibration.py",
+        "out[..., 2, RIGHT_TERMS + k] -= self._right_columns(z, rows)",
+        "out[..., 2, RIGHT_TERMS + k] -= 0 * self._right_columns(z, rows)",
+        _STEREO_FIELD,
+    ),
+    Mutation(
         "focal length beside the state: pixels do not depend on it",
         "vio/filters/separate_bias.py",
         "W = W + cross",
@@ -1786,8 +1800,8 @@ MUTATIONS = (
     Mutation(
         "rows keep what both lenses do to near points",
         "vio/filters/stereo_calibration.py",
-        "self.coefficients - np.linalg.solve(self._A + prior,",
-        "self.coefficients - 0 * np.linalg.solve(self._A + prior,",
+        "self.coefficients - self.rows_D_common @ stereo",
+        "self.coefficients - 0 * self.rows_D_common @ stereo",
         _STEREO_FIELD,
     ),
     Mutation(
