@@ -91,21 +91,21 @@ class _Told(Msckf):
     """A filter that is told of the focal length from a frame on."""
 
     found: TurnComparison = TURNS_NOT_SHOWN
-
+    before: TurnComparison | None = None
     told_in = 40
 
     def update(self, observations: Observations) -> UpdateReport:
-        self.take_turns(None if observations.frame_index < self.told_in else self.found)
+        self.take_turns(self.before if observations.frame_index < self.told_in else self.found)
         return super().update(observations)
 
 
 def _fly(
-    camera: StereoCamera, found: TurnComparison, told_in: int = 40
+    camera: StereoCamera, found: TurnComparison, told_in: int = 40, before: TurnComparison | None = None
 ) -> tuple[_Told, list[tuple[float, float] | None], FloatArray]:
     """Fly with a camera as calibrated; return the filter, what it says in each frame, and its errors (frames, 3), m."""
     noise, flight = np.random.default_rng(0), Shaking(120)
     filt = _Told(camera, T_CAM0_IMU, OFF, motion="imu")
-    filt.found, filt.told_in = found, told_in
+    filt.found, filt.told_in, filt.before = found, told_in, before
     estimates, errors = fly_with(filt, flight, _samples(flight, OFF, 0.0, noise), noise, 0.5)
     scales = [e.stereo_scale for e in estimates]
     said = [None if s is None else next(iter(s.percent().values())) for s in scales]
@@ -176,3 +176,16 @@ def test_a_baseline_is_judged_once_the_turns_are_compared() -> None:
     assert said[: found_in + 10] == [None] * (found_in + 10)
     assert said[-1] is not None
     assert abs(said[-1][0] - 10.0) < 3 * said[-1][1]
+
+
+def test_a_baseline_that_was_taken_over_stays_reported_once_the_focal_length_is_a_state() -> None:
+    """It is 20 % off, and estimated on beside the focal length: the one may have passed for the other."""
+    short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.2)
+    filt, said, _ = _fly(short, _CLEAR, 100, before=TURNS_NOT_SHOWN)
+    assert said[99] is not None
+    scale = filt.estimate().stereo_scale
+    assert scale is not None
+    for name, off in (("baseline", 20.0), ("focal length", 0.0)):
+        percent, sigma = scale.percent()[name]
+        assert abs(percent - off) < 3 * sigma
+        assert sigma < 2.0

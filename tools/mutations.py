@@ -1051,15 +1051,15 @@ MUTATIONS = (
     Mutation(
         "a focal length that is freed stays known",
         "vio/filters/msckf.py",
-        "np.array([self._settings.stereo_baseline_sigma, _FREED_FOCAL_SIGMA])",
-        "np.array([self._settings.stereo_baseline_sigma, 1e-9])",
+        "np.array([baseline, _FREED_FOCAL_SIGMA])",
+        "np.array([baseline, 1e-9])",
         ("tests/test_focal_length.py",),
     ),
     Mutation(
         "a focal length that is freed leaves the other states where they are",
         "vio/filters/window.py",
-        "J[np.delete(np.arange(len(J)), terms), -1] = V",
-        "J[np.delete(np.arange(len(J)), terms), -1] = 0 * V",
+        "J[np.delete(np.arange(len(J)), terms)] = V",
+        "J[np.delete(np.arange(len(J)), terms)] = 0 * V",
         ("tests/test_focal_length.py",),
     ),
     Mutation(
@@ -1075,6 +1075,13 @@ MUTATIONS = (
         "out[..., 2, RIGHT_TERMS + k] -= self._right_columns(z, rows)",
         "out[..., 2, RIGHT_TERMS + k] -= 0 * self._right_columns(z, rows)",
         _STEREO_FIELD,
+    ),
+    Mutation(
+        "a baseline that was taken over is forgotten once the focal length is a state",
+        "vio/filters/msckf.py",
+        "scale = replace(scale, logs=scale.logs + taken)",
+        "scale = replace(scale, logs=scale.logs + 0 * taken)",
+        ("tests/test_focal_length.py",),
     ),
     Mutation(
         "focal length beside the state: pixels do not depend on it",

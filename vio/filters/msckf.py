@@ -40,7 +40,7 @@ from vio.filters.online_calibration import (
     first_calibration,
 )
 from vio.filters.restart import GoodState, restarted
-from vio.filters.scale_test import ScaleTest
+from vio.filters.scale_test import SCALE_SIGMA, ScaleTest
 from vio.filters.separate_bias import SeparateBias
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import (
@@ -361,10 +361,12 @@ class Msckf:
         turns = self._turns
         if turns is None or window.focal is None or not (turns.differ and turns.gyro_agrees):
             return
-        self._settings = replace(self._settings, stereo_focal_sigma=_FREED_FOCAL_SIGMA)
+        # A baseline that was taken over may be what the focal length passed for.
+        baseline = self._settings.stereo_baseline_sigma if self._scale_log is None else SCALE_SIGMA
+        self._settings = replace(self._settings, stereo_baseline_sigma=baseline, stereo_focal_sigma=_FREED_FOCAL_SIGMA)
         self._walk = calibration_walk(self._settings)
         self._keep_landmarks(window, np.zeros(len(window.landmarks), dtype=np.bool_))
-        sigmas = np.array([self._settings.stereo_baseline_sigma, _FREED_FOCAL_SIGMA])
+        sigmas = np.array([baseline, _FREED_FOCAL_SIGMA])
         window.free_focal_length(replace(window.calibration, metric=True), np.diag(sigmas**2))
         self._tracks.variance = self._settings.pixel_sigma_px**2
         self._noise = MotionNoise(*IMU_FACTORS)
@@ -452,9 +454,13 @@ class Msckf:
         if window.calibration.imu_dim:
             sigmas = np.sqrt(np.diag(_imu_terms_covariance(window, output)))
             estimate = replace(estimate, imu_terms=window.nav.imu_terms, imu_terms_sigma=sigmas)
-        if self._scale_log is not None and window.scale_test is not None:
-            covariance = np.diag([window.scale_test.estimate()[1] ** 2, 0.0])
-            estimate = replace(estimate, stereo_scale=StereoScaleEstimate(np.array([self._scale_log, 0.0]), covariance))
+        if self._scale_log is not None:
+            taken, scale = np.array([self._scale_log, 0.0]), estimate.stereo_scale
+            if window.scale_test is not None:
+                scale = StereoScaleEstimate(taken, np.diag([window.scale_test.estimate()[1] ** 2, 0.0]))
+            elif scale is not None:  # of a camera with the baseline that was taken over
+                scale = replace(scale, logs=scale.logs + taken)
+            estimate = replace(estimate, stereo_scale=scale)
         if estimate.stereo_field is not None:
             field = estimate.stereo_field
             own, P = self._rows.without_common(field.coefficients), self._rows.covariance

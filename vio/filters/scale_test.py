@@ -13,7 +13,7 @@ import numpy as np
 from vio.filters.separate_bias import SeparateBias
 from vio.geometry.lie import FloatArray
 
-_PRIOR_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
+SCALE_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
 # What is worth reporting: rigs are calibrated to 1 %, and accelerometers to 1 or 2 %. On recordings with a correct
 # baseline the estimate comes to 2.0 % (the real IMU of MH_03, 0.3 % claimed) and to 3.5 standard deviations.
 _LEAST, _SIGMAS = 0.04, 5.0
@@ -37,7 +37,7 @@ class ScaleTest(SeparateBias):
     relinearising cannot pass for knowledge of the scale.
     """
 
-    def __init__(self, size: int, sigma: float = _PRIOR_SIGMA) -> None:
+    def __init__(self, size: int, sigma: float = SCALE_SIGMA) -> None:
         """Start with errors (D,) that do not depend on the scale, and its standard deviation."""
         super().__init__(size)
         self.frames = 0  # since the start

@@ -287,20 +287,22 @@ class Window:
             bias.error_D_bias[old] = V
 
     def free_focal_length(self, calibration: Calibration, covariance: FloatArray) -> None:
-        """Make a state of the focal length, on which the errors depend as was followed beside them, equation (S5).
+        """Make states of baseline and focal length; errors depend on them as was followed beside them, equation (S5).
 
         Args:
             calibration: with baseline and focal length as they were taken for known.
             covariance: of their logarithms (2, 2).
         """
         assert self.focal is not None
-        V, D, first = self.focal.error_D_bias, len(self.P), self.stereo_rows.stop
+        D, first = len(self.P), self.stereo_rows.stop
+        of_baseline = np.zeros(D) if self.scale_test is None else self.scale_test.error_D_bias + self.scaled()
+        V = np.column_stack([of_baseline, self.focal.error_D_bias])
         self.focal = self.scale_test = None
         self._insert(first, np.zeros((METRIC_TERMS, METRIC_TERMS)), calibration)
         terms = np.arange(first, first + METRIC_TERMS)
         J = np.zeros((D + METRIC_TERMS, METRIC_TERMS))
         J[terms, np.arange(METRIC_TERMS)] = 1.0
-        J[np.delete(np.arange(len(J)), terms), -1] = V
+        J[np.delete(np.arange(len(J)), terms)] = V
         self.P = self.P + J @ covariance @ J.T
 
     def scaled(self) -> FloatArray:
