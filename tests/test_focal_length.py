@@ -168,6 +168,16 @@ def test_what_is_not_beyond_doubt_changes_nothing() -> None:
     np.testing.assert_array_equal(given[2], plain[2])
 
 
+@pytest.mark.parametrize(("sigma", "followed"), [(0.004, False), (0.006, True)])
+def test_a_focal_length_is_followed_until_the_turns_agree_beyond_doubt(sigma: float, followed: bool) -> None:
+    noise, flight = np.random.default_rng(0), Shaking(5)
+    filt = Msckf(CAMERA, T_CAM0_IMU, OFF, motion="imu")
+    filt.take_turns(TurnComparison(0.005, sigma, gyro_agrees=True))
+    fly_with(filt, flight, _samples(flight, OFF, 0.0, noise), noise, 0.5)
+    assert filt._window is not None
+    assert (filt._window.focal is not None) == followed
+
+
 def test_a_baseline_is_judged_once_the_turns_are_compared() -> None:
     short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.1)
     told = _fly(short, TURNS_NOT_SHOWN, 0)[1]

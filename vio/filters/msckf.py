@@ -359,6 +359,8 @@ class Msckf:
         What noise and landmarks were learned with the wrong one are forgotten; the other states stay, and move with it.
         """
         turns = self._turns
+        if turns is not None and turns.settled:
+            window.focal = None  # what is not needed need not be followed
         if turns is None or window.focal is None or not (turns.differ and turns.gyro_agrees):
             return
         # A baseline that was taken over may be what the focal length passed for.

@@ -100,7 +100,8 @@ class RowField:
 
         Both lenses bend a near point differently, as it lies at different places in the two images.
         """
-        return np.asarray(self.coefficients - self.rows_D_common @ stereo[RIGHT_TERMS:FIELD_TERMS])
+        prior, common = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2, self._common @ stereo[RIGHT_TERMS:FIELD_TERMS]
+        return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, common))
 
     @property
     def rows_D_common(self) -> FloatArray:
