@@ -57,6 +57,38 @@ def test_the_gate_of_a_track_as_long_as_the_table_of_quantiles_or_longer() -> No
     assert tracks.gate(Residuals(np.zeros((1, 80, 4)), J, np.ones(1, dtype=np.bool_)))[2].tolist() == [199]
 
 
+@pytest.mark.parametrize("moving", [0, 40, 65])
+def test_a_blurred_frame_is_no_frame_of_outliers(moving: int) -> None:
+    """All residuals have three times the variance that is believed; of 80 tracks, some are on what moves.
+
+    The others pass as they do with the noise known, and what moves does not.
+    """
+    tracks, rng = WindowTracks(CAMERA, SETTINGS), np.random.default_rng(3)
+    J = np.ones((80, 3, 4, 3))
+    J[:, :, 3] = 0.0
+    r = rng.normal(0.0, np.sqrt(3 * tracks.variance * 6 / 9), (80, 3, 4))  # nine pixels, six degrees of freedom
+    r[:, :, 3] = 0.0
+    r[80 - moving :] += 20.0 * np.sqrt(tracks.variance)
+    passed, _, _ = tracks.gate(Residuals(r, J, np.ones(80, dtype=np.bool_)))
+    assert passed[: 80 - moving].mean() > 0.9
+    assert not passed[80 - moving :].any()
+    few = Residuals(r[:10], J[:10], np.ones(10, dtype=np.bool_))
+    assert tracks.gate(few)[0].mean() < 0.8  # too few to tell noise from outliers
+
+
+def test_what_moves_slowly_is_no_blur() -> None:
+    """Half of 80 tracks are off by two standard deviations in every pixel, and the others by what is believed."""
+    tracks, rng = WindowTracks(CAMERA, SETTINGS), np.random.default_rng(4)
+    J = np.ones((80, 3, 4, 3))
+    J[:, :, 3] = 0.0
+    r = rng.normal(0.0, np.sqrt(tracks.variance * 6 / 9), (80, 3, 4))
+    r[:40] += 2.0 * np.sqrt(tracks.variance)
+    r[:, :, 3] = 0.0
+    passed, _, _ = tracks.gate(Residuals(r, J, np.ones(80, dtype=np.bool_)))
+    assert passed[40:].mean() > 0.9
+    assert passed[:40].mean() < 0.1
+
+
 @pytest.mark.parametrize("dof", [1, 3, 6, 45, 199])
 @pytest.mark.parametrize(
     ("ratio", "count", "change"),

@@ -771,8 +771,22 @@ MUTATIONS = (
     Mutation(
         "filter: chi-square gate inverted",
         "vio/filters/window_tracks.py",
-        "passed: BoolArray = squares <= chi",
-        "passed: BoolArray = squares >= chi",
+        "passed: BoolArray = squares <= limits",
+        "passed: BoolArray = squares >= limits",
+        _WINDOW,
+    ),
+    Mutation(
+        "filter: a blurred frame taken for outliers",
+        "vio/filters/window_tracks.py",
+        "return min(max(float(ratio), 1.0), _MOST_COMMON_NOISE)",
+        "return 1.0",
+        _WINDOW,
+    ),
+    Mutation(
+        "filter: what moves decides how blurred a frame is",
+        "vio/filters/window_tracks.py",
+        "k = len(squares) // 4",
+        "k = len(squares) // 2",
         _WINDOW,
     ),
     Mutation(

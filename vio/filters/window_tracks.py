@@ -37,6 +37,7 @@ _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view
 _AGREEMENT = 0.8
 _MOST_DOF = 199
+_MOST_COMMON_NOISE = 4.0  # of a frame over the learned variance: beyond twice the noise it is no blur
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,14 +200,15 @@ class WindowTracks:
         return bool(used.any() and np.mean(squares[used] < self.variance * limits[used]) > _AGREEMENT)
 
     def gate(self, at: Residuals) -> tuple[BoolArray, FloatArray, IntArray]:
-        """Test the tracks against the chi-square quantile of the settings.
+        """Test the tracks against the chi-square quantile of the settings, relative to how well all of them fit.
 
         Returns:
             Mask (F,) of those that pass, their normalised squared residuals (F,), and the degrees of freedom (F,).
         """
         dof = np.clip(measured_pixels(at).sum(axis=(1, 2)) - 3, 1, _MOST_DOF)
         squares = np.sum(at.r**2, axis=(1, 2)) / self.variance
-        passed: BoolArray = squares <= chi_square_table(self._settings.gate_probability)[dof]
+        limits = chi_square_table(self._settings.gate_probability)[dof] * _common_noise(squares, dof)
+        passed: BoolArray = squares <= limits
         return passed, squares, dof
 
     def update_pixel_noise(self, squares: FloatArray, dof: IntArray) -> None:
@@ -231,6 +233,19 @@ class WindowTracks:
         ended = rows[~self.table.seen(rows)[:, newest]]
         self.table.forget_views(spent)
         self.table.remove(ended)
+
+
+def _common_noise(squares: FloatArray, dof: IntArray) -> float:
+    """Variance of all tracks' pixels over what is assumed, where their squared residuals (F,) show more; else 1.
+
+    Blur comes and goes faster than the noise is learned, and then what fails the gate is the whole frame. The best
+    quarter decides: tracks on what moves are in the others.
+    """
+    if len(squares) < MIN_TRACKS_FOR_NOISE:
+        return 1.0
+    k = len(squares) // 4
+    ratio = np.partition(squares / chi_square_table(0.25)[dof], k)[k]
+    return min(max(float(ratio), 1.0), _MOST_COMMON_NOISE)
 
 
 @lru_cache(maxsize=8)
