@@ -125,7 +125,7 @@ def test_a_filter_that_is_told_takes_the_focal_length_over_and_improves_it() -> 
     assert told < 0.5 * untold
     # What the wrong one did until then is taken back: 0.6 m of error before, and nothing is less known than it was.
     assert np.linalg.norm(errors[39]) > 0.5
-    assert np.linalg.norm(errors[41:], axis=1).max() < 0.05
+    assert np.linalg.norm(errors[41:], axis=1).max() < 0.2 * np.linalg.norm(errors[39])
     R = filt.estimate().T_world_imu[:3, :3]
     assert np.sqrt((R @ filt.estimate().covariance[3:, 3:] @ R.T)[2, 2]) < 0.005  # of yaw, rad; 0.06 after a new start
 
