@@ -214,6 +214,8 @@ def test_rows_without_what_both_lenses_do_to_near_points() -> None:
     bare = _learned(moved).coefficients
     assert np.abs(near.coefficients - bare).max() > 2e-4
     assert np.abs(own - bare).max() < 5e-5
+    numeric = numeric_jacobian(near.without_common, np.zeros(8))
+    np.testing.assert_allclose(near.rows_D_common, -numeric[:, 4:], atol=1e-9)
 
 
 def test_the_covariance_of_rows_covers_features_that_keep_their_error() -> None:
