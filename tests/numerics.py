@@ -22,6 +22,7 @@ TESTED_JACOBIANS = {
     "vio.filters.window.body_D_error",
     "vio.filters.window.camera_D_own",
     "vio.filters.stereo_calibration.point_D_stereo",
+    "vio.filters.stereo_calibration.rows_D_common",
     "vio.filters.vislam.z_D_landmark",
     "vio.filters.vislam.z_D_xi",
     "vio.geometry.distortion.uv_D_p_cam",

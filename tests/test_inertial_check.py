@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio.datasets.common import imu_samples
 from vio.datasets.euroc_files import read_imu_csv
 from vio.datasets.rigs import load_rig
+from vio.datasets.samples import imu_samples
 from vio.datasets.tables import read_imu_table
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, transform_points

@@ -558,13 +558,20 @@ def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch
     made: list[tuple[FloatArray, FloatArray, FloatArray, Views]] = []
     add = Window.add_landmarks
 
-    def spy(window: Window, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
+    def spy(
+        window: Window,
+        ids: IntArray,
+        p_world: FloatArray,
+        A: FloatArray,
+        covariance: FloatArray,
+        point_D_focal: FloatArray | None,
+    ) -> None:
         table = filt._tracks.table
         rows = table.rows()
         views = table.views(rows[np.isin(table.ids(rows), ids[:1])], len(window.clones))
         T = np.array([c.T_world_imu for c in window.clones])
         made.append((T, p_world[:1], A[:3, window.first_clone : window.first_landmark], views))
-        add(window, ids, p_world, A, covariance)
+        add(window, ids, p_world, A, covariance, point_D_focal)
 
     monkeypatch.setattr(Window, "add_landmarks", spy)
     settings, flight, noise = MsckfSettings(clones=5), Flight(frames=6), np.random.default_rng(0)

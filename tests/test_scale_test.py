@@ -92,9 +92,9 @@ def test_the_test_equals_a_filter_with_the_scale_as_a_state(scaled: bool) -> Non
     rng, D, sigma = np.random.default_rng(3), 4, 0.2
     P, moved = np.diag(rng.uniform(0.5, 2.0, D)), rng.normal(size=D) * scaled
     test, mean = ScaleTest(D, sigma), np.zeros(D)
-    test.error_D_scale = rng.normal(size=D)
+    test.error_D_bias = rng.normal(size=D)
     joint, vector = np.zeros((D + 1, D + 1)), np.zeros(D + 1)
-    J = np.column_stack([np.eye(D), -test.error_D_scale])  # the prior: x - V s
+    J = np.column_stack([np.eye(D), -test.error_D_bias])  # the prior: x - V s
     joint += J.T @ np.linalg.solve(P, J)
     joint[D, D] += sigma**-2
     for _ in range(2):
@@ -110,5 +110,5 @@ def test_the_test_equals_a_filter_with_the_scale_as_a_state(scaled: bool) -> Non
     s, s_sigma = test.estimate()
     np.testing.assert_allclose(s, (covariance @ vector)[D])
     np.testing.assert_allclose(s_sigma, np.sqrt(covariance[D, D]))
-    np.testing.assert_allclose(test.error_D_scale * s_sigma**2, covariance[:D, D])
-    np.testing.assert_allclose(mean + test.error_D_scale * s, (covariance @ vector)[:D])
+    np.testing.assert_allclose(test.error_D_bias * s_sigma**2, covariance[:D, D])
+    np.testing.assert_allclose(mean + test.error_D_bias * s, (covariance @ vector)[:D])

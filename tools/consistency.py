@@ -198,9 +198,16 @@ class FirstEstimates(StandardErrors):
         super().keep_landmarks(chosen)
         self._first_landmarks = self._first_landmarks[chosen]
 
-    def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
+    def add_landmarks(
+        self,
+        ids: IntArray,
+        p_world: FloatArray,
+        A: FloatArray,
+        covariance: FloatArray,
+        point_D_focal: FloatArray | None = None,
+    ) -> None:
         """Add landmarks (K, 3); where they are now is their first estimate."""
-        super().add_landmarks(ids, p_world, A, covariance)
+        super().add_landmarks(ids, p_world, A, covariance, point_D_focal)
         self._first_landmarks = np.concatenate([self._first_landmarks, p_world])
 
     def right_invariant(self, P: FloatArray) -> FloatArray:

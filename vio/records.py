@@ -338,6 +338,11 @@ class TurnComparison:
         """Whether no focal length that is off shows in them, be it that there are none."""
         return self.sigma == np.inf or (self.sigma < 2 * _TURNS_SIGMA and abs(self.excess) < _TURNS_OFF)
 
+    @property
+    def settled(self) -> bool:
+        """Whether they agree beyond doubt, so that they will not be found to differ."""
+        return abs(self.excess) + _TURNS_SIGMAS * self.sigma < _TURNS_OFF
+
 
 TURNS_NOT_SHOWN = TurnComparison(0.0, np.inf, False)
 

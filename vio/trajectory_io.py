@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+from array import array
 from dataclasses import dataclass, replace
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
@@ -27,7 +28,7 @@ from vio.geometry.lie import (
     se3_inverse,
 )
 from vio.records import BodyFrame, IntArray, Trajectory
-from vio.text_files import INT64_MAX, check_increasing, exact_text, seconds_text, text_lines
+from vio.text_files import INT64_MAX, check_increasing, exact_text, lines_of, seconds_text
 
 logger = logging.getLogger(__name__)
 
@@ -197,15 +198,17 @@ def in_first_cam0(trajectory: Trajectory, T_cam0_imu: FloatArray) -> Trajectory:
 
 
 def _read_table(path: Path) -> _Table:
-    lines = [(number, line.strip()) for number, line in text_lines(path) if line.strip()]
-    data = [(number, line) for number, line in lines if not line.startswith("#")]
-    return _Table(
-        path,
-        comments=[line[1:].strip() for _, line in lines if line.startswith("#")],
-        rows=[line for _, line in data],
-        line_numbers=[number for number, _ in data],
-        commas=bool(data) and "," in data[0][1],
-    )
+    comments: list[str] = []
+    rows: list[str] = []
+    line_numbers: list[int] = []
+    for number, text in lines_of(path):
+        line = text.strip()
+        if line.startswith("#"):
+            comments.append(line[1:].strip())
+        elif line:
+            rows.append(line)
+            line_numbers.append(number)
+    return _Table(path, comments, rows, line_numbers, commas=bool(rows) and "," in rows[0])
 
 
 def _detect(table: _Table) -> TrajectoryFormat:
@@ -231,10 +234,10 @@ def _check_columns(table: _Table, kind: TrajectoryFormat) -> None:
 
 def _floats(table: _Table, first: int, last: int) -> FloatArray:
     """Columns `first <= column < last` as finite numbers (N, last - first)."""
-    values, row = [], 0
+    values, row = array("d"), 0
     try:
         for row in range(len(table.rows)):
-            values.append(list(map(float, table.fields(row, last)[first:last])))
+            values.extend(map(float, table.fields(row, last)[first:last]))
     except ValueError as error:
         table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
     out = np.array(values).reshape(-1, last - first)

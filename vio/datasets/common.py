@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from vio.datasets.samples import MotionSamples, motion_samples
 from vio.errors import CalibrationError, DataError
 from vio.frame_rate import used_frames
 from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
@@ -22,13 +23,10 @@ from vio.records import (
     NS_PER_S,
     BoolArray,
     Event,
-    ImuRecord,
-    ImuSample,
     IntArray,
     MotionSample,
     Recording,
     StereoFrame,
-    VelocitySample,
 )
 from vio.text_files import check_increasing
 
@@ -99,14 +97,6 @@ def checked_transform(T: npt.ArrayLike, where: str) -> FloatArray:
     R = T_[:3, :3]
     deviation = float(np.abs(R.T @ R - np.eye(3)).max())
     return se3_from_parts(R if deviation <= _EXACT else nearest_rotation(R), T_[:3, 3])
-
-
-def velocity_samples(times_ns: IntArray, linear: FloatArray, angular: FloatArray) -> tuple[VelocitySample, ...]:
-    """Build samples from times (N,), m/s (N, 3) and rad/s (N, 3), all in the imu frame."""
-    return tuple(
-        VelocitySample(int(t), v, w)
-        for t, v, w in zip(times_ns.tolist(), np.ascontiguousarray(linear), np.ascontiguousarray(angular), strict=True)
-    )
 
 
 def numbers_in(text: str, count: int, where: str) -> FloatArray:
@@ -184,14 +174,6 @@ def naming(where: Path | str) -> Iterator[None]:
         raise CalibrationError(f"{where}: {error}") from error
 
 
-def imu_samples(record: ImuRecord) -> tuple[ImuSample, ...]:
-    """Convert a record to events."""
-    return tuple(
-        ImuSample(t, gyro, accel)
-        for t, gyro, accel in zip(record.times_ns.tolist(), record.gyro, record.accel, strict=True)
-    )
-
-
 def frame_range(recording: Recording, start: int, stop: int | None) -> range:
     """Return the frame numbers `start <= index < stop` of the recording.
 
@@ -253,10 +235,7 @@ def merge_events(
         frames: the frames of the range, in time order; some may be missing. The generator is closed at the end.
     """
     first_ns, last_ns = (int(recording.frame_times_ns[k]) for k in (chosen[0], chosen[-1]))
-    begins = {ImuSample: first_ns - NS_PER_S, VelocitySample: first_ns}
-    inertial_end_ns = next((x.time_ns for x in motion if isinstance(x, ImuSample) and x.time_ns >= last_ns), last_ns)
-    ends = {ImuSample: inertial_end_ns, VelocitySample: last_ns}
-    samples = iter([x for x in motion if begins[type(x)] <= x.time_ns <= ends[type(x)]])
+    samples = _samples_between(motion_samples(motion), first_ns, last_ns)
     waiting = next(samples, None)
     with contextlib.closing(frames):
         for frame in frames:
@@ -267,6 +246,16 @@ def merge_events(
     if waiting is not None:
         yield waiting
         yield from samples
+
+
+def _samples_between(motion: MotionSamples[MotionSample], first_ns: int, last_ns: int) -> Iterator[MotionSample]:
+    """Yield the samples that go with the frames between two times, see `merge_events`."""
+    times_ns, is_imu = motion.times_ns, motion.is_imu
+    after = times_ns[is_imu & (times_ns >= last_ns)]
+    begin_ns = np.where(is_imu, first_ns - NS_PER_S, first_ns)
+    end_ns = np.where(is_imu, after[0] if len(after) else last_ns, last_ns)
+    for k in np.flatnonzero((begin_ns <= times_ns) & (times_ns <= end_ns)):
+        yield motion[int(k)]
 
 
 def npz_names(path: Path) -> frozenset[str]:

@@ -10,10 +10,11 @@ from typing import TypeVar
 import numpy as np
 
 from vio.camera_rig import CameraRig, Undistorter
-from vio.datasets.common import imu_samples, naming
+from vio.datasets.common import naming
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.overlap import check_overlap, reference_of_body
 from vio.datasets.rigs import find_calibration
+from vio.datasets.samples import imu_samples, in_time_order
 from vio.datasets.tables import read_imu_table, read_velocity_table
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
@@ -71,7 +72,7 @@ def with_extrinsics(rig: AnyRig, layout: Layout, file: Path) -> tuple[AnyRig, li
 
 def read_motion(
     layout: Layout, rig: Rig | CameraRig, times_ns: IntArray, timed: bool
-) -> tuple[tuple[MotionSample, ...], list[Path], list[str]]:
+) -> tuple[Sequence[MotionSample], list[Path], list[str]]:
     """Read the IMU and the velocities, on the clock of the images; return the samples, their files and notes."""
     imu = next((f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()), None)
     velocity = layout.root / "velocity.csv"
@@ -85,7 +86,7 @@ def read_motion(
             f"{files[0]}: needs the pose of its sensor; add T_cam0_imu.txt (IMU to left camera), or use a calibration "
             "with T_cam_imu (Kalibr's camchain-imucam), or remove the file to use the images alone"
         )
-    samples: list[MotionSample] = []
+    parts: list[Sequence[MotionSample]] = []
     notes: list[str] = []
     if imu is not None:
         record, found = read_imu_table(imu)
@@ -95,12 +96,12 @@ def read_motion(
         if shift_ns:
             notes.append(f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states")
         check_overlap(times_ns, record.times_ns, imu)
-        samples += imu_samples(record)
+        parts.append(imu_samples(record))
     if velocity.is_file():
         speeds = read_velocity_table(velocity)
-        check_overlap(times_ns, np.array([s.time_ns for s in speeds], dtype=np.int64), velocity)
-        samples += speeds
-    return tuple(sorted(samples, key=lambda s: s.time_ns)), files, notes
+        check_overlap(times_ns, speeds.times_ns, velocity)
+        parts.append(speeds)
+    return in_time_order(*parts), files, notes
 
 
 def sources_of(files: Sequence[Path]) -> frozenset[MotionSource]:

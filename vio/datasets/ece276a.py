@@ -27,9 +27,9 @@ from vio.datasets.common import (
     npz_names,
     read_npz,
     shape_text,
-    velocity_samples,
 )
 from vio.datasets.features import FeatureDataset
+from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings, ExtrinsicsMode
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import CalibrationError, DataError

@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import imu_samples
 from vio.datasets.euroc_files import (
     STATE_CSV,
     TUM_FILE,
@@ -32,10 +31,12 @@ from vio.datasets.euroc_files import (
     rig_read_as,
     stamped_rows,
 )
+from vio.datasets.image_files import FilePairs, ImageFiles, stem_of
 from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import list_images
 from vio.datasets.pairing import PAIRED_NS, pair_stamps
 from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, write_frames
+from vio.datasets.samples import MotionSamples, imu_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
@@ -55,7 +56,7 @@ class _Camera:
     model: CameraModel
     T_body_cam: FloatArray  # (4, 4)
     times_ns: IntArray  # (N,) strictly increasing
-    files: tuple[Path, ...]  # N images
+    files: ImageFiles  # N
     renamed: int  # number of images whose extension differs from their list
     unlisted: int  # number of images that the list does not name
 
@@ -66,7 +67,7 @@ class _Imu:
 
     T_body_imu: FloatArray  # (4, 4)
     noise: ImuDensities | None
-    samples: tuple[ImuSample, ...]
+    samples: MotionSamples[ImuSample] | tuple[()]
     notes: tuple[str, ...]
 
 
@@ -91,13 +92,13 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     of_left, of_right, notes = _pair(left, right, mav)
     times_ns = left.times_ns[of_left]
     if imu.samples and (imu.samples[-1].time_ns < times_ns[0] or imu.samples[0].time_ns > times_ns[-1]):
-        (finding,) = judge_clocks(times_ns, np.array([x.time_ns for x in imu.samples], dtype=np.int64))
+        (finding,) = judge_clocks(times_ns, imu.samples.times_ns)
         raise DataError(
             f"{mav / 'imu0' / 'data.csv'}: no IMU sample is within the time of the images; {finding.message}; or "
             "remove imu0"
         )
     motion: frozenset[MotionSource] = frozenset({"imu"}) if imu.samples else frozenset()
-    pairs = tuple((left.files[a], right.files[b]) for a, b in zip(of_left.tolist(), of_right.tolist(), strict=True))
+    pairs = FilePairs(left.files.take(of_left.tolist()), right.files.take(of_right.tolist()))
     white, depth_notes = full_scale(pairs)
     truth = _reference_file(mav)
     recording = Recording(
@@ -142,23 +143,21 @@ def _read_camera(folder: Path) -> _Camera:
     times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
     there = list_images(folder / "data")
     files, renamed = _find_images(there, rows, path, lines)
-    return _Camera(model, T_body_cam, times_ns, files, renamed, len(set(there) - set(files)))
+    return _Camera(model, T_body_cam, times_ns, files, renamed, len(set(there.names) - set(files.names)))
 
 
-def _find_images(
-    there: Sequence[Path], names: Sequence[str], path: Path, lines: Sequence[int]
-) -> tuple[tuple[Path, ...], int]:
+def _find_images(there: ImageFiles, names: Sequence[str], path: Path, lines: Sequence[int]) -> tuple[ImageFiles, int]:
     """Return the listed images, and how many have another extension than listed."""
-    by_name, by_stem = {file.name: file for file in there}, {file.stem: file for file in there}
-    found = [by_name.get(name) or by_stem.get(Path(name).stem) for name in names]
+    by_name, by_stem = set(there.names), {stem_of(name): name for name in there.names}
+    found = [name if name in by_name else by_stem.get(Path(name).stem) for name in names]
     missing = [k for k, file in enumerate(found) if file is None]
     if missing:
         raise DataError(
-            f"{path}, line {lines[missing[0]]}: {there[0].parent / names[missing[0]]} is missing ({len(missing)} of "
+            f"{path}, line {lines[missing[0]]}: {there.folder / names[missing[0]]} is missing ({len(missing)} of "
             f"{len(names)} listed images are); copy it again, or remove such lines"
         )
-    files = tuple(file for file in found if file is not None)
-    return files, sum(file.name != name for file, name in zip(files, names, strict=True))
+    files = ImageFiles(there.folder, tuple(file for file in found if file is not None))
+    return files, sum(file != name for file, name in zip(files.names, names, strict=True))
 
 
 def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray, tuple[str, ...]]:

@@ -6,8 +6,10 @@ Reference: Burri et al., The EuRoC micro aerial vehicle datasets (2016).
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from array import array
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -21,7 +23,7 @@ from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rec
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
-from vio.text_files import INT64_MAX, check_increasing, exact_text, text_lines
+from vio.text_files import INT64_MAX, check_increasing, exact_text, lines_of
 
 DISTORTION_MODELS: dict[str, DistortionModel] = {
     "radial-tangential": "radtan",
@@ -212,20 +214,28 @@ def read_imu_csv(path: Path) -> ImuRecord:
             gravity is in the gyro's columns.
     """
     form = "timestamp [ns], gyro x y z, accel x y z"
-    times_ns, rows, lines = stamped_rows(path, 7, form)
-    try:
-        values = np.array([list(map(float, row.split(","))) for row in rows])
-    except ValueError:
-        values = np.array([[as_number(text.strip()) for text in row.split(",")] for row in rows])
-    bad = ~np.isfinite(values).all(axis=1)
-    if bad.any():
-        k = int(np.argmax(bad))
+    times, lines, numbers_read, bad = array("q"), array("q"), array("d"), []
+    for number, stamp, row in _stamped_lines(path, 7, form):
+        fields = row.split(",")
+        try:
+            values = [float(field) for field in fields]
+        except ValueError:
+            values = [as_number(field.strip()) for field in fields]
+        if not all(map(math.isfinite, values)):
+            bad.append((number, row))
+        times.append(stamp)
+        lines.append(number)
+        numbers_read.extend(values)
+    times_ns = check_increasing(times, lambda k: f"{path}, line {lines[k]}")
+    if bad:
+        number, row = bad[0]
         raise DataError(
-            f"{path}, line {lines[k]}: a reading is not a finite number ({rows[k]}; {int(bad.sum())} lines "
-            "in all); remove such lines"
+            f"{path}, line {number}: a reading is not a finite number ({row}; {len(bad)} lines in all); remove such "
+            "lines"
         )
-    check_gravity_column(values, str(path), form, "exchange these columns with 5 to 7")
-    return ImuRecord(times_ns, values[:, :3], values[:, 3:])
+    readings = np.array(numbers_read).reshape(-1, 6)
+    check_gravity_column(readings, str(path), form, "exchange these columns with 5 to 7")
+    return ImuRecord(times_ns, readings[:, :3], readings[:, 3:])
 
 
 def imu_csv(record: ImuRecord) -> str:
@@ -262,7 +272,17 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[st
     times: list[int] = []
     rows: list[str] = []
     lines: list[int] = []
-    for number, line in text_lines(path):
+    for number, stamp, row in _stamped_lines(path, columns, form):
+        times.append(stamp)
+        rows.append(row)
+        lines.append(number)
+    return check_increasing(times, lambda k: f"{path}, line {lines[k]}"), rows, lines
+
+
+def _stamped_lines(path: Path, columns: int, form: str) -> Iterator[tuple[int, int, str]]:
+    """Yield line number, time and the text behind the time of each line, see `stamped_rows`."""
+    empty = True
+    for number, line in lines_of(path):
         if line.startswith("#"):
             continue
         if (count := line.count(",") + 1) != columns:
@@ -274,9 +294,7 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[st
                 f"{path}, line {number}: {stamp!r} is no time in whole nanoseconds ({form}); write seconds times 1e9, "
                 "without a point or exponent"
             )
-        times.append(int(stamp))
-        rows.append(rest.strip())
-        lines.append(number)
-    if not times:
+        empty = False
+        yield number, int(stamp), rest.strip()
+    if empty:
         raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove its folder")
-    return check_increasing(times, lambda k: f"{path}, line {lines[k]}"), rows, lines

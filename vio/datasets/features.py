@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +27,7 @@ class FeatureDataset:
 
     recording: Recording
     tracks: FeatureTracks
-    motion: tuple[MotionSample, ...]  # in time order
+    motion: Sequence[MotionSample]  # in time order
     present: IntArray  # (P,) numbers of the frames that events may yield, increasing
     stale_frames: BoolArray  # (F,) more than half of the continued tracks repeat their pixels while moving
     variances: SensorVariances | None = None

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
 from vio.datasets.common import blank_frames, chosen_frames, merge_events
+from vio.datasets.image_files import FilePairs, stem_of
 from vio.datasets.images import WHITE_16, UnreadableImageError, list_images, load_gray, prefetch, white_level
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
@@ -18,7 +19,7 @@ from vio.records import Event, Image, MotionSample, Observations, Recording, Ste
 logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
-ImagePairs = tuple[tuple[Path, Path], ...]  # left and right image of each frame
+ImagePairs = Sequence[tuple[Path, Path]]  # left and right image of each frame
 
 _NAMED = 5  # skipped frames that get a line each; the others are counted in one at the end
 
@@ -30,14 +31,14 @@ def pair_images(left: Path, right: Path) -> ImagePairs:
         DataError: a file lacks its partner; the message gives both counts and names the first one.
     """
     lefts, rights = list_images(left), list_images(right)
-    by_name = ({path.stem: path for path in lefts}, {path.stem: path for path in rights})
-    for here, there, folder in ((by_name[0], by_name[1], right), (by_name[1], by_name[0], left)):
-        if missing := next((path for stem, path in here.items() if stem not in there), None):
+    rows = [{stem_of(name): k for k, name in enumerate(files.names)} for files in (lefts, rights)]
+    for here, there, files, folder in ((rows[0], rows[1], lefts, right), (rows[1], rows[0], rights, left)):
+        if (missing := next((k for stem, k in here.items() if stem not in there), None)) is not None:
             raise DataError(
-                f"{left} holds {len(lefts)} images and {right} {len(rights)}: {folder / missing.name} is missing; "
-                "remove its partner or copy it again"
+                f"{left} holds {len(lefts)} images and {right} {len(rights)}: {folder / files.names[missing]} is "
+                "missing; remove its partner or copy it again"
             )
-    return tuple((path, by_name[1][path.stem]) for path in lefts)
+    return FilePairs(lefts, rights.take(rows[1][stem_of(name)] for name in lefts.names))
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +137,7 @@ class ImageDataset:
 
     recording: Recording
     pairs: ImagePairs
-    motion: tuple[MotionSample, ...]  # in time order
+    motion: Sequence[MotionSample]  # in time order
     sizes: tuple[ImageSize, ImageSize]  # of the left and the right files
     settings: DatasetSettings
     white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`

@@ -7,6 +7,7 @@ is decoded.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import struct
 from collections import deque
@@ -18,6 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from vio.datasets.image_files import ImageFiles, stem_of
 from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
 from vio.datasets.png import crc32, decode_gray8
 from vio.errors import DataError
@@ -224,26 +226,26 @@ def _png_damage(data: bytes) -> str | None:
     return "the PNG is truncated"
 
 
-def list_images(folder: Path) -> tuple[Path, ...]:
+def list_images(folder: Path) -> ImageFiles:
     """The image files of a folder, sorted by name, numbers as numbers: `left2.png` before `left10.png`.
 
     Raises:
         DataError: the folder is missing or holds no image.
     """
     try:
-        images = (p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+        images = (n for n in os.listdir(folder) if os.path.splitext(n)[1].lower() in SUFFIXES and n[0] != ".")
         found = sorted(images, key=natural_key)
     except OSError as error:
         raise DataError(f"cannot list {folder}: {error.strerror or error}; give a folder of images") from error
     if not found:
         raise DataError(f"{folder}: holds no image ({', '.join(SUFFIXES)})")
-    return tuple(found)
+    return ImageFiles(folder, tuple(found))
 
 
-def natural_key(path: Path) -> tuple[tuple[tuple[int, str], ...], str]:
+def natural_key(name: str) -> tuple[tuple[tuple[int, str], ...], str]:
     """Sort key of a name with its runs of digits as numbers; equal ones (`1.png`, `01.png`) by their text."""
-    parts = re.split(r"(\d+)", path.stem)
-    return tuple((int(p), "") if k % 2 else (-1, p) for k, p in enumerate(parts)), path.name
+    parts = re.split(r"(\d+)", stem_of(name))
+    return tuple((int(p), "") if k % 2 else (-1, p) for k, p in enumerate(parts)), name
 
 
 def prefetch(load: Callable[[Item], Loaded], items: Iterable[Item], depth: int) -> Generator[Loaded]:

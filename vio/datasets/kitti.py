@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import check_intrinsics, checked_transform, clock_ns, naming, numbers_in, velocity_samples
+from vio.datasets.common import check_intrinsics, checked_transform, clock_ns, naming, numbers_in
 from vio.datasets.image_pairs import ImageDataset, ImageSize, first_readable, full_scale, pair_images
+from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
@@ -155,7 +156,7 @@ def _read_times(path: Path, folder: Path, count: int) -> IntArray:
     return clock_ns(seconds, lambda k: f"{path}, line {k + 1}")
 
 
-def _read_velocity(path: Path, frame_times_ns: IntArray) -> tuple[VelocitySample, ...]:
+def _read_velocity(path: Path, frame_times_ns: IntArray) -> Sequence[VelocitySample]:
     if not path.is_file():
         return ()
     lines = text_lines(path)

@@ -16,14 +16,13 @@ import numpy as np
 from vio.atomic import atomic_write_bytes
 from vio.datasets.common import checked_transform, read_npz
 from vio.datasets.features import FeatureDataset
+from vio.datasets.samples import MotionSamples, motion_samples
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import CameraKind, Projection, StereoCamera
 from vio.records import (
     BodyFrame,
     FeatureTracks,
-    ImuSample,
-    IntArray,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -31,7 +30,6 @@ from vio.records import (
     Recording,
     RunMotion,
     Trajectory,
-    VelocitySample,
 )
 
 FORMAT = "stereo-vio observation log"
@@ -130,15 +128,8 @@ def _joined(parts: list[np.ndarray], empty: np.ndarray) -> np.ndarray:
 
 
 def _motion_arrays(samples: Sequence[MotionSample]) -> dict[str, np.ndarray]:
-    values = np.zeros((len(samples), 6))
-    for row, sample in zip(values, samples, strict=True):
-        halves = (sample.gyro, sample.accel) if isinstance(sample, ImuSample) else (sample.linear, sample.angular)
-        row[:3], row[3:] = halves
-    return {
-        "motion_times_ns": np.array([sample.time_ns for sample in samples], dtype=np.int64),
-        "motion_is_imu": np.array([isinstance(sample, ImuSample) for sample in samples], dtype=np.bool_),
-        "motion_values": values,
-    }
+    arrays = motion_samples(samples)
+    return {"motion_times_ns": arrays.times_ns, "motion_is_imu": arrays.is_imu, "motion_values": arrays.values}
 
 
 def _optional_arrays(recording: Recording) -> dict[str, np.ndarray]:
@@ -175,8 +166,8 @@ def read_observation_log(path: Path) -> FeatureDataset:
     frames, offsets, times_ns = arrays["frame_indices"], arrays["offsets"], arrays["frame_times_ns"]
     dense_offsets = offsets[np.searchsorted(frames, np.arange(len(times_ns) + 1))]
     tracks = FeatureTracks(dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"])
-    motion = _motion_samples(arrays)
-    kinds: set[MotionSource] = {"imu" if isinstance(sample, ImuSample) else "velocity" for sample in motion}
+    motion = MotionSamples[MotionSample](arrays["motion_times_ns"], arrays["motion_values"], arrays["motion_is_imu"])
+    kinds: set[MotionSource] = {"imu" if imu else "velocity" for imu in np.unique(motion.is_imu).tolist()}
     recording = Recording(
         kind="log",
         path=path,
@@ -260,16 +251,6 @@ def _extrinsics(arrays: Mapping[str, np.ndarray], path: Path) -> FloatArray | No
         return None
     checked_transform(arrays["T_cam0_imu"], f"{path}, T_cam0_imu")
     return arrays["T_cam0_imu"]  # the stored bits, not the orthonormalised ones
-
-
-def _motion_samples(arrays: Mapping[str, np.ndarray]) -> tuple[MotionSample, ...]:
-    times_ns: IntArray = arrays["motion_times_ns"]
-    return tuple(
-        ImuSample(t, value[:3], value[3:]) if imu else VelocitySample(t, value[:3], value[3:])
-        for t, imu, value in zip(
-            times_ns.tolist(), arrays["motion_is_imu"].tolist(), arrays["motion_values"], strict=True
-        )
-    )
 
 
 def _reference(arrays: Mapping[str, np.ndarray]) -> Trajectory | None:

@@ -9,7 +9,7 @@ Reference: Sturm et al., A benchmark for the evaluation of RGB-D SLAM systems, I
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +18,7 @@ import numpy as np
 from vio.camera_rig import CameraRig, Undistorter
 from vio.datasets.common import blank_frames, chosen_frames, merge_events, naming
 from vio.datasets.companions import calibration_beside, read_motion, read_reference, sources_of, with_extrinsics
+from vio.datasets.image_files import FilePairs
 from vio.datasets.image_pairs import BadFrame, ImageSize, first_readable, full_scale, readable_frames
 from vio.datasets.images import SUFFIXES, UnreadableImageError, list_images, load_depth, load_gray
 from vio.datasets.plain import frame_times
@@ -50,9 +51,9 @@ class OneCameraDataset:
     """Implements `vio.protocols.Dataset` over the image files of one camera, with depth images or without."""
 
     recording: Recording
-    files: tuple[Path, ...]
-    depth_files: tuple[Path, ...] | None  # None: there are none
-    motion: tuple[MotionSample, ...] = field(repr=False)  # in time order
+    files: Sequence[Path]
+    depth_files: Sequence[Path] | None  # None: there are none
+    motion: Sequence[MotionSample] = field(repr=False)  # in time order
     size: ImageSize
     settings: DatasetSettings
     undistorter: Undistorter
@@ -138,7 +139,7 @@ def read_mono(path: Path, settings: DatasetSettings) -> OneCameraDataset:
     if layout is None:
         raise DataError(f"{path}: holds no folder of images ({', '.join(_FOLDERS[:4])} or others); give one with left/")
     files = list_images(layout.left)
-    pairs = tuple((file, file) for file in files)
+    pairs = FilePairs(files, files)
     times_ns, times_file, notes = frame_times(layout, pairs)
     frames = _Frames(files, None, times_ns, times_file, notes)
     return _read(layout, frames, settings, "mono")
@@ -157,12 +158,13 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> OneCameraDataset:
     layout = _layout(path)
     if layout is None or not _holds_images(layout.base / "depth"):
         raise DataError(f"{path}: holds no images beside depth/; give rgb.txt and depth.txt, or left/ and depth/")
-    depths = {file.stem: file for file in list_images(layout.base / "depth")}
-    files = tuple(file for file in list_images(layout.left) if file.stem in depths)
+    images, depth_images = list_images(layout.left), list_images(layout.base / "depth")
+    depths = {file.stem: k for k, file in enumerate(depth_images)}
+    files = images.take(k for k, file in enumerate(images) if file.stem in depths)
     if not files:
         raise DataError(f"{layout.base / 'depth'}: no file is named as one of {layout.left}; name them alike")
-    times_ns, times_file, notes = frame_times(layout, tuple((file, file) for file in files))
-    frames = _Frames(files, tuple(depths[file.stem] for file in files), times_ns, times_file, notes)
+    times_ns, times_file, notes = frame_times(layout, FilePairs(files, files))
+    frames = _Frames(files, depth_images.take(depths[file.stem] for file in files), times_ns, times_file, notes)
     return _read(layout, frames, settings, "rgbd")
 
 
@@ -170,8 +172,8 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> OneCameraDataset:
 class _Frames:
     """Files and times of the frames."""
 
-    files: tuple[Path, ...]
-    depths: tuple[Path, ...] | None
+    files: Sequence[Path]
+    depths: Sequence[Path] | None
     times_ns: IntArray
     times_file: Path | None  # where the times are from; None: assumed
     notes: tuple[str, ...]
@@ -208,7 +210,7 @@ def _tum_list(file: Path) -> tuple[IntArray, list[Path]]:
 
 
 def _read(layout: Layout, frames: _Frames, settings: DatasetSettings, kind: str) -> OneCameraDataset:
-    pairs = tuple((file, file) for file in frames.files)
+    pairs = FilePairs(frames.files, frames.files)
     _, image, _ = first_readable(pairs)
     white, white_notes = full_scale(pairs)
     file, rig = _calibration(layout, settings, (image.shape[1], image.shape[0]), tum=frames.times_file)

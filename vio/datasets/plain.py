@@ -9,7 +9,6 @@ and is not used is named in the recording's notes.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +25,7 @@ from vio.datasets.companions import (
 )
 from vio.datasets.dates import drive_times, is_date
 from vio.datasets.euroc_files import stamped_rows
+from vio.datasets.image_files import FilePairs, ImageFiles
 from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable, full_scale
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.pairing import pair_stamps
@@ -149,7 +149,7 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
 # --- images and times -----------------------------------------------------------------------------------------------
 
 
-def pair_files(lefts: Sequence[Path], rights: Sequence[Path]) -> tuple[ImagePairs, tuple[str, ...]]:
+def pair_files(lefts: ImageFiles, rights: ImageFiles) -> tuple[ImagePairs, tuple[str, ...]]:
     """Pair image files by equal names, by the last number in their names, or by stamps in their names.
 
     Raises:
@@ -163,10 +163,11 @@ def pair_files(lefts: Sequence[Path], rights: Sequence[Path]) -> tuple[ImagePair
         keys = [list(range(len(lefts))), [-1] * len(rights)]
         for i, j in zip(a.tolist(), b.tolist(), strict=True):
             keys[1][j] = i
-    right_of = dict(zip(keys[1], rights, strict=True))
+    right_of = {key: k for k, key in enumerate(keys[1])}
     if len(right_of) < len(rights) and -1 not in right_of:
         raise DataError(f"{rights[0].parent}: several images have the same number; number them uniquely")
-    pairs = tuple((p, right_of[key]) for key, p in zip(keys[0], lefts, strict=True) if key in right_of)
+    rows = [(k, right_of[key]) for k, key in enumerate(keys[0]) if key in right_of]
+    pairs = FilePairs(lefts.take(k for k, _ in rows), rights.take(k for _, k in rows))
     if not pairs:
         raise DataError(
             f"{lefts[0].parent} and {rights[0].parent}: no name of the one fits one of the other ({lefts[0].name}, "

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.common import check_gravity_column
+from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.records import ImuRecord, IntArray, VelocitySample
@@ -189,7 +190,7 @@ def imu_notes(times_ns: IntArray, where: str) -> tuple[str, ...]:
     )
 
 
-def read_velocity_table(path: Path) -> tuple[VelocitySample, ...]:
+def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
     """Read body velocity and angular rate in the IMU frame.
 
     Raises:
@@ -199,7 +200,7 @@ def read_velocity_table(path: Path) -> tuple[VelocitySample, ...]:
     if ",".join(table.header) != _VELOCITY_FORM:
         raise DataError(f"{path}, line 1: expected the header {_VELOCITY_FORM}")
     times_ns, values = stamps_ns(table), _finite(table)
-    return tuple(VelocitySample(t, row[:3], row[3:]) for t, row in zip(times_ns.tolist(), values, strict=True))
+    return velocity_samples(times_ns, values[:, :3], values[:, 3:])
 
 
 def _finite(table: Table) -> FloatArray:

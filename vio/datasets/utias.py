@@ -21,9 +21,9 @@ from vio.datasets.common import (
     finite_rows,
     naming,
     shape_text,
-    velocity_samples,
 )
 from vio.datasets.features import FeatureDataset, SensorVariances
+from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import DataError

@@ -138,7 +138,7 @@ class VideoDataset:
 
     recording: Recording
     files: tuple[Path, Path]
-    motion: tuple[MotionSample, ...] = field(repr=False)
+    motion: Sequence[MotionSample] = field(repr=False)
     sizes: tuple[ImageSize, ImageSize]
     settings: DatasetSettings
     rectifier: Rectifier

@@ -95,6 +95,11 @@ class InverseDepth:
     p_D_q: FloatArray  # (F, 3, 3) metres in the world per pixel; the third column points from the point to the camera
     q_D_p: FloatArray  # (F, 3, 3) its inverse
 
+    def take(self, rows: IntArray) -> InverseDepth:
+        """Return the points of rows (K,)."""
+        q = self
+        return InverseDepth(q.anchor[rows], q.centre[rows], q.disparity[rows], q.p_D_q[rows], q.q_D_p[rows])
+
 
 def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArray, seen: BoolArray) -> InverseDepth:
     """Return the coordinates (M5) of points (F, 3) that lie ahead of the first camera that saw them.
@@ -237,6 +242,11 @@ class TrackInformation:
     q_D_clone: FloatArray  # (F, 3, 6) how a clone's error moves a point as that clone sees it: S^-1 B
     gradient: FloatArray  # (F, 6N) before the point is eliminated
     point_gradient: FloatArray  # (F, 3)
+
+    def take(self, rows: IntArray) -> TrackInformation:
+        """Return what the tracks of rows (K,) say."""
+        columns = self.G, self.C, self.q_D_clone, self.gradient, self.point_gradient
+        return TrackInformation(self.q.take(rows), *(x[rows] for x in columns))
 
     def moved_points(self, clone_errors: FloatArray, other: FloatArray | float = 0.0) -> FloatArray:
         """Solve each point's own equations once the clones have moved: back-substitution.

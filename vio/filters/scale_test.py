@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.filters.separate_bias import SeparateBias
 from vio.geometry.lie import FloatArray
 
-_PRIOR_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
+SCALE_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
 # What is worth reporting: rigs are calibrated to 1 %, and accelerometers to 1 or 2 %. On recordings with a correct
 # baseline the estimate comes to 2.0 % (the real IMU of MH_03, 0.3 % claimed) and to 3.5 standard deviations.
 _LEAST, _SIGMAS = 0.04, 5.0
@@ -29,16 +30,16 @@ def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
     return float(velocity @ np.linalg.solve(covariance + 1e-18 * np.eye(3), velocity)) > _CLEAR
 
 
-class ScaleTest:
+class ScaleTest(SeparateBias):
     """The estimate of the logarithm of the scale beside a filter of D errors that takes it for zero.
 
     The errors are those of a world that is scaled with s, so no pixel depends on it, whatever the estimates:
     relinearising cannot pass for knowledge of the scale.
     """
 
-    def __init__(self, size: int, sigma: float = _PRIOR_SIGMA) -> None:
+    def __init__(self, size: int, sigma: float = SCALE_SIGMA) -> None:
         """Start with errors (D,) that do not depend on the scale, and its standard deviation."""
-        self.error_D_scale: FloatArray = np.zeros(size)
+        super().__init__(size)
         self.frames = 0  # since the start
         self._information, self._vector = sigma**-2, 0.0
 
@@ -54,11 +55,11 @@ class ScaleTest:
             P: covariance of the errors (D, D) after them.
             scaled: how the scaled world moves the errors (D,), for measurements in metres; None: pixels.
         """
-        V = self.error_D_scale if scaled is None else self.error_D_scale + scaled
+        V = self.error_D_bias if scaled is None else self.error_D_bias + scaled
         W = A @ V
         self._information += float(V @ W - W @ P @ W)
         self._vector += float(V @ (b - A @ mean))
-        self.error_D_scale = self.error_D_scale - P @ W
+        self.error_D_bias = self.error_D_bias - P @ W
 
     def estimate(self) -> tuple[float, float]:
         """Logarithm of the true scale over the filter's, and its standard deviation."""

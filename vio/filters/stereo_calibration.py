@@ -100,8 +100,14 @@ class RowField:
 
         Both lenses bend a near point differently, as it lies at different places in the two images.
         """
+        prior, common = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2, self._common @ stereo[RIGHT_TERMS:FIELD_TERMS]
+        return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, common))
+
+    @property
+    def rows_D_common(self) -> FloatArray:
+        """What k1, k2, q1 and q2 of (R3) add to the coefficients (7, 4) of the rows of the features seen."""
         prior = np.eye(ROW_TERMS) / _ROW_PRIOR_PX**2
-        return np.asarray(self.coefficients - np.linalg.solve(self._A + prior, self._common @ stereo[RIGHT_TERMS:]))
+        return np.asarray(np.linalg.solve(self._A + prior, self._common), dtype=np.float64)
 
     @property
     def covariance(self) -> FloatArray:
@@ -138,13 +144,25 @@ class StereoField:
     """The field at the present estimate: what is taken out of the pixels."""
 
     camera: StereoCamera
-    rows: FloatArray  # (7,) of (R2), in focal lengths; zero where the rows show no fault
+    rows: FloatArray  # (7,) of (R2) that are the right camera's own, in focal lengths; zero where they show no fault
     coefficients: FloatArray  # (10,) of (R3) and (R4)
     terms: IntArray  # (S,) which of them are estimated
+    # (7, 4) what k1, k2, q1, q2 have taken off `rows`, which were learned with them; None: nothing
+    rows_D_common: FloatArray | None = None
 
     def jacobian(self, z: FloatArray) -> FloatArray:
         """Derivatives of pixels (..., 4) by the coefficients that are estimated (..., 4, S)."""
-        return field_jacobian(self.camera, z, int(self.terms[0]), len(self.terms))
+        out = field_jacobian(self.camera, z, int(self.terms[0]), len(self.terms))
+        if self.rows_D_common is not None and self.terms[0] == 0:
+            for k, rows in enumerate(self.rows_D_common.T):
+                out[..., 2, RIGHT_TERMS + k] -= self._right_columns(z, rows)
+        return out
+
+    def _right_columns(self, z: FloatArray, rows: FloatArray) -> FloatArray:
+        """What rows (7,) of (R2) tell of the right columns of pixels (..., 4), pixels (...)."""
+        alone = StereoField(self.camera, rows, np.zeros(TERMS), self.terms)
+        out: FloatArray = z[..., 2] - alone.corrected(Views(z, np.ones_like(z))).z.reshape(z.shape)[..., 2]
+        return out
 
     def corrected(self, views: Views) -> Views:
         """Return views (..., 4) without the field."""

@@ -21,6 +21,7 @@ from vio.filters.multiview import LandmarkResiduals
 from vio.filters.navigation import DIM, ImuMotion, Measurement, NavState, Transition, TwistMotion
 from vio.filters.online_calibration import Calibration, Twist
 from vio.filters.scale_test import ScaleTest, is_clear
+from vio.filters.separate_bias import SeparateBias
 from vio.filters.stereo_calibration import METRIC_TERMS, StereoInformation
 from vio.geometry.lie import (
     FloatArray,
@@ -67,7 +68,9 @@ class Window:
         self.landmarks: FloatArray = np.zeros((0, 3))
         self.P = P
         self.prior_delta: FloatArray = np.zeros(len(P))
-        self.scale_test: ScaleTest | None = None  # its vector is transformed with the errors
+        # Constants that are estimated beside the state; their vectors are transformed with the errors.
+        self.scale_test: ScaleTest | None = None
+        self.focal: SeparateBias | None = None  # the focal length's logarithm of (R4), where it is no state
         self.clocks_compared = False  # whether exposures follow the time offset's error, (C2)
 
     @property
@@ -89,6 +92,11 @@ class Window:
         self._calibration = calibration
         self.first_clone = DIM + calibration.dim  # row of the first clone, the one after the calibration's
         self.nav_dim = DIM + calibration.imu_dim  # errors of the navigation state and, after them, of the IMU's terms
+
+    @property
+    def _biases(self) -> list[SeparateBias]:
+        """The constants that are estimated beside the state."""
+        return [bias for bias in (self.scale_test, self.focal) if bias is not None]
 
     @property
     def first_landmark(self) -> int:
@@ -173,6 +181,13 @@ class Window:
             out[rows, rows], vector[rows] = stereo.A, stereo.b
         return out, vector
 
+    def lift_focal(self, said: StereoInformation) -> FloatArray:
+        """Cross information (D,) of the errors and the focal length, the last of the calibration's terms given."""
+        out = np.zeros(len(self.P))
+        out[self.first_clone :] = said.cross[-1]
+        out[self.stereo_rows] = said.A[-1, : self.calibration.stereo_dim]
+        return out
+
     def scale_sigma(self) -> float:
         """The larger one of the standard deviations of baseline and focal length, over them; 0 where they are known."""
         if not self.calibration.metric:
@@ -225,9 +240,10 @@ class Window:
             rows = self.calibration.extrinsic_rows + DIM
             Phi[np.ix_(rows, rows)] = se3_adjoint(step.nav.T_world_imu @ se3_inverse(self.nav.T_world_imu))
         own = slice(0, len(Phi))
+        for bias in self._biases:
+            bias.error_D_bias[own] = Phi @ bias.error_D_bias[own]
         if self.scale_test is not None:
-            V, before = self.scale_test.error_D_scale, self._scaled_nav(self.nav)
-            V[own] = Phi @ V[own]
+            V, before = self.scale_test.error_D_bias, self._scaled_nav(self.nav)
             V[:DIM] += step.Phi @ before - self._scaled_nav(step.nav)
         self.nav = step.nav
         P, self._factors = self.P, {}
@@ -256,15 +272,38 @@ class Window:
             calibration: with the coefficients' first estimate.
             covariance: of their errors (S, S).
         """
-        D, S, first = len(self.P), len(covariance), self.nav_dim
+        self._insert(self.nav_dim, covariance, calibration)
+
+    def _insert(self, first: int, covariance: FloatArray, calibration: Calibration) -> None:
+        """Add errors with a covariance (S, S), from the row `first` on, of which a calibration has the means."""
+        D, S = len(self.P), len(covariance)
         old = np.concatenate([np.arange(first), np.arange(first + S, D + S)])
         P, prior_delta = np.zeros((D + S, D + S)), np.zeros(D + S)
         P[np.ix_(old, old)], prior_delta[old] = self.P, self.prior_delta
         P[first : first + S, first : first + S] = covariance
         self.P, self.prior_delta, self.calibration = P, prior_delta, calibration
-        if self.scale_test is not None:
-            V, self.scale_test.error_D_scale = self.scale_test.error_D_scale, np.zeros(D + S)
-            self.scale_test.error_D_scale[old] = V
+        for bias in self._biases:
+            V, bias.error_D_bias = bias.error_D_bias, np.zeros(D + S)
+            bias.error_D_bias[old] = V
+
+    def free_focal_length(self, calibration: Calibration, covariance: FloatArray) -> None:
+        """Make states of baseline and focal length; errors depend on them as was followed beside them, equation (S5).
+
+        Args:
+            calibration: with baseline and focal length as they were taken for known.
+            covariance: of their logarithms (2, 2).
+        """
+        assert self.focal is not None
+        D, first = len(self.P), self.stereo_rows.stop
+        of_baseline = np.zeros(D) if self.scale_test is None else self.scale_test.error_D_bias + self.scaled()
+        V = np.column_stack([of_baseline, self.focal.error_D_bias])
+        self.focal = self.scale_test = None
+        self._insert(first, np.zeros((METRIC_TERMS, METRIC_TERMS)), calibration)
+        terms = np.arange(first, first + METRIC_TERMS)
+        J = np.zeros((D + METRIC_TERMS, METRIC_TERMS))
+        J[terms, np.arange(METRIC_TERMS)] = 1.0
+        J[np.delete(np.arange(len(J)), terms)] = V
+        self.P = self.P + J @ covariance @ J.T
 
     def scaled(self) -> FloatArray:
         """How all errors (D,) move with the logarithm of the world's scale, equation (S1)."""
@@ -285,7 +324,7 @@ class Window:
         log, _ = self.scale_test.estimate()
         move = float(np.expm1(log)) * self.scaled()
         self.relinearise(move)
-        self.prior_delta = self.prior_delta - move - log * self.scale_test.error_D_scale
+        self.prior_delta = self.prior_delta - move - log * self.scale_test.error_D_bias
         self.scale_test.adopt()
         return float(np.exp(log))
 
@@ -297,7 +336,7 @@ class Window:
             P: their covariance (k, k) with it, the scale known.
         """
         assert self.scale_test is not None
-        V = self.scale_test.error_D_scale[: len(P)]
+        V = self.scale_test.error_D_bias[: len(P)]
         V = V - P @ (information @ V) + self.scaled()[: len(P)]
         out: FloatArray = self.scale_test.estimate()[1] ** 2 * np.outer(V, V)
         return out
@@ -333,8 +372,8 @@ class Window:
         self.P = to_nav @ self.P @ to_nav.T
         self.P[:6, :6] += noise
         self.prior_delta = to_nav @ self.prior_delta
-        if self.scale_test is not None:
-            self.scale_test.error_D_scale = to_nav @ self.scale_test.error_D_scale
+        for bias in self._biases:
+            bias.error_D_bias = to_nav @ bias.error_D_bias
 
     def add_clone(
         self, frame_index: int, time_ns: int, exposure: tuple[FloatArray, FloatArray, FloatArray] | None = None
@@ -358,9 +397,10 @@ class Window:
         P[:at, new], P[end, new], P[new, new] = beside[:at], beside[at:], block
         delta = self.prior_delta
         self.prior_delta = np.concatenate([delta[:at], camera_D_own @ delta[own], delta[at:]])
-        if self.scale_test is not None:
-            V = self.scale_test.error_D_scale
-            self.scale_test.error_D_scale = np.concatenate([V[:at], self._scale_of_clone(T, camera_D_own), V[at:]])
+        for bias in self._biases:
+            V = bias.error_D_bias
+            of_clone = self._scale_of_clone(T, camera_D_own) if bias is self.scale_test else camera_D_own @ V[own]
+            bias.error_D_bias = np.concatenate([V[:at], of_clone, V[at:]])
         self.P = P
         self.clones.append(Clone(frame_index, time_ns, T, self.nav.velocity))
         if len(self.landmarks):
@@ -369,7 +409,7 @@ class Window:
     def _scale_of_clone(self, T_exposed: FloatArray, camera_D_own: FloatArray) -> FloatArray:
         """How the error (6,) of a clone of the navigation state depends on the scale, its own pose being scaled too."""
         assert self.scale_test is not None
-        nav, V = self.nav, self.scale_test.error_D_scale[: self.first_clone].copy()
+        nav, V = self.nav, self.scale_test.error_D_bias[: self.first_clone].copy()
         V[:DIM] += self._scaled_nav(nav)
         out: FloatArray = camera_D_own @ V - self._scaled_nav(replace(nav, T_world_imu=T_exposed))[:6]
         return out
@@ -411,8 +451,8 @@ class Window:
         P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
         delta[first:] += p_cross @ (delta[turn] - delta[before])
-        if self.scale_test is not None:
-            V = self.scale_test.error_D_scale
+        for bias in self._biases:
+            V = bias.error_D_bias
             V[first:] += p_cross @ (V[turn] - V[before])
 
     def drop_oldest_clone(self) -> None:
@@ -433,11 +473,21 @@ class Window:
         loops.take_rows(self.P, rows, P)
         self.P = P
         self.prior_delta = self.prior_delta[rows]
-        if self.scale_test is not None:
-            self.scale_test.error_D_scale = self.scale_test.error_D_scale[rows]
+        for bias in self._biases:
+            bias.error_D_bias = bias.error_D_bias[rows]
 
-    def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
-        """Add landmarks (K, 3) whose errors are `A xi + noise`, with A (3K, D) and noise covariance (K, 3, 3)."""
+    def add_landmarks(
+        self,
+        ids: IntArray,
+        p_world: FloatArray,
+        A: FloatArray,
+        covariance: FloatArray,
+        point_D_focal: FloatArray | None = None,
+    ) -> None:
+        """Add landmarks (K, 3) whose errors are `A xi + noise`, with A (3K, D) and noise covariance (K, 3, 3).
+
+        With `point_D_focal` (3K,), they depend on the focal length as well, where it is followed.
+        """
         D, n = len(self.P), len(A)
         P = np.zeros((D + n, D + n))
         AP = A @ self.P
@@ -446,9 +496,11 @@ class Window:
         for k, block in enumerate(covariance):
             P[D + 3 * k : D + 3 * k + 3, D + 3 * k : D + 3 * k + 3] += block
         self.prior_delta = np.concatenate([self.prior_delta, A @ self.prior_delta])
-        if self.scale_test is not None:
-            V = self.scale_test.error_D_scale
-            self.scale_test.error_D_scale = np.concatenate([V, A @ V])
+        for bias in self._biases:
+            added = A @ bias.error_D_bias
+            if bias is self.focal and point_D_focal is not None:
+                added = added + point_D_focal
+            bias.error_D_bias = np.concatenate([bias.error_D_bias, added])
         self.P = 0.5 * (P + P.T)
         self.landmark_ids = np.concatenate([self.landmark_ids, ids])
         self.landmarks = np.concatenate([self.landmarks, p_world])
@@ -487,13 +539,20 @@ class Window:
             self._factors[first, size] = factor(self.P[:size, :size], first)
         return self._factors[first, size]
 
-    def absorb(self, information: FloatArray, vector: FloatArray, scaled: FloatArray | None = None) -> None:
+    def absorb(
+        self,
+        information: FloatArray,
+        vector: FloatArray,
+        scaled: FloatArray | None = None,
+        focal: FloatArray | None = None,
+    ) -> None:
         """Absorb measurements into the prior.
 
         Args:
             information: `H' R^-1 H` (D, D) of the residuals at the present means.
             vector: `H' R^-1 r` (D,).
             scaled: for measurements in metres, how the errors (D,) move with the logarithm of the world's scale.
+            focal: for pixels, `H' R^-1 h` (D,) with their derivatives h by the focal length's logarithm.
         """
         prior = self._prior_of(information, len(self.P))
         own = slice(prior.first, None)
@@ -502,6 +561,8 @@ class Window:
         self.P = P
         if self.scale_test is not None:
             self.scale_test.absorb(information, vector, -self.prior_delta, P, scaled)
+        if self.focal is not None:
+            self.focal.follow(information, P, focal)
 
     def measure(self, measurement: Measurement) -> None:
         """Absorb a measurement of the navigation state and move the means to the new prior."""
@@ -571,8 +632,8 @@ class Window:
         self.landmarks = self.landmarks @ R.T
         P = M @ self.P @ M.T
         self.P, self.prior_delta = 0.5 * (P + P.T), turn @ self.prior_delta
-        if self.scale_test is not None:
-            self.scale_test.error_D_scale = M @ self.scale_test.error_D_scale
+        for bias in self._biases:
+            bias.error_D_bias = M @ bias.error_D_bias
         return R, M
 
     def _corrected_velocities(self, motion: ImuMotion, T_world_imu: FloatArray, error: FloatArray) -> list[FloatArray]:

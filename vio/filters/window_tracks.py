@@ -5,7 +5,7 @@ Everything here is about pixels and points; poses come in as camera poses and go
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -24,11 +24,11 @@ from vio.filters.multiview import (
     usable_points,
 )
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import StereoColumns, StereoField, stereo_columns
+from vio.filters.stereo_calibration import TERMS, StereoColumns, StereoField, stereo_columns
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import StereoCamera
-from vio.records import BoolArray, IntArray
+from vio.records import ROW_TERMS, BoolArray, IntArray
 from vio.robust import median
 from vio.statistics import chi_square_quantile
 
@@ -48,6 +48,7 @@ class LinearTracks:
     rows: IntArray  # (F,) in the table
     p_world: FloatArray  # (F, 3)
     at: Residuals
+    weight: FloatArray  # (F, N) robust weight of each view
     information: TrackInformation
     stereo: StereoColumns | None  # where the stereo field is estimated
     field: StereoField | None  # what was taken out of the pixels
@@ -164,7 +165,23 @@ class WindowTracks:
             # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
             H = field.jacobian(z - at.r)
             columns = stereo_columns(at, H, information.q.p_D_q, weight)
-        return LinearTracks(T_cam0_world, rows, p_world, at, information, columns, field)
+        return LinearTracks(T_cam0_world, rows, p_world, at, weight, information, columns, field)
+
+    def focal_columns(self, tracks: LinearTracks, chosen: IntArray) -> tuple[StereoColumns, TrackInformation]:
+        """Linearise tracks (K,) by a focal length that is no state, as the last term beside those of (R3) that are.
+
+        Returns:
+            Their columns, and their part of what all tracks say.
+        """
+        terms = np.arange(TERMS)
+        field = StereoField(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), terms[-1:])
+        if tracks.field is not None:
+            field = replace(tracks.field, terms=terms)
+        z = self._views(tracks.rows[chosen], len(tracks.T_cam0_world), tracks.field).z
+        information = tracks.information.take(chosen)
+        at = Residuals(tracks.at.r[chosen], tracks.at.z_D_p[chosen], tracks.at.ahead[chosen])
+        predicted = z - at.r
+        return stereo_columns(at, field.jacobian(predicted), information.q.p_D_q, tracks.weight[chosen]), information
 
     def _views(self, rows: IntArray, clones: int, field: StereoField | None) -> Views:
         """What rows showed, without the stereo field."""

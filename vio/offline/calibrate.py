@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -289,7 +289,7 @@ def _no_imu(why: str) -> ImuReport:
 def _measure_imu(
     recording: Recording,
     tracks: FeatureTracks,
-    samples: tuple[MotionSample, ...],
+    samples: Sequence[MotionSample],
     motion: CameraMotion | NotObservable,
 ) -> ImuReport:
     if not samples:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,7 +27,7 @@ class CalibrationSource:
 
     path: Path
     rig: StereoRig | None  # as calibrated; None: features without an image size
-    raw_pairs: tuple[tuple[Path, Path], ...]  # image files, unrectified where the cameras are; empty: features only
+    raw_pairs: Sequence[tuple[Path, Path]]  # image files, unrectified where the cameras are; empty: features only
     dataset: Dataset | None  # None: images cannot be rectified with this calibration
     rejection: str | None  # the reader's error, if the images cannot be rectified
 
@@ -95,7 +95,7 @@ def track(
     build_frontend: Callable[[Dataset], Frontend],
     frames: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> tuple[FeatureTracks, tuple[MotionSample, ...]]:
+) -> tuple[FeatureTracks, Sequence[MotionSample]]:
     """Return stereo tracks of the first frames, from the file or by a front end, and the motion samples.
 
     Args:

@@ -7,12 +7,13 @@ s_b sqrt(dt).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.common import velocity_samples
+from vio.datasets.samples import velocity_samples
 from vio.geometry.lie import FloatArray
 from vio.records import ImuDensities, ImuRecord, IntArray, VelocitySample
 from vio.setting import setting
@@ -99,7 +100,7 @@ def simulate_velocity(
     noise: VelocityNoise | None = None,
     seed: int = 0,
     times_ns: npt.ArrayLike | None = None,
-) -> tuple[VelocitySample, ...]:
+) -> Sequence[VelocitySample]:
     """Simulate the paper's control input `u = [v; omega]` along a motion, in the imu frame, with the paper's noise.
 
     `times_ns` (N,) overrides the rate.

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from vio.datasets.common import frame_range, imu_samples, merge_events
+from vio.datasets.common import frame_range, merge_events
 from vio.datasets.euroc_files import read_imu_csv, stamped_rows
+from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.errors import CalibrationError, DataError
 from vio.geometry.distortion import StereoRig, rectified_camera
 from vio.geometry.lie import FloatArray, se3_inverse
@@ -68,7 +69,7 @@ class Simulation:
     taken_ns: IntArray  # (F,) when the content of each frame was exposed, true time; repeats where duplicated
     stamps_ns: IntArray  # (F,) time stamp of each frame, strictly increasing
     imu: ImuRecord | None
-    velocity: tuple[VelocitySample, ...]
+    velocity: Sequence[VelocitySample]
     effects: SensorEffects
     seed: int
     calibration: StereoRig  # as calibrated, which is what is written and read; `rig` is the true one
@@ -130,7 +131,7 @@ def simulate(
     _check_cameras(world, true_rig, motion, times)
     taken, stamps = _apply_faults(times, faults, seed)
     record = simulate_imu(motion, rate_hz=imu_rate_hz, noise=imu, seed=seed) if isinstance(imu, ImuNoise) else imu
-    samples: tuple[VelocitySample, ...] = ()
+    samples: Sequence[VelocitySample] = ()
     if velocity is not None:
         samples = simulate_velocity(motion, rate_hz=velocity_rate_hz or rate_hz, noise=velocity, seed=seed)
     exposures = None
@@ -280,11 +281,11 @@ class SimulatedRecording:
         frames = (self.frame(k) if images else StereoFrame(k, int(times_ns[k]), None, None) for k in chosen)
         return merge_events(recording, chosen, self._motion_samples(), frames)
 
-    def _motion_samples(self) -> list[MotionSample]:
+    def _motion_samples(self) -> MotionSamples[MotionSample]:
         """All samples in time order."""
         simulation = self.simulation
         inertial = () if simulation.imu is None else imu_samples(simulation.imu)
-        return sorted((*simulation.velocity, *inertial), key=lambda sample: sample.time_ns)
+        return in_time_order(simulation.velocity, inertial)
 
     def observations(self, index: int) -> Observations | None:
         """Return None: a simulated recording holds images."""

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
-
-import numpy as np
 
 from vio.camera_rig import CameraRig
 from vio.datasets.bags import bag_files
@@ -15,10 +13,10 @@ from vio.datasets.bags.index import BagIndex, index_bag, info_topic
 from vio.datasets.bags.pictures import white_of
 from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import Roles, choose
-from vio.datasets.common import imu_samples
 from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.datasets.overlap import check_overlap
 from vio.datasets.rigs import find_calibration
+from vio.datasets.samples import imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import imu_notes
 from vio.errors import CalibrationError
@@ -125,14 +123,14 @@ def is_rectified(topic: Topic) -> bool:
 
 def motion_of(
     found: Contents, rig: Rig | CameraRig, times_ns: IntArray
-) -> tuple[tuple[MotionSample, ...], frozenset[MotionSource], list[str]]:
+) -> tuple[Sequence[MotionSample], frozenset[MotionSource], list[str]]:
     """Return the samples in time order on the cameras' clock, their kinds, and notes."""
     index, roles = found.index, found.roles
     notes = [
         f"{count} messages of {topic} were recorded out of order and are sorted"
         for topic, count in index.disordered.items()
     ]
-    samples: list[MotionSample] = []
+    parts: list[Sequence[MotionSample]] = []
     sources: set[MotionSource] = set()
     record = index.imu_record()
     if rig.T_cam0_imu is None and (record is not None or index.velocities):
@@ -149,14 +147,14 @@ def motion_of(
             notes.append(f"the IMU's stamps are moved by {-1e3 * rig.time_offset_s:+.3f} ms, as the calibration states")
         check_overlap(times_ns, record.times_ns, f"{found.path}, {roles.imu.name}")
         notes += imu_notes(record.times_ns, roles.imu.name)
-        samples += imu_samples(record)
+        parts.append(imu_samples(record))
         sources.add("imu")
     if roles.velocity is not None and (speeds := index.velocity_samples()):
-        check_overlap(times_ns, np.array([s.time_ns for s in speeds], dtype=np.int64), roles.velocity.name)
+        check_overlap(times_ns, speeds.times_ns, roles.velocity.name)
         notes.append(f"the twist of {roles.velocity.name} is taken in the frame of T_cam0_imu")
-        samples += speeds
+        parts.append(speeds)
         sources.add("velocity")
-    return tuple(sorted(samples, key=lambda s: s.time_ns)), frozenset(sources), notes
+    return in_time_order(*parts), frozenset(sources), notes
 
 
 def white_level(index: BagIndex) -> tuple[int, list[str]]:

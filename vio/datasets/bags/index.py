@@ -17,6 +17,7 @@ from vio.datasets.bags.store import Bag, Message, Topic
 from vio.datasets.bags.topics import CAMERA_INFO, COMPRESSED, IMAGE, TF, Roles
 from vio.datasets.images import UnreadableImageError
 from vio.datasets.rigs.camera_info import CameraInfo
+from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse
 from vio.records import NS_PER_S, ImuRecord, IntArray, Trajectory, VelocitySample
@@ -72,12 +73,12 @@ class BagIndex:
         times, values = _sorted(self.imu)
         return ImuRecord(times, values[:, :3], values[:, 3:])
 
-    def velocity_samples(self) -> tuple[VelocitySample, ...]:
-        """The velocities in the order of their stamps."""
+    def velocity_samples(self) -> MotionSamples[VelocitySample] | None:
+        """The velocities in the order of their stamps; None: there are none."""
         if not self.velocities:
-            return ()
+            return None
         times, values = _sorted(self.velocities)
-        return tuple(VelocitySample(t, row[:3], row[3:]) for t, row in zip(times.tolist(), values, strict=True))
+        return velocity_samples(times, values[:, :3], values[:, 3:])
 
     def reference(self, *, imu: bool) -> Trajectory | None:
         """The poses as those of the IMU, or of the left camera where there is none; None: there are none.

@@ -34,7 +34,7 @@ class OneCameraBag:
     recording: Recording
     topic: Topic
     logged_ns: IntArray  # (F,) when the bag received each image
-    motion: tuple[MotionSample, ...] = field(repr=False)  # in time order
+    motion: Sequence[MotionSample] = field(repr=False)  # in time order
     size: ImageSize
     settings: DatasetSettings
     undistorter: Undistorter

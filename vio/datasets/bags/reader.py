@@ -50,7 +50,7 @@ class BagDataset:
     left_ns: IntArray  # (F,) stamps of the paired left images
     right_ns: IntArray  # (F,) of the right ones
     logged_ns: IntArray  # (F,) when the bag received the first of each pair
-    motion: tuple[MotionSample, ...] = field(repr=False)
+    motion: Sequence[MotionSample] = field(repr=False)
     sizes: tuple[ImageSize, ImageSize]
     settings: DatasetSettings
     rectifier: Rectifier
