@@ -2,7 +2,7 @@
 # The default command is the demo; its results are in /data. Own recordings: docker run … -v /path:/data stereo-vio run /data/folder
 FROM python:3.11-slim AS build
 WORKDIR /src
-COPY pyproject.toml constraints.txt README.md LICENSE ./
+COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./
 COPY vio vio
 COPY frontend frontend
 RUN python -m venv /opt/vio \

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from vio import load_config, open_dataset, run
-from vio.upright import upright_axes
+from vio.geometry.upright import upright_axes
 from vio.view.live import states_of
 
 WIDTH, EVERY, LONGEST = 480, 2, 10  # pixels of each half, frames between two pictures, steps of a feature's tail

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 import vio
-from vio.run_folder import write_run_folder
+from vio.runs.folder import write_run_folder
 
 config = vio.load_config()
 dataset = vio.open_dataset(sys.argv[1])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.finished_run import read_finished_run
+from vio.runs.finished import read_finished_run
 
 run = read_finished_run(Path(sys.argv[1]))
 T = run.estimates["T_world_imu"]  # (N, 4, 4)

@@ -6,42 +6,41 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from vio.errors import ConfigError
+from vio.frontend.settings import FrontendSettings
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Dataset, Frontend
-
-from .settings import FrontendSettings
 
 __all__ = ["BUILDERS", "FrontendSettings", "build_frontend", "one_opencv_thread"]
 
 
 def _build_klt(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from .klt import KltFrontend
+    from vio.frontend.klt import KltFrontend
 
     return KltFrontend(camera, settings)
 
 
 def _build_orb(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from .descriptors import DescriptorFrontend, MutualNearest, orb_extractor
+    from vio.frontend.descriptors import DescriptorFrontend, MutualNearest, orb_extractor
 
     match = settings.match
     return DescriptorFrontend(camera, settings, "orb", orb_extractor(match), MutualNearest(match.ratio))
 
 
 def _build_sift(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from .descriptors import DescriptorFrontend, MutualNearest, sift_extractor
+    from vio.frontend.descriptors import DescriptorFrontend, MutualNearest, sift_extractor
 
     match = settings.match
     return DescriptorFrontend(camera, settings, "sift", sift_extractor(match), MutualNearest(match.ratio))
 
 
 def _build_kornia(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from .learned import build_learned
+    from vio.frontend.learned import build_learned
 
     return build_learned(camera, settings)
 
 
 def _build_precomputed(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
-    from .precomputed import PrecomputedFrontend
+    from vio.frontend.precomputed import PrecomputedFrontend
 
     if dataset is None:
         raise ConfigError("frontend.name: precomputed needs a recording of features")

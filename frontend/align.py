@@ -15,11 +15,10 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled, compiled_sums, invert_positive
+from vio.frontend.patches import Patches, inside
 from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled, compiled_sums, invert_positive
 from vio.records import BoolArray, Image, IntArray
-
-from .patches import Patches, inside
 
 _PARAMETERS = 8  # shift u, v; gain; offset; linear part in row-major order
 _ROW_PARAMETERS = 6  # the same without the second row of the linear part

@@ -6,19 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.compiled import compiled
+from vio.frontend.align import align, on_peak, rounded, scale_change, shift_warps, template_points
+from vio.frontend.columns import take
+from vio.frontend.detect import min_distance_px
+from vio.frontend.outliers import Consensus, pixel_errors
+from vio.frontend.patches import View, inside
+from vio.frontend.prediction import moved_pixels
+from vio.frontend.settings import GridSettings, KltSettings
+from vio.frontend.tracks import AnchorBank, Tracks
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of
+from vio.numerics.compiled import compiled
 from vio.records import BoolArray, IntArray
-
-from .align import align, on_peak, rounded, scale_change, shift_warps, template_points
-from .columns import take
-from .detect import min_distance_px
-from .outliers import Consensus, pixel_errors
-from .patches import View, inside
-from .prediction import moved_pixels
-from .settings import GridSettings, KltSettings
-from .tracks import AnchorBank, Tracks
 
 _ITERATIONS = 5
 _ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost

@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled
 from vio.errors import ConfigError
+from vio.frontend.settings import GridSettings, KltSettings
 from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image, IntArray
-
-from .settings import GridSettings, KltSettings
 
 Response = npt.NDArray[np.float32]
 

@@ -15,9 +15,8 @@ from typing import Literal, TypeAlias
 import cv2
 import numpy as np
 
+from vio.frontend.right_camera import image_change
 from vio.records import Image
-
-from .right_camera import image_change
 
 Order: TypeAlias = Literal["given", "exchanged", "refused"]
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from vio.frontend.patches import mean_and_contrast
 from vio.geometry.lie import FloatArray
 from vio.records import Image
-
-from .patches import mean_and_contrast
 
 # Change of the difference of row means in a frame, gray levels (root mean square over the rows). Measured: up to 7 on
 # recordings without a fault, up to 19 where the right camera is late, 70 and more by bands of 25 %.

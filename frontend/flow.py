@@ -5,11 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from vio.frontend.patches import View, inside, mean_and_contrast
+from vio.frontend.settings import KltSettings
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image
-
-from .patches import View, inside, mean_and_contrast
-from .settings import KltSettings
 
 _LK_EPSILON_PX = 0.02  # of the half-resolution image
 _LK_MIN_EIGENVALUE = 1e-4  # as OpenCV's own default

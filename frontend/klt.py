@@ -7,28 +7,27 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from vio.frontend.anchor_fit import AnchorFit
+from vio.frontend.detect import detect_corners, half_mask, load_mask
+from vio.frontend.exchange import ExchangeDetector, MatchCounts
+from vio.frontend.flicker import BandRemoval
+from vio.frontend.flow import lost_contrast, track_with_retries
+from vio.frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains
+from vio.frontend.new_features import NewFeatures
+from vio.frontend.one_camera import with_depths, with_prior_depths
+from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
+from vio.frontend.patches import View, half_image, inside
+from vio.frontend.prediction import guessed_pixels, prior_rows, usable_prior
+from vio.frontend.right_camera import RightCamera
+from vio.frontend.right_delay import RightDelay
+from vio.frontend.right_match import PreviousFrame, RightMatcher
+from vio.frontend.settings import FrontendSettings
+from vio.frontend.stereo_fit import StereoFit
+from vio.frontend.tracks import AnchorBank, Tracks, no_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, Image, StereoFrame, TrackPrior
-
-from .anchor_fit import AnchorFit
-from .detect import detect_corners, half_mask, load_mask
-from .exchange import ExchangeDetector, MatchCounts
-from .flicker import BandRemoval
-from .flow import lost_contrast, track_with_retries
-from .frames import FrameValidator, Stopwatch, SwapDetector, make_output
-from .moving_object import ObjectReport, choose_motion, one_motion_explains
-from .new_features import NewFeatures
-from .one_camera import with_depths, with_prior_depths
-from .outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
-from .patches import View, half_image, inside
-from .prediction import guessed_pixels, prior_rows, usable_prior
-from .right_camera import RightCamera
-from .right_delay import RightDelay
-from .right_match import PreviousFrame, RightMatcher
-from .settings import FrontendSettings
-from .stereo_fit import StereoFit
-from .tracks import AnchorBank, Tracks, no_tracks
 
 _EXCHANGE_POINTS = 80  # points that matches of either sign are counted at
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped

@@ -6,9 +6,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from vio.compiled import compiled
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.compiled import compiled
 
 Lens: TypeAlias = tuple[float, float, float, float, bool]  # fu, fv, cu, cv, whether the projection is a cylinder
 

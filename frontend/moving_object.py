@@ -16,12 +16,11 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.frontend.outliers import Consensus, RansacProblem, bearing_consensus, best_motion, pixel_errors
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, z_D_p_cam
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import MotionPrior
-from vio.statistics import chi_square_quantile
-
-from .outliers import Consensus, RansacProblem, bearing_consensus, best_motion, pixel_errors
 
 Decision: TypeAlias = Literal["predicted", "undecided"]
 

@@ -6,17 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from vio.frontend.align import rounded
+from vio.frontend.columns import joined, take
+from vio.frontend.outliers import Consensus
+from vio.frontend.patches import View, inside
+from vio.frontend.settings import GridSettings, KltSettings
+from vio.frontend.stereo_fit import StereoFit
+from vio.frontend.tracks import AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.records import BoolArray, Image, IntArray
-
-from .align import rounded
-from .columns import joined, take
-from .outliers import Consensus
-from .patches import View, inside
-from .settings import GridSettings, KltSettings
-from .stereo_fit import StereoFit
-from .tracks import AnchorBank, Tracks, new_tracks
 
 _FEW = 0.5  # share of the least number of features below which corners without depth are added
 _TRIED = 1.5  # corners aligned per missing feature

@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from vio.frontend.prediction import prior_depths
+from vio.frontend.tracks import Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.records import BoolArray, TrackPrior
-
-from .prediction import prior_depths
-from .tracks import Tracks
 
 # Disparities of four neighbouring pixels on a surface differ by less, also where it is seen at a slant of 80 degrees;
 # at the outline of an object they differ by more, and which side a feature lies on is not known.

@@ -17,14 +17,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vio.compiled import compiled, move_by_twist, solve_positive
+from vio.frontend.lens import Lens, lens_of, moved_pixel
+from vio.frontend.settings import ConsensusSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project
+from vio.numerics.compiled import compiled, move_by_twist, solve_positive
+from vio.numerics.robust import median
 from vio.records import BoolArray, IntArray
-from vio.robust import median
-
-from .lens import Lens, lens_of, moved_pixel
-from .settings import ConsensusSettings
 
 _MIN_DEPTH_M = 0.05
 _MIN_POINTS = 8  # with fewer points, a consensus may be chance

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled
+from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image
 
 Patches: TypeAlias = npt.NDArray[np.float32]  # (N, h, w) gray levels

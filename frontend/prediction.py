@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.compiled import compiled
+from vio.frontend.lens import Lens, lens_of, moved_pixel
+from vio.frontend.patches import inside
+from vio.frontend.tracks import Tracks
 from vio.geometry.lie import FloatArray, se3_from_parts
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays
+from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image, IntArray, TrackPrior
-
-from .lens import Lens, lens_of, moved_pixel
-from .patches import inside
-from .tracks import Tracks
 
 _ROTATION_SLACK = 1e-3  # largest deviation of R R' of a predicted rotation from the identity
 _MIN_DEPTH_M = 0.1

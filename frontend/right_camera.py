@@ -13,10 +13,9 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
-from vio.compiled import compiled_sums
+from vio.frontend.patches import mean_and_contrast, statistics
+from vio.numerics.compiled import compiled_sums
 from vio.records import BoolArray, Image
-
-from .patches import mean_and_contrast, statistics
 
 Cause: TypeAlias = Literal["frozen", "dark", "contradicts"]
 
@@ -183,7 +182,7 @@ def image_change(image: Image, other: Image) -> float:
 def _difference(image: Image, other: Image) -> float:
     """Mean absolute difference of two images, each less its mean and over its contrast; 0: equal to the bit."""
     height, width = image.shape
-    all_pixels = int(np.int64(1))  # no literal: see `vio.compiled`
+    all_pixels = int(np.int64(1))  # no literal: see `vio.numerics.compiled`
     (mean, contrast), (other_mean, other_contrast) = statistics(image, all_pixels), statistics(other, all_pixels)
     scale, other_scale = max(contrast, 1.0), max(other_contrast, 1.0)
     total, unlike = 0.0, 0

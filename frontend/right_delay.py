@@ -11,12 +11,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.compiled import solve_positive
+from vio.frontend.tracks import Tracks
+from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays
-
-from .tracks import Tracks
-from .weighted_fit import add_equations
+from vio.numerics.compiled import solve_positive
 
 _MEMORY = 0.97  # per frame, of the normal equations
 _LEAST_MATCHES = 30  # in a frame that is learned from

@@ -6,17 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.frontend.one_camera import with_prior_depths
+from vio.frontend.outliers import Consensus
+from vio.frontend.patches import View
+from vio.frontend.right_camera import RightCamera
+from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
+from vio.frontend.stereo_fit import StereoFit
+from vio.frontend.tracks import Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import Image, IntArray, StereoFrame, TrackPrior
-
-from .one_camera import with_prior_depths
-from .outliers import Consensus
-from .patches import View
-from .right_camera import RightCamera
-from .right_delay import PairingCounts, RightDelay, at_exposure, at_present
-from .stereo_fit import StereoFit
-from .tracks import Tracks, no_tracks
 
 _PAIRING_POINTS = 150  # features that are tried with images of other frames
 

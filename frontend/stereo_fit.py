@@ -10,18 +10,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from vio.compiled import compiled
+from vio.frontend.align import align, on_peak
+from vio.frontend.columns import take
+from vio.frontend.lens import Lens, lens_of, point_at
+from vio.frontend.patches import View
+from vio.frontend.settings import DisparitySettings, KltSettings
+from vio.frontend.stereo_match import RowField, match_rows, shifted_rows
+from vio.frontend.tracks import AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, depth_of
+from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image, IntArray
-
-from .align import align, on_peak
-from .columns import take
-from .lens import Lens, lens_of, point_at
-from .patches import View
-from .settings import DisparitySettings, KltSettings
-from .stereo_match import RowField, match_rows, shifted_rows
-from .tracks import AnchorBank, Tracks
 
 _ITERATIONS = 5
 _MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4

@@ -11,12 +11,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled, solve_positive
+from vio.frontend.align import FLAT_RMS
+from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled, solve_positive
 from vio.records import BoolArray, Image, IntArray
-
-from .align import FLAT_RMS
-from .weighted_fit import add_equations
 
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak

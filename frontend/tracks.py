@@ -6,11 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.frontend.align import cut_patches, empty_templates, replace_templates, shift_warps
+from vio.frontend.columns import joined
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
-
-from .align import cut_patches, empty_templates, replace_templates, shift_warps
-from .columns import joined
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from vio.compiled import compiled
 from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled
 
 
 @compiled

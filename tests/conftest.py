@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hypothesis import Phase, settings
 
-from vio.threads import one_blas_thread
+from vio.numerics.threads import one_blas_thread
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from frontend.align import FLAT_RMS, Templates, offsets
 from vio.filters.multiview import (
     CAUCHY,
     LEAST_DISPARITY_PX,
@@ -17,6 +16,7 @@ from vio.filters.multiview import (
 )
 from vio.filters.navigation import _free_flow
 from vio.filters.stereo_calibration import StereoColumns, StereoInformation
+from vio.frontend.align import FLAT_RMS, Templates, offsets
 from vio.geometry.lie import FloatArray, circledot, se3_exp, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project, z_D_p_cam
 from vio.records import BoolArray

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 
 from tests.euroc_maker import RADTAN_RIG, noise_image, truth_poses
+from vio.cameras.rig import Rig
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import quat_xyzw_from_rotation, se3_inverse
-from vio.rig import Rig
 
 STEP_S = 0.05
 

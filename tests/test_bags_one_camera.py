@@ -14,7 +14,7 @@ rosbags = pytest.importorskip("rosbags", reason="needs the extra bags")
 
 from tests.bag_maker import Script, noise_frames  # noqa: E402
 from tests.same_events import assert_same_events  # noqa: E402
-from vio.camera_rig import CameraRig  # noqa: E402
+from vio.cameras.camera_rig import CameraRig  # noqa: E402
 from vio.config import Config  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
 from vio.datasets.bags.one_camera import OneCameraBag  # noqa: E402
@@ -23,9 +23,9 @@ from vio.errors import CalibrationError, ConfigError, DataError  # noqa: E402
 from vio.geometry.distortion import CameraModel  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402
 from vio.geometry.stereo import one_camera  # noqa: E402
-from vio.pipeline import run  # noqa: E402
 from vio.protocols import Dataset  # noqa: E402
 from vio.records import ImuSample, StereoFrame  # noqa: E402
+from vio.runs.pipeline import run  # noqa: E402
 
 START_NS = 10**18
 T_CAM0_IMU = se3_exp([0.1, -0.05, 0.02, 1.2, -1.2, 1.2])

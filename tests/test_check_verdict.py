@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vio.colmap.reconstruction import Mapper, Reconstructed
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera
-from vio.mapping.comparison import compare_keyframes
-from vio.mapping.keyframes import TrackedPath
 from vio.offline.check import draw_check, expected_minutes
+from vio.offline.colmap.reconstruction import Mapper, Reconstructed
+from vio.offline.comparison import compare_keyframes
+from vio.offline.keyframes import TrackedPath
 from vio.offline.verdict import MapperResult, overall_verdict
 from vio.records import FeatureTracks, Trajectory
 

@@ -17,7 +17,7 @@ from tests.dataset_makers import T_CAM0_IMU, ece276a_arrays, make_drive, make_ki
 from vio.cli import main
 from vio.config import BASIC, Config, describe
 from vio.errors import DataError
-from vio.trajectory_io import read_trajectory
+from vio.files.trajectories import read_trajectory
 
 FRAMES = 24
 CONTRACT = ("out", "frames", "path_length_m", "ms_per_frame", "ate_m", "rpe", "t_err_percent", "r_err_deg_per_100m")
@@ -312,7 +312,7 @@ def test_run_interrupted_while_its_picture_is_drawn_goes_on(
 
     out = tmp_path / "deep" / "out"
     with monkeypatch.context() as patch:
-        patch.setattr("vio.plotting.plot_run", stop)
+        patch.setattr("vio.runs.picture.plot_run", stop)
         assert main(["run", str(recording), "--out", str(out)]) == 130
     assert f"interrupted; what was flushed is in {out}" in capsys.readouterr().err
     assert len(read_trajectory(out / "trajectory.tum")) > 0
@@ -405,7 +405,7 @@ def test_config_prints_the_effective_configuration(tmp_path: Path, capsys: pytes
 def test_eval_aligns_as_requested(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from dataclasses import replace
 
-    from vio.trajectory_io import write_tum
+    from vio.files.trajectories import write_tum
 
     _json(capsys, "run", str(recording), "--out", str(tmp_path / "out"))
     estimate = tmp_path / "out" / "trajectory.tum"

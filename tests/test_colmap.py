@@ -13,27 +13,27 @@ import pytest
 
 from tests.dataset_makers import make_kitti
 from vio.cli import main
-from vio.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px, write_model
-from vio.colmap.reconstruction import pairs_to_match
-from vio.colmap.trajectory import read_colmap_trajectory
 from vio.config import Config
 from vio.datasets import open_dataset
 from vio.errors import DataError, EstimationError
-from vio.evaluation import rotation_angle_deg
+from vio.evaluation.trajectories import rotation_angle_deg
+from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import project
-from vio.loop_files import write_loops
-from vio.loops import LoopEvent, LoopMatches
-from vio.mapped_run import corrected
-from vio.mapping.comparison import Comparison, GroundTruth, compare_keyframes
-from vio.mapping.keyframes import TrackedPath, choose_keyframes
-from vio.mapping.loop_tracks import loop_rows
-from vio.mapping.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
-from vio.mapping.poses import align_to_points, position_covariances
-from vio.pipeline import run as process
-from vio.records import Estimate
-from vio.run_folder import write_run_folder
-from vio.saved_run import read_saved_run, with_poses
+from vio.offline.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px, write_model
+from vio.offline.colmap.reconstruction import pairs_to_match
+from vio.offline.colmap.trajectory import read_colmap_trajectory
+from vio.offline.comparison import Comparison, GroundTruth, compare_keyframes
+from vio.offline.keyframes import TrackedPath, choose_keyframes
+from vio.offline.loop_tracks import loop_rows
+from vio.offline.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
+from vio.offline.poses import align_to_points, position_covariances
+from vio.offline.saved_run import read_saved_run, with_poses
+from vio.records import Estimate, LoopEvent, LoopMatches
+from vio.runs.folder import write_run_folder
+from vio.runs.loop_files import write_loops
+from vio.runs.mapped import corrected
+from vio.runs.pipeline import run as process
 from vio.sim.effects import CLEAN
 from vio.sim.export import export_kitti
 from vio.sim.imu import ImuNoise
@@ -42,7 +42,6 @@ from vio.sim.oracle import OracleFrontend, OracleSettings
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, Simulation, simulate
 from vio.sim.world import room
-from vio.trajectory_io import write_tum
 
 SIGMA_PX = 0.3
 
@@ -331,7 +330,7 @@ def test_an_interrupted_refinement_leaves_nothing(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("vio.run_folder.write_landmarks_ply", interrupted)  # while writing
+    monkeypatch.setattr("vio.runs.folder.write_landmarks_ply", interrupted)  # while writing
     assert main(["refine", str(folder)]) == 130
     capsys.readouterr()
     assert _contents(folder) == before

@@ -15,19 +15,18 @@ import pytest
 from numba.core import types
 from numba.core.dispatcher import Dispatcher
 
-from frontend import outliers, patches, right_camera
-from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
-from frontend.lens import lens_of
-from frontend.outliers import _gauss_newton, _refine, pixel_errors
-from frontend.prediction import _borrow, moved_pixels
-from frontend.stereo_fit import _triangulate
-from frontend.weighted_fit import add_equations
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
-from vio.compiled import invert_positive, move_by_twist, solve_positive
 from vio.datasets import png_rows
 from vio.filters import multiview, pose_loops, stereo_calibration, track_loops
 from vio.filters.multiview import Views
+from vio.frontend import outliers, patches, right_camera
+from vio.frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
+from vio.frontend.lens import lens_of
+from vio.frontend.outliers import _gauss_newton, _refine, pixel_errors
+from vio.frontend.prediction import _borrow, moved_pixels
+from vio.frontend.stereo_fit import _triangulate
+from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import (
     FloatArray,
     se3_adjoint,
@@ -39,6 +38,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.numerics.compiled import invert_positive, move_by_twist, solve_positive
 
 CAMERA = StereoCamera(fu=300.0, fv=310.0, cu=150.0, cv=100.0, baseline_m=0.1)
 CAMERAS = {"pinhole": CAMERA, "cylinder": replace(CAMERA, projection="cylinder")}
@@ -363,7 +363,9 @@ def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     )
 
 
-MODULE = "from vio.compiled import compiled\n\n@compiled\ndef doubled(x: float) -> float:\n    return 2.0 * x\n"
+MODULE = (
+    "from vio.numerics.compiled import compiled\n\n@compiled\ndef doubled(x: float) -> float:\n    return 2.0 * x\n"
+)
 
 
 def test_functions_run_where_no_cache_folder_is_writable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,8 @@ from tests.same_events import assert_same_events
 from vio.cli import main
 from vio.config import load_config
 from vio.datasets import open_dataset
-from vio.pipeline import run
 from vio.records import VelocitySample
+from vio.runs.pipeline import run
 
 BAGS = ("rosbag2", "mcap")
 

@@ -11,9 +11,9 @@ import pytest
 from tests.dataset_makers import T_CAM0_IMU, make_drive
 from vio.cli import main
 from vio.datasets.kitti import write_calibration
+from vio.files.trajectories import read_trajectory, write_euroc, write_kitti, write_tum
 from vio.geometry.stereo import StereoCamera
 from vio.records import Trajectory
-from vio.trajectory_io import read_trajectory, write_euroc, write_kitti, write_tum
 
 TIMES_NS = 1403715523912143104 + 50_000_000 * np.arange(12)
 TRUTH = Trajectory(make_drive(12).T_world_imu, TIMES_NS, "imu")

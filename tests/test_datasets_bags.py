@@ -13,6 +13,7 @@ rosbags = pytest.importorskip("rosbags", reason="needs the extra bags")
 
 from tests.bag_maker import Script, noise_frames, of_stereo  # noqa: E402
 from tests.same_events import assert_same_events  # noqa: E402
+from vio.cameras.rig import Rig  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
 from vio.datasets.bags.pictures import raw_gray, white_of  # noqa: E402
 from vio.datasets.bags.reader import BagDataset  # noqa: E402
@@ -21,7 +22,6 @@ from vio.errors import CalibrationError, DataError, VioError  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402
 from vio.protocols import Dataset  # noqa: E402
 from vio.records import ImuSample, StereoFrame, VelocitySample  # noqa: E402
-from vio.rig import Rig  # noqa: E402
 
 START_NS = 10**18
 T_CAM0_IMU = se3_exp([0.1, -0.05, 0.02, 1.2, -1.2, 1.2])
@@ -86,7 +86,7 @@ def test_a_bag_is_the_same_recording_to_the_bit(storage: str, flight: Path, tmp_
 
 def test_the_same_trajectory_to_the_bit(flight: Path, tmp_path: Path) -> None:
     from vio.config import Config
-    from vio.pipeline import run
+    from vio.runs.pipeline import run
 
     euroc = open_dataset(flight)
     bag = open_dataset(bag_of(euroc, "mcap", tmp_path / "f"), DatasetSettings(calibration=flight))

@@ -30,10 +30,10 @@ from vio.datasets.features import FeatureDataset
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, tracks_from_dense
 from vio.errors import CalibrationError, DataError
+from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project, triangulate
 from vio.records import FeatureTracks
-from vio.trajectory_io import read_trajectory
 
 DEFAULT = DatasetSettings()
 

@@ -29,6 +29,7 @@ from tests.euroc_maker import (
     write_imu,
 )
 from tools.research.check_rectification import match_sift
+from vio.cameras.rig import rectifier_of
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.euroc import pair_stamps, read_euroc
 from vio.datasets.euroc_files import camera_yaml, read_camera_yaml, rig_read_as
@@ -40,7 +41,6 @@ from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import rectify, rectifying_rotations
 from vio.geometry.stereo import StereoCamera
 from vio.records import ImuDensities, ImuSample, Recording, StereoFrame
-from vio.rig import rectifier_of
 from vio.sim.rigs import euroc_like_rig
 
 

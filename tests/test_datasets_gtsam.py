@@ -15,10 +15,10 @@ from vio.datasets import open_dataset
 from vio.datasets.features import FeatureDataset
 from vio.datasets.gtsam import read_gtsam
 from vio.errors import VioError
-from vio.evaluation import evaluate
+from vio.evaluation.trajectories import evaluate
 from vio.geometry.lie import se3_inverse
-from vio.pipeline import run
 from vio.records import Trajectory
+from vio.runs.pipeline import run
 
 FACTORS = "VO_stereo_factors_small.txt"
 FIRST = 7  # number of the first frame: GTSAM's files begin at 0 and at 1

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.dataset_makers import T_CAM0_IMU, calib_text, make_drive, make_images, make_kitti
+from vio.cameras.rig import Rig
 from vio.datasets import open_dataset
 from vio.datasets.kitti import read_calibration, read_kitti
 from vio.datasets.rigs.kalibr import kalibr_text
@@ -22,7 +23,6 @@ from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import se3_from_parts, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import StereoFrame, VelocitySample
-from vio.rig import Rig
 
 DEFAULT = DatasetSettings()
 OFFICIAL_00 = """P0: 7.188560000000e+02 0.000000000000e+00 6.071928000000e+02 0.000000000000e+00 0.000000000000e+00 \

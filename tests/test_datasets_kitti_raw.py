@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.euroc_maker import KITTI_RIG, RECT_SIZE, T_CAM0_VELO, T_VELO_IMU, make_kitti_raw
+from vio.cameras.rig import Rig
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.images import load_gray
 from vio.datasets.kitti_raw import KittiRawCalibration, read_cam_to_cam, read_kitti_raw
@@ -22,7 +23,6 @@ from vio.geometry.distortion import CameraModel, StereoRig, project_point
 from vio.geometry.lie import FloatArray, se3_inverse, so3_exp, so3_log
 from vio.geometry.rectify import rectify, rectifying_rotations
 from vio.records import StereoFrame
-from vio.rig import Rig
 
 
 def _read(path: Path) -> RectifiedDataset:

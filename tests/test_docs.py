@@ -267,7 +267,7 @@ def test_simulation_along_a_flight_runs(data_dir: Path) -> None:
 
 
 def test_inertial_check_runs(simulation: dict[str, object], caplog: pytest.LogCaptureFixture) -> None:
-    from vio.watch.inertial import InertialCheck
+    from vio.monitor.inertial import InertialCheck
 
     dataset, oracle = simulation["recording"], simulation["oracle"]
     events = list(dataset.events(images=False))  # type: ignore[attr-defined]

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from vio.cli import main
 from vio.errors import EvaluationError
-from vio.evaluation import (
+from vio.evaluation.trajectories import (
     KITTI_LENGTHS_M,
     AlignMode,
     align_poses,
@@ -36,6 +36,7 @@ from vio.evaluation import (
     rotation_angle_deg,
     settle_rotation,
 )
+from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import (
     FloatArray,
     nearest_rotation,
@@ -47,7 +48,6 @@ from vio.geometry.lie import (
     so3_exp,
 )
 from vio.records import BodyFrame, Trajectory
-from vio.trajectory_io import read_trajectory, write_tum
 
 properties = settings(max_examples=30, deadline=None)
 MODES: tuple[AlignMode, ...] = ("se3", "sim3", "none", "first")

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from frontend import FrontendSettings, build_frontend
 from vio.cli import main
 from vio.errors import DataError
+from vio.frontend import FrontendSettings, build_frontend
 from vio.geometry.stereo import StereoCamera
 from vio.records import FrontendOutput, StereoFrame, observations
 from vio.testing import check_frontend

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontend.exchange import ExchangeDetector, MatchCounts
-from frontend.klt import KltFrontend
-from frontend.settings import FrontendSettings, GridSettings
 from tests.test_frontend_klt import FRAMES
 from tests.test_frontend_scene import CAMERA
 from tests.test_right_camera import pair
+from vio.frontend.exchange import ExchangeDetector, MatchCounts
+from vio.frontend.klt import KltFrontend
+from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.records import FrontendOutput
 
 SETTINGS = FrontendSettings(grid=GridSettings(target_features=150))

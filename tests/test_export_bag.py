@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from vio.cli import main
-from vio.finished_run import read_finished_run
 from vio.geometry.lie import rotation_from_quat_xyzw, se3_exp, se3_inverse, so3_log
 from vio.offline.export_bag import ros_covariance
+from vio.runs.finished import read_finished_run
 
 rosbags = pytest.importorskip("rosbags", reason="needs the extra bags")
 

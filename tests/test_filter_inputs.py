@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frontend import FrontendSettings, build_frontend
 from tests.dataset_makers import CAMERA, FRAME_S, T_CAM0_IMU, make_drive
 from vio.config import Config
 from vio.errors import CalibrationError, ConfigError, DataError
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings, VislamSettings
 from vio.filters.vislam import Vislam
+from vio.frontend import FrontendSettings, build_frontend
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, ImuSample, Observations, StereoFrame, VelocitySample, observations
 

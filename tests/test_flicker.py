@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontend.flicker import BandRemoval
-from frontend.klt import KltFrontend
-from frontend.settings import FrontendSettings, GridSettings
 from tests.test_frontend_klt import FRAMES, step_errors
 from tests.test_frontend_scene import CAMERA
 from tests.test_right_camera import pair
+from vio.frontend.flicker import BandRemoval
+from vio.frontend.klt import KltFrontend
+from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.records import FrontendOutput, Image, StereoFrame
 
 

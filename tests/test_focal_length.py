@@ -16,10 +16,10 @@ from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera
+from vio.imu.findings import InertialFinding
 from vio.records import TURNS_NOT_SHOWN, ImuSample, Observations, TurnComparison, UpdateReport
 from vio.sim.motion import evaluate, hand_held, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU
-from vio.watch.finding import InertialFinding
 
 
 def _longer(camera: StereoCamera) -> StereoCamera:

@@ -16,12 +16,12 @@ from vio.bench.worker import _Truth, _used
 from vio.cli import main
 from vio.config import Config, load_config
 from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.frame_rate import FrameRateLimit
 from vio.errors import DataError
-from vio.frame_rate import FrameRateLimit
-from vio.odometry import Odometry
-from vio.pipeline import run
+from vio.live.odometry import Odometry
+from vio.monitor.run import RunWatch
 from vio.records import StereoFrame
-from vio.watch.run import RunWatch
+from vio.runs.pipeline import run
 
 TEN = DatasetSettings(max_frame_rate=10.0)
 

@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontend import BUILDERS, FrontendSettings, build_frontend
-from frontend.klt import KltFrontend
-from frontend.precomputed import PrecomputedFrontend
-from frontend.settings import GridSettings, LearnedSettings, MatchSettings
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
 from vio.errors import DataError
+from vio.frontend import BUILDERS, FrontendSettings, build_frontend
+from vio.frontend.klt import KltFrontend
+from vio.frontend.precomputed import PrecomputedFrontend
+from vio.frontend.settings import GridSettings, LearnedSettings, MatchSettings
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Frontend
 from vio.records import FrontendOutput, Observations, StereoFrame, observations

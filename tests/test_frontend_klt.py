@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
-from frontend import one_opencv_thread
-from frontend.detect import cell_index, grid_shape, min_distance_px
-from frontend.klt import KltFrontend
-from frontend.outliers import fit_motion
-from frontend.settings import FrontendSettings, GridSettings, KltSettings
 from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
 from vio.errors import ConfigError, DataError
+from vio.frontend import one_opencv_thread
+from vio.frontend.detect import cell_index, grid_shape, min_distance_px
+from vio.frontend.klt import KltFrontend
+from vio.frontend.outliers import fit_motion
+from vio.frontend.settings import FrontendSettings, GridSettings, KltSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import FrontendOutput, StereoFrame, TrackPrior

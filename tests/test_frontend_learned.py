@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
-from frontend.settings import FrontendSettings, GridSettings, LearnedSettings, MatchSettings
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
 from tools.bench_frontend import kornia_options
 from vio.errors import ConfigError, DataError, MissingDependencyError
+from vio.frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
+from vio.frontend.settings import FrontendSettings, GridSettings, LearnedSettings, MatchSettings
 from vio.geometry.lie import FloatArray
 from vio.records import StereoFrame
 
@@ -34,7 +34,7 @@ SMALL = replace(CAMERA, width=240, height=160)
 
 
 def build(settings: LearnedSettings, match: MatchSettings = MATCH) -> DescriptorFrontend:
-    from frontend.learned import build_learned
+    from vio.frontend.learned import build_learned
 
     grid = GridSettings(target_features=200)
     return build_learned(SMALL, FrontendSettings(grid=grid, match=match, learned=settings))
@@ -224,8 +224,8 @@ def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> 
 @pytest.mark.parametrize("detector", ["gftt", "harris"])
 def test_corner_positions_are_unbiased(torch: Any, detector: str) -> None:
     """White squares: the errors of the four corners cancel, so that a shift of half a pixel would be detected."""
-    from frontend.learned.extractors import build_extractor
-    from frontend.learned.weights import pick_device
+    from vio.frontend.learned.extractors import build_extractor
+    from vio.frontend.learned.weights import pick_device
 
     image = np.full((192, 256), 40, dtype=np.uint8)
     true = []
@@ -266,7 +266,7 @@ def test_mutual_nearest_equals_a_loop() -> None:
 
 
 def test_binary_descriptors_use_hamming_distance() -> None:
-    from frontend.descriptors import distances
+    from vio.frontend.descriptors import distances
 
     rng = np.random.default_rng(4)
     a, b = rng.integers(0, 256, (5, 32), dtype=np.uint8), rng.integers(0, 256, (7, 32), dtype=np.uint8)

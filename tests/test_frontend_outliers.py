@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from frontend.outliers import (
+from vio.frontend.outliers import (
     RansacProblem,
     bearing_consensus,
     epipolar_distance,
@@ -14,7 +14,7 @@ from frontend.outliers import (
     rigid_consensus,
     static_tracks,
 )
-from frontend.settings import ConsensusSettings
+from vio.frontend.settings import ConsensusSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
 

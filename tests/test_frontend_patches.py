@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
-from frontend.columns import joined, take
-from frontend.detect import (
+from vio.frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
+from vio.frontend.columns import joined, take
+from vio.frontend.detect import (
     cell_index,
     corner_response,
     detect_corners,
@@ -20,11 +20,11 @@ from frontend.detect import (
     noise_gradient,
     spread_evenly,
 )
-from frontend.patches import half_image, inside
-from frontend.prediction import moved_pixels, prior_pixels
-from frontend.settings import GridSettings, KltSettings
-from frontend.stereo_match import RowField, match_rows, row_correlation
-from frontend.tracks import AnchorBank
+from vio.frontend.patches import half_image, inside
+from vio.frontend.prediction import moved_pixels, prior_pixels
+from vio.frontend.settings import GridSettings, KltSettings
+from vio.frontend.stereo_match import RowField, match_rows, row_correlation
+from vio.frontend.tracks import AnchorBank
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, Image, IntArray, TrackPrior

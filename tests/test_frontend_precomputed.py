@@ -10,10 +10,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from frontend import BUILDERS, FrontendSettings, build_frontend
-from frontend.klt import KltFrontend
-from frontend.precomputed import PrecomputedFrontend
 from vio.errors import ConfigError, DataError
+from vio.frontend import BUILDERS, FrontendSettings, build_frontend
+from vio.frontend.klt import KltFrontend
+from vio.frontend.precomputed import PrecomputedFrontend
 from vio.geometry.stereo import StereoCamera
 from vio.protocols import Dataset
 from vio.records import Event, Observations, Recording, StereoFrame, observations

@@ -8,12 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from frontend import FrontendSettings, build_frontend
-from frontend.outliers import pixel_errors, predicted_motion, rigid_consensus
-from frontend.prediction import usable_prior
-from frontend.settings import ConsensusSettings, GridSettings, MatchSettings
 from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
 from tools.frontend_accuracy import accuracy_scenario
+from vio.frontend import FrontendSettings, build_frontend
+from vio.frontend.outliers import pixel_errors, predicted_motion, rigid_consensus
+from vio.frontend.prediction import usable_prior
+from vio.frontend.settings import ConsensusSettings, GridSettings, MatchSettings
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse
 from vio.records import FrontendOutput, Observations, StereoFrame, TrackPrior

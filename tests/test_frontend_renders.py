@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 
-from frontend import FrontendSettings, build_frontend
-from frontend.settings import GridSettings
 from tools.frontend_accuracy import Tally, accuracy_scenario, evaluate, figures
+from vio.frontend import FrontendSettings, build_frontend
+from vio.frontend.settings import GridSettings
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import se3_from_parts
 from vio.protocols import Frontend

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontend.klt import KltFrontend
-from frontend.stereo_match import RowField, shifted_rows
 from tests.test_frontend_scene import CAMERA, flight, stereo_frame
+from vio.frontend.klt import KltFrontend
+from vio.frontend.stereo_match import RowField, shifted_rows
 from vio.records import FrontendOutput, Image
 
 

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from vio.camera_rig import with_virtual_baseline
+from vio.cameras.camera_rig import with_virtual_baseline
 from vio.config import load_config
-from vio.evaluation import evaluate
+from vio.evaluation.trajectories import evaluate
 from vio.geometry.lie import se3_exp
 from vio.geometry.stereo import one_camera
-from vio.pipeline import run
+from vio.monitor.frozen import IMAGES, FrozenImages, Repeated, RepeatReport, corner_flow
 from vio.records import (
     Event,
     Image,
@@ -28,12 +28,12 @@ from vio.records import (
     TrackPrior,
     observations,
 )
+from vio.runs.pipeline import run
 from vio.sim.imu import ImuNoise
 from vio.sim.motion import hand_held
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate
 from vio.sim.world import room
-from vio.watch.frozen import IMAGES, FrozenImages, Repeated, RepeatReport, corner_flow
 
 STEP_NS = 50_000_000
 FRAMES, FIRST, LAST = 32, 14, 23  # frames of the flight, of which 10 are repeated: 0.5 s

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vio.monitor.health import RunHealth
 from vio.records import Estimate, StereoFieldEstimate, StereoScaleEstimate, UpdateReport
-from vio.watch.health import RunHealth
 
 GOOD = UpdateReport(50, 2, 1, 30, 0.3, 1.0)
 EMPTY = UpdateReport(0, 0, 0, 30, None, None)

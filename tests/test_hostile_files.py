@@ -20,10 +20,10 @@ from vio.datasets.common import read_npz
 from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import UnreadableImageError, load_gray, white_level
 from vio.errors import CalibrationError, ConfigError, DataError
+from vio.files.text import text_lines
+from vio.files.yaml_text import read_yaml
 from vio.filters.settings import MsckfSettings
 from vio.records import StereoFrame
-from vio.text_files import text_lines
-from vio.yaml_text import read_yaml
 
 PIXELS = np.random.default_rng(5).integers(0, 256, (24, 32)).astype(np.uint8)
 

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from tests.test_msckf import CAMERA, T_CAM0_IMU, Flight
-from vio.event_order import EventOrder
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
-from vio.imu_faults import ImuSampleCheck
+from vio.imu.clocks import Coverage
+from vio.imu.faults import ImuSampleCheck
+from vio.live.event_order import EventOrder
+from vio.monitor.run import RunWatch
 from vio.records import Event, ImuSample, StereoFrame
-from vio.watch.clocks import Coverage
-from vio.watch.run import RunWatch
 
 FRAMES = 60
 AXES = np.eye(3)

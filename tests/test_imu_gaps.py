@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
-from vio.evaluation import nees, nees_bounds
-from vio.event_order import EventOrder
+from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
+from vio.live.event_order import EventOrder
+from vio.monitor.run import RunWatch
 from vio.records import Event, ImuSample, StereoFrame, UpdateReport, VelocitySample
-from vio.watch.run import RunWatch
 
 QUIET = MsckfSettings()
 FLIGHT = Flight(frames=200)

@@ -14,8 +14,6 @@ from tests.numerics import numeric_jacobian
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from tests.test_navigation import MOVING as WITHOUT_TERMS
 from tests.test_online_calibration import Shaking, fly_with
-from vio.chain import build_backend
-from vio.checkpoint import load_checkpoint, save_checkpoint
 from vio.cli.running import _calibration_rows
 from vio.config import Config
 from vio.errors import ConfigError
@@ -26,13 +24,15 @@ from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState, rotation_t
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_log
 from vio.geometry.stereo import CameraKind
-from vio.pose_prediction import PosePredictor
+from vio.live.chain import build_backend
+from vio.live.prediction import PosePredictor
 from vio.records import Estimate, ImuSample, MotionSource, imu_matrices
-from vio.run_folder import imu_calibration
+from vio.runs.checkpoint import load_checkpoint, save_checkpoint
+from vio.runs.folder import imu_calibration
 
 if TYPE_CHECKING:
-    from vio.pipeline import RunResult
     from vio.protocols import Dataset
+    from vio.runs.pipeline import RunResult
 
 T_IMU_CAM0 = se3_inverse(T_CAM0_IMU)
 OFF = MsckfSettings(calibrate="none")

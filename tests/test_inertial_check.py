@@ -14,18 +14,18 @@ from vio.datasets.euroc_files import read_imu_csv
 from vio.datasets.rigs import load_rig
 from vio.datasets.samples import imu_samples
 from vio.datasets.tables import read_imu_table
+from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
+from vio.imu.clocks import judge_clocks
+from vio.imu.findings import InertialFinding
+from vio.monitor.inertial import InertialCheck
+from vio.monitor.run import RunWatch
 from vio.records import ImuSample, Observations, observations
 from vio.sim.imu import ImuNoise, simulate_imu
 from vio.sim.motion import MotionSpline, car_loop, evaluate, fit_spline, hand_held, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_rectified_rig, small_rig
-from vio.trajectory_io import read_trajectory
-from vio.watch.clocks import judge_clocks
-from vio.watch.finding import InertialFinding
-from vio.watch.inertial import InertialCheck
-from vio.watch.run import RunWatch
 
 _FRAME_NS = 50_000_000
 

@@ -11,8 +11,15 @@ from hypothesis import strategies as st
 
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, z_D_p_cam
-from vio.information import MotionInformation, lazy_greedy, log_det_gain, motion_rows, prior_information, row_weights
 from vio.records import MotionPrior, observations
+from vio.selection.information import (
+    MotionInformation,
+    lazy_greedy,
+    log_det_gain,
+    motion_rows,
+    prior_information,
+    row_weights,
+)
 
 CAMERA = StereoCamera(430.0, 440.0, 364.0, 254.0, 0.11, 752, 480)
 BROAD = prior_information(None)

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import pytest
 
-from vio.atomic import atomic_folder, atomic_write_text, check_writable
 from vio.cli.running import check_out
 from vio.errors import DataError, VioError
+from vio.files.atomic import atomic_folder, atomic_write_text, check_writable
 
 HOLD = """
 import sys, time
 import vio.cli
-from vio.atomic import atomic_folder
+from vio.files.atomic import atomic_folder
 
 def hold(args):
     with atomic_folder(sys.argv[1], replace=True) as folder:

@@ -15,7 +15,7 @@ from vio.geometry.lie import se3_adjoint, se3_exp
 def _public_jacobians() -> set[str]:
     """Names 'module.function' of all public `*_D_*`, read from the sources without importing them."""
     found = set()
-    for package in ("vio", "frontend"):
+    for package in ("vio", "vio/frontend"):
         for path in (ROOT / package).rglob("*.py"):
             module = ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -14,10 +14,10 @@ import pytest
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import project, triangulate
-from vio.loops import LoopEvent
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures, extract
 from vio.mapping.map_store import MapStore
+from vio.records import LoopEvent
 from vio.sim.motion import look_rotation, spline_from_waypoints
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate

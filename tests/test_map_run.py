@@ -17,21 +17,19 @@ from vio.cli import main
 from vio.config import Config
 from vio.datasets import open_dataset
 from vio.errors import ConfigError, DataError
+from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
-from vio.finished_run import read_finished_run
-from vio.frame_result import FrameResult
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
-from vio.loop_files import read_loops, write_loops
-from vio.loops import LoopEvent, LoopMatches
-from vio.mapped_run import corrected
 from vio.mapping.builder import MapBuilder, MapUpdate
 from vio.mapping.map_store import MapStore
 from vio.mapping.session import HANDOVER_FRAMES, MapSession
-from vio.pipeline import run
-from vio.records import Estimate, Observations, StereoFrame, observations
-from vio.run_recorder import GrowingFolder
-from vio.trajectory_io import read_trajectory
+from vio.records import Estimate, FrameResult, LoopEvent, LoopMatches, Observations, StereoFrame, observations
+from vio.runs.finished import read_finished_run
+from vio.runs.loop_files import read_loops, write_loops
+from vio.runs.mapped import corrected
+from vio.runs.pipeline import run
+from vio.runs.recorder import GrowingFolder
 
 
 @pytest.fixture(scope="module")

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontend.klt import KltFrontend
-from frontend.moving_object import ObjectReport, TwoMotions, choose_motion, one_motion_explains
-from frontend.outliers import Consensus, rigid_consensus
-from frontend.patches import View
-from frontend.prediction import usable_prior
-from frontend.settings import FrontendSettings
-from frontend.tracks import new_tracks
 from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
+from vio.frontend.klt import KltFrontend
+from vio.frontend.moving_object import ObjectReport, TwoMotions, choose_motion, one_motion_explains
+from vio.frontend.outliers import Consensus, rigid_consensus
+from vio.frontend.patches import View
+from vio.frontend.prediction import usable_prior
+from vio.frontend.settings import FrontendSettings
+from vio.frontend.tracks import new_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import project, triangulate
 from vio.records import BoolArray, MotionPrior, TrackPrior

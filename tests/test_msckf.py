@@ -9,7 +9,7 @@ import pytest
 
 from tests.numerics import numeric_jacobian
 from vio.errors import ConfigError, DivergedError, EstimationError
-from vio.evaluation import nees, nees_bounds
+from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import (
     Residuals,

@@ -16,20 +16,19 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 import vio
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
+from vio.cameras.rig import Rig
 from vio.config import Config
 from vio.errors import CalibrationError, ConfigError, DataError, VioError
-from vio.frame_result import FrameResult
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_log
-from vio.odometry import Odometry
-from vio.records import Estimate, FrontendOutput, ImuSample, StereoFrame
-from vio.rig import Rig
+from vio.live.odometry import Odometry
+from vio.numerics.threads import BlasLimit, one_blas_thread
+from vio.records import Estimate, FrameResult, FrontendOutput, ImuSample, StereoFrame
 from vio.sim.effects import CLEAN
 from vio.sim.imu import ImuNoise
 from vio.sim.motion import hand_held
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate
 from vio.sim.world import room
-from vio.threads import BlasLimit, one_blas_thread
 
 FRAMES = 12
 IMAGES_ALONE = replace(Config(), motion="none")
@@ -302,7 +301,7 @@ def test_what_the_rig_does_not_have_is_refused_at_once() -> None:
 
 @pytest.mark.parametrize("fails", [False, True])
 def test_one_blas_thread_inside_and_the_callers_number_outside(fails: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vio.threads._pinned", 0)  # as outside of these tests, which hold one thread throughout
+    monkeypatch.setattr("vio.numerics.threads._pinned", 0)  # as outside of these tests, which hold one thread
     inside: list[int] = []
 
     def threads() -> list[int]:

@@ -14,26 +14,26 @@ import numpy as np
 import pytest
 
 import vio
-from frontend import FrontendSettings, build_frontend
-from frontend.one_camera import disparities
 from tests.test_frontend_scene import CAMERA as WALL_CAMERA
 from tests.test_frontend_scene import SLANTED
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
-from vio.camera_rig import CameraRig, with_virtual_baseline
-from vio.chain import build_backend
+from vio.cameras.camera_rig import CameraRig, with_virtual_baseline
+from vio.cameras.rig import Rig
 from vio.config import Config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rigs.kalibr import kalibr_camera_text
 from vio.errors import CalibrationError, ConfigError, DataError
-from vio.evaluation import nees_bounds
+from vio.evaluation.trajectories import nees_bounds
 from vio.filters.alignment import Bearings, FreeMotion, align, gyro_bias
 from vio.filters.mono_msckf import MonoMsckf
 from vio.filters.settings import MsckfSettings
+from vio.frontend import FrontendSettings, build_frontend
+from vio.frontend.one_camera import disparities
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import left_alone, left_rays, one_camera
+from vio.live.chain import build_backend
 from vio.records import ImuSample, Observations, StereoFrame
-from vio.rig import Rig
 
 LEFT = left_alone(CAMERA)
 SETTINGS = MsckfSettings()

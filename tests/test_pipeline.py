@@ -16,13 +16,13 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from vio.config import Config, load_config
 from vio.errors import ConfigError, DataError, VioError
+from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
-from vio.frame_result import FrameResult
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.pipeline import resolve_motion, run
 from vio.records import (
     Event,
+    FrameResult,
     FrontendOutput,
     Landmarks,
     Observations,
@@ -34,9 +34,9 @@ from vio.records import (
     VelocitySample,
     observations,
 )
-from vio.run_folder import read_run, write_run_folder
-from vio.run_tables import ESTIMATE, FRAME
-from vio.trajectory_io import read_trajectory
+from vio.runs.folder import read_run, write_run_folder
+from vio.runs.pipeline import resolve_motion, run
+from vio.runs.tables import ESTIMATE, FRAME
 
 CAMERA = StereoCamera(700.0, 700.0, 600.0, 180.0, 0.54, 1242, 375)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.1, 0.7, -1.1]))

@@ -13,8 +13,8 @@ import pytest
 from tests.dataset_makers import ece276a_arrays, make_drive, make_npz
 from vio.cli import main
 from vio.config import Config, load_config, to_yaml
-from vio.plotting import _view
-from vio.printable import json_text, printable
+from vio.files.printable import json_text, printable
+from vio.runs.picture import _view
 
 
 def test_the_map_of_a_drive_holds_the_path_and_that_of_a_standing_rig_its_landmarks() -> None:

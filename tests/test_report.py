@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 
 from vio.cli import main
-from vio.evaluation import evaluate
+from vio.evaluation.trajectories import evaluate
+from vio.files.trajectories import read_trajectory
 from vio.filters.navigation import ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
-from vio.finished_run import read_finished_run, with_distinct_names
 from vio.geometry.lie import se3_from_parts, so3_exp
-from vio.loops import LoopEvent, MapKeyframes
+from vio.geometry.upright import attitude_deg, up_of, upright_axes
+from vio.records import LoopEvent, MapKeyframes
 from vio.report.curves import curves_of
 from vio.report.page import page
 from vio.report.words import figures_of, summary
-from vio.trajectory_io import read_trajectory
-from vio.upright import attitude_deg, up_of, upright_axes
+from vio.runs.finished import read_finished_run, with_distinct_names
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 

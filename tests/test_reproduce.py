@@ -9,10 +9,10 @@ import pytest
 
 from vio.config import load_config
 from vio.datasets import open_dataset
-from vio.evaluation import evaluate
-from vio.pipeline import run
-from vio.reproduce import VARIANTS
-from vio.trajectory_io import read_trajectory
+from vio.evaluation.trajectories import evaluate
+from vio.files.trajectories import read_trajectory
+from vio.offline.reproduce import VARIANTS
+from vio.runs.pipeline import run
 
 ROOT = Path(__file__).resolve().parent.parent
 rows = pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import yaml
 import vio
 from tests.euroc_maker import EQUIDISTANT_RIG, RADTAN_RIG, calib_cam_to_cam, make_euroc, rigid_text
 from tests.numerics import numeric_jacobian
+from vio.cameras.rig import Rig, remap
 from vio.datasets.kitti import write_calibration
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError
@@ -23,7 +24,6 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, s
 from vio.geometry.rectify import rectify
 from vio.geometry.sphere_models import double_sphere, double_sphere_D_p, unified, unified_D_p
 from vio.records import ImuDensities
-from vio.rig import Rig, remap
 
 LENSES = {
     "unified": CameraModel(660.0, 661.0, 320.0, 240.0, 640, 480, "unified", (1.4, -0.2, 0.05, 1e-3, -2e-3)),

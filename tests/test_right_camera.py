@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from frontend.klt import KltFrontend
-from frontend.prediction import prior_depths
-from frontend.right_camera import RightCamera
-from frontend.settings import FrontendSettings, GridSettings
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
+from vio.frontend.klt import KltFrontend
+from vio.frontend.prediction import prior_depths
+from vio.frontend.right_camera import RightCamera
+from vio.frontend.settings import FrontendSettings, GridSettings
 from vio.records import FrontendOutput, Image, StereoFrame, TrackPrior
 
 SETTINGS = FrontendSettings(grid=GridSettings(target_features=150))

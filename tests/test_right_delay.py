@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from frontend.klt import KltFrontend
-from frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
-from frontend.settings import FrontendSettings, GridSettings
-from frontend.tracks import new_tracks
 from tests.test_frontend_scene import CAMERA, SLANTED, stereo_frame, truth
+from vio.frontend.klt import KltFrontend
+from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
+from vio.frontend.settings import FrontendSettings, GridSettings
+from vio.frontend.tracks import new_tracks
 from vio.geometry.lie import FloatArray, se3_exp, transform_points
 from vio.geometry.stereo import project
 from vio.records import FrontendOutput, StereoFrame

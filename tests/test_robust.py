@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vio.robust import jackknife, median, robust_sigma
+from vio.numerics.robust import jackknife, median, robust_sigma
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 100, 101])

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from vio.datasets.euroc_files import imu_csv, read_imu_csv
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order, motion_samples, velocity_samples
 from vio.errors import DataError
+from vio.files.text import lines_of
 from vio.records import ImuRecord, ImuSample, VelocitySample
-from vio.text_files import lines_of
 
 _SAMPLES = 20_000  # 100 s at 200 Hz
 _ROW_BYTES = 8 + 48 + 1  # of a time, six readings and the kind
@@ -85,5 +85,5 @@ def test_lines_read_in_pieces_are_those_of_the_whole(
     while whole and not whole[-1].strip():
         whole.pop()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vio.text_files._PIECE", piece)
+        patch.setattr("vio.files.text._PIECE", piece)
         assert list(lines_of(path)) == list(enumerate(whole, start=1))

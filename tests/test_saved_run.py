@@ -12,7 +12,7 @@ import pytest
 from tests.dataset_makers import calib_text, ece276a_arrays, make_drive, make_kitti, make_npz
 from vio.cli import main
 from vio.errors import DataError
-from vio.saved_run import SavedRun, read_saved_run, stereo_frames, with_poses
+from vio.offline.saved_run import SavedRun, read_saved_run, stereo_frames, with_poses
 
 FRAMES = 6
 

@@ -11,7 +11,7 @@ from vio.errors import ConfigError
 from vio.geometry.lie import se3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import MotionPrior, Observations, observations
-from vio.selectors import Selector, SelectorSettings, build_selector
+from vio.selection.selectors import Selector, SelectorSettings, build_selector
 
 CAMERA = StereoCamera(430.0, 430.0, 320.0, 180.0, 0.11, 640, 360)
 BUDGETED = ("visibility", "information")

@@ -12,8 +12,8 @@ from vio.calibration.intrinsics import Intrinsics, judge_intrinsics, judged_obse
 from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.mapping.points import PointTracks
-from vio.mapping.self_calibration import (
+from vio.offline.points import PointTracks
+from vio.offline.self_calibration import (
     NAMES,
     SelfCalibration,
     Stretch,

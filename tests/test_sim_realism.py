@@ -14,10 +14,10 @@ from vio.cli import build_parser, main
 from vio.cli.render import scenario_from
 from vio.config import Config
 from vio.datasets.euroc_files import read_camera_yaml
-from vio.evaluation import evaluate
+from vio.evaluation.trajectories import evaluate
 from vio.geometry.distortion import StereoRig, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
-from vio.pipeline import run
+from vio.runs.pipeline import run
 from vio.sim.effects import Exposure, SensorEffects, apply_effects, average_exposures
 from vio.sim.errors import SimulationError
 from vio.sim.exposure import _control

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from vio.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile
 
 
 @pytest.mark.parametrize("probability", [1e-6, 0.025, 0.5, 0.95, 0.9999])

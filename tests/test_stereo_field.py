@@ -28,6 +28,7 @@ from vio.calibration.stereo_field import (
     field_of,
     rig_off_by,
 )
+from vio.cameras.rig import Rig
 from vio.cli import main
 from vio.config import load_config
 from vio.datasets.observation_log import write_observation_log
@@ -37,10 +38,9 @@ from vio.geometry.distortion import StereoRig, project_point
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.geometry.rectify import rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera
-from vio.plotting import has_calibration_panel
+from vio.offline.saved_run import read_saved_run, stereo_frames
 from vio.records import Estimate, Observations, Recording, StereoFieldEstimate, StereoScaleEstimate
-from vio.rig import Rig
-from vio.saved_run import read_saved_run, stereo_frames
+from vio.runs.picture import has_calibration_panel
 
 CAMERA = replace(test_filter_truth.CAMERA, width=752, height=480)
 RECTIFIED = Rig.rectified(718.0, 715.0, 607.0, 185.0, 0.54, 1242, 375)
@@ -282,7 +282,7 @@ def test_check_refine_and_export_take_the_calibration_of_the_run(ran: Path, monk
             image[20] = 255
             return [vio.records.StereoFrame(start, 0, image, image)]
 
-    monkeypatch.setattr("vio.saved_run.open_dataset", lambda source, options: Images())
+    monkeypatch.setattr("vio.offline.saved_run.open_dataset", lambda source, options: Images())
     (frame,) = stereo_frames(run, None, np.array([3]))
     assert frame.left is not None
     assert frame.right is not None

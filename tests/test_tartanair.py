@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from frontend import FrontendSettings, build_frontend
 from vio.datasets.images import load_gray
+from vio.frontend import FrontendSettings, build_frontend
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, StereoFrame

@@ -13,11 +13,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from vio.atomic import atomic_folder, atomic_write_bytes, atomic_write_text
 from vio.errors import DataError, VioError
+from vio.files.atomic import atomic_folder, atomic_write_bytes, atomic_write_text
+from vio.files.trajectories import is_trajectory_file, read_trajectory, write_kitti, write_tum
 from vio.geometry.lie import so3_exp
 from vio.records import Trajectory
-from vio.trajectory_io import is_trajectory_file, read_trajectory, write_kitti, write_tum
 
 EUROC_HEADER = "#timestamp [ns],p_x [m],p_y [m],p_z [m],q_w [],q_x [],q_y [],q_z [],v_x,v_y,v_z\n"
 TUM_ROW = "0 0 0 0 0 0 1"
@@ -331,7 +331,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path: Path, monkeypatch: pytest.M
     def full_disk(_: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("vio.atomic.os.fsync", full_disk)
+    monkeypatch.setattr("vio.files.atomic.os.fsync", full_disk)
     with pytest.raises(DataError, match=r"cannot write .*a\.txt: No space left on device; choose"):
         atomic_write_text(path, "new")
     assert path.read_text() == "old"

@@ -20,26 +20,26 @@ import pytest
 
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
 from tests.test_pipeline import FakeDrive
-from vio.checkpoint import load_checkpoint, save_checkpoint
 from vio.cli import main
 from vio.config import Config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import write_observation_log
 from vio.errors import DataError, EstimationError
+from vio.files.tables import Table
+from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
-from vio.pipeline import RunResult, run
 from vio.protocols import Dataset
 from vio.records import Estimate, Recording, StereoFieldEstimate, StereoScaleEstimate
-from vio.run_recorder import GrowingFolder
-from vio.run_tables import estimate_of, estimate_row
+from vio.runs.checkpoint import load_checkpoint, save_checkpoint
+from vio.runs.pipeline import RunResult, run
+from vio.runs.recorder import GrowingFolder
+from vio.runs.tables import estimate_of, estimate_row
 from vio.sim.effects import CLEAN
 from vio.sim.imu import ImuNoise
 from vio.sim.motion import hand_held
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate
 from vio.sim.world import room
-from vio.tables import Table
-from vio.trajectory_io import read_trajectory
 
 FRAMES = 60
 ROW = np.dtype([("a", "<i8"), ("b", "<f8", (2,))])
@@ -174,7 +174,7 @@ def test_a_run_goes_on_to_the_same_bits(
 def test_points_put_away_while_running_stay_in_the_map(
     flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vio.run_recorder._CHECKPOINT_S", 0.05)
+    monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.05)
     whole = run(open_dataset(flight_log), Config())
     grown = run(open_dataset(flight_log), Config(), folder=GrowingFolder(tmp_path / "run", {}))
     assert len(grown.landmarks.ids) > 50
@@ -186,7 +186,7 @@ def test_a_checkpoint_does_not_wait_for_an_imu_that_begins_late(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, imu_from_s: int
 ) -> None:
     """The points put away are those of one world: that of the first frame, which knows no gravity."""
-    monkeypatch.setattr("vio.run_recorder._CHECKPOINT_S", 0.05)
+    monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.05)
     log = _flight_log(tmp_path / "late.npz", imu_from_ns=imu_from_s * 10**9)
     whole = run(open_dataset(log), Config())
     grown = run(open_dataset(log), Config(), folder=GrowingFolder(tmp_path / "run", {}))
@@ -230,7 +230,7 @@ def test_an_estimate_comes_back_from_its_row_with_all_that_it_holds() -> None:
 # Processes that end
 
 PATCHED = (
-    "import sys, vio.run_recorder as r, vio.cli; r._FLUSH_S = 0.0; r._CHECKPOINT_S = 0.1; "
+    "import sys, vio.runs.recorder as r, vio.cli; r._FLUSH_S = 0.0; r._CHECKPOINT_S = 0.1; "
     "sys.exit(vio.cli.main(sys.argv[1:]))"
 )
 
@@ -331,7 +331,7 @@ def test_a_divergence_keeps_the_results_so_far(
 def test_a_disk_that_fills_keeps_what_is_written(
     flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("vio.run_recorder._FLUSH_S", 0.0)
+    monkeypatch.setattr("vio.runs.recorder._FLUSH_S", 0.0)
     append, room_left = Table.append, iter(range(100))
 
     def limited(self: Table, rows: Any) -> None:
@@ -366,7 +366,7 @@ def test_a_checkpoint_cannot_call_what_is_not_the_estimators(state: tuple[Path, 
         def __reduce__(self) -> Any:
             return self.call
 
-    from vio.atomic import atomic_write_bytes
+    from vio.files.atomic import atomic_write_bytes
 
     head = path.read_bytes().split(b"\n")[0]
     target = path.with_name("owned")

@@ -15,9 +15,8 @@ from vio.cli import main
 from vio.config import load_config
 from vio.datasets import open_dataset
 from vio.geometry.stereo import StereoCamera
-from vio.loops import LoopEvent
-from vio.pipeline import RunResult, run
-from vio.records import Estimate, UpdateReport, observations
+from vio.records import Estimate, LoopEvent, UpdateReport, observations
+from vio.runs.pipeline import RunResult, run
 from vio.view.live import RerunViewer, ViewedRig, age_colours, states_of
 
 rr = pytest.importorskip("rerun", reason="needs the extra view")

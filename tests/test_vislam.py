@@ -15,8 +15,8 @@ from vio.filters.vislam import Vislam, update_landmarks, update_pose, z_D_landma
 from vio.filters.vislam_motion import predict, predict_twist
 from vio.geometry.lie import FloatArray, se3_curly_hat, se3_exp, se3_from_parts, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.offline.reproduce import PAPER
 from vio.records import ImuSample, Observations, VelocitySample, observations
-from vio.reproduce import PAPER
 
 CAMERA = StereoCamera(700.0, 710.0, 600.0, 180.0, 0.54, 1242, 375)
 # The usual mounting: camera z is the body's x, camera x the body's -y.

@@ -15,7 +15,7 @@ from vio.cli import _COMMANDS as COMMANDS
 from vio.cli import main
 
 ROOT = Path(__file__).resolve().parent.parent
-_SOURCES = ("pyproject.toml", "README.md", "LICENSE", "vio", "frontend")
+_SOURCES = ("pyproject.toml", "setup.py", "README.md", "LICENSE", "vio")
 
 
 @pytest.fixture(scope="module")
@@ -35,11 +35,11 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_wheel_holds_the_packages_and_their_data_only(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
-    assert {name.partition("/")[0] for name in names if ".dist-info" not in name} == {"vio", "frontend"}
-    assert {"vio/py.typed", "frontend/py.typed"} <= set(names)
+    assert {name.partition("/")[0] for name in names if ".dist-info" not in name} == {"vio"}
+    assert {"vio/py.typed", "vio/frontend/py.typed"} <= set(names)
     assert any(name.endswith("licenses/LICENSE") for name in names)
     sources = {
-        path.relative_to(ROOT).as_posix() for part in ("vio", "frontend") for path in (ROOT / part).rglob("*.py")
+        path.relative_to(ROOT).as_posix() for part in ("vio", "vio/frontend") for path in (ROOT / part).rglob("*.py")
     }
     assert {name for name in names if name.endswith(".py")} == sources
 
@@ -48,8 +48,8 @@ def test_the_unpacked_wheel_runs_outside_the_repository(wheel: Path, tmp_path: P
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path / "site")}
     code = (
-        "import vio, frontend, vio.config; from vio.cli import main; "
-        "assert all('site' in m.__file__ for m in (vio, frontend)), vio.__file__; vio.config.load_config(); "
+        "import vio, vio.frontend, vio.config; from vio.cli import main; "
+        "assert all('site' in m.__file__ for m in (vio, vio.frontend)), vio.__file__; vio.config.load_config(); "
         "raise SystemExit(main(['config', '--show']))"
     )
     shown = subprocess.run(

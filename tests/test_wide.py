@@ -11,28 +11,28 @@ import numpy as np
 import pytest
 
 import vio
-from frontend.outliers import RansacProblem, bearing_consensus, epipolar_distance
-from frontend.settings import ConsensusSettings
 from tests import test_msckf
 from tests.numpy_twins import residuals
+from vio.cameras.rig import Rig
 from vio.cli import main
 from vio.cli.running import _opened
 from vio.config import Config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
-from vio.evaluation import nees, nees_bounds
+from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters import multiview
 from vio.filters.multiview import Views
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import TERMS, RowField, StereoField, field_jacobian
+from vio.frontend.outliers import RansacProblem, bearing_consensus, epipolar_distance
+from vio.frontend.settings import ConsensusSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.rectify import PINHOLE_REACH
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
+from vio.offline.saved_run import read_saved_run, stereo_frames
 from vio.offline.source import open_source
 from vio.records import Observations, StereoFrame, observations
-from vio.rig import Rig
-from vio.saved_run import read_saved_run, stereo_frames
 from vio.sim.rigs import wide_rig
 
 CYLINDER = StereoCamera(200.0, 200.0, 300.0, 314.0, 0.11, 600, 628, "cylinder")

@@ -17,7 +17,7 @@ from typing import Any
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rigs import load_rig
 from vio.errors import VioError
-from vio.trajectory_io import read_trajectory
+from vio.files.trajectories import read_trajectory
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "bad_inputs.md"
 _MAKERS = {"tests.test_datasets_euroc": "make_euroc", "tests.test_datasets_kitti_raw": "make_kitti_raw"}

@@ -89,8 +89,8 @@ def _measure(source: str, args: argparse.Namespace) -> dict[str, Any]:
         cv2.setNumThreads(args.threads)
     from vio.config import load_config
     from vio.datasets import open_dataset
-    from vio.pipeline import run
-    from vio.threads import one_blas_thread
+    from vio.numerics.threads import one_blas_thread
+    from vio.runs.pipeline import run
 
     config = load_config(None, [*args.set, f'motion="{args.motion}"'])
     dataset = open_dataset(source, config.dataset)

@@ -25,15 +25,16 @@ from typing import Any
 import cv2
 import numpy as np
 
-from frontend import build_frontend
-from frontend.outliers import fit_motion, pixel_errors
 from vio.config import load_config
 from vio.datasets import open_dataset
 from vio.datasets.images import load_gray
 from vio.errors import VioError
+from vio.frontend import build_frontend
+from vio.frontend.outliers import fit_motion, pixel_errors
 from vio.geometry.distortion import StereoRig, rectified_camera
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera, triangulate
+from vio.numerics.threads import one_blas_thread
 from vio.records import BoolArray, FrontendOutput, Observations, Recording, StereoFrame
 from vio.sim.effects import SensorEffects, apply_effects
 from vio.sim.motion import MotionSpline, car_loop, hand_held
@@ -42,7 +43,6 @@ from vio.sim.render import correspondence
 from vio.sim.rigs import kitti_like_rig, small_rig
 from vio.sim.sequence import SimulatedRecording, simulate, views
 from vio.sim.world import World, room, street
-from vio.threads import one_blas_thread
 
 Truth = Callable[[int, FloatArray], tuple[FloatArray, BoolArray]]  # frame, left pixels (N, 2): true pixels, visible
 

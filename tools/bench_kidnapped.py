@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from vio.config import Config, MotionName
-from vio.evaluation import align_poses
+from vio.evaluation.trajectories import align_poses
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
-from vio.pipeline import run
 from vio.records import BoolArray, Image, IntArray
+from vio.runs.pipeline import run
 from vio.sim.effects import SensorEffects
 from vio.sim.imu import ImuNoise
 from vio.sim.motion import MotionSpline, evaluate, fit_spline, hand_held, rotate_body_axes

@@ -27,14 +27,14 @@ import numpy as np
 
 from tools.consistency import CAMERA, T_CAM0_IMU, Flight, Scenario
 from vio.errors import VioError
-from vio.evaluation import nees, nees_bounds
+from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import left_rays
+from vio.numerics.threads import one_blas_thread
 from vio.records import RIGHT_TERMS, Estimate, ImuSample, Observations, imu_matrices
-from vio.threads import one_blas_thread
 
 Rig = Literal["camera-IMU", "IMU", "camera-IMU and IMU", "right camera turned", "baseline"]
 RIGS: tuple[Rig, ...] = get_args(Rig)

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from vio.errors import VioError
-from vio.evaluation import nees, nees_bounds
+from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import Residuals
 from vio.filters.navigation import DIM, ImuMotion, NavState, Transition
@@ -50,6 +50,7 @@ from vio.geometry.lie import (
     transform_points,
 )
 from vio.geometry.stereo import StereoCamera, project
+from vio.numerics.threads import one_blas_thread
 from vio.records import (
     BoolArray,
     ImuSample,
@@ -60,7 +61,6 @@ from vio.records import (
     VelocitySample,
     observations,
 )
-from vio.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from typing_extensions import Self  # in typing from Python 3.11

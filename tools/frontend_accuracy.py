@@ -21,18 +21,18 @@ from typing import Any
 import cv2
 import numpy as np
 
-from frontend import build_frontend
 from vio.config import Config, load_config
 from vio.errors import VioError
+from vio.frontend import build_frontend
 from vio.geometry.distortion import rectified_camera, unproject_pixel
 from vio.geometry.lie import FloatArray
+from vio.numerics.threads import one_blas_thread
 from vio.protocols import Frontend
 from vio.records import FrontendOutput, Image, IntArray, Observations, StereoFrame
 from vio.sim.render import View, cast, correspondence, inside_image, observe, surface_points
 from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, default_workers, plan
 from vio.sim.sequence import SimulatedRecording, Simulation, views
 from vio.sim.world import Surfaces, surfaces_at
-from vio.threads import one_blas_thread
 
 SHOWN_EFFECTS = (
     "exposure",

@@ -23,7 +23,7 @@ _CASES = {
     "import numpy": ("-c", "import numpy"),
     "import cv2": ("-c", "import cv2"),
     "import vio.config": ("-c", "import vio.config"),
-    "import vio.pipeline": ("-c", "import vio.pipeline"),
+    "import vio.runs.pipeline": ("-c", "import vio.runs.pipeline"),
     "import vio.cli.running": ("-c", "import vio.cli.running"),
 }
 

@@ -56,7 +56,7 @@ def repository_copy() -> Iterator[Path]:
         for name in _COPIED:
             source = ROOT / name
             if source.is_dir():
-                shutil.copytree(source, Path(folder, name), ignore=shutil.ignore_patterns("__pycache__"))
+                shutil.copytree(source, Path(folder, name), symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
             else:
                 shutil.copy2(source, Path(folder, name))
         yield Path(folder)
@@ -72,7 +72,7 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
     environment = {**os.environ, "PYTHONPATH": str(copy), "VIO_DATA": data}
     # The process that tests says which packages it would test.
     code = (
-        "import frontend, pytest, sys, vio; print(vio.__file__, frontend.__file__); "
+        "import pytest, sys, vio, vio.frontend; print(vio.__file__, vio.frontend.__file__); "
         f"sys.exit(pytest.main({[*_PYTEST, *options, *tests]!r}))"
     )
     begin = time.perf_counter()

@@ -23,8 +23,8 @@ import numpy as np
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
 from vio.geometry.stereo import StereoCamera
-from vio.pipeline import run
 from vio.records import Event, Image, Observations, Recording, StereoFrame
+from vio.runs.pipeline import run
 
 FEATURES = (50, 100, 200, 400, 800)
 CLONES = (5, 8, 11, 15, 20, 25)

@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING
 from vio._version import __version__
 
 if TYPE_CHECKING:
-    from vio.camera_rig import CameraRig
+    from vio.cameras.camera_rig import CameraRig
+    from vio.cameras.rig import Rig
     from vio.config import load_config
     from vio.datasets import open_dataset
     from vio.datasets.rigs import load_rig
     from vio.datasets.rigs.one_camera import load_camera
-    from vio.evaluation import evaluate
-    from vio.odometry import Odometry
-    from vio.pipeline import run
-    from vio.rig import Rig
+    from vio.evaluation.trajectories import evaluate
+    from vio.live.odometry import Odometry
+    from vio.runs.pipeline import run
 
 __all__ = [
     "CameraRig",
@@ -35,15 +35,15 @@ __all__ = [
 ]
 
 _MODULES = {  # loaded when the name is first used
-    "CameraRig": "vio.camera_rig",
-    "Odometry": "vio.odometry",
-    "Rig": "vio.rig",
-    "evaluate": "vio.evaluation",
+    "CameraRig": "vio.cameras.camera_rig",
+    "Odometry": "vio.live.odometry",
+    "Rig": "vio.cameras.rig",
+    "evaluate": "vio.evaluation.trajectories",
     "load_camera": "vio.datasets.rigs.one_camera",
     "load_config": "vio.config",
     "load_rig": "vio.datasets.rigs",
     "open_dataset": "vio.datasets",
-    "run": "vio.pipeline",
+    "run": "vio.runs.pipeline",
 }
 
 

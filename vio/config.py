@@ -14,23 +14,18 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 
 from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError
+from vio.files.inputs import read_input
+from vio.files.yaml_text import MOST_BYTES, read_yaml
 from vio.filters.settings import MsckfSettings, VislamSettings
-from vio.frontend_package import frontend_module
-from vio.input_files import read_input
-from vio.selectors import SelectorSettings
+from vio.frontend.settings import FrontendSettings
+from vio.selection.selectors import SelectorSettings
 from vio.setting import Range, Section, setting
-from vio.yaml_text import MOST_BYTES, read_yaml
-
-if TYPE_CHECKING:
-    from frontend.settings import FrontendSettings
-else:
-    FrontendSettings = frontend_module("settings").FrontendSettings
 
 BackendName = Literal["vislam", "msckf"]
 MotionName = Literal["auto", "imu", "velocity", "none"]

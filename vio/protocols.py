@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
 
-from vio.frame_result import FrameResult
 from vio.records import (
     Estimate,
     Event,
+    FrameResult,
     FrontendOutput,
     ImuDensities,
     Landmarks,
@@ -24,7 +24,7 @@ from vio.records import (
 )
 
 if TYPE_CHECKING:
-    from vio.rig import Rectifier
+    from vio.cameras.rig import Rectifier
 
 Progress: TypeAlias = Callable[[int, int], None]  # called after each frame: frames done, frames in all
 

@@ -482,3 +482,95 @@ def need_stereo(recording: Recording, what: str) -> None:
     if recording.camera.kind != "stereo":
         cameras = "one camera" if recording.camera.kind == "mono" else "one camera with depth images"
         raise DataError(f"{recording.path}: {what} needs a stereo pair, and this recording has {cameras}")
+
+
+@dataclass(frozen=True, slots=True)
+class LoopMatches:
+    """The features that agree with a loop: what the keyframe and the frame show of the same points."""
+
+    z_keyframe: FloatArray  # (P, 4) rectified pixels [ul vl ur vr] in the keyframe
+    z_frame: FloatArray  # (P, 4) likewise in the frame that shows the place again
+    has_right_keyframe: BoolArray  # (P,)
+    has_right_frame: BoolArray  # (P,)
+
+    def __len__(self) -> int:
+        return len(self.z_frame)
+
+
+@dataclass(frozen=True, slots=True)
+class LoopEvent:
+    """A place of the map seen again."""
+
+    frame: int  # number of the frame that shows it
+    time_ns: int
+    keyframe: int  # number in the map of the keyframe that showed it before
+    keyframe_time_ns: int
+    inliers: int  # corners of the frame that agree, with this keyframe or with those around it
+    gap_m: float  # by which the loop moved the position of the frame, before the optimisation
+    joined: bool  # whether it is the first link between two sessions
+    keyframe_frame: int | None = None  # number of the keyframe's frame in this run; None: an earlier session's
+    kept: bool = True  # at the end of a run: whether it agrees with the other loops; those that do not move nothing
+    matches: LoopMatches | None = field(default=None, compare=False, repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class MapKeyframes:
+    """The keyframes of a map that share a run's frame, at the end of the run."""
+
+    keyframe: IntArray  # (K,) number in the map
+    frame: IntArray  # (K,) number of the frame in its own recording
+    time_ns: IntArray  # (K,)
+    own: BoolArray  # (K,) whether it is of this run
+    T_map_body: FloatArray  # (K, 4, 4) pose in the map of this run's body with its left camera at the keyframe's
+
+
+def no_map_keyframes() -> MapKeyframes:
+    """Return none, as of a run without a map."""
+    none = np.zeros(0, dtype=np.int64)
+    return MapKeyframes(none, none, none, np.zeros(0, dtype=np.bool_), np.zeros((0, 4, 4)))
+
+
+STAGES = ("read", "frontend", "watch", "select", "filter")  # of a frame's wall time
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLog:
+    """What happened in one frame: one row of frames.csv."""
+
+    index: int
+    time_ns: int
+    read_ms: float
+    frontend_ms: float
+    watch_ms: float
+    select_ms: float
+    filter_ms: float
+    detected: int
+    tracked: int
+    matched: int
+    selected: int
+    stale: int
+    used: int
+    gated: int
+    landmarks: int
+    innovation_median_px: float | None
+    nis_per_dof: float | None
+    stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
+
+    @property
+    def total_ms(self) -> float:
+        """Wall time of the whole frame."""
+        return sum(getattr(self, f"{stage}_ms") for stage in STAGES)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameResult:
+    """All that the chain made of one frame."""
+
+    frame: StereoFrame
+    output: FrontendOutput
+    selection: Selection
+    report: UpdateReport
+    estimate: Estimate
+    log: FrameLog
+    loops: tuple[LoopEvent, ...] = ()  # places of the map seen again, whose results have come with this frame
+    is_keyframe: bool = False  # whether the frame becomes a keyframe of the map

@@ -8,13 +8,12 @@ needs them is built.
 from __future__ import annotations
 
 from vio.errors import MissingDependencyError
+from vio.frontend.descriptors import DescriptorFrontend, Matcher, MutualNearest
+from vio.frontend.learned.extractors import build_extractor
+from vio.frontend.learned.lightglue import build_lightglue
+from vio.frontend.learned.weights import pick_device
+from vio.frontend.settings import FrontendSettings
 from vio.geometry.stereo import StereoCamera
-
-from ..descriptors import DescriptorFrontend, Matcher, MutualNearest
-from ..settings import FrontendSettings
-from .extractors import build_extractor
-from .lightglue import build_lightglue
-from .weights import pick_device
 
 
 def build_learned(camera: StereoCamera, settings: FrontendSettings) -> DescriptorFrontend:

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 import numpy as np
 
 from vio.errors import DataError
+from vio.frontend.descriptors import Extractor, Keypoints
+from vio.frontend.learned.weights import SECTION, Module, filled, half_precision, load_weights
+from vio.frontend.settings import LearnedSettings, MatchSettings
 from vio.records import Image
-
-from ..descriptors import Extractor, Keypoints
-from ..settings import LearnedSettings, MatchSettings
-from .weights import SECTION, Module, filled, half_precision, load_weights
 
 if TYPE_CHECKING:
     import torch

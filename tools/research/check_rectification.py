@@ -21,16 +21,16 @@ from typing import get_args
 import cv2
 import numpy as np
 
-from frontend.align import align, cut_patches, shift_warps, templates
-from frontend.flow import lucas_kanade
+from vio.cameras.rig import Rectifier
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rectified import make_rectifier
 from vio.errors import VioError
+from vio.frontend.align import align, cut_patches, shift_warps, templates
+from vio.frontend.flow import lucas_kanade
 from vio.geometry.distortion import StereoRig, project_point, rig_from_rectified, unproject_pixel
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import Interpolation, ProjectionMode, Rectification, rectify, rectify_pixels
 from vio.records import BoolArray, Image, StereoFrame
-from vio.rig import Rectifier
 from vio.sim.effects import SensorEffects, apply_effects
 from vio.sim.motion import MotionSpline, evaluate, hand_held, rotate_body_axes
 from vio.sim.render import View, camera_rays, correspondence, inside_image, render

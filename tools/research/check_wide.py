@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from frontend.align import align, cut_patches, shift_warps, templates
-from frontend.flow import lucas_kanade
+from vio.frontend.align import align, cut_patches, shift_warps, templates
+from vio.frontend.flow import lucas_kanade
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import rectify, rectifying_rotations

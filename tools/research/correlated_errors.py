@@ -18,14 +18,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from vio.config import load_config
-from vio.evaluation import nees
-from vio.frame_result import FrameResult
+from vio.evaluation.trajectories import nees
 from vio.geometry.distortion import unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.odometry import Odometry
-from vio.pipeline import run
-from vio.records import BoolArray, IntArray
+from vio.live.odometry import Odometry
+from vio.records import BoolArray, FrameResult, IntArray
+from vio.runs.pipeline import run
 from vio.sim.render import View, cast, surface_points
 from vio.sim.scenarios import Scenario, plan
 from vio.sim.sequence import SimulatedRecording, views

@@ -2,10 +2,10 @@
 
     python tools/research/draw_structure.py docs/images/structure.png [--root CHECKOUT]
 
-A package here is a package or a single module directly in `vio/`, or `frontend/`. It stands one layer above the
-highest one that it imports. Arrows point at what is imported; those that a longer way implies are left out, and so are
-those to the foundation (records, protocols, geometry, errors, setting), on which nearly everything stands. Imports
-inside functions count. An import that closes a cycle is red.
+A package here is a package or a single module directly in `vio/`; `frontend/` is `vio.frontend`. It is one layer above
+the highest one that it imports. Arrows point at what is imported; those that a longer path implies are left out, and so
+are those to the foundation (records, protocols, geometry, errors, setting, numerics, files), which nearly everything
+imports. Imports inside functions count. An import that closes a cycle is red.
 """
 
 from __future__ import annotations
@@ -22,17 +22,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
-FOUNDATION = (
-    "vio.records",
-    "vio.protocols",
-    "vio.geometry",
-    "vio.errors",
-    "vio.setting",
-    "vio.threads",
-    "vio.atomic",
-    "vio.statistics",
-)
-_COLOURS = {"vio.cli": "#e8d5b5", "frontend": "#f0c9c9", "vio.filters": "#cfe3cf", "vio.sim": "#dcd3ea"}
+FOUNDATION = ("vio.records", "vio.protocols", "vio.geometry", "vio.errors", "vio.setting", "vio.numerics", "vio.files")
+_COLOURS = {"vio.cli": "#e8d5b5", "vio.frontend": "#f0c9c9", "vio.filters": "#cfe3cf", "vio.sim": "#dcd3ea"}
 _PLAIN, _GROUND, _CLOSING = "#d6e2f0", "#e9e9e9", "#c23b5a"
 _WIDTH, _HEIGHT = 1.0, 0.62
 
@@ -51,7 +42,8 @@ def read_packages(root: Path) -> dict[str, Package]:
     """Return all packages of a checkout by name."""
     files: dict[str, list[Path]] = {}
     for path in sorted([*(root / "vio").rglob("*.py"), *(root / "frontend").rglob("*.py")]):
-        name = _package_of(".".join(path.relative_to(root).with_suffix("").parts))
+        parts = path.relative_to(root).with_suffix("").parts
+        name = _package_of(".".join(parts if parts[0] == "vio" else ("vio", *parts)))
         if name not in ("vio.__init__", "vio.__main__", "vio._version"):
             files.setdefault(name, []).append(path)
     packages = {}
@@ -65,9 +57,8 @@ def read_packages(root: Path) -> dict[str, Package]:
 
 
 def _package_of(module: str) -> str:
-    """`vio.filters.window` lies in the package `vio.filters`, `frontend.klt` in `frontend`."""
-    parts = module.split(".")
-    return "frontend" if parts[0] == "frontend" else ".".join(parts[:2])
+    """`vio.filters.window` lies in the package `vio.filters`."""
+    return ".".join(module.split(".")[:2])
 
 
 def _imports(text: str) -> Iterator[str]:
@@ -79,8 +70,6 @@ def _imports(text: str) -> Iterator[str]:
             skipped.update(id(child) for statement in node.body for child in ast.walk(statement))
         elif id(node) not in skipped and isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "frontend_module":
-            yield "frontend"  # vio.frontend_package finds it by its place
         elif id(node) not in skipped and isinstance(node, ast.ImportFrom) and node.module and not node.level:
             # `from vio import calibration` names a package, `from vio.records import Image` something in one.
             yield from (f"vio.{alias.name}" for alias in node.names) if node.module == "vio" else [node.module]

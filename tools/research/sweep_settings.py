@@ -36,12 +36,12 @@ from vio.config import Config, SettingInfo, describe, load_config, merge
 from vio.datasets import open_dataset
 from vio.datasets.observation_log import write_observation_log
 from vio.errors import VioError
-from vio.evaluation import evaluate
-from vio.pipeline import RunResult, run
+from vio.evaluation.trajectories import evaluate
+from vio.files.trajectories import read_trajectory
+from vio.numerics.threads import one_blas_thread
 from vio.protocols import Dataset
 from vio.records import Event, Observations, Recording, Trajectory
-from vio.threads import one_blas_thread
-from vio.trajectory_io import read_trajectory
+from vio.runs.pipeline import RunResult, run
 
 Change = Literal["base", "half", "double", "other"]
 Identity: TypeAlias = tuple[str, str, str, str]  # context, source, setting, value as JSON

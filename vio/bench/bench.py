@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from vio._version import __version__
-from vio.atomic import atomic_write_text, check_writable, locked_folder
 from vio.bench.engines import run_here, run_on_dask
 from vio.bench.execute import failed
 from vio.bench.identity import Identity, InputDigests, code_digest, package_versions
@@ -21,8 +20,9 @@ from vio.bench.suite import Suite
 from vio.bench.tables import Outcome, csv_of_rows, csv_of_runs, markdown, rows_of
 from vio.bench.tasks import Task, tasks_of
 from vio.errors import DataError
-from vio.input_files import read_input
-from vio.printable import json_text
+from vio.files.atomic import atomic_write_text, check_writable, locked_folder
+from vio.files.inputs import read_input
+from vio.files.printable import json_text
 
 log = logging.getLogger(__name__)
 RESULTS = "bench.json"

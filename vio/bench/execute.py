@@ -16,9 +16,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from vio.atomic import lock_path
 from vio.bench.identity import ROOT
 from vio.errors import DataError, VioError
+from vio.files.atomic import lock_path
 
 try:
     import fcntl

@@ -12,8 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-from vio.atomic import atomic_write_text
 from vio.errors import DataError
+from vio.files.atomic import atomic_write_text
 
 Identity = Literal["content", "stat"]
 ROOT = Path(__file__).resolve().parent.parent.parent
@@ -21,10 +21,10 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 _NO_FIGURE = (
     "vio/cli/",
     "vio/bench/",
-    "vio/plotting.py",
+    "vio/runs/picture.py",
     "vio/report/",
     "vio/inspection/",
-    "vio/colmap/",
+    "vio/offline/colmap/",
     "vio/offline/",
 )
 _TASK_CODE = ("vio/bench/worker.py", "vio/bench/figures.py")
@@ -46,8 +46,8 @@ RENDER_CODE = (
     "vio/datasets/yaml_files.py",
     "vio/records.py",
     "vio/setting.py",
-    "vio/text_files.py",
-    "vio/trajectory_io.py",
+    "vio/files/text.py",
+    "vio/files/trajectories.py",
     "vio/cli/render.py",
 )
 _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba")  # whose versions may change bits
@@ -62,7 +62,9 @@ def digest_of(value: Any) -> str:
 @cache
 def code_digest() -> str:
     """Return the digest of all code that a run's figures depend on."""
-    kept = [path for path in _sources(("vio/", "frontend/")) if not path.startswith(_NO_FIGURE) or path in _TASK_CODE]
+    kept = [
+        path for path in _sources(("vio/", "vio/frontend/")) if not path.startswith(_NO_FIGURE) or path in _TASK_CODE
+    ]
     return _digest_files(kept)
 
 
@@ -163,13 +165,13 @@ def _digest_file(file: Path) -> str:
 
 
 def _sources(names: Iterable[str]) -> list[str]:
-    """Our Python files under some folders or names, relative to the checkout or installation."""
-    found = []
+    """Our Python files under some folders (links to folders only by name) or names, relative to the installation."""
+    found: set[str] = set()
     for name in names:
         path = ROOT / name
         files = sorted(path.rglob("*.py")) if name.endswith("/") else [path]
-        found += [file.relative_to(ROOT).as_posix() for file in files]
-    return found
+        found.update(file.relative_to(ROOT).as_posix() for file in files)
+    return sorted(found)
 
 
 def _digest_files(names: Iterable[str]) -> str:

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from vio.atomic import atomic_write_text
 from vio.bench.suite import Suite
 from vio.bench.tables import METRICS, Outcome, Row, markdown
+from vio.files.atomic import atomic_write_text
 
 log = logging.getLogger(__name__)
 _COLOURS = ("#1f5fbf", "#d9822b", "#5aa469", "#c23b5a", "#8e63b8", "#6b7785", "#b59f3b", "#2a9d8f")

@@ -7,9 +7,9 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from vio.atomic import atomic_write_text
 from vio.errors import DataError
-from vio.printable import json_text
+from vio.files.atomic import atomic_write_text
+from vio.files.printable import json_text
 
 log = logging.getLogger(__name__)
 Record = dict[str, Any]

@@ -13,8 +13,8 @@ from typing import Any
 from vio.config import Config, load_config, merge
 from vio.datasets.span import Seconds, parse_bound
 from vio.errors import ConfigError
-from vio.input_files import read_input
-from vio.yaml_text import MOST_BYTES, read_yaml
+from vio.files.inputs import read_input
+from vio.files.yaml_text import MOST_BYTES, read_yaml
 
 SHIPPED = Path(__file__).resolve().parent / "suites"
 _NAME = re.compile(r"[\w.+-]+")  # of a sequence or configuration: it becomes part of a command line and of a CSV file

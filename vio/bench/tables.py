@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vio.bench.suite import Suite
-from vio.printable import printable
+from vio.files.printable import printable
 
 
 @dataclass(frozen=True, slots=True)

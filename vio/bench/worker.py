@@ -24,18 +24,18 @@ from vio.bench.identity import code_digest, package_versions
 from vio.bench.suite import bound
 from vio.config import Config, merge
 from vio.datasets import open_dataset
+from vio.datasets.frame_rate import used_frames
 from vio.datasets.span import frames_between
 from vio.errors import DataError, VioError
-from vio.evaluation import Evaluation, evaluate
-from vio.frame_rate import used_frames
-from vio.printable import json_text
+from vio.evaluation.trajectories import Evaluation, evaluate
+from vio.files.printable import json_text
+from vio.files.trajectories import read_trajectory, tum_text
 from vio.protocols import Dataset
 from vio.records import IntArray, Trajectory
-from vio.trajectory_io import read_trajectory, tum_text
 
 if TYPE_CHECKING:
-    from vio.frame_result import FrameResult
-    from vio.pipeline import RunResult
+    from vio.records import FrameResult
+    from vio.runs.pipeline import RunResult
 
 _WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as in tools/bench.py
 _MOST_WARNINGS = 5
@@ -150,8 +150,8 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
     """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
     import cv2
 
-    from vio.pipeline import run  # loads the compiled functions: not for a recording that cannot be opened
-    from vio.run_folder import growing_folder
+    from vio.runs.folder import growing_folder
+    from vio.runs.pipeline import run  # loads the compiled functions: not for a recording that cannot be opened
 
     cv2.setNumThreads(1)  # tasks run side by side; the figures do not depend on it
     with tempfile.TemporaryDirectory(prefix="vio-bench-", dir=job["scratch"]) as folder:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
+from vio.cameras.rig import Rig
 from vio.errors import CalibrationError
 from vio.records import Estimate
-from vio.rig import Rig
 
 _MOST_LEFT_PX = 5.0  # a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
 

@@ -8,8 +8,8 @@ from vio.calibration.egomotion import CameraMotion
 from vio.calibration.findings import NotObservable
 from vio.calibration.inertial import ImuAlignment, Rates
 from vio.geometry.lie import FloatArray, nearest_rotation, so3_exp, so3_log
+from vio.numerics.robust import jackknife, robust_sigma
 from vio.records import BoolArray
-from vio.robust import jackknife, robust_sigma
 
 _BLOCKS = 10  # of the jackknife
 _ROTATION_DEG = 1.0  # standard deviations beyond these are called weak …

@@ -12,8 +12,8 @@ from vio.calibration.findings import NotObservable
 from vio.calibration.inertial import ImuAlignment, Rates
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.robust import jackknife, robust_sigma
 from vio.records import FeatureTracks, IntArray
-from vio.robust import jackknife, robust_sigma
 
 _BLOCKS = 10  # of the jackknife over windows
 _MAX_SIGMA_M = 0.02  # with a larger standard deviation the value is not observable

@@ -10,8 +10,8 @@ import numpy as np
 
 from vio.calibration.findings import NotObservable
 from vio.geometry.lie import FloatArray, so3_exp, so3_log
+from vio.numerics.robust import robust_sigma
 from vio.records import BoolArray, IntArray
-from vio.robust import robust_sigma
 
 _BLOCKS = 10  # of a jackknife
 _WIDEST_DEG, _NARROWER_DEG = 1.0, 0.3  # gates on epipolar angles in successive fits

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.cameras.rig import Rig
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.geometry.rectify import MapArray, rectified_cameras, rectify_pixels
@@ -28,7 +29,6 @@ from vio.records import (
     StereoFieldEstimate,
     StereoScaleEstimate,
 )
-from vio.rig import Rig
 
 # Parameters of a rig's correction: rotation of the right camera (rad, in the rectified frame: its points p are seen as
 # `exp(w) p`), its principal point (focal lengths), focal ratios and tangential distortion against the left camera;

@@ -41,7 +41,7 @@ from vio.cli import (
     view,
 )
 from vio.errors import StoppedError, VioError
-from vio.printable import printable
+from vio.files.printable import printable
 
 _COMMANDS = (
     run,

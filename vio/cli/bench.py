@@ -97,7 +97,7 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
 
     from vio.bench.tables import METRICS, number, rows_of, summary_of
     from vio.cli.output import print_result
-    from vio.printable import printable
+    from vio.files.printable import printable
 
     summary = summary_of(rows_of(result.outcomes))
     lines = []

@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from vio.calibration.findings import NotObservable
     from vio.calibration.intrinsics import Intrinsics
     from vio.calibration.stereo import RowResiduals, StereoEstimate
-    from vio.mapping.self_calibration import SelfCalibration
     from vio.offline.calibrate import CalibrationReport, ImuReport
+    from vio.offline.self_calibration import SelfCalibration
     from vio.protocols import Dataset, Frontend
 
 MARKER = "calibration.json"
@@ -46,17 +46,17 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.atomic import atomic_folder, check_replaceable, check_writable
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.cli.running import free_folder
-    from vio.colmap import quiet
     from vio.errors import ConfigError
+    from vio.files.atomic import atomic_folder, check_replaceable, check_writable
+    from vio.files.printable import json_text
+    from vio.numerics.threads import one_blas_thread
     from vio.offline.calibrate import measure
     from vio.offline.calibration_files import write_calibration
+    from vio.offline.colmap import quiet
     from vio.offline.source import open_source
-    from vio.printable import json_text
-    from vio.threads import one_blas_thread
 
     if args.pairs < 1 or args.frames < 2:
         raise ConfigError("--pairs must be at least 1 and --frames at least 2")
@@ -76,11 +76,9 @@ def execute(args: argparse.Namespace) -> int:
 
 def _frontend(dataset: Dataset) -> Frontend:
     """Return the default front end."""
-    from vio.frontend_package import frontend_module
+    from vio.frontend import FrontendSettings, build_frontend
 
-    package = frontend_module()
-    frontend: Frontend = package.build_frontend("auto", dataset.recording.camera, package.FrontendSettings(), dataset)
-    return frontend
+    return build_frontend("auto", dataset.recording.camera, FrontendSettings(), dataset)
 
 
 def _facts(report: CalibrationReport) -> dict[str, Any]:
@@ -112,7 +110,7 @@ def _plain(record: Any) -> dict[str, Any]:
 
 def _parameters(found: SelfCalibration) -> dict[str, Any]:
     """Return what a bundle adjustment says of the calibration, by name."""
-    from vio.mapping.self_calibration import NAMES
+    from vio.offline.self_calibration import NAMES
 
     rows = zip(NAMES, found.values.tolist(), found.sigmas.tolist(), strict=True)
     return {

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vio.colmap.reconstruction import Mapper
+    from vio.offline.colmap.reconstruction import Mapper
     from vio.offline.verdict import MapperResult
 
 MARKER = "check.json"
@@ -48,15 +48,15 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
 
-    from vio.atomic import atomic_folder
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
-    from vio.colmap import quiet
     from vio.errors import ConfigError
+    from vio.files.atomic import atomic_folder
+    from vio.files.printable import json_text
     from vio.offline.check import check_run
+    from vio.offline.colmap import quiet
+    from vio.offline.saved_run import read_saved_run
     from vio.offline.verdict import overall_verdict
-    from vio.printable import json_text
-    from vio.saved_run import read_saved_run
 
     if args.threads < 1 or args.keyframes < 2:
         raise ConfigError("--threads must be at least 1 and --keyframes at least 2")

@@ -36,7 +36,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.trajectory_io import is_trajectory_file
+    from vio.files.trajectories import is_trajectory_file
 
     if args.to == "tum" or is_trajectory_file(Path(args.source)):
         return _trajectory(args)
@@ -45,12 +45,12 @@ def execute(args: argparse.Namespace) -> int:
 
 def _trajectory(args: argparse.Namespace) -> int:
     """Write a trajectory, or the ground truth of a recording."""
-    from vio.atomic import check_new_file
     from vio.cli.output import print_result
     from vio.datasets import open_dataset
     from vio.errors import ConfigError
+    from vio.files.atomic import check_new_file
+    from vio.files.trajectories import is_trajectory_file
     from vio.offline.convert_trajectory import convert_trajectory, write_reference
-    from vio.trajectory_io import is_trajectory_file
 
     source, config = Path(args.source), config_from(args)
     if args.start or args.stop is not None:
@@ -74,14 +74,14 @@ def _recording(args: argparse.Namespace) -> int:
     import logging
     from dataclasses import replace
 
-    from vio.atomic import atomic_folder, check_spares
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.datasets import open_dataset
     from vio.datasets.span import frames_between
+    from vio.files.atomic import atomic_folder, check_spares
+    from vio.files.text import write_text
     from vio.offline.convert import convert
     from vio.records import need_stereo
-    from vio.text_files import write_text
 
     log = logging.getLogger(__name__)
     dataset = open_dataset(args.source, replace(config_from(args).dataset, projection="pinhole"))

@@ -12,7 +12,7 @@ from vio.cli.arguments import add_lengths_argument
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from vio.evaluation import Evaluation
+    from vio.evaluation.trajectories import Evaluation
     from vio.geometry.lie import FloatArray
     from vio.records import Trajectory
 
@@ -65,7 +65,7 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
-    from vio.evaluation import evaluate
+    from vio.evaluation.trajectories import evaluate
 
     estimate, T_cam0_imu = _read(args.estimate)
     reference, other = _read(args.reference)
@@ -91,7 +91,7 @@ def execute(args: argparse.Namespace) -> int:
 
 def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
     """Yield the figures as rows of a table, one quantity each."""
-    from vio.evaluation import lengths_text, rotation_drift_text
+    from vio.evaluation.trajectories import lengths_text, rotation_drift_text
 
     share = f"{100 * result.coverage.estimate:.1f} % of the estimate"
     if result.coverage.reference_span is not None:
@@ -117,11 +117,11 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
     """Read a trajectory file, a run's folder or a COLMAP model, with the extrinsics if it has them."""
-    from vio.run_folder import MARKER, read_run
+    from vio.runs.folder import MARKER, read_run
 
     if path.is_dir() and not (path / MARKER).is_file():
-        from vio.colmap import quiet
-        from vio.colmap.trajectory import model_folder, read_colmap_trajectory
+        from vio.offline.colmap import quiet
+        from vio.offline.colmap.trajectory import model_folder, read_colmap_trajectory
 
         quiet()
         if model_folder(path) is not None:

@@ -39,11 +39,11 @@ def execute(args: argparse.Namespace) -> int:
 def _bag(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from vio.atomic import atomic_folder
     from vio.cli.output import print_result
     from vio.errors import ConfigError
+    from vio.files.atomic import atomic_folder
+    from vio.files.printable import json_text
     from vio.offline.export_bag import export_bag
-    from vio.printable import json_text
 
     if args.refined or args.keyframes is not None or args.source is not None or args.no_images:
         raise ConfigError("--refined, --keyframes, --source and --no-images are for colmap; leave them out")
@@ -59,15 +59,15 @@ def _bag(args: argparse.Namespace) -> int:
 def _colmap(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from vio.atomic import atomic_folder
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
-    from vio.colmap import quiet
     from vio.errors import ConfigError
+    from vio.files.atomic import atomic_folder
+    from vio.files.printable import json_text
+    from vio.numerics.threads import one_blas_thread
+    from vio.offline.colmap import quiet
     from vio.offline.export import export_colmap
-    from vio.printable import json_text
-    from vio.saved_run import read_saved_run, with_poses
-    from vio.threads import one_blas_thread
+    from vio.offline.saved_run import read_saved_run, with_poses
 
     if args.keyframes is not None and args.keyframes < 2:
         raise ConfigError("--keyframes must be at least 2")

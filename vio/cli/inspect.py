@@ -31,13 +31,13 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from frontend import build_frontend
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.datasets import open_dataset
     from vio.errors import ConfigError
+    from vio.frontend import build_frontend
     from vio.inspection.inspect import inspect_recording
-    from vio.threads import one_blas_thread
+    from vio.numerics.threads import one_blas_thread
 
     if args.pairs < 1 or args.frames < 0:
         raise ConfigError("--pairs must be at least 1, and --frames at least 0")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vio.printable import json_text, printable
+from vio.files.printable import json_text, printable
 
 
 def print_result(

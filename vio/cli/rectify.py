@@ -34,7 +34,6 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import logging
 
-    from vio.atomic import atomic_folder, check_spares
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.datasets import DatasetSettings, open_dataset
@@ -42,9 +41,10 @@ def execute(args: argparse.Namespace) -> int:
     from vio.datasets.kitti_raw import write_rectified_kitti
     from vio.datasets.rectified import RectifiedDataset, check_not_rectified
     from vio.errors import DataError
-    from vio.printable import json_text
+    from vio.files.atomic import atomic_folder, check_spares
+    from vio.files.printable import json_text
+    from vio.files.text import write_text
     from vio.records import need_stereo
-    from vio.text_files import write_text
 
     dataset = open_dataset(args.source, DatasetSettings(interpolation=args.interpolation, projection="pinhole"))
     recording = dataset.recording

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from vio.offline.refine import Refinement
-    from vio.saved_run import SavedRun
+    from vio.offline.saved_run import SavedRun
 
 FOLDER = "refined"
 
@@ -41,11 +41,11 @@ def execute(args: argparse.Namespace) -> int:
 
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
-    from vio.colmap import quiet
     from vio.errors import ConfigError
+    from vio.numerics.threads import one_blas_thread
+    from vio.offline.colmap import quiet
     from vio.offline.refine import STEPS, refine_run
-    from vio.saved_run import read_saved_run
-    from vio.threads import one_blas_thread
+    from vio.offline.saved_run import read_saved_run
 
     if args.threads < 1 or (args.keyframes is not None and args.keyframes < 2):
         raise ConfigError("--threads must be at least 1 and --keyframes at least 2")
@@ -96,10 +96,10 @@ def _facts(run: SavedRun, done: Refinement) -> dict[str, Any]:
 def _write(out: Path, run: SavedRun, done: Refinement, metrics: dict[str, Any]) -> None:
     """Write a folder that `vio eval` and `vio export` read like a run's."""
 
-    from vio.atomic import atomic_folder
-    from vio.printable import json_text
-    from vio.run_folder import MARKER, write_landmarks_ply
-    from vio.trajectory_io import write_tum
+    from vio.files.atomic import atomic_folder
+    from vio.files.printable import json_text
+    from vio.files.trajectories import write_tum
+    from vio.runs.folder import MARKER, write_landmarks_ply
 
     with atomic_folder(out, replace=True, marker=MARKER) as folder:
         in_body = done.trajectory.in_imu(run.T_cam0_imu) if run.metrics["body"] == "imu" else done.trajectory

@@ -87,11 +87,11 @@ def execute(args: argparse.Namespace) -> int:
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
     from vio.errors import ConfigError
+    from vio.numerics.threads import one_blas_thread
     from vio.sim.export import export_euroc, export_kitti
     from vio.sim.export_rgbd import export_rgbd
     from vio.sim.scenarios import ParallelRecording, default_workers, plan
     from vio.sim.sequence import SimulatedRecording
-    from vio.threads import one_blas_thread
 
     if args.workers is not None and not 1 <= args.workers <= 64:
         raise ConfigError(f"--workers takes 1 to 64 processes, got {args.workers}")

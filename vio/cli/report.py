@@ -24,9 +24,9 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.atomic import check_new_file
     from vio.errors import DataError
-    from vio.finished_run import read_finished_run, with_distinct_names
+    from vio.files.atomic import check_new_file
+    from vio.runs.finished import read_finished_run, with_distinct_names
 
     try:
         from vio.report.page import write_report

@@ -24,8 +24,8 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
 
-    from vio.printable import json_text
-    from vio.reproduce import reproduce
+    from vio.files.printable import json_text
+    from vio.offline.reproduce import reproduce
 
     tables = [reproduce(*_split(text), args.out) for text in args.files]
     if args.json:

@@ -10,20 +10,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vio.atomic import atomic_write_text, check_new_file, check_replaceable, check_writable, locked_folder
 from vio.cli.progress import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
 from vio.datasets import open_dataset
+from vio.datasets.frame_rate import used_frames
 from vio.datasets.span import Seconds, frames_between
 from vio.errors import CalibrationError, ConfigError, DataError, StoppedError, VioError
-from vio.evaluation import lengths_text, rotation_drift_text
-from vio.frame_rate import used_frames
-from vio.frame_result import FrameResult
-from vio.pipeline import RunResult, given_rig, resolve_motion, run
+from vio.evaluation.trajectories import lengths_text, rotation_drift_text
+from vio.files.atomic import atomic_write_text, check_new_file, check_replaceable, check_writable, locked_folder
+from vio.files.trajectories import read_trajectory
 from vio.protocols import Dataset, Viewer
-from vio.records import Trajectory
-from vio.run_folder import (
+from vio.records import FrameResult, Trajectory
+from vio.runs.folder import (
     CALIBRATION,
     FILES,
     MARKER,
@@ -32,8 +31,8 @@ from vio.run_folder import (
     growing_folder,
     read_request,
 )
-from vio.run_recorder import CHECKPOINT, UNFINISHED
-from vio.trajectory_io import read_trajectory
+from vio.runs.pipeline import RunResult, given_rig, resolve_motion, run
+from vio.runs.recorder import CHECKPOINT, UNFINISHED
 
 if TYPE_CHECKING:
     from vio.view.live import RerunViewer

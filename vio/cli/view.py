@@ -24,7 +24,7 @@ def add_parser(commands: Any) -> None:
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
-    from vio.finished_run import read_finished_run
+    from vio.runs.finished import read_finished_run
     from vio.view.finished import show_finished_run
     from vio.view.stream import open_stream, wait_for_interrupt
 

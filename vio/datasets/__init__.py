@@ -10,7 +10,7 @@ from pathlib import Path
 
 from vio.datasets.settings import DatasetSettings
 from vio.errors import DataError
-from vio.input_files import check_regular
+from vio.files.inputs import check_regular
 from vio.protocols import Dataset
 
 __all__ = ["READERS", "DatasetSettings", "open_dataset"]

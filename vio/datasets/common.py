@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from vio.datasets.frame_rate import used_frames
 from vio.datasets.samples import MotionSamples, motion_samples
 from vio.errors import CalibrationError, DataError
-from vio.frame_rate import used_frames
+from vio.files.inputs import check_regular
+from vio.files.text import check_increasing
 from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
-from vio.input_files import check_regular
 from vio.records import (
     NS_PER_S,
     BoolArray,
@@ -28,7 +29,6 @@ from vio.records import (
     Recording,
     StereoFrame,
 )
-from vio.text_files import check_increasing
 
 _GRAVITY, _GRAVITY_OFF = 9.81, 1.5  # m/s^2; by what accelerations and biases move the median of a motion's readings
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits

@@ -9,7 +9,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from vio.camera_rig import CameraRig, Undistorter
+from vio.cameras.camera_rig import CameraRig, Undistorter
+from vio.cameras.rig import Rectifier, Rig
 from vio.datasets.common import naming
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.overlap import check_overlap, reference_of_body
@@ -18,9 +19,8 @@ from vio.datasets.samples import imu_samples, in_time_order
 from vio.datasets.tables import read_imu_table, read_velocity_table
 from vio.datasets.unused import Layout
 from vio.errors import CalibrationError, DataError
+from vio.files.trajectories import read_trajectory
 from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource, Trajectory
-from vio.rig import Rectifier, Rig
-from vio.trajectory_io import read_trajectory
 
 AnyRig = TypeVar("AnyRig", Rig, CameraRig)
 IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")

@@ -7,8 +7,8 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 from vio.errors import DataError
+from vio.files.text import check_increasing, text_lines
 from vio.records import NS_PER_S, IntArray
-from vio.text_files import check_increasing, text_lines
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=timezone.utc)
 _MAX_SINCE = timedelta(days=100_000)  # so that nanoseconds fit 64 bits

@@ -40,13 +40,13 @@ from vio.datasets.samples import MotionSamples, imu_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
+from vio.files.text import write_text
+from vio.files.trajectories import read_trajectory
 from vio.geometry.distortion import CameraModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_inverse
+from vio.imu.clocks import judge_clocks
 from vio.protocols import Progress
 from vio.records import ImuDensities, ImuSample, IntArray, MotionSource, Recording, StereoFrame, Trajectory
-from vio.text_files import write_text
-from vio.trajectory_io import read_trajectory
-from vio.watch.clocks import judge_clocks
 
 
 @dataclass(frozen=True, slots=True)

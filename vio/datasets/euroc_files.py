@@ -19,11 +19,11 @@ import numpy as np
 from vio.datasets.common import check_gravity_column, checked_transform, image_size, naming
 from vio.datasets.yaml_files import as_number, numbers, read_yaml
 from vio.errors import CalibrationError, DataError
+from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, ImuDensities, ImuRecord, IntArray
-from vio.text_files import INT64_MAX, check_increasing, exact_text, lines_of
 
 DISTORTION_MODELS: dict[str, DistortionModel] = {
     "radial-tangential": "radtan",

@@ -19,10 +19,10 @@ from vio.datasets.common import naming
 from vio.datasets.features import FeatureDataset
 from vio.datasets.tracks import refuse_swapped
 from vio.errors import CalibrationError, DataError
+from vio.files.text import read_numbers
 from vio.geometry.lie import FloatArray, nearest_rotation, rigid_fault, se3_from_parts
 from vio.geometry.stereo import StereoCamera
 from vio.records import FeatureTracks, IntArray, Recording, Trajectory
-from vio.text_files import read_numbers
 
 _FACTORS = "stereo_factors"
 _FRAME_NS = 100_000_000  # KITTI's cameras

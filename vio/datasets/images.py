@@ -23,8 +23,8 @@ from vio.datasets.image_files import ImageFiles, stem_of
 from vio.datasets.image_formats import OTHER_SUFFIXES, other_damage
 from vio.datasets.png import crc32, decode_gray8
 from vio.errors import DataError
+from vio.files.inputs import check_regular, read_input
 from vio.geometry.lie import FloatArray
-from vio.input_files import check_regular, read_input
 from vio.records import Image
 
 SUFFIXES = (".png", ".jpg", ".jpeg", *OTHER_SUFFIXES)

@@ -22,11 +22,11 @@ from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
+from vio.files.text import exact_text, read_numbers, seconds_text, text_lines, write_text
+from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.records import IntArray, Recording, Trajectory, VelocitySample
-from vio.text_files import exact_text, read_numbers, seconds_text, text_lines, write_text
-from vio.trajectory_io import read_trajectory
 
 VELOCITY_HEADER = "time_s,vx_mps,vy_mps,vz_mps,wx_radps,wy_radps,wz_radps"
 _GRAY, _COLOUR = (0, 1), (2, 3)

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.cameras.rig import Rectifier
 from vio.datasets.common import check_intrinsics, checked_transform, image_size, naming, numbers_in
 from vio.datasets.dates import drive_times
 from vio.datasets.image_pairs import ImagePairs, first_readable, full_scale, pair_images
@@ -27,12 +28,11 @@ from vio.datasets.rectified import RectifiedDataset, make_rectifier, rig_sizes, 
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
+from vio.files.text import text_lines
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.protocols import Progress
 from vio.records import IntArray, Recording, StereoFrame
-from vio.rig import Rectifier
-from vio.text_files import text_lines
 
 CAMERAS = "calib_cam_to_cam.txt"
 VELO = "calib_velo_to_cam.txt"

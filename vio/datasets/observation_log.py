@@ -13,11 +13,11 @@ from typing import cast, get_args
 
 import numpy as np
 
-from vio.atomic import atomic_write_bytes
 from vio.datasets.common import checked_transform, read_npz
 from vio.datasets.features import FeatureDataset
 from vio.datasets.samples import MotionSamples, motion_samples
 from vio.errors import DataError
+from vio.files.atomic import atomic_write_bytes
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import CameraKind, Projection, StereoCamera
 from vio.records import (

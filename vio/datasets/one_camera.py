@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.camera_rig import CameraRig, Undistorter
+from vio.cameras.camera_rig import CameraRig, Undistorter
 from vio.datasets.common import blank_frames, chosen_frames, merge_events, naming
 from vio.datasets.companions import calibration_beside, read_motion, read_reference, sources_of, with_extrinsics
 from vio.datasets.image_files import FilePairs
@@ -27,9 +27,9 @@ from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import parse_stamps
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
+from vio.files.text import text_lines
 from vio.geometry.distortion import CameraModel
 from vio.records import Event, ImuDensities, IntArray, MotionSample, Observations, Recording, StereoFrame
-from vio.text_files import text_lines
 
 _FOLDERS = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
 _INSIDE = ("data", "images", "")

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.camera_rig import CameraRig, Undistorter
+from vio.cameras.camera_rig import CameraRig, Undistorter
+from vio.cameras.rig import Rectifier, Rig
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
+from vio.imu.clocks import judge_clocks
 from vio.records import IntArray, Trajectory
-from vio.rig import Rectifier, Rig
-from vio.watch.clocks import judge_clocks
 
 
 def check_overlap(frame_times_ns: IntArray, times_ns: IntArray, where: Path | str) -> None:

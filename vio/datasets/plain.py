@@ -35,8 +35,8 @@ from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import parse_stamps
 from vio.datasets.unused import Layout, unused_note
 from vio.errors import DataError
+from vio.files.text import text_lines
 from vio.records import NS_PER_S, IntArray, Recording
-from vio.text_files import text_lines
 
 _FOLDERS = (
     ("left", "right"),

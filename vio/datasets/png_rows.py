@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled
+from vio.numerics.compiled import compiled
 from vio.records import Image
 
 _SIDE_BY_SIDE = 16  # rows, as many as a vector of the processor holds numbers of 16 bits
@@ -16,7 +16,7 @@ _Lanes = npt.NDArray[np.int16]  # (16,) one number a row
 @compiled
 def unfilter(rows: Image, out: Image) -> None:
     """Write the pixels (H, W) of filtered rows (H, 1 + W), each with the number of its filter in front."""
-    y = int(np.int64(0))  # no literal: see `vio.compiled`
+    y = int(np.int64(0))  # no literal: see `vio.numerics.compiled`
     while y < len(out):
         if y > 0 and _paeth_rows(rows, y) >= _SIDE_BY_SIDE:
             _side_by_side(rows, out, y)

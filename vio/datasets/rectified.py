@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.cameras.rig import Rectifier, rectifier_of
 from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageDataset, ImageSize
 from vio.datasets.images import write_png
@@ -16,7 +17,6 @@ from vio.geometry.distortion import StereoRig
 from vio.geometry.rectify import Interpolation, ProjectionMode
 from vio.protocols import Progress
 from vio.records import Image, ImuDensities, IntArray, StereoFrame
-from vio.rig import Rectifier, rectifier_of
 
 
 def make_rectifier(

@@ -13,9 +13,9 @@ import numpy as np
 from vio.datasets.common import check_gravity_column
 from vio.datasets.samples import MotionSamples, velocity_samples
 from vio.errors import DataError
+from vio.files.text import INT64_MAX, check_increasing, text_lines
 from vio.geometry.lie import FloatArray
 from vio.records import ImuRecord, IntArray, VelocitySample
-from vio.text_files import INT64_MAX, check_increasing, text_lines
 
 _UNITS = {"s": 9, "sec": 9, "ms": 6, "us": 3, "ns": 0}  # powers of ten to nanoseconds
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?|[+-]?(nan|inf|infinity)", re.IGNORECASE)

@@ -27,9 +27,9 @@ from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tracks import moving_frames, resolve_repeats, tracks_from_dense
 from vio.errors import DataError
+from vio.files.inputs import check_regular
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
-from vio.input_files import check_regular
 from vio.records import IntArray, Landmarks, Recording, Trajectory
 
 KEYS = ("y_k_j", "t", "v_vk_vk_i", "w_vk_vk_i", "fu", "fv", "cu", "cv", "b", "C_c_v", "rho_v_c_v")

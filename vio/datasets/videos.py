@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vio.cameras.rig import Rectifier
 from vio.datasets.common import chosen_frames, merge_events, naming
 from vio.datasets.companions import (
     find_calibration_of,
@@ -40,7 +41,6 @@ from vio.records import (
     Recording,
     StereoFrame,
 )
-from vio.rig import Rectifier
 
 SUFFIXES = (".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v")
 _NAMES = (("left", "right"), ("Left", "Right"), ("cam0", "cam1"), ("image_0", "image_1"), ("video_0", "video_1"))

@@ -9,9 +9,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from vio.errors import CalibrationError
+from vio.files.text import text_lines
+from vio.files.yaml_text import read_yaml as read_yaml_text
 from vio.geometry.lie import FloatArray
-from vio.text_files import text_lines
-from vio.yaml_text import read_yaml as read_yaml_text
 
 Entries: TypeAlias = Mapping[str, object]
 

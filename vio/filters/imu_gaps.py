@@ -16,8 +16,8 @@ import numpy as np
 
 from vio.filters.pose_loops import lacks_samples
 from vio.geometry.lie import FloatArray
+from vio.numerics.robust import median
 from vio.records import ImuSample, IntArray
-from vio.robust import median
 
 _NS = 1e-9
 _MEMORY_S = 2.0  # samples that the structure function is learned from

@@ -15,8 +15,8 @@ import numpy as np
 from vio.errors import EstimationError
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, so3_exp
+from vio.imu.standstill import NOISE_FACTOR, STANDSTILL_S, blocks_agree
 from vio.records import ImuSample
-from vio.standstill import NOISE_FACTOR, STANDSTILL_S, blocks_agree
 
 _MOST_TILT_RAD = np.pi / 4  # beyond, the direction of gravity is unknown; a larger prior says no more
 

@@ -18,8 +18,8 @@ from vio.filters.window import Window
 from vio.filters.window_posterior import scale_sigma
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
+from vio.imu.standstill import STANDSTILL_S
 from vio.records import Estimate, ImuSample, MotionSample, Observations, UpdateReport
-from vio.standstill import STANDSTILL_S
 
 # A landmark that is marginalised at a scale that is still off holds on to it: of V1_02's 76 m, ATE is 0.020 m with 30
 # landmarks where the scale is known to 1 %, and 0.004 m without any (rendered images, simulated IMU).

@@ -27,8 +27,8 @@ from vio.filters.window_posterior import WindowPosterior, scale_sigma
 from vio.filters.window_tracks import LinearTracks, WindowTracks, chi_square_table
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.geometry.stereo import StereoCamera, left_rays
+from vio.imu.standstill import STANDSTILL_S
 from vio.records import ImuSample, Observations
-from vio.standstill import STANDSTILL_S
 
 _SPAN_S = 3.0  # of views: what a gyro bias leaves of rotations is corrected to first order only
 _LEAST_SPAN_S = 0.6  # half of it shows less than the standard deviation of the accelerometer's bias

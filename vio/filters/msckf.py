@@ -60,6 +60,7 @@ from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_exp, so3_hat, so3_log, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, depth_of, project
+from vio.numerics.robust import median
 from vio.records import (
     ROW_TERMS,
     TURNS_NOT_SHOWN,
@@ -80,7 +81,6 @@ from vio.records import (
     VelocitySample,
     no_landmarks,
 )
-from vio.robust import median
 
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 # Factors on the motion model's densities: at the start, at least, at most.

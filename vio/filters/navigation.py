@@ -14,7 +14,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from vio.compiled import move_by_twist
 from vio.errors import EstimationError
 from vio.filters import pose_loops as loops
 from vio.filters.imu_gaps import Hidden, ImuHistory
@@ -41,7 +40,8 @@ from vio.geometry.lie import (
     so3_exp,
     so3_hat,
 )
-from vio.imu_faults import ImuSampleCheck, readings_of
+from vio.imu.faults import ImuSampleCheck, readings_of
+from vio.numerics.compiled import move_by_twist
 from vio.records import ImuSample, IntArray, MotionSample, VelocitySample
 
 DIM = 15  # error dimensions of the navigation state

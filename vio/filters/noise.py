@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from vio.geometry.lie import FloatArray
-from vio.statistics import chi_square_cdf, chi_square_quantile
+from vio.numerics.statistics import chi_square_cdf, chi_square_quantile
 
 _STEPS = 10  # over which corrections are summed: errors that last, such as a gyro's scale, show only in the sum
 _INFORMED = 0.3  # share of its predicted variance that the images must have removed for a direction to count

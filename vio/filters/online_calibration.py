@@ -17,8 +17,8 @@ from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, ImuTerms, term_si
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import METRIC_TERMS, TERMS
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import FIELD_TERMS, Estimate, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
-from vio.statistics import chi_square_quantile
 
 # Columns of the full error [IMU terms; stereo field; baseline and focal length; eta; time offset].
 _IMU, _STEREO = np.arange(IMU_TERMS), IMU_TERMS + np.arange(TERMS)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.compiled import compiled
 from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled
 from vio.records import IntArray
 
 

@@ -19,8 +19,8 @@ from vio.filters import track_loops as loops
 from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.robust import median
 from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, IntArray, Observations
-from vio.robust import median
 
 METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
 TERMS = FIELD_TERMS + METRIC_TERMS

@@ -10,9 +10,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from vio.compiled import compiled, solve_positive
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.compiled import compiled, solve_positive
 from vio.records import BoolArray, IntArray
 
 Lens: TypeAlias = tuple[float, float, float, float, float, bool]

@@ -16,6 +16,7 @@ from vio.filters.settings import VislamSettings
 from vio.filters.vislam_motion import DriftingTwist, HeldInput
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, p_cam_D_z, project, triangulate, z_D_p_cam
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import (
     BoolArray,
     Estimate,
@@ -29,7 +30,6 @@ from vio.records import (
     VelocitySample,
     no_landmarks,
 )
-from vio.statistics import chi_square_quantile
 
 _MIN_DEPTH_M = 0.3
 _MIN_FEATURES = 3  # fewer points leave a pose undetermined, and a single wrong one would steer it

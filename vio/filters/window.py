@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from vio.compiled import move_poses
 from vio.filters import pose_loops as loops
 from vio.filters import track_loops
 from vio.filters.multiview import LandmarkResiduals
@@ -32,6 +31,7 @@ from vio.geometry.lie import (
     so3_exp,
     so3_hat,
 )
+from vio.numerics.compiled import move_poses
 from vio.records import BoolArray, IntArray
 
 

@@ -10,8 +10,8 @@ from vio.filters.navigation import ImuMotion
 from vio.filters.window import Clone, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, se3_inverse, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import Estimate
-from vio.statistics import chi_square_quantile
 
 _LEAST_MOTION_M = 1e-3  # of all poses from the oldest one: less has no scale
 _STATIONARY_LIMIT = float(chi_square_quantile(0.95, 6))  # of the motion over the window

@@ -28,9 +28,9 @@ from vio.filters.stereo_calibration import TERMS, StereoColumns, StereoField, st
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import StereoCamera
+from vio.numerics.robust import median
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import ROW_TERMS, BoolArray, IntArray
-from vio.robust import median
-from vio.statistics import chi_square_quantile
 
 MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals

@@ -6,9 +6,9 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, so3_log
 from vio.inspection.finding import Part
+from vio.monitor.accelerometer import judge_up
+from vio.monitor.samples import judge_size
 from vio.records import NS_PER_S, BoolArray, ImuDensities, ImuRecord
-from vio.watch.accelerometer import judge_up
-from vio.watch.samples import judge_size
 
 _WINDOW_S = 0.5  # over which standstill is judged
 _STILL_GYRO, _STILL_ACCEL = 0.02, 0.15  # rad/s, m/s^2: spread within a window; ten times the noise of usual sensors

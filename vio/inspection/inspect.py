@@ -7,14 +7,14 @@ from collections.abc import Callable
 import numpy as np
 
 from vio.geometry.rectify import field_of_view
+from vio.imu.findings import InertialFinding
 from vio.inspection.finding import Inspection, Part
 from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
 from vio.inspection.pictures import depths_part, images_part, rows_part
 from vio.inspection.times import frames_part, imu_clock_part
+from vio.monitor.inertial import InertialCheck
 from vio.protocols import Dataset, Frontend
 from vio.records import ImuRecord, ImuSample, Recording, StereoFrame
-from vio.watch.finding import InertialFinding
-from vio.watch.inertial import InertialCheck
 
 PAIRS = 12  # or single images looked at, spread over the recording
 TRACKED = 60  # frames tracked to compare the IMU with the images' motion

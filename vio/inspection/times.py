@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.imu.clocks import judge_clocks
 from vio.inspection.finding import Part
+from vio.numerics.robust import robust_sigma
 from vio.records import NS_PER_S, IntArray, Recording
-from vio.robust import robust_sigma
-from vio.watch.clocks import judge_clocks
 
 _GAP = 1.5  # intervals longer than this multiple of the median are gaps
 _LEAST_IMU_HZ = 50.0  # as the readers say it

@@ -19,7 +19,6 @@ from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, triangulate
-from vio.loops import LoopEvent, LoopMatches
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.guided_search import LEAST_CORNERS, Guided, Shown, View, place_points, search, shown
 from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, verify
@@ -27,8 +26,8 @@ from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.overlap import Overlaps
 from vio.mapping.place_index import PlaceIndex
-from vio.records import BoolArray, IntArray
-from vio.statistics import chi_square_quantile
+from vio.numerics.statistics import chi_square_quantile
+from vio.records import BoolArray, IntArray, LoopEvent, LoopMatches
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_inverse, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project, triangulate
@@ -32,6 +31,7 @@ from vio.mapping.loop_geometry import (
     pose_of_most,
 )
 from vio.mapping.overlap import LEAST_DEPTH_M, SCALES, VIEW_COS
+from vio.numerics.compiled import compiled
 from vio.records import IntArray
 
 _MOST_BITS = 64  # in which the descriptors of one point differ: a quarter

@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, so3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate
-from vio.loops import LoopMatches
 from vio.mapping.features import KeyframeFeatures
-from vio.records import BoolArray, IntArray
-from vio.statistics import chi_square_quantile
+from vio.numerics.compiled import compiled
+from vio.numerics.statistics import chi_square_quantile
+from vio.records import BoolArray, IntArray, LoopMatches
 
 LEAST_INLIERS = 20
 _LEAST_SHARE = 0.25  # of the pairs that must agree; wrong pairs are at random

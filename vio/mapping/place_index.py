@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.compiled import compiled
 from vio.geometry.lie import FloatArray
 from vio.mapping.features import DESCRIPTOR_BYTES, Bits
+from vio.numerics.compiled import compiled
 from vio.records import BoolArray, IntArray
 
 Words = npt.NDArray[np.uint16]

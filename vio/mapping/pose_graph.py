@@ -15,8 +15,8 @@ from scipy.sparse.linalg import splu
 
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse, se3_left_jacobian, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
+from vio.numerics.statistics import chi_square_quantile
 from vio.records import BoolArray, IntArray
-from vio.statistics import chi_square_quantile
 
 _TRUNCATION = 0.999  # probability at which a loop's residual is cut off
 _MU_GROWTH = 1.6  # of the control parameter, from one step to the next

@@ -17,11 +17,10 @@ import numpy as np
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
-from vio.loops import LoopEvent, MapKeyframes
 from vio.mapping.builder import Keyframe, MapBuilder, MapUpdate, check_camera
 from vio.mapping.features import extract
 from vio.mapping.map_store import MapStore
-from vio.records import Estimate, Image, IntArray, Observations, StereoFrame
+from vio.records import Estimate, Image, IntArray, LoopEvent, MapKeyframes, Observations, StereoFrame
 
 Relative: TypeAlias = Callable[[int, int], "RelativePose | None"]
 

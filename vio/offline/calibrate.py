@@ -26,7 +26,6 @@ from vio.calibration.stereo import (
 )
 from vio.calibration.stereo_field import PARAMETERS, field_of
 from vio.calibration.verdicts import judge_exchange, judge_imu, judge_stereo, judge_velocity_lever_arm
-from vio.colmap.pairs import adjust_rig, relative_pose, sift_matches
 from vio.datasets.image_pairs import full_scale
 from vio.datasets.images import load_gray
 from vio.errors import EstimationError
@@ -34,9 +33,10 @@ from vio.geometry.distortion import StereoRig, unproject_pixel
 from vio.geometry.lie import FloatArray, so3_log
 from vio.geometry.rectify import rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
-from vio.mapping.keyframes import choose_keyframes, tracked_stretches
-from vio.mapping.points import build_tracks
-from vio.mapping.self_calibration import SelfCalibration, Stretch, intrinsics_of, self_calibrate
+from vio.offline.colmap.pairs import adjust_rig, relative_pose, sift_matches
+from vio.offline.keyframes import choose_keyframes, tracked_stretches
+from vio.offline.points import build_tracks
+from vio.offline.self_calibration import SelfCalibration, Stretch, intrinsics_of, self_calibrate
 from vio.offline.source import CalibrationSource, track
 from vio.protocols import Dataset, Frontend
 from vio.records import BoolArray, FeatureTracks, IntArray, MotionSample, Recording

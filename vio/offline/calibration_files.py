@@ -11,13 +11,13 @@ from vio.calibration.inertial import ImuAlignment
 from vio.calibration.lever_arm import LeverArm
 from vio.calibration.stereo import StereoEstimate
 from vio.calibration.stereo_field import rig_off_by
+from vio.cameras.rig import Rig
 from vio.datasets.euroc_files import SENSOR_YAML_MODELS, camera_yaml, median_rate_hz
 from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.geometry.distortion import StereoRig
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 from vio.offline.calibrate import CalibrationReport
-from vio.rig import Rig
 
 _USUAL_RATE_HZ = 20.0  # where there are no time stamps to derive it from
 

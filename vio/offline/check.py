@@ -11,16 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from vio.colmap.model import keyframe_images
-from vio.colmap.reconstruction import Mapper, match_images, reconstruct
-from vio.mapping.comparison import compare_keyframes
-from vio.mapping.keyframes import choose_keyframes
-from vio.mapping.loop_tracks import loop_pairs
+from vio.offline.colmap.model import keyframe_images
+from vio.offline.colmap.reconstruction import Mapper, match_images, reconstruct
+from vio.offline.comparison import compare_keyframes
 from vio.offline.images import write_images
+from vio.offline.keyframes import choose_keyframes
+from vio.offline.loop_tracks import loop_pairs
+from vio.offline.saved_run import SavedRun
 from vio.offline.verdict import MapperResult, overall_verdict
-from vio.plotting import write_picture
 from vio.records import Trajectory
-from vio.saved_run import SavedRun
+from vio.runs.picture import write_picture
 
 _MATCH_S, _MAP_S = 2.0, 1.0  # for a keyframe, see `expected_minutes`
 _MARGIN = 0.15  # of the path's extent, left free about it

@@ -9,6 +9,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.cameras.rig import Rig
 from vio.datasets.euroc_files import TUM_FILE as EUROC_TUM
 from vio.datasets.euroc_files import (
     camera_yaml,
@@ -23,6 +24,8 @@ from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.datasets.rigs.kalibr import NOISE_KEYS, kalibr_text
 from vio.errors import DataError
+from vio.files.text import exact_text, seconds_text, write_text
+from vio.files.trajectories import in_first_cam0, write_tum
 from vio.offline.convert_bag import write_bag
 from vio.protocols import Dataset, Progress
 from vio.records import (
@@ -34,9 +37,6 @@ from vio.records import (
     Trajectory,
     VelocitySample,
 )
-from vio.rig import Rig
-from vio.text_files import exact_text, seconds_text, write_text
-from vio.trajectory_io import in_first_cam0, write_tum
 
 Folder: TypeAlias = Literal["euroc", "kitti", "plain"]
 Form: TypeAlias = Literal["euroc", "kitti", "plain", "rosbag2", "mcap"]

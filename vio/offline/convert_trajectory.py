@@ -11,11 +11,11 @@ from vio.datasets.kitti import read_extrinsics
 from vio.datasets.rigs import load_rig
 from vio.datasets.tables import parse_stamps
 from vio.errors import CalibrationError, DataError
+from vio.files.text import text_lines
+from vio.files.trajectories import TrajectoryFormat, read_trajectory, write_euroc, write_kitti, write_tum
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
 from vio.records import BodyFrame, IntArray, Trajectory
-from vio.text_files import text_lines
-from vio.trajectory_io import TrajectoryFormat, read_trajectory, write_euroc, write_kitti, write_tum
 
 _Writer: TypeAlias = Callable[[Path, Trajectory], None]
 _WRITERS: dict[TrajectoryFormat, _Writer] = {"tum": write_tum, "kitti": write_kitti, "euroc": write_euroc}

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.colmap.model import (
+from vio.geometry.lie import FloatArray
+from vio.offline.colmap.model import (
     ColourArray,
     ModelImages,
     build_model,
@@ -16,14 +17,13 @@ from vio.colmap.model import (
     mean_reprojection_error_px,
     write_model,
 )
-from vio.colmap.nerfstudio import coloured_ply, nerfstudio_transforms
-from vio.geometry.lie import FloatArray
-from vio.mapping.keyframes import choose_keyframes
-from vio.mapping.loop_tracks import loop_pairs
-from vio.mapping.points import PointTracks, build_tracks
+from vio.offline.colmap.nerfstudio import coloured_ply, nerfstudio_transforms
 from vio.offline.images import write_images
+from vio.offline.keyframes import choose_keyframes
+from vio.offline.loop_tracks import loop_pairs
+from vio.offline.points import PointTracks, build_tracks
+from vio.offline.saved_run import SavedRun
 from vio.records import Image, IntArray
-from vio.saved_run import SavedRun
 
 
 @dataclass(frozen=True, slots=True)

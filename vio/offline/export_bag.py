@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.bags.writer import Storage, bag_writer
-from vio.finished_run import FinishedRun, read_finished_run
+from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.records import Trajectory
-from vio.trajectory_io import read_trajectory
+from vio.runs.finished import FinishedRun, read_finished_run
 
 POSE, PATH, REFERENCE, POINTS = "/vio/pose", "/vio/path", "/reference/path", "/vio/landmarks"
 _WORLD = "world"

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from vio.colmap.model import ModelImages
 from vio.datasets.images import write_png
+from vio.offline.colmap.model import ModelImages
+from vio.offline.saved_run import SavedRun, stereo_frames
 from vio.records import Image, IntArray
-from vio.saved_run import SavedRun, stereo_frames
 
 
 def write_images(

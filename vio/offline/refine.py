@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.colmap.adjustment import Adjustment, PositionPriors, adjust
 from vio.config import Config, merge
 from vio.errors import ConfigError, EvaluationError
-from vio.evaluation import evaluate
-from vio.input_files import read_input
-from vio.mapping.keyframes import choose_keyframes
-from vio.mapping.loop_tracks import loop_pairs
-from vio.mapping.points import build_tracks, landmarks_of
-from vio.mapping.poses import fill_between, position_covariances, position_difference_m
-from vio.pipeline import run as process
+from vio.evaluation.trajectories import evaluate
+from vio.files.inputs import read_input
+from vio.files.yaml_text import MOST_BYTES, read_yaml
+from vio.offline.colmap.adjustment import Adjustment, PositionPriors, adjust
+from vio.offline.keyframes import choose_keyframes
+from vio.offline.loop_tracks import loop_pairs
+from vio.offline.points import build_tracks, landmarks_of
+from vio.offline.poses import fill_between, position_covariances, position_difference_m
+from vio.offline.saved_run import SavedRun
 from vio.records import IntArray, Landmarks, Trajectory
-from vio.saved_run import SavedRun
-from vio.yaml_text import MOST_BYTES, read_yaml
+from vio.runs.pipeline import run as process
 
 log = logging.getLogger(__name__)
 

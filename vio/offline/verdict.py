@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.colmap.reconstruction import Mapper, Reconstructed
-from vio.mapping.comparison import Comparison, Segment, motion_differences
+from vio.offline.colmap.reconstruction import Mapper, Reconstructed
+from vio.offline.comparison import Comparison, Segment, motion_differences
 from vio.records import IntArray
 
 _SCALE = 0.01  # by which lengths may differ without a word: matches that are off by 0.1 px make as much at far points

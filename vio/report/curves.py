@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vio.evaluation import align_poses, settle_rotation
-from vio.finished_run import FinishedRun
+from vio.evaluation.trajectories import align_poses, settle_rotation
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, transform_points
-from vio.upright import attitude_deg, up_of, upright_axes
+from vio.geometry.upright import attitude_deg, up_of, upright_axes
+from vio.runs.finished import FinishedRun
 
 _MOST = 3000  # samples of a curve; more are not seen on a screen
 _MOST_POINTS = 6000

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.finished_run import FinishedRun
 from vio.geometry.lie import FloatArray
-from vio.pipeline import STAGES
 from vio.report.curves import Curves, Truth, thinned
+from vio.runs.finished import FinishedRun
+from vio.runs.pipeline import STAGES
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from vio.evaluation import lengths_text, rotation_drift_text
-from vio.finished_run import FinishedRun
+from vio.evaluation.trajectories import lengths_text, rotation_drift_text
+from vio.runs.finished import FinishedRun
 
 _MOTION = {"imu": "an IMU", "velocity": "velocities", "none": "images alone"}
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.atomic import atomic_folder
 from vio.datasets.euroc_files import (
     STATE_CSV,
     camera_yaml,
@@ -24,6 +23,9 @@ from vio.datasets.euroc_files import (
 from vio.datasets.images import write_png
 from vio.datasets.kitti import write_calibration, write_times, write_velocity
 from vio.errors import CalibrationError
+from vio.files.atomic import atomic_folder
+from vio.files.text import exact_text, write_text
+from vio.files.trajectories import in_first_cam0
 from vio.geometry.distortion import StereoRig, rectified_camera
 from vio.geometry.lie import se3_inverse
 from vio.protocols import Progress
@@ -32,8 +34,6 @@ from vio.sim.errors import SimulationError
 from vio.sim.imu import ADIS16448, sample_times
 from vio.sim.motion import evaluate
 from vio.sim.sequence import SimulatedRecording
-from vio.text_files import exact_text, write_text
-from vio.trajectory_io import in_first_cam0
 
 MARKER = "simulation.json"
 _TRUTH_HZ = 200.0

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.atomic import atomic_folder
-from vio.camera_rig import CameraRig
+from vio.cameras.camera_rig import CameraRig
 from vio.datasets.euroc_files import imu_csv
 from vio.datasets.images import write_png
 from vio.datasets.rigs.kalibr import kalibr_camera_text
+from vio.files.atomic import atomic_folder
+from vio.files.text import seconds_text, write_text
+from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.protocols import Progress
 from vio.sim.export import MARKER, description
 from vio.sim.sequence import SimulatedRecording
-from vio.text_files import seconds_text, write_text
-from vio.trajectory_io import write_tum
 
 _FACTOR = 5000  # levels per metre, as TUM's
 _NOISE = 1.5e-3  # 1/m, k of a depth's standard deviation k z^2: structured light

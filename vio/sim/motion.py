@@ -19,11 +19,11 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from vio.errors import DataError
+from vio.files.text import check_increasing
+from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log
 from vio.records import BoolArray, IntArray
 from vio.sim.errors import SimulationError
-from vio.text_files import check_increasing
-from vio.trajectory_io import read_trajectory
 
 logger = logging.getLogger(__name__)
 

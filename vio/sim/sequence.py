@@ -15,6 +15,7 @@ from vio.datasets.common import frame_range, merge_events
 from vio.datasets.euroc_files import read_imu_csv, stamped_rows
 from vio.datasets.samples import MotionSamples, imu_samples, in_time_order
 from vio.errors import CalibrationError, DataError
+from vio.files.text import check_increasing
 from vio.geometry.distortion import StereoRig, rectified_camera
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.records import (
@@ -39,7 +40,6 @@ from vio.sim.miscalibration import CalibrationErrors, miscalibrated
 from vio.sim.motion import FitReport, MotionSpline, evaluate, recorded_motion
 from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
 from vio.sim.world import World, check_clear, room
-from vio.text_files import check_increasing
 
 logger = logging.getLogger(__name__)
 

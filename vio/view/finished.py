@@ -11,12 +11,11 @@ import numpy as np
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError, VioError
-from vio.finished_run import FinishedRun
 from vio.geometry.stereo import Projection, StereoCamera
-from vio.loops import LoopEvent
-from vio.records import Image, Landmarks, StereoFrame, UpdateReport
-from vio.run_tables import estimate_of
-from vio.saved_run import OBSERVATIONS
+from vio.offline.saved_run import OBSERVATIONS
+from vio.records import Image, Landmarks, LoopEvent, StereoFrame, UpdateReport
+from vio.runs.finished import FinishedRun
+from vio.runs.tables import estimate_of
 from vio.view.live import SERIES, RerunViewer, ViewedRig, states_of
 
 if TYPE_CHECKING:

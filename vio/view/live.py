@@ -1,7 +1,7 @@
 """A run in the rerun viewer, frame by frame.
 
 Reference: rerun's Python SDK, https://ref.rerun.io/docs/python. Entities below `world/run` are in the world of the run,
-which `world` turns upright (`vio.upright`); pixels are those of the rectified left image.
+which `world` turns upright (`vio.geometry.upright`); pixels are those of the rectified left image.
 """
 
 from __future__ import annotations
@@ -14,12 +14,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.frame_result import FrameResult
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays
-from vio.loops import LoopEvent
-from vio.records import BoolArray, Estimate, Image, IntArray, Landmarks, Observations, Trajectory, UpdateReport
-from vio.upright import up_of, upright_axes
+from vio.geometry.upright import up_of, upright_axes
+from vio.records import (
+    BoolArray,
+    Estimate,
+    FrameResult,
+    Image,
+    IntArray,
+    Landmarks,
+    LoopEvent,
+    Observations,
+    Trajectory,
+    UpdateReport,
+)
 
 if TYPE_CHECKING:
     import rerun as rr

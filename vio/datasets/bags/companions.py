@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
 
-from vio.camera_rig import CameraRig
+from vio.cameras.camera_rig import CameraRig
+from vio.cameras.rig import Rig
 from vio.datasets.bags import bag_files
 from vio.datasets.bags.index import BagIndex, index_bag, info_topic
 from vio.datasets.bags.pictures import white_of
@@ -21,7 +22,6 @@ from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import imu_notes
 from vio.errors import CalibrationError
 from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource
-from vio.rig import Rig
 
 AnyRig = TypeVar("AnyRig", Rig, CameraRig)
 Size = tuple[int, int]

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from vio.camera_rig import CameraRig, Undistorter
+from vio.cameras.camera_rig import CameraRig, Undistorter
 from vio.datasets.bags.companions import Contents, chosen_rig, is_rectified, motion_of, white_level
 from vio.datasets.bags.index import stamp_of
 from vio.datasets.bags.pictures import gray_of

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from vio.cameras.rig import Rectifier, Rig
 from vio.datasets.bags.companions import Contents, chosen_rig, contents, is_rectified, motion_of, white_level
 from vio.datasets.bags.index import BagIndex, stamp_of
 from vio.datasets.bags.one_camera import OneCameraBag, read_one_camera
@@ -29,7 +30,6 @@ from vio.datasets.rigs.camera_info import rig_from_camera_infos
 from vio.datasets.settings import DatasetSettings
 from vio.errors import CalibrationError, DataError
 from vio.records import Event, ImuDensities, IntArray, MotionSample, Observations, Recording, StereoFrame
-from vio.rig import Rectifier, Rig
 
 
 @dataclass(frozen=True, slots=True)

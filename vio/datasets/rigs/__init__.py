@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.cameras.rig import Rig
 from vio.datasets.common import naming
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.kitti import read_calibration, read_extrinsics
@@ -17,9 +18,8 @@ from vio.datasets.rigs.kalibr import is_camchain, read_camchain
 from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
 from vio.datasets.yaml_files import read_yaml
 from vio.errors import CalibrationError
+from vio.files.text import text_lines
 from vio.geometry.lie import se3_from_parts, se3_inverse
-from vio.rig import Rig
-from vio.text_files import text_lines
 
 __all__ = ["find_calibration", "load_rig"]
 

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.camera_rig import CameraRig
+from vio.cameras.camera_rig import CameraRig
+from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.rigs.opencv import CoefficientsError, trimmed_coefficients
 from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import FloatArray, se3_from_parts
-from vio.rig import Rig, camera_from_matrix
 
 _MODELS: dict[str, DistortionModel] = {
     "": "radtan",

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import yaml
 
-from vio.camera_rig import CameraRig
+from vio.cameras.camera_rig import CameraRig
+from vio.cameras.rig import Rig
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.records import ImuDensities
-from vio.rig import Rig
 
 _BENDS: dict[str, DistortionModel] = {
     "none": "pinhole",

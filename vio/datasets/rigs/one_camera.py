@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.camera_rig import CameraRig
+from vio.cameras.camera_rig import CameraRig
+from vio.cameras.rig import camera_from_matrix
 from vio.datasets.common import naming
 from vio.datasets.euroc_files import read_camera_yaml, read_imu_yaml
 from vio.datasets.rigs import KNOWN, find_calibration, load_rig
@@ -16,7 +17,6 @@ from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import se3_inverse
-from vio.rig import camera_from_matrix
 
 
 def load_camera(path: str | os.PathLike[str], *, image_size: tuple[int, int] | None = None) -> CameraRig:

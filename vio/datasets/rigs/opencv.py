@@ -13,12 +13,12 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import checked_transform, naming
 from vio.datasets.yaml_files import Entries, as_number, matrix, read_yaml
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import FloatArray
-from vio.rig import Rig, camera_from_matrix
 
 _NAMES: dict[str, tuple[str, ...]] = {  # ours, then the names in files
     "K0": (

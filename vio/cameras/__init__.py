@@ -1,0 +1,1 @@
+"""The calibration of cameras and IMU as given by the user."""

@@ -1,0 +1,112 @@
+"""Read and write text files: numbered lines, exact digits, and increasing clocks in integer nanoseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.errors import DataError
+from vio.files.inputs import read_input
+from vio.geometry.lie import FloatArray
+from vio.records import NS_PER_S, IntArray
+
+INT64_MAX = 2**63 - 1
+_PIECE = 2**16  # characters that are split into lines at a time
+
+
+def text_lines(path: Path) -> list[tuple[int, str]]:
+    """Read the lines of a text file with their numbers from 1, without blank lines at its end.
+
+    Raises:
+        DataError: the file is missing or is no text.
+    """
+    return list(lines_of(path))
+
+
+def lines_of(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield what `text_lines` returns: an hour of an IMU has 700,000 lines, which take 100 MB at a time.
+
+    Raises:
+        DataError: the file is missing or is no text.
+    """
+    try:
+        text = read_input(path).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: not a text file ({error.reason}); give the original file") from error
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror or error}; give a readable file") from error
+    blank: list[tuple[int, str]] = []  # lines that are left out at the end
+    for number, line in enumerate(_split_lines(text), start=1):
+        if not line.strip():
+            blank.append((number, line))
+            continue
+        if blank:
+            yield from blank
+            blank = []
+        yield number, line
+
+
+def _split_lines(text: str) -> Iterator[str]:
+    """Yield `text.splitlines()`, some lines at a time."""
+    start = 0
+    while start < len(text):
+        end = text.find("\n", start + _PIECE) + 1 or len(text)
+        yield from text[start:end].splitlines()
+        start = end
+
+
+def read_numbers(path: Path, columns: int, *, separator: str | None = None, skip: int = 0) -> FloatArray:
+    """Read a text table of numbers (N, columns), skipping the first `skip` lines and blank ones at the end.
+
+    Raises:
+        DataError: the file cannot be read, or a line holds something else; the message names the line.
+    """
+    rows: list[list[float]] = []
+    for number, line in text_lines(path)[skip:]:
+        fields = line.split(separator)
+        if len(fields) != columns:
+            raise DataError(f"{path}, line {number}: {len(fields)} values instead of {columns}; correct that line")
+        try:
+            rows.append([float(value) for value in fields])
+        except ValueError as error:
+            raise DataError(f"{path}, line {number}: not a number ({error}); write plain decimals") from error
+    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+def write_text(path: Path, text: str) -> None:
+    r"""Write UTF-8 with `\n` line ends on every system."""
+    path.write_text(text, encoding="utf-8", newline="\n")
+
+
+def exact_text(values: npt.ArrayLike, separator: str = " ") -> str:
+    """Format numbers (any shape, row by row) as the shortest decimals that read back to the same bits."""
+    return separator.join(repr(float(value)) for value in np.ravel(values))
+
+
+def seconds_text(time_ns: int) -> str:
+    """Format nanoseconds as decimal seconds, exact to the last digit."""
+    whole, remainder = divmod(abs(int(time_ns)), NS_PER_S)
+    return f"{'-' if time_ns < 0 else ''}{whole}.{remainder:09d}"
+
+
+def check_increasing(times_ns: npt.ArrayLike, where: Callable[[int], str]) -> IntArray:
+    """Check that times (N,) in nanoseconds strictly increase, and return them.
+
+    Args:
+        times_ns: integers that fit 64 bits.
+        where: returns the location of an entry for the error message ("times.txt, line 3").
+
+    Raises:
+        DataError: a time is not later than the one before; the message names its entry.
+    """
+    times = np.asarray(times_ns, dtype=np.int64)
+    back = np.flatnonzero(times[1:] <= times[:-1])
+    if len(back):
+        k = int(back[0]) + 1
+        what = "repeats" if times[k] == times[k - 1] else "runs backwards"
+        now, before = seconds_text(int(times[k])), seconds_text(int(times[k - 1]))
+        raise DataError(f"{where(k)}: the clock {what} ({now} s after {before} s); remove or reorder that entry")
+    return times

@@ -1,0 +1,348 @@
+"""Trajectory files: TUM, KITTI and EuRoC ground truth.
+
+Times never pass through a float: they are integer nanoseconds here and decimal text in the files.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from array import array
+from dataclasses import dataclass, replace
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, NoReturn, TypeAlias, get_args
+
+import numpy as np
+
+from vio.errors import DataError
+from vio.files.atomic import atomic_write_text
+from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of, seconds_text
+from vio.geometry.lie import (
+    FloatArray,
+    nearest_rotation,
+    quat_xyzw_from_rotation,
+    rotation_from_quat_xyzw,
+    se3_from_parts,
+    se3_inverse,
+)
+from vio.records import BodyFrame, IntArray, Trajectory
+
+logger = logging.getLogger(__name__)
+
+TrajectoryFormat: TypeAlias = Literal["tum", "kitti", "euroc"]
+
+ROTATION_TOLERANCE = 1e-3  # deviation of a quaternion's norm or of R^T R from one accepted as rounding
+_LARGEST = 1e12  # of a coordinate, in metres: beyond, squares overflow
+_EXACT = 1e-12  # rotations this close to orthonormal keep their bits
+_MAX_S = Decimal(INT64_MAX).scaleb(-9)
+_COLUMNS: dict[TrajectoryFormat, str] = {
+    "tum": "8 columns 'timestamp tx ty tz qx qy qz qw'",
+    "kitti": "12 columns, the first three rows of a 4x4 pose",
+    "euroc": "at least 8 comma-separated columns 'timestamp [ns], px, py, pz, qw, qx, qy, qz'",
+}
+_EUROC_HEADER = "#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w, q_RS_x, q_RS_y, q_RS_z\n"
+_STAMP = re.compile(r"[+-]?\d{1,19}")
+_LONGEST_LINE = 2**20  # bytes: the frames of a day with gaps are numbered in a comment of less
+_LONGEST_LIST = 100  # characters of frame numbers in a warning
+_DEFAULT_BODY: dict[TrajectoryFormat, BodyFrame] = {"tum": "imu", "kitti": "cam0", "euroc": "imu"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """The lines of a text file that hold poses, with their numbers."""
+
+    path: Path
+    comments: list[str]  # without the leading '#'
+    rows: list[str]
+    line_numbers: list[int]  # from 1, one per row
+    commas: bool  # what separates the fields of the first row; else white space
+
+    def fields(self, row: int, most: int = -1) -> list[str]:
+        """Return the fields of a row as text; behind the first `most`, the rest is one field."""
+        return self.rows[row].split("," if self.commas else None, most)
+
+    def where(self, row: int) -> str:
+        return f"{self.path}, line {self.line_numbers[row]}"
+
+    def fail(self, row: int, what: str) -> NoReturn:
+        raise DataError(f"{self.where(row)}: {what}")
+
+
+def read_trajectory(
+    path: str | os.PathLike[str], *, fmt: TrajectoryFormat | None = None, body: BodyFrame | None = None
+) -> Trajectory:
+    """Read a trajectory; the format is detected from the content unless given.
+
+    A KITTI file describes cam0 and has no times; an EuRoC file describes the IMU; a TUM file describes the
+    frame of its comment `# body: imu` or `# body: cam0`, else the IMU. `body` overrides all of these. A comment
+    `# frames: 0-41 45-99` in a TUM file (written by `write_tum`) numbers the poses.
+
+    Raises:
+        DataError: the file cannot be used; the message names file, line and remedy.
+    """
+    if fmt is not None and fmt not in get_args(TrajectoryFormat):
+        raise DataError(f"unknown trajectory format {fmt!r}; choose one of {', '.join(get_args(TrajectoryFormat))}")
+    table = _read_table(Path(path))
+    if not table.rows:
+        raise DataError(f"{table.path}: holds no poses; give a TUM, KITTI or EuRoC trajectory file")
+    kind = fmt or _detect(table)
+    _check_columns(table, kind)
+    if kind == "kitti":
+        return Trajectory(_kitti_poses(table), None, body or _DEFAULT_BODY[kind])
+    times_ns = _times_ns(table, kind)
+    poses = _quaternion_poses(table, kind)
+    header_body = _header(table, r"body:\s*(\S+)") if kind == "tum" else None
+    frames = _header(table, r"frames:\s*(.*\S)") if kind == "tum" else None
+    return Trajectory(
+        poses,
+        times_ns,
+        _body(table, header_body, body) or _DEFAULT_BODY[kind],
+        None if frames is None else _parse_frames(table, frames),
+    )
+
+
+def write_tum(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write `timestamp tx ty tz qx qy qz qw`, seconds with nine decimals, metres; body and frames in the comments.
+
+    Raises:
+        DataError: the trajectory has no times, or the file cannot be written.
+    """
+    if trajectory.times_ns is None:
+        raise DataError(f"cannot write {path}: a TUM file needs times and this trajectory has none; write KITTI form")
+    text = tum_text(trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices)
+    atomic_write_text(path, text)
+
+
+def tum_text(
+    times_ns: IntArray, T_world_body: FloatArray, *, body: BodyFrame | None = None, frames: IntArray | None = None
+) -> str:
+    """Return the lines of `write_tum`.
+
+    Args:
+        times_ns: (N,)
+        T_world_body: (N, 4, 4)
+        body: what the poses describe, for the comments; None: no comments, as lines to append.
+        frames: (N,) numbers for the comments, where known.
+    """
+    lines = []
+    if body is not None:
+        lines.append(f"# body: {body}")
+        if frames is not None and len(frames):
+            lines.append(f"# frames: {_format_frames(frames)}")
+        lines.append("# timestamp tx ty tz qx qy qz qw")
+    values = np.concatenate([T_world_body[:, :3, 3], quat_xyzw_from_rotation(T_world_body[:, :3, :3])], axis=1)
+    lines += [f"{seconds_text(t)} {exact_text(row)}" for t, row in zip(times_ns.tolist(), values, strict=True)]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def write_kitti(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write the first three rows of each cam0 pose as 12 numbers a line, without comments.
+
+    Every reader of this form assumes that row k is frame k; other frame numbers are logged as a warning.
+
+    Raises:
+        DataError: the poses describe the IMU, or the file cannot be written.
+    """
+    if trajectory.body != "cam0":
+        raise DataError(f"cannot write {path}: KITTI form describes cam0; convert with Trajectory.in_cam0 first")
+    frames = trajectory.frame_indices
+    if frames is not None and not np.array_equal(frames, np.arange(len(trajectory))):
+        text = _format_frames(frames)
+        if len(text) > _LONGEST_LIST:
+            text = f"{frames[0]} to {frames[-1]} with gaps, {len(frames)} in all"
+        logger.warning(
+            "%s: its rows are the frames %s; tools that number rows from 0 will misread them", Path(path).name, text
+        )
+    rows = trajectory.T_world_body[:, :3, :].reshape(-1, 12)
+    atomic_write_text(path, "".join(f"{exact_text(row)}\n" for row in rows))
+
+
+def write_euroc(path: str | os.PathLike[str], trajectory: Trajectory) -> None:
+    """Write `timestamp [ns], p x y z, q w x y z` of the IMU, the columns of EuRoC's ground truth up to the velocity.
+
+    Raises:
+        DataError: the poses describe the camera or have no times, or the file cannot be written.
+    """
+    if trajectory.body != "imu" or trajectory.times_ns is None:
+        lacks = "describes the IMU; convert with Trajectory.in_imu" if trajectory.body != "imu" else "needs times"
+        raise DataError(f"cannot write {path}: EuRoC form {lacks} first")
+    T = trajectory.T_world_body
+    q_wxyz = np.roll(quat_xyzw_from_rotation(T[:, :3, :3]), 1, axis=1)
+    values = np.concatenate([T[:, :3, 3], q_wxyz], axis=1)
+    rows = (f"{t},{exact_text(row, ',')}\n" for t, row in zip(trajectory.times_ns.tolist(), values, strict=True))
+    atomic_write_text(path, "".join([_EUROC_HEADER, *rows]))
+
+
+def is_trajectory_file(path: Path) -> bool:
+    """Return whether a text file begins like a trajectory: comments, then a row of 8 or 12 numbers, or a wider csv."""
+    if not path.is_file():
+        return False
+    with path.open("rb") as stream:
+        lines = iter(lambda: stream.readline(_LONGEST_LINE).decode("utf-8", errors="replace"), "")
+        first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    fields = first.split("," if "," in first else None)
+    try:
+        [float(field) for field in fields]
+    except ValueError:
+        return False
+    return len(fields) >= 8 if "," in first else len(fields) in (8, 12)
+
+
+def in_first_cam0(trajectory: Trajectory, T_cam0_imu: FloatArray) -> Trajectory:
+    """Return a trajectory in KITTI's convention: cam0 poses relative to the first one."""
+    cam0 = trajectory.in_cam0(T_cam0_imu)
+    return replace(cam0, T_world_body=se3_inverse(cam0.T_world_body[0]) @ cam0.T_world_body)
+
+
+def _read_table(path: Path) -> _Table:
+    comments: list[str] = []
+    rows: list[str] = []
+    line_numbers: list[int] = []
+    for number, text in lines_of(path):
+        line = text.strip()
+        if line.startswith("#"):
+            comments.append(line[1:].strip())
+        elif line:
+            rows.append(line)
+            line_numbers.append(number)
+    return _Table(path, comments, rows, line_numbers, commas=bool(rows) and "," in rows[0])
+
+
+def _detect(table: _Table) -> TrajectoryFormat:
+    """Detect the format from the first row."""
+    if table.commas:
+        return "euroc"
+    n = len(table.fields(0))
+    if n not in (8, 12):
+        forms = "; ".join(f"{kind}: {columns}" for kind, columns in _COLUMNS.items())
+        table.fail(0, f"{n} columns fit no known format ({forms})")
+    return "tum" if n == 8 else "kitti"
+
+
+def _check_columns(table: _Table, kind: TrajectoryFormat) -> None:
+    expected = len(table.fields(0)) if kind == "euroc" else {"tum": 8, "kitti": 12}[kind]
+    if kind == "euroc":
+        expected = max(expected, 8)
+    for row, line in enumerate(table.rows):
+        count = line.count(",") + 1 if table.commas else len(line.split())
+        if count != expected:
+            table.fail(row, f"{count} columns instead of {expected}; {kind} form has {_COLUMNS[kind]}")
+
+
+def _floats(table: _Table, first: int, last: int) -> FloatArray:
+    """Columns `first <= column < last` as finite numbers (N, last - first)."""
+    values, row = array("d"), 0
+    try:
+        for row in range(len(table.rows)):
+            values.extend(map(float, table.fields(row, last)[first:last]))
+    except ValueError as error:
+        table.fail(row, f"{error}; only numbers and comment lines with '#' are allowed")
+    out = np.array(values).reshape(-1, last - first)
+    bad = ~(np.abs(out) < _LARGEST).all(axis=1)
+    if bad.any():
+        table.fail(
+            int(np.argmax(bad)),
+            f"a pose is not finite, or beyond {_LARGEST:g} (first of {int(bad.sum())}); remove such lines",
+        )
+    return out
+
+
+def _times_ns(table: _Table, kind: TrajectoryFormat) -> IntArray:
+    """The first column as strictly increasing integer nanoseconds (N,)."""
+    times = [_time_ns(table, row, kind) for row in range(len(table.rows))]
+    return check_increasing(times, table.where)
+
+
+def _time_ns(table: _Table, row: int, kind: TrajectoryFormat) -> int:
+    text = table.fields(row, 1)[0].strip()
+    if kind == "euroc":
+        if not _STAMP.fullmatch(text) or abs(int(text)) > INT64_MAX:
+            table.fail(row, f"the time {text!r} is not in whole nanoseconds; EuRoC form has {_COLUMNS[kind]}")
+        return int(text)
+    try:
+        seconds = Decimal(text)
+    except InvalidOperation:
+        seconds = Decimal("NaN")
+    if not seconds.is_finite():
+        table.fail(row, f"the time {text!r} is not a number of seconds; remove or correct this line")
+    if not -_MAX_S <= seconds <= _MAX_S:
+        table.fail(row, f"the time {text!r} cannot be in seconds; divide nanoseconds by 1e9 first")
+    return int(seconds.scaleb(9).to_integral_value())
+
+
+def _quaternion_poses(table: _Table, kind: TrajectoryFormat) -> FloatArray:
+    values = _floats(table, 1, 8)
+    p, q = values[:, :3], values[:, 3:]
+    q_xyzw = q if kind == "tum" else np.roll(q, -1, axis=1)
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(q_xyzw, axis=1)
+    bad = np.abs(norm - 1) > ROTATION_TOLERANCE
+    if bad.any():
+        row = int(np.argmax(bad))
+        table.fail(row, f"the quaternion has norm {norm[row]:.6g}, not 1; check the column order ({_COLUMNS[kind]})")
+    return se3_from_parts(rotation_from_quat_xyzw(q_xyzw), p)
+
+
+def _kitti_poses(table: _Table) -> FloatArray:
+    values = _floats(table, 0, 12).reshape(-1, 3, 4)
+    R = values[:, :, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        deviation = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
+        mirrored = np.linalg.det(R) < 0
+    bad = ~(deviation <= ROTATION_TOLERANCE) | mirrored
+    if bad.any():
+        row = int(np.argmax(bad))
+        why = "mirrors" if deviation[row] <= ROTATION_TOLERANCE else f"is off orthonormal by {deviation[row]:.3g}"
+        table.fail(row, f"the rotation {why}; KITTI form has {_COLUMNS['kitti']}, row by row")
+    orthonormal = np.where((deviation <= _EXACT)[:, None, None], R, nearest_rotation(R))
+    return se3_from_parts(orthonormal, values[:, :, 3])
+
+
+def _header(table: _Table, pattern: str) -> str | None:
+    """Return the value of the first comment that matches the pattern."""
+    found = (re.fullmatch(pattern, comment) for comment in table.comments)
+    return next((match.group(1) for match in found if match), None)
+
+
+def _body(table: _Table, header_body: str | None, requested: BodyFrame | None) -> BodyFrame | None:
+    if header_body is not None and header_body not in get_args(BodyFrame):
+        raise DataError(
+            f"{table.path}: its comment names the body {header_body!r}; use '# body: imu' or '# body: cam0'"
+        )
+    if requested is not None:
+        if header_body is not None and header_body != requested:
+            logger.warning(
+                "%s describes %s according to its comment; read as %s, as requested", table.path, header_body, requested
+            )
+        return requested
+    return "cam0" if header_body == "cam0" else "imu" if header_body == "imu" else None
+
+
+def _format_frames(frames: IntArray) -> str:
+    """Format frame numbers as ranges: [0 1 2 5] becomes '0-2 5-5', and [0 2 4], every second frame, '0-4/2'."""
+    numbers, runs, first = frames.tolist(), [], 0
+    while first < len(numbers):
+        last = min(first + 1, len(numbers) - 1)
+        step = max(numbers[last] - numbers[first], 1)
+        while last + 1 < len(numbers) and numbers[last + 1] - numbers[last] == step:
+            last += 1
+        if step > 1 and last == first + 1:  # two frames apart are no rhythm
+            last = first
+        runs.append(f"{numbers[first]}-{numbers[last]}" + (f"/{step}" if step > 1 and last > first else ""))
+        first = last + 1
+    return " ".join(runs)
+
+
+def _parse_frames(table: _Table, text: str) -> IntArray:
+    runs = [re.fullmatch(r"(\d{1,9})-(\d{1,9})(?:/([1-9]\d{0,8}))?", run) for run in text.split()]
+    spans = [range(int(run.group(1)), int(run.group(2)) + 1, int(run.group(3) or 1)) for run in runs if run]
+    ordered = all(len(a) and len(b) and a[-1] < b[0] for a, b in pairwise(spans))
+    if not all(runs) or not ordered or sum(map(len, spans)) != len(table.rows):
+        raise DataError(
+            f"{table.path}: its comment '# frames: {text[:60]}' does not number its {len(table.rows)} poses; "
+            "remove the comment or correct it"
+        )
+    return np.concatenate([np.arange(span.start, span.stop, span.step, dtype=np.int64) for span in spans])

@@ -1,0 +1,1 @@
+"""What can be said of IMU samples by themselves: faults, standstill, clocks."""

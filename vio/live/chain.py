@@ -1,0 +1,205 @@
+"""One frame through the whole chain: predict, front end, selector, filter, and the checks beside them."""
+
+from __future__ import annotations
+
+import time
+
+from vio.config import BackendName, Config
+from vio.errors import ConfigError, DataError, DivergedError
+from vio.filters.late_imu import LateImuMsckf
+from vio.filters.mono_msckf import MonoMsckf
+from vio.filters.msckf import Msckf
+from vio.filters.vislam import Vislam
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.monitor.run import RunWatch
+from vio.protocols import Backend, Frontend, Selector
+from vio.records import (
+    FrameLog,
+    FrameResult,
+    FrontendOutput,
+    MotionSample,
+    MotionSource,
+    Observations,
+    Selection,
+    StereoFrame,
+    UpdateReport,
+    no_features,
+)
+
+BACKENDS: dict[BackendName, type[Vislam] | type[Msckf]] = {"vislam": Vislam, "msckf": Msckf}
+
+
+class Chain:
+    """Front end, selector and filter, fed with events in the order of `EventOrder`."""
+
+    def __init__(
+        self,
+        camera: StereoCamera,
+        T_cam0_body: FloatArray,
+        motion: MotionSource | None,
+        *,
+        frontend: Frontend,
+        selector: Selector,
+        backend: Backend,
+        use_prior: bool,
+    ) -> None:
+        """Connect the parts.
+
+        Args:
+            camera: the rectified pair.
+            T_cam0_body: (4, 4) extrinsics of the body that the filter estimates.
+            motion: what carries the pose between frames; None: images alone.
+            frontend: gives the observations.
+            selector: chooses among them.
+            backend: estimates.
+            use_prior: whether the front end is offered the pixels that the filter expects.
+        """
+        self.frontend, self.selector, self.backend = frontend, selector, backend
+        self.watch = RunWatch(camera, T_cam0_body, imu=motion == "imu")
+        self._motion = motion
+        self._use_prior = use_prior
+        self._propagate_ms = 0.0  # since the last frame
+
+    def sample(self, sample: MotionSample) -> None:
+        """Take one motion sample."""
+        start = time.perf_counter()
+        self.watch.sample(sample)
+        if self._motion is not None:
+            self.backend.propagate(sample)
+        self._propagate_ms += 1e3 * (time.perf_counter() - start)
+
+    def frame(self, frame: StereoFrame) -> FrameResult | None:
+        """Process one frame; None where the front end refused it, which the watch says.
+
+        Raises:
+            EstimationError: the filter is lost.
+        """
+        timer = _StageTimer()
+        expected = self.backend.predict(frame.time_ns)
+        timer.end("predict")
+        try:
+            if self.watch.repeats(frame, expected):
+                output = no_features(frame)
+            else:
+                shown = self.watch.without_repeated_depth(frame)
+                output = self.frontend.process(shown, expected.tracks if expected and self._use_prior else None)
+        except DataError as error:
+            self.watch.refused(frame.index, str(error))
+            return None
+        timer.end("frontend")
+        self.watch.observations(output.observations, output.warnings)
+        timer.end("watch")
+        seen = output.observations
+        if self.backend.stereo_only:
+            seen = seen.take(seen.has_right)
+        selection = self.selector.select(seen, expected.motion if expected else None)
+        timer.end("select")
+        if self._motion == "imu" and isinstance(self.backend, Msckf):
+            self.backend.take_turns(self.watch.turns)
+        report = self._update(seen.take(selection.chosen))
+        if not self._has_started(frame, report):
+            return None
+        estimate = self.backend.estimate()
+        timer.end("update")
+        self.watch.update(frame.index, report, estimate)
+        timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
+        self._propagate_ms = 0.0
+        return FrameResult(
+            frame, output, selection, report, estimate, _frame_log(frame, timer.ms, output, selection, report)
+        )
+
+    def _update(self, seen: Observations) -> UpdateReport:
+        """Update with a frame; a back end that can start again does so where it diverges."""
+        try:
+            return self.backend.update(seen)
+        except DivergedError as error:
+            if not isinstance(self.backend, Msckf):
+                raise
+            report = self.backend.restart(seen)
+            if report.started:
+                self.watch.restarted(seen.frame_index, str(error), self.backend.estimate())
+            else:
+                self.watch.lost(seen.frame_index, str(error))
+            return report
+
+    def _has_started(self, frame: StereoFrame, report: UpdateReport) -> bool:
+        """Whether the back end has an estimate; the watch says why not, and when it begins."""
+        backend = self.backend
+        if isinstance(backend, MonoMsckf):
+            start = backend.begun
+            if start is None:
+                self.watch.waiting(frame, backend.waits_for)
+            else:
+                self.watch.begun(frame, start.scale_sigma)
+        return report.started
+
+
+def build_backend(
+    camera: StereoCamera, T_cam0_body: FloatArray, config: Config, motion: MotionSource | None
+) -> Backend:
+    """Build the configured back end; `T_cam0_body` is (4, 4)."""
+    if camera.kind == "mono":
+        return _mono_backend(camera, T_cam0_body, config, motion)
+    if config.backend == "msckf" and motion == "imu":
+        return LateImuMsckf(camera, T_cam0_body, config.msckf)
+    if config.backend == "msckf":
+        return Msckf(camera, T_cam0_body, config.msckf, motion=motion)
+    return Vislam(camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
+
+
+def _mono_backend(
+    camera: StereoCamera, T_cam0_body: FloatArray, config: Config, motion: MotionSource | None
+) -> Backend:
+    if config.backend != "msckf":
+        raise ConfigError(f"backend {config.backend} needs a stereo pair, and this is one camera; take msckf")
+    if motion != "imu":
+        raise ConfigError(
+            "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu; --motion none leaves it out), depth "
+            "images or a second camera"
+        )
+    if config.msckf.calibrate_imu != "off":
+        raise ConfigError(
+            f"msckf.calibrate_imu: {config.msckf.calibrate_imu} needs a stereo pair, as the scale of one camera is the "
+            "accelerometer's; set it to off"
+        )
+    return MonoMsckf(camera, T_cam0_body, config.msckf)
+
+
+class _StageTimer:
+    """Wall time of the stages of one frame, the end of one being the beginning of the next."""
+
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def end(self, stage: str) -> None:
+        """Note how long a stage has taken."""
+        now = time.perf_counter()
+        self.ms[stage] = 1e3 * (now - self._last)
+        self._last = now
+
+
+def _frame_log(
+    frame: StereoFrame, ms: dict[str, float], output: FrontendOutput, selection: Selection, report: UpdateReport
+) -> FrameLog:
+    return FrameLog(
+        index=frame.index,
+        time_ns=frame.time_ns,
+        read_ms=0.0,  # who reads the images, knows
+        frontend_ms=ms["frontend"],
+        watch_ms=ms["watch"],
+        select_ms=ms["select"],
+        filter_ms=ms["filter"],
+        detected=output.detected,
+        tracked=output.tracked,
+        matched=output.matched,
+        selected=int(selection.chosen.sum()),
+        stale=int(output.observations.stale.sum()),
+        used=report.used,
+        gated=report.gated,
+        landmarks=report.landmarks,
+        innovation_median_px=report.innovation_median_px,
+        nis_per_dof=report.nis_per_dof,
+        stages_ms=output.stages_ms,
+    )

@@ -1,0 +1,154 @@
+"""Faults of an accelerometer or of the lever arm, found by comparing its readings with the camera's motion."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from vio.calibration.egomotion import CameraMotion
+from vio.calibration.findings import NotObservable
+from vio.calibration.inertial import ImuAlignment, Rates
+from vio.calibration.lever_arm import estimate_lever_arm
+from vio.calibration.verdicts import judge_imu
+from vio.geometry.lie import FloatArray
+from vio.imu.findings import InertialFinding
+from vio.monitor.axes import axes_text, signed_permutations
+from vio.monitor.evidence import Evidence
+from vio.monitor.force_fit import WINDOW_S, ForceFit
+from vio.monitor.gyro_fit import GyroFit
+from vio.monitor.motion import Record
+from vio.monitor.samples import Size, gravity_removed
+
+log = logging.getLogger(__name__)
+
+_SIGN_SIGMAS = 6.0
+AXES_WORSE = 3.0  # ratio of the given axes' squared misfit to that of others
+_UPSIDE_DOWN = 0.5  # cosine between image-down and up: within 60 degrees
+_UPSIDE_SHARE = 0.95
+_NS = 1e-9
+
+
+def resolve_size(size: Size, evidence: Evidence) -> Size:
+    """Resolve an ambiguous magnitude: use the images' accelerations to test whether the readings are in m/s^2."""
+    if size.clear or size.finding is None or size.unit is None:
+        return size
+    if evidence.force is not None:
+        scale, sigma = evidence.force.sign(evidence.R_cam0_imu)
+        if 0 < scale < 0.5 * size.unit - _SIGN_SIGMAS * sigma:
+            seen = f"{size.finding.seen}, though the images' accelerations are only {scale:.2f} times its own"
+            return Size(gravity_removed(seen), None)
+    return size if evidence.force_final else Size(None, size.unit)
+
+
+def judge_force(evidence: Evidence, unit: float) -> tuple[list[InertialFinding], bool]:
+    """Judge axes and sign of the accelerometer, and return whether its sign was measured.
+
+    Args:
+        evidence: the fits.
+        unit: factor that makes the readings m/s^2.
+    """
+    gyro_fit, force, R = evidence.gyro_fit, evidence.force, evidence.R_cam0_imu
+    readings = gyro_fit.force[gyro_fit.covered]
+    if force is not None:
+        wrong = _wrong_axes(force, R * unit)
+        if wrong is not None:
+            return [wrong], True
+        scale, sigma = force.sign(R * unit)
+        if abs(scale) > _SIGN_SIGMAS * sigma and 0.5 < abs(scale) < 2.0:
+            return ([_wrong_sign(scale, sigma)] if scale < 0 else judge_up(readings, R, measured=True)), True
+    return (judge_up(readings, R, measured=False) if evidence.last else []), False
+
+
+def _wrong_sign(scale: float, sigma: float) -> InertialFinding:
+    return InertialFinding(
+        "accelerometer sign",
+        f"the images' accelerations are {scale:+.2f} times (standard deviation {sigma:.2f}) those of the accelerometer",
+        "all readings have the wrong sign (specific force is +9.8 m/s^2 upwards at standstill); change it",
+    )
+
+
+def _wrong_axes(force: ForceFit, C: FloatArray) -> InertialFinding | None:
+    """Return exchanged axes of the accelerometer that fit clearly better than the given map (3, 3) to the camera."""
+    given = force.cost(C)
+    others = [P for P in signed_permutations() if abs(np.trace(P)) < 2.5]
+    costs = [force.cost(C @ P) for P in others]
+    k = int(np.argmin(costs))
+    # Neither the given axes nor their negative may explain the readings: the sign is judged separately.
+    if costs[k] * AXES_WORSE > min(given, force.cost(-C)):
+        return None
+    return InertialFinding(
+        "accelerometer axes",
+        f"with the given axes the accelerometer deviates from the camera's path by {100 * np.sqrt(given):.1f} cm over "
+        f"{WINDOW_S:g} s, with others by {100 * np.sqrt(costs[k]):.1f} cm, while the gyro agrees",
+        f"its axes contain {axes_text(others[k].T)} in place of [+x +y +z]; correct their order and signs",
+    )
+
+
+def judge_up(force: FloatArray, R_cam0_imu: FloatArray, *, measured: bool) -> list[InertialFinding]:
+    """Return a hint if the accelerometer's 'up' points down in nearly all images.
+
+    Args:
+        force: (K, 3) mean specific forces, imu frame, any unit.
+        R_cam0_imu: (3, 3).
+        measured: whether motion has shown that the accelerometer's sign is right.
+    """
+    up = force @ R_cam0_imu.T
+    down_in_image = up[:, 1] / np.maximum(np.linalg.norm(up, axis=1), 1e-9)
+    share = float(np.mean(down_in_image > _UPSIDE_DOWN)) if len(up) else 0.0
+    if share < _UPSIDE_SHARE:
+        return []
+    explanation = (
+        "the camera is mounted upside down, or gravity was added with the wrong sign (a + g in place of a - g), which "
+        "motion alone cannot distinguish"
+        if measured
+        else "the camera is mounted upside down, or the accelerometer's sign, that of its gravity, or T_cam0_imu is "
+        "wrong; the motion is too small to decide"
+    )
+    return [
+        InertialFinding(
+            "upside down",
+            f"the accelerometer's 'up' points down in the image in {100 * share:.0f} % of the frames",
+            f"{explanation}; unless the camera is upside down, the estimated world will be",
+            certain=False,
+        )
+    ]
+
+
+def judge_lever_arm(record: Record, gyro_fit: GyroFit, T_cam0_imu: FloatArray, rates: Rates) -> list[InertialFinding]:
+    """Report an inverted lever arm by the fit of `vio calibrate`; nothing if the motion does not determine it.
+
+    Args:
+        record: intervals and samples.
+        gyro_fit: the gyro's fit; it must agree with the given rotation.
+        T_cam0_imu: (4, 4) as given.
+        rates: the samples.
+    """
+    times_ns = record.origin_ns + np.round(np.concatenate([record.begin, record.end[-1:]]) / _NS).astype(np.int64)
+    frames = np.flatnonzero(np.append(record.joined[1:], True))  # whose interval ends where the next frame is
+    motion = CameraMotion(times_ns, frames.astype(np.int64), record.twists[frames])
+    alignment = ImuAlignment(
+        R_cam0_imu=T_cam0_imu[:3, :3],
+        rotation_sigma_deg=np.zeros(3),
+        time_offset_s=gyro_fit.offset_s,
+        time_offset_sigma_s=0.0,
+        gyro_bias=np.asarray(-np.linalg.lstsq(gyro_fit.A, gyro_fit.b, rcond=None)[0], dtype=np.float64),
+        residual_radps=gyro_fit.noise_radps,
+        intervals=gyro_fit.count,
+        weak=None,
+    )
+    lever_arm = estimate_lever_arm(motion, rates, alignment)
+    if isinstance(lever_arm, NotObservable):
+        log.info("the translation of T_cam0_imu was not checked: %s", lever_arm)
+        return []
+    faults = judge_imu(alignment, lever_arm, T_cam0_imu)
+    return [
+        InertialFinding(
+            "extrinsics translation",
+            fault.detail,
+            "the translation of T_cam0_imu has the wrong sign or belongs to the inverse transform; it must be the "
+            "IMU's position in the left camera's frame",
+        )
+        for fault in faults
+        if fault.fault == "IMU-camera translation inverted"
+    ]

@@ -1,0 +1,143 @@
+"""The accelerometer against the images: the best linear map from its readings to the camera's accelerations, (I3)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, se3_exp, so3_exp
+from vio.monitor.gyro_fit import AGREES, GyroFit
+from vio.monitor.motion import Record
+from vio.numerics.robust import jackknife
+from vio.records import BoolArray
+
+WINDOW_S = 2.0
+_LEAST_WINDOWS = 3
+_BIAS_PRIOR_MPS2 = 0.3
+_LEVER_ARM_PRIOR_M = 1.0
+_MISFIT_M = 0.02  # standard deviation of a window's positions, to weight the priors
+_PRIOR = _MISFIT_M**2 / np.repeat([_BIAS_PRIOR_MPS2, _LEVER_ARM_PRIOR_M], 3) ** 2  # information, (6,)
+_MAP_PRIOR = np.full(9, _MISFIT_M**2 / 400)  # information on the map's entries, (9,): keeps the fit solvable
+_REWEIGHTINGS = 4
+
+
+@dataclass(frozen=True, slots=True)
+class ForceFit:
+    """Normal equations of `camera acceleration - gravity = A force + b` over windows, (I3): A by rows, b, lever arm."""
+
+    N: FloatArray  # (W, 15, 15)
+    h: FloatArray  # (W, 15)
+    c: FloatArray  # (W,)
+    weight: FloatArray  # (W,)
+
+    def reduced(self, keep: BoolArray | None = None) -> tuple[FloatArray, FloatArray, float]:
+        """Return N, h, c of the cost `c - 2 h a + a N a` of a linear map a (9,), bias and lever arm marginalised."""
+        w = self.weight if keep is None else self.weight * keep
+        N, h, c = np.tensordot(w, self.N, 1), w @ self.h, float(w @ self.c)
+        K = np.linalg.solve(N[9:, 9:] + np.diag(_PRIOR), np.column_stack([N[9:, :9], h[9:]]))
+        return N[:9, :9] - N[:9, 9:] @ K[:, :9], h[:9] - N[:9, 9:] @ K[:, 9], c - float(h[9:] @ K[:, 9])
+
+    def cost(self, C: FloatArray) -> float:
+        """Return the squared misfit (m^2) of a map (3, 3) from force to the camera frame."""
+        N, h, c = self.reduced()
+        a = C.reshape(9)
+        return max(float(c - 2 * h @ a + a @ N @ a), 0.0)
+
+    def sign(self, C: FloatArray) -> tuple[float, float]:
+        """Return the best factor on a map (3, 3), and its standard error by a jackknife over windows."""
+        a, values = C.reshape(9), []
+        every = np.arange(len(self.c))
+        for left_out in (-1, *every):
+            N, h, _ = self.reduced(every != left_out)
+            values.append(float(h @ a) / max(float(a @ N @ a), 1e-300))
+        return values[0], float(jackknife(values[1:]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Window:
+    """Consecutive intervals without tracking loss, as long as a window."""
+
+    dt: FloatArray  # (n,) seconds
+    omega: FloatArray  # (n, 3) rotation rate, cam0 frame
+    twists: FloatArray  # (n, 6) [v; omega] of cam0, cam0 frame
+    force: FloatArray  # (n, 3) mean readings of the accelerometer
+
+
+def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> ForceFit | None:
+    """Fit over whole windows; None: too few of them are without tracking loss.
+
+    Args:
+        record: intervals and samples.
+        gyro_fit: the gyro's fit; it gives the camera's rotation where it explains the images.
+        lever_arm: (3,) given position of the IMU in cam0, metres; a correction to it is fitted.
+    """
+    blocks = [_normal_equations(window, lever_arm) for window in _windows(record, gyro_fit)]
+    if len(blocks) < _LEAST_WINDOWS:
+        return None
+    N, h, c = (np.array([b[k] for b in blocks]) for k in range(3))
+    weight: FloatArray = np.ones(len(blocks))
+    prior = np.diag(np.concatenate([_MAP_PRIOR, _PRIOR]))
+    for _ in range(_REWEIGHTINGS):
+        x = np.linalg.solve(np.tensordot(weight, N, 1) + prior, weight @ h)
+        misfit = np.maximum(c - 2 * h @ x + np.einsum("i,wij,j->w", x, N, x), 0)
+        weight = 1 / (1 + misfit / max(4 * float(np.median(misfit)), 1e-9)) ** 2
+    return ForceFit(N, h, c, weight)
+
+
+def _windows(record: Record, gyro_fit: GyroFit) -> Iterator[_Window]:
+    """Yield consecutive windows; after a tracking loss the next one starts anew."""
+    dt, joined = record.end - record.begin, record.joined
+    omega = gyro_fit.gyro @ gyro_fit.A.T + gyro_fit.b if gyro_fit.unexplained < AGREES else record.twists[:, 3:]
+    first = 0
+    while first < len(dt):
+        last = first
+        while last < len(dt) and gyro_fit.covered[last] and (last == first or joined[last]):
+            last += 1
+            if record.end[last - 1] - record.begin[first] >= WINDOW_S:
+                rows = slice(first, last)
+                yield _Window(dt[rows], omega[rows], record.twists[rows], gyro_fit.force[rows])
+                break
+        first = max(last, first + 1)
+
+
+def _normal_equations(window: _Window, lever_arm: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Return normal equations N (15, 15), h (15,), c of one window; start velocity and gravity are projected out."""
+    n, dt = len(window.dt), window.dt
+    R = _rotations(window)
+    position = np.cumsum(np.einsum("nij,nj->ni", R[:-1], se3_exp(dt[:, None] * window.twists)[:, :3, 3]), axis=0)
+    swing = R[1:] - np.eye(3)
+    X = np.concatenate([_double_integrals(window, R[:-1]), -swing], axis=2)
+    y = position + swing @ lever_arm  # the correction to the given lever arm is fitted
+    elapsed = np.cumsum(dt)
+    Q = np.linalg.qr(np.stack([elapsed, elapsed**2], axis=1))[0]
+    X = X - np.tensordot(Q, np.tensordot(Q, X, (0, 0)), (1, 0))
+    y = y - Q @ (Q.T @ y)
+    X, flat = X.reshape(3 * n, 15), y.reshape(3 * n)
+    return X.T @ X / n, X.T @ flat / n, float(flat @ flat) / n
+
+
+def _rotations(window: _Window) -> FloatArray:
+    """Return rotations (n + 1, 3, 3) of the camera at the intervals' ends into its first frame."""
+    turns = so3_exp(window.dt[:, None] * window.omega)
+    R = np.empty((len(turns) + 1, 3, 3))
+    R[0] = np.eye(3)
+    for k, turn in enumerate(turns):
+        R[k + 1] = R[k] @ turn
+    return R
+
+
+def _double_integrals(window: _Window, R: FloatArray) -> FloatArray:
+    """Return the Jacobian (n, 3, 12) of the IMU's position at the intervals' ends w.r.t. A by rows and b.
+
+    Args:
+        window: the intervals.
+        R: (n, 3, 3) rotations at their starts.
+    """
+    n, dt = len(window.dt), window.dt[:, None, None]
+    middle = R @ so3_exp(window.dt[:, None] / 2 * window.omega)
+    of_map = np.einsum("nij,nl->nijl", middle, window.force).reshape(n, 3, 9)
+    gain = dt * np.concatenate([of_map, middle], axis=2)
+    velocity = np.concatenate([np.zeros((1, 3, 12)), np.cumsum(gain, axis=0)])[:-1]
+    return np.cumsum(dt * (velocity + gain / 2), axis=0)

@@ -1,0 +1,286 @@
+"""Find images and depth images that show no motion although the rig moves: a camera or driver gives them again.
+
+Equal to the last bit is the same exposure, as noise differs from one to the next. Nearly equal pairs (encoded again, or
+with noise on top) are the same where the tracked corners have not moved, while the motion predicted since the last
+frame moves them by more than its uncertainty allows and the IMU is not at standstill. A rig at standstill gives nearly
+equal images, too; there the prediction agrees, and they are used.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray, se3_log
+from vio.imu.standstill import STANDSTILL_S, blocks_agree
+from vio.numerics.compiled import compiled
+from vio.numerics.robust import median
+from vio.numerics.statistics import chi_square_quantile
+from vio.records import Image, ImuSample, IntArray, MotionPrior, Observations, Prediction, StereoFrame
+
+_RADIUS = 4  # of the patches whose flow is measured, pixels
+_CORNERS = 60  # measured per image
+_LEAST_CORNERS = 15
+_PREDICTED_PX = 1.0  # a corner that is predicted to move less tells nothing …
+_ERRORS = 3.0  # … nor one that moves by less than so many times what predictions were off by …
+_RECENT, _LEAST_RECENT = 20, 5  # … at most in so many frames
+_UNMOVED_PX = 0.15  # the flow of an unmoved corner under noise of a few gray levels
+_SHARE = 0.8  # of the corners that must be unmoved
+_FIRST_ROWS = 8  # compared before all others
+_LIMIT = float(chi_square_quantile(0.9999, 6))  # of the predicted motion for no motion to be possible
+_MOST_LINES = 3  # rows of repetitions that are reported one by one
+_GYRO_NOISE, _ACCEL_NOISE = 2e-4, 1.2e-2  # rad/s/sqrt(Hz) and m/s^2/sqrt(Hz), of a rig's IMU by its data sheet
+_NS = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Repeated:
+    """A pair that shows the exposure of an earlier frame."""
+
+    of_index: int  # that frame's number
+    exact: bool  # equal to the last bit
+
+
+class FrozenImages:
+    """Compares each pair with the last one that showed something new."""
+
+    def __init__(self) -> None:
+        self._imu: deque[ImuSample] = deque()
+        self._shown: StereoFrame | None = None  # the last frame that is no repetition
+        self._seen: Observations | None = None  # its features
+        self._repeating: Repeated | None = None  # of the frame before
+        self._deep: StereoFrame | None = None  # the last frame with a depth image that is no repetition
+        self._same_depth = False  # that of the frame before was one
+        self._expected: Prediction | None = None  # of the present frame
+        self._errors_px: deque[float] = deque(maxlen=_RECENT)  # median error of each frame's predicted pixels
+
+    def sample(self, sample: ImuSample) -> None:
+        """Take a sample of the IMU."""
+        self._imu.append(sample)
+        while (sample.time_ns - self._imu[0].time_ns) * _NS > STANDSTILL_S:
+            self._imu.popleft()
+
+    def observations(self, seen: Observations) -> None:
+        """Take the features of a frame that `check` let pass."""
+        if self._expected is not None:
+            _, a, b = np.intersect1d(seen.ids, self._expected.tracks.ids, assume_unique=True, return_indices=True)
+            if len(a):
+                off = seen.z[a, :2] - self._expected.tracks.z[b, :2]
+                self._errors_px.append(median(np.linalg.norm(off, axis=1)))
+        self._seen = seen
+
+    def check(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
+        """Return which frame a pair repeats; None: it shows something new, or a rig at standstill.
+
+        Args:
+            frame: the pair, with or without images; frames come in time order.
+            expected: the back end's prediction of this frame, its motion since the last frame with features.
+        """
+        self._expected, self._repeating = expected, self._compare(frame, expected)
+        if self._repeating is None:
+            self._shown = frame
+        return self._repeating
+
+    def check_depth(self, frame: StereoFrame) -> Repeated | None:
+        """Return which frame's depth image a frame repeats; None: it is new, or the rig is at standstill.
+
+        Call it after `check`, with frames whose images are new.
+        """
+        before, depth = self._deep, frame.depth
+        if depth is None:
+            return None
+        if before is None or before.depth is None or not _same_depths(depth, before.depth):
+            self._deep, self._same_depth = frame, False
+            return None
+        self._same_depth = self._same_depth or self._moves(self._expected)
+        return Repeated(before.index, True) if self._same_depth else None
+
+    def _compare(self, frame: StereoFrame, expected: Prediction | None) -> Repeated | None:
+        shown = self._shown
+        if shown is None or frame.left is None:
+            return None
+        images, before = _images(frame), _images(shown)
+        if [image.shape for image in images] != [image.shape for image in before]:
+            return None  # the front end refuses it
+        again = self._repeating is not None  # what was given again once is, until it changes
+        if all(_equal(new, old) for new, old in zip(images, before, strict=True)):
+            return Repeated(shown.index, True) if again or self._moves(expected) else None
+        if self._seen is None or expected is None:
+            return None
+        if again:
+            return Repeated(shown.index, False) if _unmoved(shown, frame, self._seen) else None
+        if len(self._errors_px) < _LEAST_RECENT or not self._contradicts(expected.motion):
+            return None
+        moving = _predicted_to_move(self._seen, expected, max(_PREDICTED_PX, _ERRORS * max(self._errors_px)))
+        # The IMU comes last, as nearly every new frame has moved.
+        frozen = _unmoved(shown, frame, moving) and not self._at_standstill()
+        return Repeated(shown.index, False) if frozen else None
+
+    def _moves(self, expected: Prediction | None) -> bool:
+        """Whether the rig moves: by the IMU's samples, else by the prediction."""
+        if self._imu:
+            return not self._at_standstill()
+        return expected is not None and self._contradicts(expected.motion)
+
+    def _at_standstill(self) -> bool:
+        """Whether the IMU's last half second shows noise alone; steady motion looks the same, but no rig is steady."""
+        if not self._imu:
+            return False
+        times_s = np.array([x.time_ns - self._imu[-1].time_ns for x in self._imu]) * _NS
+        gyro, accel = np.array([x.gyro for x in self._imu]), np.array([x.accel for x in self._imu])
+        return blocks_agree(times_s, gyro, _GYRO_NOISE) and blocks_agree(times_s, accel, _ACCEL_NOISE)
+
+    def _contradicts(self, motion: MotionPrior | None) -> bool:
+        """Whether no motion at all contradicts the predicted one, by chi-square."""
+        if motion is None:
+            return False
+        xi = se3_log(motion.T_curr_prev)
+        C = motion.covariance
+        scale = float(np.trace(C)) + 1e-18
+        return bool(xi @ np.linalg.solve(C + 1e-9 * scale * np.eye(6), xi) > _LIMIT)
+
+
+def _equal(a: Image, b: Image) -> bool:
+    """Whether two images (H, W) are the same to the bit; most differ in their first rows, and need no more."""
+    return np.array_equal(a[:_FIRST_ROWS], b[:_FIRST_ROWS]) and np.array_equal(a, b)
+
+
+def _same_depths(a: FloatArray, b: FloatArray) -> bool:
+    """Whether two depth images (H, W) are the same to the bit; without any depth they are of a scene out of range."""
+    return a.shape == b.shape and np.array_equal(a, b, equal_nan=True) and bool(np.any(a > 0))
+
+
+def _predicted_to_move(seen: Observations, expected: Prediction, least_px: float) -> Observations:
+    """The features of the last frame that the prediction moves clearly in the left image."""
+    _, a, b = np.intersect1d(seen.ids, expected.tracks.ids, assume_unique=True, return_indices=True)
+    moved = np.linalg.norm(expected.tracks.z[b, :2] - seen.z[a, :2], axis=1)
+    return seen.take(a[moved > least_px])
+
+
+def _images(frame: StereoFrame) -> list[Image]:
+    """The images of a frame: left and right, or that of one camera."""
+    return [image for image in (frame.left, frame.right) if image is not None]
+
+
+def _is_blank(frame: StereoFrame) -> bool:
+    """Whether the images of a frame are of one gray value: black, or blown out."""
+    return all(image.min() == image.max() for image in _images(frame))
+
+
+def _unmoved(before: StereoFrame, now: StereoFrame, seen: Observations) -> bool:
+    """Whether features have not moved since they were seen, in both images."""
+    of_images = seen.z[:_CORNERS, :2], seen.z[seen.has_right][:_CORNERS, 2:]
+    for old, new, pixels in zip(_images(before), _images(now), of_images, strict=False):
+        flow = corner_flow(old, new, pixels)
+        if len(flow) < _LEAST_CORNERS or np.mean(np.linalg.norm(flow, axis=1) < _UNMOVED_PX) < _SHARE:
+            return False
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class RepeatWords:
+    """How a report names what was given again."""
+
+    what: str
+    exact: str
+    cause: str
+    effect: str
+    summary: str
+
+
+IMAGES = RepeatWords(
+    "images",
+    "both images are the same to the last bit",
+    "the camera or its driver gave them again",
+    "the pose is a prediction",
+    "repeated earlier images and were left out",
+)
+DEPTHS = RepeatWords(
+    "depth images",
+    "the depth image is the same to the last bit",
+    "the depth camera or its driver gave it again",
+    "its features have no depth",
+    "repeated earlier depth images, which were left out",
+)
+
+
+class RepeatReport:
+    """Reports what was given again: the first time, long rows of it, and its number."""
+
+    def __init__(self, words: RepeatWords) -> None:
+        self._words = words
+        self._row: list[StereoFrame] = []  # frames of the present row
+        self._reported = 0
+        self._total = 0
+
+    def frame(self, frame: StereoFrame, repeated: Repeated | None) -> list[str]:
+        """Take a frame and what it repeats; return the lines that follow from it."""
+        lines = self._ended(frame) if repeated is None else []
+        if repeated is None:
+            self._row = []
+            return lines
+        self._row.append(frame)
+        self._total += 1
+        if len(self._row) > 1 or self._reported >= _MOST_LINES:
+            return lines
+        self._reported += 1
+        if _is_blank(frame):
+            return [
+                f"frame {frame.index}: the {self._words.what} have one gray value everywhere, as those of frame "
+                f"{repeated.of_index}: the lens is covered, the exposure failed, or the images were not delivered; "
+                f"left out, {self._words.effect}"
+            ]
+        seen = self._words.exact if repeated.exact else "both images show nothing that has moved"
+        cause = self._words.cause if repeated.exact else f"{self._words.cause}, or it sees only what moves with it"
+        return [
+            f"frame {frame.index}: {seen} since frame {repeated.of_index} although the rig moves: {cause}; "
+            f"left out, {self._words.effect}"
+        ]
+
+    def finish(self) -> list[str]:
+        """Return the line at the end of the run."""
+        what, effect = self._words.what, self._words.summary
+        still = [f"the {what} stayed the same from frame {self._row[0].index} to the end"] if self._row else []
+        return [*still, f"{self._total} frames {effect}"] if self._total > 1 else still
+
+    def _ended(self, frame: StereoFrame) -> list[str]:
+        if len(self._row) < 2:
+            return []
+        seconds = (frame.time_ns - self._row[0].time_ns) * _NS
+        row = f"{len(self._row)} repetitions ({seconds:.2f} s)"
+        return [f"frame {frame.index}: the {self._words.what} change again, after {row}"]
+
+
+def corner_flow(before: Image, after: Image, pixels: FloatArray) -> FloatArray:
+    """Flow (M, 2) of patches at pixels (N, 2) between two images by one Lucas-Kanade step, offsets of gray removed.
+
+    Exact for no motion; for motions of many pixels it only says that there is one. Patches that leave the image are
+    left out, so M <= N.
+    """
+    height, width = before.shape
+    margin, at = _RADIUS + 1, np.rint(pixels).astype(np.int64)
+    inside = np.all((at >= margin) & (at < np.array([width, height]) - margin), axis=1)
+    flow = np.empty((int(inside.sum()), 2))
+    _write_flow(before, after, at[inside], flow)
+    return flow
+
+
+@compiled
+def _write_flow(before: Image, after: Image, at: IntArray, flow: FloatArray) -> None:
+    """Write the flow (M, 2) of patches around whole pixels (M, 2)."""
+    size = (2 * _RADIUS + 1) ** 2
+    for m in range(len(at)):
+        uu, uv, vv = 1.0, 0.0, 1.0  # one gray level squared, against patches without texture
+        ut, vt, u_sum, v_sum, change = 0.0, 0.0, 0.0, 0.0, 0.0
+        for y in range(at[m, 1] - _RADIUS, at[m, 1] + _RADIUS + 1):
+            for x in range(at[m, 0] - _RADIUS, at[m, 0] + _RADIUS + 1):
+                gu = 0.5 * (float(before[y, x + 1]) - float(before[y, x - 1]))
+                gv = 0.5 * (float(before[y + 1, x]) - float(before[y - 1, x]))
+                t = float(after[y, x]) - float(before[y, x])
+                uu, uv, vv = uu + gu * gu, uv + gu * gv, vv + gv * gv
+                ut, vt, u_sum, v_sum, change = ut + gu * t, vt + gv * t, u_sum + gu, v_sum + gv, change + t
+        ut, vt = ut - u_sum * change / size, vt - v_sum * change / size  # less the mean change
+        det = uu * vv - uv * uv
+        flow[m, 0], flow[m, 1] = -(vv * ut - uv * vt) / det, -(uu * vt - uv * ut) / det

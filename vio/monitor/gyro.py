@@ -1,0 +1,179 @@
+"""Faults of a gyro or of the extrinsics, found by comparing its rates with those of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+
+from vio.evaluation.trajectories import rotation_angle_deg
+from vio.geometry.lie import FloatArray, nearest_rotation
+from vio.imu.findings import InertialFault, InertialFinding
+from vio.monitor.accelerometer import AXES_WORSE
+from vio.monitor.axes import axes_text, matrix_text, signed_permutations, triple_text
+from vio.monitor.evidence import Evidence
+from vio.monitor.gyro_fit import AGREES, FAR_OFFSETS_S, GyroFit
+
+_DISAGREES = 0.5  # share of the rotation that the best linear map leaves unexplained
+_EXCESS_CLIPPED = 0.5  # excess allowed where readings are clipped, which rotates and shortens the gyro's rates
+_EXCESS_BRIEF = 0.7  # likewise with fewer intervals than in the first evaluation
+
+
+@dataclass(frozen=True, slots=True)
+class _Explanation:
+    """A mistake that would explain the gyro's rates."""
+
+    fault: InertialFault
+    C: FloatArray  # (3, 3) map from gyro to camera that it implies
+    seen: str
+    explanation: str
+
+
+def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
+    """Compare the gyro's rates, mapped by the given rotation, with those of the camera.
+
+    Args:
+        evidence: the fits.
+        unit: factor that makes the accelerometer's readings m/s^2.
+    """
+    gyro_fit, R, brief = evidence.gyro_fit, evidence.R_cam0_imu, evidence.brief
+    if gyro_fit.unexplained > _DISAGREES:
+        return [] if brief else [_disagreement(gyro_fit)]
+    limit = max(gyro_fit.tolerance, _EXCESS_CLIPPED * evidence.clipped, _EXCESS_BRIEF * brief)
+    if gyro_fit.unexplained > AGREES or gyro_fit.excess(R, 1.0) < limit:
+        return []
+    if gyro_fit.fits(R):
+        return _judge_scale(evidence, R)
+    if not evidence.force_final:
+        return []
+    seen = _contradiction(gyro_fit, R)
+    likely = _explanations(R, gyro_alone=_gyro_alone(evidence, unit))
+    uncertain = brief or evidence.clipped
+    for mistake in chain(likely, () if uncertain else _free_explanations(gyro_fit.S_cg)):
+        if gyro_fit.fits(mistake.C):
+            finding = InertialFinding(mistake.fault, f"{seen}, and {mistake.seen}", mistake.explanation)
+            return [finding, *_judge_scale(evidence, mistake.C)]
+    if uncertain:
+        return []
+    stretch = np.linalg.svd(gyro_fit.A, compute_uv=False)
+    return [
+        InertialFinding(
+            "gyro units",
+            f"{seen}, and no rotation fits: the best linear map stretches by {triple_text(stretch)}",
+            "the gyro's axes have different scales, or one of them is dead",
+        )
+    ]
+
+
+def _gyro_alone(evidence: Evidence, unit: float) -> bool:
+    """Return whether the accelerometer agrees with the given rotation, so that only the gyro is at fault."""
+    if evidence.force is None:
+        return False
+    best = nearest_rotation(evidence.gyro_fit.S_cg)
+    return evidence.force.cost(evidence.R_cam0_imu * unit) * AXES_WORSE < evidence.force.cost(best * unit)
+
+
+def _contradiction(gyro_fit: GyroFit, R: FloatArray) -> str:
+    """Describe how far the given rotation (3, 3) contradicts the gyro, and which rotation fits best."""
+    best = nearest_rotation(gyro_fit.S_cg)
+    near = f"; the best rotation is {rotation_angle_deg(best @ R.T):.0f} deg from the given one"
+    few = {1: "one axis", 2: "two axes"}.get(gyro_fit.axes)
+    about = "" if few is None else f" (it rotates about {few} only, so other explanations fit, too)"
+    share = gyro_fit.excess(R, max(gyro_fit.scale(R), 0.0))
+    return (
+        f"with the given T_cam0_imu {100 * share:.0f} % of the camera's rotation contradicts the gyro"
+        f"{near if gyro_fit.fits(best) else ''}{about}"
+    )
+
+
+def _disagreement(gyro_fit: GyroFit) -> InertialFinding:
+    rate = np.degrees(float(np.sqrt(np.trace(gyro_fit.S_cc))))
+    gyro_rms = float(np.sqrt(np.trace(gyro_fit.S_gg)))
+    return InertialFinding(
+        "gyro disagrees",
+        f"the camera rotates at {rate:.1f} deg/s (RMS) and the gyro explains {100 * (1 - gyro_fit.unexplained):.0f} % "
+        f"of it at the best clock offset within {FAR_OFFSETS_S[-1]:g} s (the gyro's own RMS is {gyro_rms:.3g})",
+        "the IMU's file may belong to another recording, the clocks may be further apart, the gyro may be dead, or the "
+        "images may show something that moves with the camera",
+    )
+
+
+def _judge_scale(evidence: Evidence, C: FloatArray) -> list[InertialFinding]:
+    """Judge the gyro's unit by the factor on a map (3, 3) to the camera, unless its effect is negligible."""
+    gyro_fit = evidence.gyro_fit
+    scale = gyro_fit.scale(C)
+    if gyro_fit.excess(C, 1.0) < gyro_fit.tolerance or (evidence.clipped and 0.5 < scale < 2.0):
+        return []
+    seen = (
+        f"the gyro must be multiplied by {scale:.4g} to agree with the images "
+        f"(then {100 * gyro_fit.unexplained:.1f} % differ)"
+    )
+    named = {
+        np.pi / 180: "the gyro is in deg/s: multiply its readings by pi/180",
+        180 / np.pi: "the gyro was converted from deg/s twice: multiply its readings by 180/pi",
+        np.pi / 180e3: "the gyro is in mdeg/s: multiply its readings by pi/180000",
+        1e-3: "the gyro is in mrad/s: divide its readings by 1000",
+    }
+    odd = "the gyro's scale is wrong, or the camera's focal length is; rad/s are expected"
+    explanation = next(
+        (explanation for factor, explanation in named.items() if abs(np.log(scale / factor)) < 0.15), odd
+    )
+    return [InertialFinding("gyro units", seen, explanation)]
+
+
+def _explanations(R: FloatArray, *, gyro_alone: bool) -> Iterator[_Explanation]:
+    """Yield the known mistakes, the likeliest first."""
+    if not gyro_alone:
+        yield _Explanation(
+            "extrinsics inverted",
+            R.T,
+            "the inverse of its rotation fits",
+            "T_imu_cam0 was given as T_cam0_imu; invert the transform",
+        )
+    yield _Explanation(
+        "gyro sign",
+        -R,
+        "the inverted gyro fits",
+        "the gyro's rates are left-handed (all three have the wrong sign); change the sign of its readings",
+    )
+    if not gyro_alone:
+        yield _Explanation(
+            "extrinsics rotation",
+            np.eye(3),
+            "the identity fits",
+            "IMU and camera have the same axes in these files; the rotation of T_cam0_imu should be the identity",
+        )
+    for P in signed_permutations():
+        # The recording contains P^T times the true rates, so that R P maps it to the camera.
+        explanation = f"the gyro's axes contain {axes_text(P.T)} in place of [+x +y +z]"
+        if np.linalg.det(P) < 0:
+            explanation = f"{explanation}, a left-handed frame; correct their order and signs"
+            yield _Explanation("gyro axes", R @ P, "exchanged axes fit", explanation)
+        elif gyro_alone:
+            yield _Explanation(
+                "gyro axes", R @ P, "exchanged axes fit", f"{explanation}; correct their order and signs"
+            )
+        else:
+            explanation = (
+                f"T_cam0_imu belongs to other IMU axes, or {explanation}; its rotation should be {matrix_text(R @ P)}"
+            )
+            yield _Explanation("extrinsics rotation", R @ P, "a rotation by multiples of 90 degrees fits", explanation)
+
+
+def _free_explanations(S_cg: FloatArray) -> Iterator[_Explanation]:
+    """Yield the best rotation and reflection by moments (3, 3). Reference: Markley 1988, Wahba's problem by SVD."""
+    best = nearest_rotation(S_cg)
+    yield _Explanation(
+        "extrinsics rotation",
+        best,
+        "another rotation fits",
+        f"the rotation of T_cam0_imu should be about {matrix_text(best)}; run `vio calibrate`",
+    )
+    yield _Explanation(
+        "gyro axes",
+        -nearest_rotation(-S_cg),  # rotations with the wrong sign are those of a reflection
+        "a mirrored frame fits",
+        "the gyro's axes are left-handed; check their order and signs",
+    )

@@ -1,0 +1,154 @@
+"""The gyro's rates against those of the camera: the best linear map between them, at the best clock offset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray
+from vio.imu.findings import InertialFinding
+from vio.monitor.motion import Record
+from vio.numerics.robust import robust_sigma
+from vio.records import BoolArray
+
+_MIN_RATE_RADPS = 0.02  # a gyro is not judged where the camera rotates less
+_CLEAR_OF_NOISE = 5.0  # the camera's rates must exceed their noise by this factor
+AGREES = 0.2  # share of the rotation that the best linear map leaves unexplained: below, explanations are judged
+_EXCESS = 0.2  # misfit over the best linear map, as a share of the rotation: 11 degrees, or 20 % of scale
+_CHANCE = 30.0  # over the intervals, times the unexplained share: squared excess due to the map's free parameters
+_CLEARLY_WORSE = 2.0
+_NAMED_OFFSET_S = 0.02
+_NEAR_OFFSETS_S = np.arange(-0.1, 0.1001, 0.01)
+FAR_OFFSETS_S = np.arange(-5.0, 5.001, 0.025)
+
+
+@dataclass(frozen=True, slots=True)
+class GyroFit:
+    """Second moments of the camera's and the gyro's rates at one clock offset, and the best linear map, (I1)."""
+
+    offset_s: float
+    S_cc: FloatArray  # (3, 3) camera, weighted mean of products, (rad/s)^2
+    S_cg: FloatArray  # (3, 3) camera and gyro
+    S_gg: FloatArray  # (3, 3) gyro
+    A: FloatArray  # (3, 3) camera rate = A gyro + b
+    b: FloatArray  # (3,)
+    unexplained: float  # share of the camera's rotation that the map leaves unexplained, 0 to 1
+    noise_radps: float  # of the camera's rates, each axis, from their second differences
+    count: int  # intervals with samples
+    gyro: FloatArray  # (K, 3) mean rates of each interval, rad/s
+    force: FloatArray  # (K, 3) mean specific forces, unit of the readings
+    covered: BoolArray  # (K,) samples cover the interval
+    weight: FloatArray  # (K,) robust weights at the best map, zero where not covered
+
+    @property
+    def rms_rates_radps(self) -> FloatArray:
+        """RMS rates (3,) of the camera about its three principal axes, largest first."""
+        out: FloatArray = np.sqrt(np.maximum(np.linalg.eigvalsh(self.S_cc)[::-1], 0))
+        return out
+
+    @property
+    def axes(self) -> int:
+        """Number of axes about which the camera clearly rotates."""
+        clear = max(_MIN_RATE_RADPS, _CLEAR_OF_NOISE * self.noise_radps)
+        return int(np.sum(self.rms_rates_radps > clear))
+
+    def scale(self, C: FloatArray) -> float:
+        """Return the best factor on an orthogonal map (3, 3) from gyro to camera."""
+        return float(np.sum(C * self.S_cg) / max(float(np.trace(self.S_gg)), 1e-300))
+
+    def excess(self, C: FloatArray, scale: float) -> float:
+        """Return the misfit of `scale C` beyond that of the best linear map, as a share of the rotation, (I2)."""
+        total = float(np.trace(self.S_cc))
+        misfit = total - 2 * scale * float(np.sum(C * self.S_cg)) + scale**2 * float(np.trace(self.S_gg))
+        return float(np.sqrt(max(misfit / max(total, 1e-300) - self.unexplained, 0.0)))
+
+    @property
+    def tolerance(self) -> float:
+        """The excess up to which a map is accepted."""
+        return max(_EXCESS, float(np.sqrt(_CHANCE / max(self.count, 1) * self.unexplained)))
+
+    def fits(self, C: FloatArray) -> bool:
+        """Return whether an orthogonal map (3, 3) from gyro to camera is accepted at its best scale."""
+        scale = self.scale(C)
+        return scale > 0 and self.excess(C, scale) < self.tolerance
+
+
+def fit_gyro(record: Record, least: int) -> GyroFit | None:
+    """Fit the camera's rates by the gyro's at the best clock offset; None: too little rotation."""
+    omega = record.twists[:, 3:]
+    noise = robust_sigma(np.diff(omega, 2, axis=0)) / np.sqrt(6) if len(omega) > 4 else np.inf
+    best = _at_offset(record, _NEAR_OFFSETS_S, least, noise)
+    if best is None or best.axes == 0:
+        return None
+    if best.unexplained > AGREES:
+        far = _at_offset(record, FAR_OFFSETS_S, max(least, len(omega) // 2), noise)
+        best = far if far is not None and far.unexplained < 0.5 * best.unexplained else best
+    for step in (0.01, 0.003):
+        near = _at_offset(record, best.offset_s + step * np.arange(-2, 3), least, noise)
+        best = near if near is not None and near.unexplained <= best.unexplained else best
+    return best if best.axes else None
+
+
+def _at_offset(record: Record, offsets: npt.NDArray[np.floating], least: int, noise: float) -> GyroFit | None:
+    """Fit the linear map at the best of some clock offsets, then robustly."""
+    means, covered = record.means(offsets)
+    omega, gyro = record.twists[:, 3:], means[..., :3]
+    enough = covered.sum(axis=1) >= least
+    if not enough.any():
+        return None
+    shares = np.where(enough, _moments(omega, gyro, covered.astype(np.float64))[3], np.inf)
+    k = int(np.argmin(shares))
+    weight = covered[k].astype(np.float64)
+    for _ in range(4):
+        S_cc, S_cg, S_gg, share, A, b = (x[0] for x in _moments(omega, gyro[k : k + 1], weight[None]))
+        r = np.linalg.norm(omega - gyro[k] @ A.T - b, axis=1)
+        width = max(2 * robust_sigma(r[covered[k]]), 1e-6)
+        weight = covered[k] / (1 + (r / width) ** 2) ** 2
+    return GyroFit(
+        offset_s=float(offsets[k]),
+        S_cc=S_cc,
+        S_cg=S_cg,
+        S_gg=S_gg,
+        A=A,
+        b=b,
+        unexplained=float(share),
+        noise_radps=noise,
+        count=int(covered[k].sum()),
+        gyro=gyro[k],
+        force=means[k, :, 3:],
+        covered=covered[k],
+        weight=weight,
+    )
+
+
+def _moments(omega: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[FloatArray, ...]:
+    """Return centred moments cc, cg, gg (M, 3, 3), unexplained share (M,), A (M, 3, 3), b (M, 3) for weights (M, K)."""
+    w = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-12)
+    mean_c, mean_g = w @ omega, np.einsum("mk,mki->mi", w, gyro)
+    c, g = omega[None] - mean_c[:, None], gyro - mean_g[:, None]
+    cw = np.swapaxes(c * w[..., None], 1, 2)
+    S_cc, S_cg, S_gg = cw @ c, cw @ g, np.swapaxes(g * w[..., None], 1, 2) @ g
+    size = np.trace(S_gg, axis1=1, axis2=2)[:, None, None]
+    A = np.linalg.solve(S_gg + (1e-9 * size + 1e-300) * np.eye(3), np.swapaxes(S_cg, 1, 2))
+    A = np.swapaxes(A, 1, 2)
+    total = np.trace(S_cc, axis1=1, axis2=2)
+    share = 1 - np.sum(A * S_cg, axis=(1, 2)) / np.maximum(total, 1e-300)
+    return S_cc, S_cg, S_gg, np.clip(share, 0.0, 1.0), A, mean_c - np.einsum("mij,mj->mi", A, mean_g)
+
+
+def judge_offset(gyro_fit: GyroFit, record: Record, least: int) -> InertialFinding | None:
+    """Report a relevant clock offset, where the rotation determines it clearly."""
+    if abs(gyro_fit.offset_s) < _NAMED_OFFSET_S or gyro_fit.unexplained > AGREES:
+        return None
+    as_stamped = _at_offset(record, np.zeros(1), least, gyro_fit.noise_radps)
+    if as_stamped is not None and as_stamped.unexplained < _CLEARLY_WORSE * gyro_fit.unexplained + 0.003:
+        return None
+    left = "cannot be compared" if as_stamped is None else f"leaves {100 * as_stamped.unexplained:.1f} % unexplained"
+    return InertialFinding(
+        "clocks apart",
+        f"the rates of gyro and images agree best if a frame stamped t is at t {gyro_fit.offset_s:+.3f} s of the "
+        f"IMU's clock ({100 * gyro_fit.unexplained:.1f} % of the rotation unexplained; without the shift it {left})",
+        f"the IMU's clock is ahead of the camera's by {gyro_fit.offset_s:+.3f} s; subtract that from the IMU's stamps",
+    )

@@ -1,0 +1,179 @@
+"""Monitor a run for divergence by the estimator's outputs; each event is reported once."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.numerics.robust import median
+from vio.records import Estimate, UpdateReport
+
+_NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a prediction only
+_GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many times the usual time
+_LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
+_REJECTING_FRAMES = 20
+_ROWS_OFF_PX = 0.2
+# No rig comes to this by itself: a camera that is turned by one degree in its mount shows 8 px at a focal length of
+# 430 px. EuRoC's two cameras show 26 px where they are exchanged, and where their images are turned by 180 degrees.
+_OTHER_PAIR_PX = 10.0
+_SCALE_OFF_PERCENT, _SCALE_SIGMAS = 1.0, 3.0  # of baseline or focal length, both to be exceeded
+_RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
+_MAX_SPEED_MPS = 100.0
+_MAX_GYRO_BIAS_RADPS = 0.5
+_MAX_ACCEL_BIAS_MPS2 = 3.0
+
+
+class RunHealth:
+    """Monitor each frame's report and estimate; return one line when an event begins or ends."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, FloatArray] | None = None  # time and position of the frame before
+        self._last_used: tuple[int, int] | None = None  # index and time of the last frame with used features
+        self._without_features = False
+        self._steps_s: deque[float] = deque(maxlen=_RECENT_STEPS)
+        self._last_index = 0
+        self._rejecting = 0
+        self._reported: set[str] = set()
+        self._restarted_ns: int | None = None  # time of the last restart
+
+    def restarted(self, index: int, why: str, estimate: Estimate) -> tuple[str, ...]:
+        """Return the line on a restart after a divergence; none if the last one was less than a second before.
+
+        Args:
+            index: frame number.
+            why: what the estimator said.
+            estimate: the state that it goes on from.
+        """
+        last_ns, self._restarted_ns = self._restarted_ns, estimate.time_ns
+        self._last = estimate.time_ns, estimate.T_world_imu[:3, 3].copy()
+        if last_ns is not None and (estimate.time_ns - last_ns) * 1e-9 < _RESTART_EVENT_S:
+            return ()
+        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        return (
+            f"frame {index}: {why}; started again from the last good pose, the standard deviation of its position is "
+            f"{sigma:.2f} m",
+        )
+
+    def frame(self, index: int, report: UpdateReport, estimate: Estimate) -> tuple[str, ...]:
+        """Return the warnings of this frame.
+
+        Args:
+            index: frame number.
+            report: what the update did.
+            estimate: the state estimate after it.
+        """
+        lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
+        lines += self._rejections(index, report)
+        lines += self._stereo(index, estimate)
+        lines += self._scale(index, estimate)
+        lines += self._implausible(index, estimate)
+        return tuple(lines)
+
+    def _gap(self, index: int, estimate: Estimate) -> list[str]:
+        """Report a time without frames, with what is known of the pose after it."""
+        last, last_index = self._last, self._last_index
+        self._last_index = index
+        if last is None:
+            return []
+        step_s = (estimate.time_ns - last[0]) * 1e-9
+        usual_s = np.inf
+        if step_s > _GAP_S and len(self._steps_s) >= _LEAST_STEPS:  # a shorter one is no gap, whatever is usual
+            usual_s = median(self._steps_s)
+        self._steps_s.append(step_s)
+        if step_s <= max(_GAP_S, _GAP_STEPS * usual_s):
+            return []
+        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        return [
+            f"frame {index}: no frame for {step_s:.2f} s since frame {last_index}; the motion in between is a "
+            f"prediction, the standard deviation of the position is {sigma:.2g} m after it"
+        ]
+
+    def _stereo(self, index: int, estimate: Estimate) -> list[str]:
+        """Report once that the filter estimates the stereo calibration, as the rows show that it is off."""
+        field = estimate.stereo_field
+        if field is None or field.rows_rms_px < _ROWS_OFF_PX or "stereo" in self._reported:
+            return []
+        self._reported.add("stereo")
+        seen = f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms)"
+        if field.rows_rms_px > _OTHER_PAIR_PX:
+            return [
+                f"{seen}: left and right are exchanged, the calibration is not that of these images, or a camera was "
+                "moved; `vio calibrate` tells which; what the calibration is off by is estimated while running, which "
+                "may not suffice (msckf.calibrate_stereo)"
+            ]
+        return [
+            f"{seen} in a smooth pattern: the stereo calibration is off; what it is off by is estimated while running "
+            "(msckf.calibrate_stereo)"
+        ]
+
+    def _scale(self, index: int, estimate: Estimate) -> list[str]:
+        """Report once that baseline or focal length differ from the calibration beyond doubt and beyond harm."""
+        lines: list[str] = []
+        found = {} if estimate.stereo_scale is None else estimate.stereo_scale.percent()
+        for name, (percent, sigma) in found.items():
+            if abs(percent) <= max(_SCALE_OFF_PERCENT, _SCALE_SIGMAS * sigma) or name in self._reported:
+                continue
+            self._reported.add(name)
+            # One scale does not tell them apart.
+            named = f"{name}, or the focal length," if len(found) == 1 and name == "baseline" else name
+            lines.append(
+                f"frame {index}: the {named} is {abs(percent):.1f} % {'longer' if percent > 0 else 'shorter'} than "
+                f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor measures, and is taken "
+                "as that; unless the sensor is wrong (check its unit, axes and clock), calibrate the cameras anew, or "
+                "check that images and calibration have one size; of depth images, check dataset.depth_factor"
+            )
+        return lines
+
+    def _features(self, index: int, report: UpdateReport, estimate: Estimate) -> list[str]:
+        """Report when features have been missing for long, and when they are back."""
+        time_ns = estimate.time_ns
+        starts = report.initialised > 0 and not self._without_features
+        if report.used > 0 or starts or self._last_used is None:
+            ended = self._without_features
+            away_s = 0.0 if self._last_used is None else (time_ns - self._last_used[1]) * 1e-9
+            self._last_used, self._without_features = (index, time_ns), False
+            return [f"frame {index}: features again, after {away_s:.1f} s without"] if ended else []
+        seconds = (time_ns - self._last_used[1]) * 1e-9
+        if self._without_features or seconds < _NO_FEATURES_S:
+            return []
+        self._without_features = True
+        sigma = float(np.sqrt(np.trace(estimate.covariance[:3, :3])))
+        return [
+            f"frame {index}: no usable feature since frame {self._last_used[0]} ({seconds:.1f} s); the pose is a "
+            f"prediction, the standard deviation of its position is {sigma:.2f} m"
+        ]
+
+    def _rejections(self, index: int, report: UpdateReport) -> list[str]:
+        """Report when more features are rejected than used for many frames in a row."""
+        self._rejecting = self._rejecting + 1 if report.gated > report.used else 0
+        if self._rejecting != _REJECTING_FRAMES:
+            return []
+        return [
+            f"frame {index}: more features rejected than used for {_REJECTING_FRAMES} frames: wrong matches, moving "
+            "objects in the majority, or a pose that has diverged"
+        ]
+
+    def _implausible(self, index: int, estimate: Estimate) -> list[str]:
+        """Report once when the state is implausible for a vehicle."""
+        lines = []
+        position = estimate.T_world_imu[:3, 3].copy()
+        if self._last is not None and estimate.time_ns > self._last[0]:
+            speed = float(np.linalg.norm(position - self._last[1])) / ((estimate.time_ns - self._last[0]) * 1e-9)
+            lines += self._once("speed", speed, _MAX_SPEED_MPS, f"frame {index}: the estimate moves at {speed:.0f} m/s")
+        self._last = estimate.time_ns, position
+        for name, bias, limit, unit in (
+            ("gyro bias", estimate.gyro_bias, _MAX_GYRO_BIAS_RADPS, "rad/s"),
+            ("accelerometer bias", estimate.accel_bias, _MAX_ACCEL_BIAS_MPS2, "m/s^2"),
+        ):
+            if bias is not None:
+                size = float(np.linalg.norm(bias))
+                lines += self._once(name, size, limit, f"frame {index}: the {name} is estimated as {size:.2g} {unit}")
+        return lines
+
+    def _once(self, what: str, value: float, limit: float, line: str) -> list[str]:
+        if value <= limit or what in self._reported:
+            return []
+        self._reported.add(what)
+        return [f"{line}: the filter has diverged; check calibration, units and clocks"]

@@ -1,0 +1,208 @@
+"""Check a run's IMU for wrong units, signs, axes, extrinsics and clocks, for clipping and for gaps.
+
+The camera's motion comes from the stereo tracks of consecutive frames, the gyro and the accelerometer are fitted to it
+by *general* linear maps, and every named explanation (the given extrinsics, their inverse, a permutation of axes,
+degrees, g, …) is then judged by how much worse it fits than the general map. A fault is named only where the given
+calibration fails clearly and the explanation does not; for equations (I1) to (I4) see docs/inertial.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vio.calibration.inertial import Rates
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.imu.clocks import Coverage
+from vio.imu.findings import InertialFault, InertialFinding
+from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
+from vio.monitor.evidence import FIRST_EVALUATION, Evidence
+from vio.monitor.force_fit import fit_force
+from vio.monitor.gyro import judge_gyro
+from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset
+from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
+from vio.monitor.samples import Samples, Size, judge_size
+from vio.monitor.stamps import judge_stamps
+from vio.monitor.turns import compare_turns, judge_turns
+from vio.records import TURNS_NOT_SHOWN, ImuSample, Observations, TurnComparison
+
+_LEAST_AT_END = 20  # intervals needed to judge at the end of a run
+_LATER_EVALUATIONS = 150  # intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
+_ENOUGH = 400  # intervals with rotation about all axes after which the comparison ends
+_NS = 1e-9
+
+
+class InertialCheck:
+    """Monitor a run with raw IMU data without influencing it, and report each fault once.
+
+    Pass every sample and every frame's observations in time order; log what `frame` and `finish` return. The comparison
+    of motions ends after enough rotation about all axes; gaps and clipping are checked until the end of the run.
+    """
+
+    def __init__(self, camera: StereoCamera, T_cam0_imu: FloatArray) -> None:
+        """Create the check.
+
+        Args:
+            camera: rectified pair that the observations belong to.
+            T_cam0_imu: (4, 4) as the run uses it.
+        """
+        self._stereo, self._T = camera, np.array(T_cam0_imu, dtype=np.float64)
+        self._reported: set[str] = set()
+        self._samples = Samples()
+        self._coverage = Coverage()
+        self._frames = 0
+        self.reset()
+
+    @property
+    def done(self) -> bool:
+        """Whether the comparison of motions has ended; `reset` restarts it."""
+        return self._done
+
+    def reset(self) -> None:
+        """Restart the comparison of motions; reported findings are not repeated."""
+        self._camera, self._motion = CameraTwists(self._stereo), RecentMotion()
+        self._since_evaluation = self._seen = 0
+        self._suspected: set[InertialFault] = set()
+        self._done = False
+        self.turns: TurnComparison | None = None  # the newest comparison; None: too few frames yet
+        self.imu_at_fault = False  # by the newest judgement of units, axes, signs and clocks, reported yet or not
+
+    def imu(self, sample: ImuSample) -> None:
+        """Add one sample."""
+        self._samples.add(sample)
+
+    def frame(self, observations: Observations) -> tuple[InertialFinding, ...]:
+        """Add the observations of one frame, and return new findings."""
+        self._frames += 1
+        self._coverage.frame(observations.time_ns, self._samples.last_ns)
+        found = self._coverage.so_far(self._samples.span_ns, self._samples.step_s / _NS)
+        if not self._done:
+            found += self._compare(observations)
+        elif self._frames % BATCH == 0:
+            found += self._samples.check_new(keep=False)
+        return self._unreported(found)
+
+    def finish(self) -> tuple[InertialFinding, ...]:
+        """Return the findings at the end of the run; call it also when the run fails."""
+        found = self._coverage.at_end(self._samples.span_ns, self._samples.step_s / _NS)
+        found += self._samples.check_new(keep=not self._done)
+        if not self._done:
+            motion = self._camera.flush()
+            if motion is not None:
+                self._motion.add(motion)
+            found += self._judge(last=True)
+        return self._unreported(found)
+
+    def _compare(self, observations: Observations) -> list[InertialFinding]:
+        """Add a frame's features, and evaluate when there is enough motion.
+
+        Before the end of a run, a fault must be found in two consecutive evaluations.
+        """
+        motion = self._camera.frame(observations)
+        if motion is None:
+            return []
+        found = self._samples.check_new(keep=True)
+        self._motion.add(motion)
+        self._since_evaluation += len(motion)
+        self._seen += len(motion)
+        if self._since_evaluation < (FIRST_EVALUATION if self._seen < _ENOUGH else _LATER_EVALUATIONS):
+            if self.turns is None:
+                self._compare_first_turns()
+            return found
+        self._since_evaluation = 0
+        judged = self._judge(last=False)
+        found += [f for f in judged if f.fault in self._suspected]
+        self._suspected = {f.fault for f in judged}
+        return found
+
+    def _judge(self, *, last: bool) -> list[InertialFinding]:
+        """Evaluate the stored samples and motions."""
+        times_ns, values = self._samples.table()
+        if len(times_ns) < 2:
+            return []
+        size = judge_size(times_ns, values[:, 3:])
+        self.imu_at_fault = size.finding is not None
+        motion = self._motion.joined()
+        if motion is None:
+            return [] if size.finding is None else [size.finding]
+        record = record_of(motion, times_ns, values)
+        gyro_fit = fit_gyro(record, _LEAST_AT_END)
+        if gyro_fit is None:
+            if self._seen >= _ENOUGH:
+                self.turns = self.turns or TURNS_NOT_SHOWN
+            return self._judge_stationary(size, record, last=last)
+        force = None if size.unit is None else fit_force(record, gyro_fit, self._T[:3, 3])
+        evidence = Evidence(
+            R_cam0_imu=self._T[:3, :3],
+            gyro_fit=gyro_fit,
+            force=force,
+            # The accelerometer decides whether gyro or extrinsics are at fault: wait for it.
+            force_final=force is not None or size.unit is None or last or gyro_fit.count >= _ENOUGH,
+            clipped="saturation" in self._reported,
+            last=last,
+        )
+        rates = Rates(times_ns, values[:, :3], values[:, 3:], True)
+        return self._judge_rotating(evidence, size, record, rates)
+
+    def _judge_stationary(self, size: Size, record: Record, *, last: bool) -> list[InertialFinding]:
+        """Judge without rotation: the magnitude of the readings and, at the end, the direction of gravity."""
+        found = [] if size.finding is None else [size.finding]
+        means, covered = record.means(np.zeros(1))
+        if last and size.unit is not None and int(covered.sum()) >= _LEAST_AT_END:
+            found += judge_up(means[0, covered[0], 3:], self._T[:3, :3], measured=False)
+        return found
+
+    def _judge_rotating(self, evidence: Evidence, size: Size, record: Record, rates: Rates) -> list[InertialFinding]:
+        """Judge with rotation, and decide whether the comparison may end."""
+        gyro_fit, last = evidence.gyro_fit, evidence.last
+        size = resolve_size(size, evidence)
+        offset = judge_offset(gyro_fit, record, _LEAST_AT_END)
+        found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
+        rotation = judge_gyro(evidence, size.unit or 1.0)
+        found += rotation
+        found += self._compare_turns(record, gyro_fit) if not rotation else []
+        agrees, measured = gyro_fit.unexplained < AGREES, False
+        if size.unit is not None and agrees and all(f.fault == "gyro units" for f in rotation):
+            forces, measured = judge_force(evidence, size.unit)
+            found += forces
+        self.imu_at_fault |= any(f.certain and f.fault != "camera stamps" for f in found)
+        self.imu_at_fault |= agrees and not gyro_fit.fits(evidence.R_cam0_imu)  # whatever turns out to be the cause
+        enough = gyro_fit.count >= _ENOUGH and gyro_fit.axes == 3 and (measured or size.unit is None or bool(rotation))
+        if not found and (last or enough) and agrees and measured:
+            found = judge_lever_arm(record, gyro_fit, self._T, rates)
+            if not last:
+                self._suspected |= {f.fault for f in found}  # at this stage, one evaluation suffices
+        self._done = enough and all(f.fault in self._suspected for f in found)
+        return found
+
+    def _compare_first_turns(self) -> None:
+        """Find before the first evaluation that the turns agree, for which the filter waits; to differ takes more."""
+        times_ns, values = self._samples.table()
+        motion = self._motion.joined()
+        if len(times_ns) < 2 or motion is None:
+            return
+        self.imu_at_fault = judge_size(times_ns, values[:, 3:]).finding is not None
+        record = record_of(motion, times_ns, values)
+        gyro_fit = fit_gyro(record, _LEAST_AT_END)
+        turns = None if gyro_fit is None else compare_turns(record, gyro_fit, self._T[:3, :3])
+        if turns is not None and np.isfinite(turns.sigma) and turns.agree:
+            self.turns = turns
+
+    def _compare_turns(self, record: Record, gyro_fit: GyroFit) -> list[InertialFinding]:
+        """Compare the camera's turns with the gyro's until the filter has been told that the focal length is off."""
+        known = self.turns
+        if known is not None and known.differ and known.gyro_agrees:
+            return []
+        self.turns = compare_turns(record, gyro_fit, self._T[:3, :3])
+        return judge_turns(self.turns, self._stereo)
+
+    def _unreported(self, found: Sequence[InertialFinding]) -> tuple[InertialFinding, ...]:
+        """Return the findings of groups that were not reported before."""
+        out = []
+        for finding in found:
+            if finding.group not in self._reported:
+                self._reported.add(finding.group)
+                out.append(finding)
+        return tuple(out)

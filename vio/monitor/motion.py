@@ -1,0 +1,147 @@
+"""The left camera's twists from frame to frame, in batches, and the IMU's readings on the same clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.calibration.egomotion import stereo_twists
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.monitor.samples import GAP_S, MEMORY_S
+from vio.numerics.robust import median
+from vio.records import BoolArray, IntArray, Observations, feature_tracks
+
+BATCH = 20  # frames whose motion is computed at once
+_TRACKS = 80  # tracks of a frame that the camera's motion is computed from
+_LEAST_LINKS = 15  # tracks between two frames
+_LONGEST_INTERVAL_S = 0.25
+_SAME_S = 1e-6  # intervals whose end and start differ by less are contiguous
+_NS = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Intervals:
+    """Frame intervals whose camera motion is known, in time order."""
+
+    begin_ns: IntArray  # (K,)
+    end_ns: IntArray  # (K,)
+    twists: FloatArray  # (K, 6) [v; omega] of cam0, cam0 frame, m/s and rad/s
+
+    def __len__(self) -> int:
+        return len(self.begin_ns)
+
+
+class CameraTwists:
+    """Compute the left camera's twists from frame to frame, from a subset of the tracks, in batches."""
+
+    def __init__(self, camera: StereoCamera) -> None:
+        self._camera = camera
+        self._kept: list[Observations] = []
+        self._guess: list[FloatArray] = []
+        self._links: list[int] = []
+
+    def frame(self, seen: Observations) -> Intervals | None:
+        """Add one frame; every `BATCH` frames, return the motions since the last batch."""
+        rows = np.flatnonzero(seen.has_right & ~seen.stale)
+        if len(rows) > _TRACKS:
+            # The same random choice of ids in every frame, so that tracks continue.
+            hashed = (seen.ids[rows] * np.int64(2654435761)) & np.int64(0xFFFFFFFF)
+            rows = np.sort(rows[np.argpartition(hashed, _TRACKS)[:_TRACKS]])
+        kept = seen.take(rows)
+        if self._kept:
+            last = self._kept[-1]
+            _, a, b = np.intersect1d(last.ids, kept.ids, assume_unique=True, return_indices=True)
+            self._links.append(len(a))
+            self._guess.append(self._initial_rotation(last, kept, kept.z[b, :2] - last.z[a, :2]))
+        self._kept.append(kept)
+        return self.flush() if len(self._kept) > BATCH else None
+
+    def _initial_rotation(self, last: Observations, kept: Observations, flow: FloatArray) -> FloatArray:
+        """Return the initial twist of a pure rotation: flow du = -fu wy dt, dv = fv wx dt."""
+        out = np.zeros(6)
+        dt = (kept.time_ns - last.time_ns) * _NS
+        if len(flow) and dt > 0:
+            du, dv = median(flow[:, 0]), median(flow[:, 1])
+            out[3], out[4] = dv / self._camera.fv / dt, -du / self._camera.fu / dt
+        return out
+
+    def flush(self) -> Intervals | None:
+        """Return the motions since the last batch; None: there are none."""
+        if len(self._kept) < 2:
+            return None
+        kept, links = self._kept, np.array(self._links)
+        tracks = feature_tracks(dict(enumerate(kept)), len(kept))
+        times_ns = np.array([o.time_ns for o in kept], dtype=np.int64)
+        found = stereo_twists(self._camera, tracks, times_ns, np.array(self._guess))
+        good = (links[found.frames] >= _LEAST_LINKS) & (np.diff(times_ns)[found.frames] * _NS < _LONGEST_INTERVAL_S)
+        frames = found.frames[good]
+        self._kept, self._guess, self._links = kept[-1:], [], []
+        return Intervals(times_ns[frames], times_ns[frames + 1], found.twists[good])
+
+
+class RecentMotion:
+    """The intervals of the last minute."""
+
+    def __init__(self) -> None:
+        self._parts: list[Intervals] = []
+
+    def add(self, motion: Intervals) -> None:
+        """Add the next intervals, and drop old ones."""
+        if not len(motion):
+            return
+        self._parts.append(motion)
+        while motion.end_ns[-1] - self._parts[0].end_ns[-1] > MEMORY_S / _NS:
+            del self._parts[0]
+
+    def joined(self) -> Intervals | None:
+        """Return all intervals; None: there are none."""
+        if not self._parts:
+            return None
+        return Intervals(
+            np.concatenate([i.begin_ns for i in self._parts]),
+            np.concatenate([i.end_ns for i in self._parts]),
+            np.concatenate([i.twists for i in self._parts]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Intervals and samples on one clock of seconds, with the running integrals of the readings."""
+
+    t: FloatArray  # (S,)
+    integral: FloatArray  # (S, 6) of [gyro; accel] over time
+    begin: FloatArray  # (K,)
+    end: FloatArray  # (K,)
+    twists: FloatArray  # (K, 6)
+    origin_ns: int
+
+    @property
+    def joined(self) -> BoolArray:
+        """Whether each interval (K,) starts where the previous one ends."""
+        return np.concatenate([[False], np.abs(self.begin[1:] - self.end[:-1]) < _SAME_S])
+
+    def means(self, offsets: npt.NDArray[np.floating]) -> tuple[FloatArray, BoolArray]:
+        """Return mean readings (M, K, 6) over the intervals shifted by offsets (M,), and a mask (M, K) of coverage."""
+        edges = [edge[None, :] + offsets[:, None] for edge in (self.begin, self.end)]
+        low, high = (
+            np.stack([np.interp(at.ravel(), self.t, self.integral[:, k]).reshape(at.shape) for k in range(6)], axis=-1)
+            for at in edges
+        )
+        covered = (edges[0] >= self.t[0]) & (edges[1] <= self.t[-1])
+        for k in np.flatnonzero(np.diff(self.t) > GAP_S):
+            covered &= (edges[1] <= self.t[k]) | (edges[0] >= self.t[k + 1])
+        return (high - low) / (self.end - self.begin)[None, :, None], covered
+
+
+def record_of(intervals: Intervals, times_ns: IntArray, values: FloatArray) -> Record:
+    """Convert intervals and readings (S, 6) [gyro; accel] at times (S,) to one clock."""
+    origin = int(intervals.begin_ns[0])
+    t, begin, end = (
+        np.asarray((x - origin) * _NS, dtype=np.float64) for x in (times_ns, intervals.begin_ns, intervals.end_ns)
+    )
+    steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2
+    integral = np.concatenate([np.zeros((1, 6)), np.cumsum(steps, axis=0)])
+    return Record(t, integral, begin, end, intervals.twists, origin)

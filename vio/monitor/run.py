@@ -1,0 +1,225 @@
+"""All monitors of a run in one: plausibility of the estimate and, with raw IMU data, of the readings."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
+from vio.monitor.health import RunHealth
+from vio.monitor.imu_faults import ImuFaultReport
+from vio.monitor.silence import ImuSilence
+from vio.records import (
+    Estimate,
+    ImuSample,
+    MotionSample,
+    Observations,
+    Prediction,
+    StereoFrame,
+    TurnComparison,
+    UpdateReport,
+)
+
+if TYPE_CHECKING:
+    from vio.imu.findings import InertialFinding
+    from vio.monitor.inertial import InertialCheck
+
+log = logging.getLogger(__name__)
+
+_PREVENTS_START = ("size", "overlap")  # groups of faults without whose cure one camera finds no scale
+
+
+class RunWatch:
+    """Monitor all events of a run in time order; log warnings, and keep them in `lines`."""
+
+    def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, *, imu: bool) -> None:
+        """Create the monitors.
+
+        Args:
+            camera: rectified pair.
+            T_cam0_body: (4, 4) as the run uses it.
+            imu: whether the run propagates with raw IMU samples.
+        """
+        self._health = RunHealth()
+        self._baseline_fault = camera.baseline_fault
+        self._inertial: InertialCheck | None = None
+        self._silence = ImuSilence() if imu else None
+        self._faults = ImuFaultReport() if imu else None
+        self._frozen, self._repeats, self._depths = FrozenImages(), RepeatReport(IMAGES), RepeatReport(DEPTHS)
+        self._repeated = False  # the present frame shows an earlier exposure
+        if imu:
+            from vio.monitor.inertial import InertialCheck  # it loads scipy.optimize
+
+            self._inertial = InertialCheck(camera, T_cam0_body)
+        self._new: list[ImuSample] = []  # since the last frame
+        self._frames = self._features = 0
+        self._index, self._index_before = -1, -1  # of the present frame, and of the one before it
+        self._refused_last = -2
+        self.frames_refused = 0
+        self.frames_waiting = 0  # that have no pose, as the back end had not begun
+        self._waiting_since: int | None = None
+        self._waits_for = ""
+        self._imu_at_fault = False
+        self.lines: list[str] = []
+
+    def sample(self, sample: MotionSample) -> None:
+        """Add one motion sample; it is judged with all others before the next frame."""
+        if self._silence is not None and isinstance(sample, ImuSample):
+            self._new.append(sample)
+
+    def _take_new(self) -> None:
+        """Judge the samples since the last frame."""
+        new, self._new = self._new, []
+        if self._silence is None or not new:
+            return
+        taken = 0
+        for k, sample in enumerate(new):
+            gap = self._silence.sample(sample.time_ns)
+            if gap:  # what is to be said of earlier samples comes first
+                self._check(new[taken:k])
+                self._report(gap)
+                taken = k
+        self._check(new[taken:])
+
+    def _check(self, samples: list[ImuSample]) -> None:
+        """Report faulty samples, and hand the others on."""
+        if self._faults is None or self._inertial is None:
+            return
+        usable, lines = self._faults.samples(samples)
+        self._report(lines)
+        for x in usable:
+            self._inertial.imu(x)
+            self._frozen.sample(x)
+
+    def repeats(self, frame: StereoFrame, expected: Prediction | None) -> bool:
+        """Return whether a frame shows an earlier exposure again and must not be used; called before `observations`.
+
+        Args:
+            frame: in time order.
+            expected: the back end's prediction of it.
+        """
+        self._index, self._index_before = frame.index, self._index
+        self._take_new()
+        repeated = self._frozen.check(frame, expected)
+        self._repeated = repeated is not None
+        self._report(self._repeats.frame(frame, repeated))
+        return self._repeated
+
+    def without_repeated_depth(self, frame: StereoFrame) -> StereoFrame:
+        """Return a frame that `repeats` let pass, without its depths where they are those of an earlier frame."""
+        if frame.depth is None:
+            return frame
+        repeated = self._frozen.check_depth(frame)
+        self._report(self._depths.frame(frame, repeated))
+        return frame if repeated is None else replace(frame, depth=np.zeros_like(frame.depth))
+
+    def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
+        """Add the front end's observations, before feature selection, and what it says of the images."""
+        self._take_new()
+        if self._baseline_fault is not None and not self._frames:
+            self._report([f"{self._baseline_fault}, or the path has another unit"])
+        self._report(warnings)
+        self._frames += 1
+        self._features += len(seen)
+        if self._silence is not None:
+            self._report(self._silence.frame(seen.frame_index, seen.time_ns))
+        if self._faults is not None:
+            self._faults.frame(seen.frame_index)
+        if self._repeated:
+            return
+        self._frozen.observations(seen)
+        if self._inertial is not None:
+            self._report_findings(self._inertial.frame(seen))
+
+    @property
+    def turns(self) -> TurnComparison | None:
+        """How the camera's turns compare with the gyro's so far; None: not compared yet, or no IMU.
+
+        While the IMU looks faulty, turns that agree count as not compared: the filter, which waits for them to judge
+        the baseline by the IMU, then takes no wrong unit or axis for a wrong baseline.
+        """
+        check = self._inertial
+        if check is None or check.turns is None:
+            return None
+        return None if check.imu_at_fault and check.turns.agree else check.turns
+
+    def refused(self, index: int, reason: str) -> None:
+        """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
+        if self._refused_last != self._index_before:
+            self._report([f"frame skipped: {reason}"])
+        self._refused_last = index
+        self.frames_refused += 1
+
+    def waiting(self, frame: StereoFrame, why: str) -> None:
+        """Add a frame without a pose, as the back end's start is not observable yet; `why` is said at the end."""
+        self._waits_for = why
+        if self._waiting_since is None:
+            self._waiting_since = frame.time_ns
+        self.frames_waiting += 1
+
+    def begun(self, frame: StereoFrame, scale_sigma: float | None) -> None:
+        """Add a frame with a pose of a back end that may have waited: the first one says how it began."""
+        since, self._waiting_since = self._waiting_since, None
+        if since is None:
+            return
+        how = (
+            "at standstill"
+            if scale_sigma is None
+            else f"in motion, its scale known to {100 * scale_sigma:.1f} % by the IMU"
+        )
+        self._report(
+            [
+                f"frame {frame.index}: one camera: the trajectory begins here, {how}; the frames of "
+                f"{(frame.time_ns - since) * 1e-9:.1f} s before have no pose"
+            ]
+        )
+
+    def lost(self, index: int, why: str) -> None:
+        """Report that the back end diverged in a frame and has no estimate until its start is observable again."""
+        self._report([f"frame {index}: {why}; there are no poses until the scale is observable again"])
+
+    def restarted(self, index: int, why: str, estimate: Estimate) -> None:
+        """Report that the back end diverged in a frame and was started again; repeats within a second are one event."""
+        self._report(self._health.restarted(index, why, estimate))
+
+    def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
+        """Add the back end's report and estimate of a frame."""
+        self._report(self._health.frame(index, report, estimate))
+
+    def close(self) -> None:
+        """Finish at the end of the run, also of a failed one."""
+        self._take_new()
+        if self._frames and not self._features:
+            self._report(
+                [f"no feature in any of {self._frames} frames: the trajectory contains no information on the motion"]
+            )
+        self._report([*self._repeats.finish(), *self._depths.finish()])
+        if self._silence is not None:
+            self._report(self._silence.finish())
+        if self._faults is not None:
+            self._report(self._faults.finish())
+        if self._inertial is not None:
+            findings = self._inertial.finish()
+            if self._faults is not None and self._faults.stuck_at_end:  # which is no matter of clocks
+                findings = tuple(f for f in findings if f.group != "overlap")
+            self._report_findings(findings)
+        if self._waiting_since is not None:
+            why = "mend the fault of the IMU that is named above first" if self._imu_at_fault else self._waits_for
+            self._report([f"one camera: {self.frames_waiting} frames have no pose; {why}"])
+
+    def _report_findings(self, findings: Iterable[InertialFinding]) -> None:
+        """Log findings; gaps are reported one by one by `ImuSilence`."""
+        findings = tuple(findings)
+        self._imu_at_fault |= any(f.certain and f.group in _PREVENTS_START for f in findings)
+        self._report(finding.message for finding in findings if finding.fault != "IMU gap")
+
+    def _report(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            log.warning("%s", line)
+            self.lines.append(line)

@@ -1,0 +1,183 @@
+"""The IMU's readings of the last minute, and the faults that they show by themselves: gaps, clipping, magnitude."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.imu.findings import InertialFinding
+from vio.numerics.robust import robust_sigma
+from vio.records import BoolArray, ImuSample, IntArray
+
+GAP_S = 0.1  # readings further apart are a gap …
+GAP_STEPS = 8.0  # … if that is so many times their usual interval
+MEMORY_S = 60.0  # older readings and motions are dropped
+
+_LEAST_RUN = 5  # equal readings at the extreme in a row
+_LEAST_CHANCE = 1e-8  # probability of such a run by quantisation alone
+_LEAST_LEVELS = 20  # different readings on the axis
+
+_SMOOTH_S = 0.2  # readings are averaged over this time before their magnitude is judged
+_LEAST_SIZE_S = 1.0
+_GRAVITY = 9.80665
+_NS = 1e-9
+
+
+class Samples:
+    """The IMU's readings of the last minute."""
+
+    def __init__(self) -> None:
+        self._new: list[ImuSample] = []
+        self._times: list[IntArray] = []
+        self._values: list[FloatArray] = []
+        self._first_ns: int | None = None
+        self.last_ns: int | None = None
+        self._step_s: float | None = None
+
+    @property
+    def span_ns(self) -> tuple[int, int] | None:
+        """Stamps of the first and the last reading ever added; None: there are none."""
+        return None if self._first_ns is None or self.last_ns is None else (self._first_ns, self.last_ns)
+
+    @property
+    def step_s(self) -> float:
+        """The usual time between two readings; 0.0 before there are two."""
+        if self._step_s is None and len(self._new) > 1:
+            self._step_s = float(np.median(np.diff([s.time_ns for s in self._new]))) * _NS
+        return self._step_s or 0.0
+
+    def add(self, sample: ImuSample) -> None:
+        """Add one reading."""
+        if self.last_ns is not None and sample.time_ns <= self.last_ns:
+            return  # readers reject decreasing stamps; a repeated reading adds no information
+        self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
+        self.last_ns = sample.time_ns
+        self._new.append(sample)
+
+    def check_new(self, *, keep: bool) -> list[InertialFinding]:
+        """Check the readings since the last call for gaps and clipping, and keep or drop them."""
+        if len(self._new) < 2:
+            return []
+        times = np.array([s.time_ns for s in self._new], dtype=np.int64)
+        values = np.array([[*s.gyro, *s.accel] for s in self._new])
+        before = self._times[-1][-1:] if self._times else times[:0]
+        steps = np.diff(np.concatenate([before, times])) * _NS
+        found = [*_gap(times, steps, self.step_s), *_saturation(times, values)]
+        if keep:
+            self._times.append(times)
+            self._values.append(values)
+            while self._times[-1][-1] - self._times[0][-1] > MEMORY_S / _NS:
+                del self._times[0], self._values[0]
+        else:
+            self._times, self._values = [times[-1:]], [values[-1:]]
+        self._new = []
+        return found
+
+    def table(self) -> tuple[IntArray, FloatArray]:
+        """Return times (S,) and readings (S, 6) [gyro; accel]."""
+        if not self._times:
+            return np.zeros(0, dtype=np.int64), np.zeros((0, 6))
+        return np.concatenate(self._times), np.concatenate(self._values)
+
+
+def _gap(times_ns: IntArray, steps: FloatArray, usual_s: float) -> Iterator[InertialFinding]:
+    """Yield the longest gap before readings at times (S,), if any; steps (S or S - 1,) in seconds end there."""
+    if not len(steps) or steps.max() <= max(GAP_S, GAP_STEPS * usual_s):
+        return
+    k = len(times_ns) - len(steps) + int(np.argmax(steps))
+    yield InertialFinding(
+        "IMU gap",
+        f"no sample for {steps.max():.3f} s before {times_ns[k]} ns (samples are {1e3 * usual_s:.1f} ms apart)",
+        "samples were lost; the motion in between is interpolated from the samples on both sides",
+    )
+
+
+def _saturation(times_ns: IntArray, values: FloatArray) -> Iterator[InertialFinding]:
+    """Yield runs of equal readings at the extreme of an axis that quantisation or held samples do not explain."""
+    if len(values) < 4 * _LEAST_RUN:
+        return
+    equal = values[1:] == values[:-1]
+    for axis in range(6):
+        for extreme in (values[:, axis].max(), values[:, axis].min()):
+            at = values[:, axis] == extreme
+            if at.sum() < _LEAST_RUN or at.all():
+                continue
+            # Equal neighbours elsewhere are due to chance: a run of n has the probability held^(n-1).
+            held = float(np.mean(equal[~(at[1:] & at[:-1]), axis]))
+            chance = np.log(_LEAST_CHANCE) / np.log(held) if held > 0 else 0.0
+            run = _longest_run(at)
+            if run < max(_LEAST_RUN, 1 + chance) or len(np.unique(values[:, axis])) < _LEAST_LEVELS:
+                continue
+            name, unit = ("gyro", "rad/s") if axis < 3 else ("accelerometer", "m/s^2")
+            yield InertialFinding(
+                "saturation",
+                f"{int(at.sum())} samples of the {name}'s {'xyz'[axis % 3]} axis are at {extreme:.4g} {unit}, {run} "
+                f"in a row, near {times_ns[int(np.argmax(at))]} ns",
+                "the motion exceeds the sensor's range; choose a larger range, and expect drift there",
+            )
+            return
+
+
+def _longest_run(mask: BoolArray) -> int:
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
+    return int((edges[1::2] - edges[::2]).max()) if len(edges) else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Magnitude of the accelerometer's mean readings, and the implied unit."""
+
+    finding: InertialFinding | None
+    unit: float | None  # factor that makes the readings m/s^2; None: unknown, since gravity was removed
+    clear: bool = True  # False: biased readings without gravity can have this magnitude, too
+
+
+def judge_size(times_ns: IntArray, accel: FloatArray) -> Size:
+    """Judge the accelerometer's unit by the magnitude of its mean readings (S, 3) at times (S,)."""
+    t = np.asarray((times_ns - times_ns[0]) * _NS, dtype=np.float64)
+    if t[-1] < _LEAST_SIZE_S:
+        return Size(None, 1.0)
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(np.diff(t)[:, None] * (accel[1:] + accel[:-1]) / 2, axis=0)])
+    edges = np.arange(0.0, t[-1], _SMOOTH_S)
+    mean = np.diff(np.stack([np.interp(edges, t, integral[:, k]) for k in range(3)], axis=1), axis=0) / _SMOOTH_S
+    size = np.linalg.norm(mean, axis=1)
+    median = float(np.median(size))
+    return _judge_median(median, robust_sigma(size - median) / max(median, 1e-300))
+
+
+def _judge_median(median: float, spread: float) -> Size:
+    """Judge a median magnitude and its relative spread."""
+    if 0.5 < median / _GRAVITY < 2.5:
+        return Size(None, 1.0)
+    seen = f"the accelerometer's median magnitude is {median:.4g} where gravity alone gives 9.8 m/s^2"
+    units = {
+        1.0: "in g: multiply by 9.81",
+        1000.0: "in mg (multiply by 0.00981) or in cm/s^2 (divide by 100)",
+        9807.0: "in mm/s^2: divide by 1000",
+    }
+    for gravity, explanation in units.items():
+        if 0.6 < median / gravity < 1.6 and spread < 0.3:
+            finding = InertialFinding("accelerometer units", seen, f"the readings are {explanation}")
+            clear = gravity > 1.0 or (abs(median - 1.0) < 0.1 and spread < 0.06)
+            return Size(finding, _GRAVITY / gravity, clear)
+    if median < 0.5 * _GRAVITY and (spread >= 0.3 or median < 0.5):
+        return Size(gravity_removed(f"{seen}, and it varies by {100 * spread:.0f} %"), None)
+    finding = InertialFinding(
+        "accelerometer units",
+        f"{seen} (spread {100 * spread:.0f} %)",
+        f"the unit or scale is unknown; a factor of {_GRAVITY / median:.4g} would make it 9.8",
+    )
+    return Size(finding, _GRAVITY / median, median > 0.5 * _GRAVITY)
+
+
+def gravity_removed(seen: str) -> InertialFinding:
+    """Return the finding that readings lack gravity, given the observation."""
+    return InertialFinding(
+        "gravity removed",
+        seen,
+        "gravity has been taken out ('linear acceleration'), or the sensor is dead; a filter needs the raw specific "
+        "force (+9.8 m/s^2 upwards at standstill)",
+    )

@@ -1,0 +1,67 @@
+"""The camera's turns about the axes of its image against the gyro's: they differ where the focal length is off."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.imu.findings import InertialFinding
+from vio.monitor.gyro_fit import AGREES, GyroFit
+from vio.monitor.motion import Record
+from vio.records import TURNS_NOT_SHOWN, TurnComparison
+
+_BLOCKS = 10  # of the record, for the jackknife
+_IMAGE, _OPTICAL = [0, 1], [2]  # the camera's axes
+
+
+def compare_turns(record: Record, fit: GyroFit, R_cam0_imu: FloatArray) -> TurnComparison:
+    """Compare the rates of camera and gyro about the axes of the image, and about the optical axis; equation (I5).
+
+    Args:
+        record: the camera's motions.
+        fit: the gyro's rates at the best clock offset.
+        R_cam0_imu: (3, 3) as given.
+    """
+    used = fit.covered
+    if fit.unexplained > AGREES or not fit.fits(R_cam0_imu) or not used.any():
+        return TURNS_NOT_SHOWN
+    camera, gyro = record.twists[used, 3:], fit.gyro[used] @ R_cam0_imu.T
+    (image, sigma), (optical, optical_sigma) = (
+        _factor(camera[:, axes], gyro[:, axes], fit.weight[used]) for axes in (_IMAGE, _OPTICAL)
+    )
+    excess = image - 1
+    agrees = abs(optical - 1) < abs(excess) / 2 and optical_sigma < abs(excess) / 4
+    return TurnComparison(excess, sigma, agrees)
+
+
+def _factor(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[float, float]:
+    """Return the factor from the gyro's rates (K, n) to the camera's, and its standard deviation by a jackknife."""
+    blocks = np.arange(len(weight)) * _BLOCKS // len(weight)
+    weights = np.concatenate([weight[None], weight * (blocks != np.arange(_BLOCKS)[:, None])])  # all, and all but one
+    total = np.maximum(weights.sum(axis=1), 1e-12)
+    mean_c, mean_g = (weights @ x / total[:, None] for x in (camera, gyro))
+    products = weights @ np.sum(camera * gyro, axis=1) - total * np.sum(mean_c * mean_g, axis=1)
+    squares = weights @ np.sum(gyro**2, axis=1) - total * np.sum(mean_g**2, axis=1)
+    if squares.min() <= 0:
+        return 1.0, np.inf
+    factors = products / squares
+    spread = float(np.sum((factors[1:] - factors[1:].mean()) ** 2))
+    return float(factors[0]), float(np.sqrt((_BLOCKS - 1) / _BLOCKS * spread))
+
+
+def judge_turns(compared: TurnComparison, camera: StereoCamera) -> list[InertialFinding]:
+    """Report turns that differ where the gyro's scale may be the cause, or the filter cannot find the focal length."""
+    if not compared.differ or (compared.gyro_agrees and not camera.is_cylinder):
+        return []
+    estimate = "" if camera.is_cylinder else ", or have the focal length estimated (msckf.stereo_focal_sigma: 0.05)"
+    return [
+        InertialFinding(
+            "camera turns",
+            f"about the axes of the image the camera turns {100 * abs(compared.excess):.1f} ± "
+            f"{100 * compared.sigma:.1f} % {'more' if compared.excess > 0 else 'less'} than the gyro says",
+            f"the focal length or the lens is not as calibrated, or the gyro's scale is off; calibrate the cameras anew"
+            f"{estimate}",
+            certain=False,
+        )
+    ]

@@ -1,0 +1,131 @@
+"""Single stereo pairs: SIFT matches, relative pose by RANSAC, and bundle adjustment of the rig over all pairs."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from vio.calibration.stereo import RayMatches
+from vio.geometry.lie import FloatArray
+from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
+from vio.offline.colmap.model import (
+    LEFT,
+    RIGHT,
+    add_frame,
+    frame_id,
+    image_id,
+    matrix,
+    numbered,
+    pinhole,
+    rig_geometry,
+    rig_model,
+    without_scale,
+)
+from vio.offline.colmap.solver import adjustment_config, solve, solver_options
+from vio.records import BoolArray, Image
+
+_RATIO = 0.8  # of the distances to the best and the second best descriptor
+_VIRTUAL_PX = 500.0  # focal length of the camera that projects rays to pixels
+_VIRTUAL_SIZE = (1000, 1000)  # required by COLMAP; without effect
+_VIRTUAL_PARAMS = (_VIRTUAL_PX, _VIRTUAL_PX, 0.0, 0.0)
+_ESSENTIAL_PX = 1.0
+
+
+def sift_matches(left: Image, right: Image, *, threads: int = 1) -> tuple[FloatArray, FloatArray]:
+    """Return pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), including outliers."""
+    options = pycolmap.FeatureExtractionOptions(num_threads=threads)
+    options.sift.max_num_features = SIFT_FEATURES
+    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
+    (keys0, features0), (keys1, features1) = (_features(extractor, image) for image in (left, right))
+    if len(keys0) < 2 or len(keys1) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    similarity = features0 @ features1.T
+    norm0, norm1 = np.sum(features0**2, axis=1), np.sum(features1**2, axis=1)
+    distance = norm0[:, None] + norm1[None, :] - 2 * similarity
+    best1, best0 = np.argmin(distance, axis=1), np.argmin(distance, axis=0)
+    two = np.partition(distance, 1, axis=1)[:, :2]
+    good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _RATIO**2 * two[:, 1])
+    uv0, uv1 = (keys - HALF_PX for keys in (keys0, keys1))
+    return uv0[good], uv1[best1[good]]
+
+
+def _features(extractor: pycolmap.FeatureExtractor, image: Image) -> tuple[FloatArray, npt.NDArray[np.float32]]:
+    """Return COLMAP's pixels (N, 2) of an image's features, and their descriptors (N, 128)."""
+    keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(image))
+    if not len(keypoints):
+        return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
+    matrix = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float64)
+    return matrix[:, :2], np.asarray(descriptors.data, dtype=np.float32)
+
+
+def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:
+    """Estimate `R_cam1_cam0` (3, 3) and the unit direction (3,) of cam1 in cam0, by RANSAC over all matches.
+
+    None: no consensus.
+    """
+    pixels = _virtual_pixels(matches)
+    camera = pinhole(LEFT, _VIRTUAL_SIZE, _VIRTUAL_PARAMS)
+    options = pycolmap.RANSACOptions(
+        max_error=_ESSENTIAL_PX, random_seed=SEED, min_num_trials=200, max_num_trials=2000, num_threads=1
+    )
+    found = pycolmap.estimate_essential_matrix(*pixels, camera, camera, options)
+    if found is None:
+        return None
+    return without_scale(matrix(found["cam2_from_cam1"]))
+
+
+def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Bundle-adjust the pose of cam1 in a rig over the matches (inliers) of all pairs; same form as the input.
+
+    Each pair is a frame of one rig with its own points. Only the rig's extrinsics and the points are free; the result
+    is without scale, which two cameras do not determine.
+
+    Raises:
+        EstimationError: the solver failed.
+    """
+    rig = pycolmap.Rigid3d(pycolmap.Rotation3d(R_cam1_cam0), -R_cam1_cam0 @ direction)
+    model = rig_model(_VIRTUAL_SIZE, _VIRTUAL_PARAMS, rig)
+    points, valid = _two_view_points(matches, R_cam1_cam0, direction)
+    matches, points = matches.take(valid), points[valid]
+    names, pair = np.unique(matches.pair, return_inverse=True)
+    left, right = _virtual_pixels(matches)
+    order = np.argsort(pair, kind="stable")
+    for k in range(len(names)):
+        rows = order[pair[order] == k]
+        add_frame(model, k, np.eye(4), numbered(len(names)), left[rows] - HALF_PX, right[rows] - HALF_PX)
+        for at, row in enumerate(rows.tolist()):
+            track = pycolmap.Track(
+                [pycolmap.TrackElement(image_id(k, LEFT), at), pycolmap.TrackElement(image_id(k, RIGHT), at)]
+            )
+            model.add_point3D(points[row], track, np.zeros(3, dtype=np.uint8))
+    config = adjustment_config(model)
+    for k in range(len(names)):
+        config.set_constant_rig_from_world_pose(frame_id(k))
+    options = solver_options(0.5, 1)
+    options.refine_sensor_from_rig = True
+    options.refine_rig_from_world = False
+    solve(pycolmap.create_default_bundle_adjuster(options, config, model))
+    return rig_geometry(model)
+
+
+def _virtual_pixels(matches: RayMatches) -> tuple[FloatArray, FloatArray]:
+    """Return COLMAP's pixels (N, 2) of the rays of both cameras in pinhole cameras without distortion."""
+    left, right = (_VIRTUAL_PX * ray[:, :2] / ray[:, 2:] for ray in (matches.ray0, matches.ray1))
+    return left, right
+
+
+def _two_view_points(
+    matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return points (N, 3) in cam0, in units of the baseline, nearest to both rays, and a mask of those ahead."""
+    a, b = matches.ray0, matches.ray1 @ R_cam1_cam0
+    cosine = np.sum(a * b, axis=1)
+    along_a, along_b = a @ direction, b @ direction
+    sine2 = 1 - cosine**2
+    valid = sine2 > 1e-6
+    safe = np.where(valid, sine2, 1.0)
+    s, t = (along_a - cosine * along_b) / safe, (cosine * along_a - along_b) / safe
+    valid &= (s > 0.5) & (t > 0.5)
+    points = (s[:, None] * a + direction + t[:, None] * b) / 2
+    return points, valid

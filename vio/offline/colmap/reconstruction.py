@@ -1,0 +1,184 @@
+"""Reconstruction of keyframes from their images alone, by COLMAP's features, matches and mappers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+import pycolmap
+
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.stereo import StereoCamera
+from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
+from vio.offline.colmap.model import ModelImages, matrix, mean_reprojection_error_px, rectified_rig
+from vio.records import IntArray
+
+Mapper: TypeAlias = Literal["incremental", "global"]
+_NEXT = (1, 2, 3, 5, 8, 16)  # index offsets of later keyframes that left images are matched with
+_CROSS_NEXT = (1,)  # likewise between right images and later left ones
+_AROUND_LOOP = (-1, 0, 1)  # index offsets from both keyframes of a loop, whose left images are matched with one another
+_LEAST_REGISTERED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Reconstructed:
+    """A reconstruction by COLMAP."""
+
+    mapper: Mapper
+    T_world_cam0: FloatArray  # (R, 4, 4) of the registered keyframes, in COLMAP's world frame, metric by the rig
+    keyframes: IntArray  # (R,) their indices, increasing
+    points: int
+    mean_reprojection_error_px: float
+    shared: IntArray  # (L,) points that both left images of each loop show
+
+
+def match_images(
+    database: Path, images: Path, names: ModelImages, camera: StereoCamera, loops: IntArray, *, threads: int = 1
+) -> None:
+    """Find SIFT features in image files and match them within and between keyframes, into a new COLMAP database.
+
+    Args:
+        database: the file to create.
+        images: folder that the names are relative to; left images must be in one folder, right ones in another.
+        names: the keyframes' images.
+        camera: the rectified pair, intrinsics and baseline of the rig.
+        loops: (L, 2) keyframes that show one place, which are matched as well, and those next to them.
+        threads: for all steps; one makes the result repeatable.
+    """
+    pycolmap.set_random_seed(SEED)
+    reader = pycolmap.ImageReaderOptions(
+        camera_model="PINHOLE",
+        camera_params=f"{camera.fu!r},{camera.fv!r},{camera.cu + HALF_PX!r},{camera.cv + HALF_PX!r}",
+    )
+    extraction = pycolmap.FeatureExtractionOptions(num_threads=threads)
+    extraction.sift.max_num_features = SIFT_FEATURES
+    pycolmap.extract_features(
+        database,
+        images,
+        image_names=[*names.left, *names.right],
+        camera_mode=pycolmap.CameraMode.PER_FOLDER,
+        reader_options=reader,
+        extraction_options=extraction,
+        device=pycolmap.Device.cpu,
+    )
+    left, right = (f"{Path(side[0]).parent.as_posix()}/" for side in (names.left, names.right))
+    rig = pycolmap.RigConfig(
+        cameras=[
+            pycolmap.RigConfigCamera(ref_sensor=True, image_prefix=left),
+            pycolmap.RigConfigCamera(image_prefix=right, cam_from_rig=rectified_rig(camera)),
+        ]
+    )
+    with pycolmap.Database.open(database) as opened:
+        pycolmap.apply_rig_config([rig], opened)
+    pairs = database.with_name("pairs.txt")
+    pairs.write_text("".join(f"{a} {b}\n" for a, b in pairs_to_match(names, loops)), encoding="utf-8")
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    verification.ransac.max_error = 2.0
+    pycolmap.match_image_pairs(
+        database,
+        matching_options=pycolmap.FeatureMatchingOptions(num_threads=threads),
+        pairing_options=pycolmap.ImportedPairingOptions(match_list_path=pairs),
+        verification_options=verification,
+        device=pycolmap.Device.cpu,
+    )
+    pairs.unlink()
+
+
+def pairs_to_match(names: ModelImages, loops: IntArray) -> list[tuple[str, str]]:
+    """Return the pairs of image files to match, each once."""
+    count = len(names.left)
+    out = list(zip(names.left, names.right, strict=True))
+    out += [(names.left[k], names.left[k + step]) for step in _NEXT for k in range(count - step)]
+    out += [(names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)]
+    around = {(a + i, b + j) for a, b in loops.tolist() for i in _AROUND_LOOP for j in _AROUND_LOOP}
+    out += [(names.left[a], names.left[b]) for a, b in sorted(around) if 0 <= a < b < count]
+    return list(dict.fromkeys(out))
+
+
+def reconstruct(
+    database: Path,
+    images: Path,
+    names: ModelImages,
+    mapper: Mapper,
+    out: Path,
+    loops: IntArray,
+    *,
+    threads: int = 1,
+) -> Reconstructed | None:
+    """Reconstruct keyframes from a database of matches, with fixed rig and intrinsics; None: not successful.
+
+    Args:
+        database: made by `match_images`; not modified.
+        images: folder that the names are relative to.
+        names: the keyframes' images.
+        mapper: COLMAP's incremental or global mapper.
+        out: folder for the model, created if missing.
+        loops: (L, 2) keyframes that show one place.
+        threads: for all steps.
+    """
+    pycolmap.set_random_seed(SEED)
+    out.mkdir(parents=True, exist_ok=True)
+    if mapper == "incremental":
+        models = pycolmap.incremental_mapping(database, images, out, options=_incremental_options(threads))
+    else:
+        models = pycolmap.global_mapping(database, images, out, options=_global_options(threads))
+    if not models:
+        return None
+    model = max(models.values(), key=lambda m: int(m.num_reg_images()))
+    place = {name: k for k, name in enumerate(names.left)}
+    found = sorted(
+        (place[image.name], matrix(image.cam_from_world()))
+        for image in model.images.values()
+        if image.has_pose and image.name in place
+    )
+    if len(found) < _LEAST_REGISTERED:
+        return None
+    return Reconstructed(
+        mapper,
+        se3_inverse(np.array([T for _, T in found])),
+        np.array([k for k, _ in found], dtype=np.int64),
+        int(model.num_points3D()),
+        mean_reprojection_error_px(model),
+        np.array([_shared_points(model, names.left[a], names.left[b]) for a, b in loops.tolist()], dtype=np.int64),
+    )
+
+
+def _shared_points(model: pycolmap.Reconstruction, one: str, other: str) -> int:
+    """Return how many points of a model two images show; zero where it has not both."""
+    images = [model.find_image_with_name(name) for name in (one, other)]
+    seen = [{p.point3D_id for p in image.points2D if p.has_point3D()} for image in images if image is not None]
+    return len(seen[0] & seen[1]) if len(seen) == 2 else 0
+
+
+def _incremental_options(threads: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions(num_threads=threads, random_seed=SEED)
+    options.multiple_models = options.extract_colors = False
+    options.min_model_size = _LEAST_REGISTERED
+    options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
+    options.ba_refine_sensor_from_rig = False
+    options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
+    options.mapper.init_min_tri_angle = 4.0  # keyframes of one drive see the scene from nearly one direction
+    options.mapper.init_min_num_inliers = 50
+    options.mapper.filter_max_reproj_error = 2.0
+    options.mapper.filter_min_tri_angle = 0.5
+    options.triangulation.min_angle = 0.5
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = 1.3
+    return options
+
+
+def _global_options(threads: int) -> pycolmap.GlobalPipelineOptions:
+    options = pycolmap.GlobalPipelineOptions(num_threads=threads, random_seed=SEED)
+    mapper = options.mapper
+    mapper.num_threads, mapper.random_seed = threads, SEED
+    mapper.refine_sensor_from_rig = False
+    mapper.min_tri_angle_deg = 0.5
+    mapper.global_positioning.use_gpu = False
+    adjustment = mapper.bundle_adjustment
+    adjustment.refine_focal_length = adjustment.refine_principal_point = adjustment.refine_extra_params = False
+    adjustment.refine_sensor_from_rig = False
+    adjustment.ceres.use_gpu = False
+    mapper.retriangulation.min_angle = 0.5
+    return options

@@ -1,0 +1,178 @@
+"""Comparison of two trajectories over the same keyframes: distance, scale, and segments that disagree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.errors import EvaluationError
+from vio.evaluation.trajectories import align_poses, apply_alignment, evaluate, rotation_angle_deg
+from vio.geometry.lie import FloatArray, nearest_rotation, se3_inverse
+from vio.numerics.robust import robust_sigma
+from vio.offline.keyframes import TrackedPath
+from vio.records import BoolArray, IntArray, Trajectory
+
+_SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
+_LEAST_MOTIONS = 8  # keyframes needed to detect outlying motions
+_LEAST_PIECE = 3  # keyframes that an alignment needs
+_OUTLYING = 6.0  # robust standard deviations
+_BROKEN = 1.0  # of the motion between two keyframes: beyond it, one of both trajectories has jumped there
+
+
+@dataclass(frozen=True, slots=True)
+class GroundTruth:
+    """A reference trajectory."""
+
+    trajectory: Trajectory  # of the left camera or the IMU
+    T_cam0_imu: FloatArray  # (4, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """A range of keyframes over which the motions of two trajectories differ."""
+
+    first_frame: int
+    last_frame: int
+    difference_m: float  # largest difference of the motions between neighbouring keyframes
+    difference_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Comparison of a run's keyframes with other poses of the same frames."""
+
+    total: int  # keyframes compared
+    frames: IntArray  # (R,) frame numbers
+    piece: BoolArray  # (R,) keyframes of the longest stretch without a jump of either trajectory
+    aligned: FloatArray  # (R, 4, 4) the other poses in the run's world, after SE(3) alignment of this piece
+    difference_m: FloatArray  # (R,)
+    difference_deg: FloatArray  # (R,)
+    ate_m: float  # of the piece
+    ate_deg: float
+    scale: float | None  # length of the other trajectory over the run's; None: see why_no_scale
+    scale_sigma: float | None  # standard error
+    why_no_scale: str | None
+    segments: tuple[Segment, ...]
+    reference_ate_m: float | None  # of the other poses, against ground truth
+    reference_scale: float | None  # length of the other trajectory over that of ground truth
+    run_reference_ate_m: float | None  # of the run at the same keyframes
+
+
+def compare_keyframes(
+    run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray, truth: GroundTruth | None = None
+) -> Comparison:
+    """Compare poses of the left camera from another source with those of a run.
+
+    Args:
+        run: the run.
+        rows: (R,) rows of its trajectory.
+        T_other_cam0: (R, 4, 4) poses from the other source at these rows, in any world frame.
+        truth: ground truth to compare both with.
+
+    Reference: Umeyama (1991) for the alignment, as in `vio.evaluation.trajectories`.
+    """
+    own = run.trajectory.T_world_body[rows]
+    piece = _longest_piece(own, T_other_cam0)
+    aligned = apply_alignment(align_poses(T_other_cam0[piece], own[piece], "se3"), T_other_cam0)
+    difference_m = np.linalg.norm(aligned[:, :3, 3] - own[:, :3, 3], axis=1)
+    # Rotations are aligned separately: on a straight path an alignment by positions leaves the roll unobservable.
+    turn = nearest_rotation(np.einsum("nij,nkj->ik", own[piece, :3, :3], T_other_cam0[piece, :3, :3]))
+    difference_deg = rotation_angle_deg(np.swapaxes(own[:, :3, :3], 1, 2) @ turn @ T_other_cam0[:, :3, :3])
+    ate_m, ate_deg = (float(np.sqrt(np.mean(d[piece] ** 2))) for d in (difference_m, difference_deg))
+    scale, sigma, why = _scale_ratio(T_other_cam0[piece], own[piece], ate_m)
+    against = (None, None, None) if truth is None else _against(truth, run, rows, T_other_cam0)
+    return Comparison(
+        total=len(rows),
+        frames=run.frames[rows],
+        piece=piece,
+        aligned=aligned,
+        difference_m=difference_m,
+        difference_deg=difference_deg,
+        ate_m=ate_m,
+        ate_deg=ate_deg,
+        scale=scale,
+        scale_sigma=sigma,
+        why_no_scale=why,
+        segments=_disagreements(run.frames[rows], own, T_other_cam0),
+        reference_ate_m=against[0],
+        reference_scale=against[1],
+        run_reference_ate_m=against[2],
+    )
+
+
+def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[float | None, float | None, str | None]:
+    """Return the other trajectory's scale relative to the run with its standard error, or why there is none."""
+    p = T_own[:, :3, 3]
+    extent = float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
+    if len(p) < 3:
+        return None, None, f"only {len(p)} keyframes are connected"
+    try:
+        alignment = align_poses(T_other, T_own, "sim3")
+    except EvaluationError:
+        return None, None, "the camera does not move (pure rotation or standstill)"
+    residual = apply_alignment(alignment, T_other)[:, :3, 3] - p
+    sigma = float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))) / (extent * np.sqrt(len(p)))
+    if sigma > _SCALE_SIGMA:
+        return None, None, f"the camera moves over {extent:.3g} m only, against differences of {ate_m:.2g} m"
+    return 1 / alignment.scale, sigma, None
+
+
+def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray) -> tuple[Segment, ...]:
+    """Return segments where motions between neighbouring keyframes differ by outliers."""
+    if len(frames) < _LEAST_MOTIONS:
+        return ()
+    off_m, off_deg = motion_differences(T_own, T_other)
+    bad = _stands_out(off_m) | _stands_out(off_deg)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8)))
+    return tuple(
+        Segment(int(frames[a]), int(frames[b]), float(off_m[a:b].max()), float(off_deg[a:b].max()))
+        for a, b in edges.reshape(-1, 2).tolist()
+    )
+
+
+def _longest_piece(T_own: FloatArray, T_other: FloatArray) -> BoolArray:
+    """Return the rows (R,) of the longest stretch in which no motion differs by more than its own length."""
+    if len(T_own) < _LEAST_MOTIONS:
+        return np.ones(len(T_own), dtype=bool)
+    moved_m = np.linalg.norm(np.diff(T_own[:, :3, 3], axis=0), axis=1)
+    off_m, _ = motion_differences(T_own, T_other)
+    broken = _stands_out(off_m) & (off_m > _BROKEN * np.maximum(moved_m, np.median(moved_m)))
+    number = np.concatenate([[0], np.cumsum(broken)])
+    piece: BoolArray = number == np.bincount(number).argmax()
+    return piece if piece.sum() >= _LEAST_PIECE else np.ones_like(piece)
+
+
+def motion_differences(T_own: FloatArray, T_other: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return by how much the motions between neighbouring poses (R, 4, 4) differ: (R - 1,) metres and degrees."""
+    motion_own = se3_inverse(T_own[:-1]) @ T_own[1:]
+    motion_other = se3_inverse(T_other[:-1]) @ T_other[1:]
+    off_m: FloatArray = np.linalg.norm(motion_own[:, :3, 3] - motion_other[:, :3, 3], axis=1)
+    return off_m, rotation_angle_deg(np.swapaxes(motion_own[:, :3, :3], 1, 2) @ motion_other[:, :3, :3])
+
+
+def _stands_out(values: FloatArray) -> BoolArray:
+    middle = float(np.median(values))
+    return values > middle + _OUTLYING * max(robust_sigma(values - middle), 0.1 * middle, 1e-9)
+
+
+def _against(
+    truth: GroundTruth, run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray
+) -> tuple[float | None, float | None, float | None]:
+    """Return ATE and scale of the other poses, and ATE of the run; None where they cannot be compared."""
+    own = replace(
+        run.trajectory,
+        T_world_body=run.trajectory.T_world_body[rows],
+        times_ns=None if run.trajectory.times_ns is None else run.trajectory.times_ns[rows],
+        frame_indices=run.frames[rows],
+    )
+    other = replace(own, T_world_body=T_other_cam0)
+    try:
+        ate, of_run = (
+            float(evaluate(t, truth.trajectory, T_cam0_imu=truth.T_cam0_imu).as_dict()["ate_m"]) for t in (other, own)
+        )
+        scaled = evaluate(other, truth.trajectory, align="sim3", T_cam0_imu=truth.T_cam0_imu)
+        scale = float(scaled.as_dict()["scale"])
+    except EvaluationError:
+        return None, None, None
+    return ate, 1 / scale, of_run

@@ -1,0 +1,218 @@
+"""Reader of a run's folder, with its observations and the images of its recording."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vio.calibration.stereo_field import PixelField
+from vio.cameras.rig import Rectifier
+from vio.datasets import DatasetSettings, open_dataset
+from vio.datasets.common import read_npz
+from vio.datasets.features import FeatureDataset
+from vio.datasets.observation_log import read_observation_log
+from vio.errors import DataError
+from vio.files.trajectories import read_trajectory
+from vio.filters.multiview import Views
+from vio.filters.stereo_calibration import METRIC_TERMS, TERMS, StereoField
+from vio.filters.tracks import measured
+from vio.geometry.distortion import rig_from_rectified
+from vio.geometry.lie import FloatArray
+from vio.geometry.rectify import pinhole_maps, pinhole_pixels, pinhole_within
+from vio.geometry.stereo import StereoCamera
+from vio.offline.comparison import GroundTruth
+from vio.offline.keyframes import TrackedPath
+from vio.records import FIELD_TERMS, ROW_TERMS, FeatureTracks, IntArray, LoopEvent, StereoFrame, need_stereo
+from vio.runs.folder import read_metrics
+from vio.runs.loop_files import read_loops
+
+OBSERVATIONS = "observations.npz"
+
+
+@dataclass(frozen=True, slots=True)
+class SavedRun:
+    """Contents of a run's folder, with its observations."""
+
+    tracked: TrackedPath  # the left camera's trajectory with its observations; `tracked.where` is the folder
+    source: str  # the recording of the images, as `kind:path`
+    dataset: FeatureDataset  # observations of every frame, as a recording
+    T_cam0_imu: FloatArray  # (4, 4)
+    metrics: dict[str, Any]
+    field: PixelField | None = None  # what the run found its stereo calibration to be off by; None: nothing
+
+    @property
+    def truth(self) -> GroundTruth | None:
+        """The ground truth in the recording; None: there is none."""
+        reference = self.dataset.recording.reference
+        return None if reference is None else GroundTruth(reference, self.T_cam0_imu)
+
+
+def read_saved_run(folder: Path) -> SavedRun:
+    """Read the folder of `vio run --save-observations`.
+
+    Where the run estimated what its stereo calibration is off by, the tracks are those of a rectified pair without it;
+    where its images were rectified to a cylinder, those of a pinhole inside it, as other programs know no cylinder.
+    `dataset` holds the pixels as the front end saw them. Where the run had a map and closed loops between its own
+    frames, the poses are those in the map, and the tracks have the loops.
+
+    Raises:
+        DataError: no such folder, or the observations were not saved.
+    """
+    metrics, T_cam0_imu = read_metrics(folder)
+    log = folder / OBSERVATIONS
+    if not log.is_file():
+        raise DataError(f"{folder} has no {OBSERVATIONS}; repeat its run with --save-observations")
+    dataset = read_observation_log(log)
+    need_stereo(replace(dataset.recording, path=folder), "checking, refining or exporting a run")
+    loops = tuple(o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None and o.matches is not None)
+    poses = "map_trajectory.tum" if loops else "trajectory.tum"
+    trajectory = read_trajectory(folder / poses)
+    frames = trajectory.frame_indices
+    if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
+        raise DataError(f"{folder}: {poses} and {OBSERVATIONS} are not of the same complete run; repeat the run")
+    camera, tracks = dataset.recording.camera, dataset.tracks
+    coefficients, field = _field_coefficients(folder, camera, metrics), None
+    if camera.is_cylinder:
+        camera, tracks = _in_pinhole(camera, tracks, coefficients)
+    elif coefficients is not None:
+        field = PixelField(camera, coefficients)
+        tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
+        loops = tuple(_without(field, o) for o in loops)
+    tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks, loops)
+    return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics, field)
+
+
+def _without(field: PixelField, loop: LoopEvent) -> LoopEvent:
+    """Return a loop with the pixels of a rectified pair without the field."""
+    m = loop.matches
+    if m is None:
+        return loop
+    z = field.without(m.z_keyframe, m.has_right_keyframe), field.without(m.z_frame, m.has_right_frame)
+    return replace(loop, matches=replace(m, z_keyframe=z[0], z_frame=z[1]))
+
+
+def _in_pinhole(
+    camera: StereoCamera, tracks: FeatureTracks, coefficients: FloatArray | None
+) -> tuple[StereoCamera, FeatureTracks]:
+    """Return the pinhole inside a cylinder, and those of the tracks' pixels that it shows.
+
+    They are without the stereo field of the coefficients (15,) of (R3) and (R2), where there is one.
+    """
+    z = tracks.z
+    if coefficients is not None:
+        states = np.concatenate([coefficients[:FIELD_TERMS], np.zeros(METRIC_TERMS)])
+        stereo = StereoField(camera, coefficients[FIELD_TERMS:], states, np.arange(TERMS))
+        z = stereo.corrected(Views(z, measured(tracks.has_right))).z
+        z[:, 3] = z[:, 1]
+    pinhole = pinhole_within(camera)
+    left, kept = pinhole_pixels(camera, pinhole, z[:, :2])
+    right, has_right = pinhole_pixels(camera, pinhole, z[:, 2:])
+    has_right &= tracks.has_right
+    offsets = np.concatenate([[0], np.cumsum(kept)])[tracks.offsets]
+    z = np.concatenate([left, right], axis=1)[kept]
+    return pinhole, FeatureTracks(offsets, tracks.ids[kept], z, has_right[kept], tracks.stale[kept])
+
+
+def _field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> FloatArray | None:
+    """Return the coefficients (15,) of (R3) and (R2) in a run's metrics; None: the run estimated none.
+
+    Raises:
+        DataError: the metrics are damaged.
+    """
+    stated = metrics.get("stereo_field")
+    if stated is None or stated.get("rows_px") is None:
+        return None
+    try:
+        coefficients = np.array([*stated["coefficients_px"], *stated["rows_px"]], dtype=np.float64) / camera.fu
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
+    if coefficients.shape != (FIELD_TERMS + ROW_TERMS,) or not np.isfinite(coefficients).all():
+        raise DataError(
+            f"{folder}: stereo_field of its metrics holds no {FIELD_TERMS + ROW_TERMS} finite numbers; repeat the run"
+        )
+    return coefficients
+
+
+def _original_source(log: Path) -> str:
+    """Return the recording of the images, through any number of replayed logs."""
+    source = str(read_npz(log, ["source"])["source"])
+    kind, _, path = source.partition(":")
+    seen = {log.resolve()}
+    while kind == "log" and Path(path).is_file() and Path(path).resolve() not in seen:
+        seen.add(Path(path).resolve())
+        source = str(read_npz(Path(path), ["source"])["source"])
+        kind, _, path = source.partition(":")
+    return source
+
+
+def with_poses(run: SavedRun, folder: Path) -> SavedRun:
+    """Return the run with the poses of another folder, such as that of `vio refine`.
+
+    Raises:
+        DataError: that folder does not exist or contains other frames.
+    """
+    if not (folder / "trajectory.tum").is_file():
+        raise DataError(f"{folder} contains no trajectory; create it with `vio refine {run.tracked.where}`")
+    trajectory = read_trajectory(folder / "trajectory.tum").in_cam0(run.T_cam0_imu)
+    if trajectory.frame_indices is None or not np.array_equal(trajectory.frame_indices, run.tracked.frames):
+        raise DataError(f"{folder} contains other frames than {run.tracked.where}; refine again")
+    return replace(run, tracked=replace(run.tracked, trajectory=trajectory))
+
+
+def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator[StereoFrame]:
+    """Yield the rectified image pairs of rows (K,) of the trajectory, in order, as the run corrected their calibration.
+
+    Args:
+        run: the run.
+        source: the recording, if it is not at the path stored in the run.
+        rows: increasing.
+
+    Raises:
+        DataError: the recording is missing, has no images or another camera, or a frame cannot be read.
+    """
+    seen = run.dataset.recording.camera  # by the front end
+    try:
+        dataset = open_dataset(source or run.source, DatasetSettings(projection=seen.projection))
+    except DataError as error:
+        raise DataError(
+            f"the images of {run.tracked.where} are not available: {error}; name the recording with --source"
+        ) from error
+    recording = dataset.recording
+    if not recording.has_images:
+        raise DataError(
+            f"{source or run.source} contains no images; name the recording with --source or use --no-images"
+        )
+    ours, theirs = seen if seen.is_cylinder else run.tracked.camera, recording.camera
+    if not np.allclose(
+        [ours.fu, ours.fv, ours.cu, ours.cv, ours.baseline_m],
+        [theirs.fu, theirs.fv, theirs.cu, theirs.cv, theirs.baseline_m],
+        rtol=1e-9,
+    ):
+        raise DataError(f"{recording.path} has another calibration than the run {run.tracked.where}; repeat the run")
+    correct = _image_correction(run)
+    for row in rows.tolist():
+        index = int(run.tracked.frames[row])
+        found = [e for e in dataset.events(index, index + 1) if isinstance(e, StereoFrame)]
+        if not found or found[0].left is None or found[0].right is None:
+            raise DataError(f"{recording.path}: frame {index} cannot be read; see the warnings above")
+        if correct is None:
+            yield found[0]
+        else:
+            left, right = correct(found[0].left, found[0].right)
+            yield replace(found[0], left=left, right=right)
+
+
+def _image_correction(run: SavedRun) -> Rectifier | None:
+    """Return the map of the front end's image pairs to those of the tracks; None: they are the same."""
+    seen, camera = run.dataset.recording.camera, run.tracked.camera
+    if seen.is_cylinder:
+        maps = (pinhole_maps(seen, camera),) * 2
+    elif run.field is not None:
+        maps = run.field.maps()
+    else:
+        return None
+    return Rectifier(rig_from_rectified(camera, np.eye(4)), camera, np.eye(4), maps, "linear")

@@ -1,0 +1,376 @@
+"""Bundle adjustment of stretches of video with the calibration of the stereo pair free: what motion tells of it.
+
+All stretches share the calibration; each has its own poses and points, which are eliminated. A prior decides where
+neither matches nor motion do. Standard deviations come from the scatter of what regions of the image say (a sandwich
+estimate clustered by region and stretch), as errors of a lens model, of features that wander along edges and of moving
+objects are shared by all rows of a region.
+References: Triggs et al., Bundle adjustment: a modern synthesis (2000) for the elimination; Liang & Zeger, Longitudinal
+data analysis using generalized linear models, Biometrika (1986) for the covariance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vio.calibration.findings import NotObservable
+from vio.calibration.intrinsics import Intrinsics, judged_observable
+from vio.calibration.stereo_field import PARAMETERS
+from vio.errors import EstimationError
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat
+from vio.geometry.stereo import StereoCamera
+from vio.numerics.robust import robust_sigma
+from vio.offline.points import MIN_DEPTH_M, PointTracks, keep_rows
+from vio.records import BoolArray, IntArray
+
+# Of both cameras: focal length and its ratio along v to along u (relative), principal point (focal lengths), radial and
+# tangential distortion. Of the right camera against the left one: rotation (rad, its points p are seen as `exp(w) p`),
+# direction of the baseline (over its length), principal point, focal lengths, tangential distortion.
+NAMES = (
+    *("focal", "aspect", "cu", "cv", "k", "q1", "q2"),
+    *("wx", "wy", "wz", "ty", "tz", "right_cu", "right_cv", "right_fu", "right_fv", "p1", "p2"),
+)
+# Widths of a Cauchy prior: intrinsics of a good calibration are right to a few per cent, and the right camera agrees
+# with the left one as in vio.calibration.stereo_field.
+_PRIOR = np.array(
+    [*[0.05, 0.005, 0.02, 0.02, 1e-2, 2e-3, 2e-3], *[np.radians(0.5)] * 3, *[5e-3] * 2, *[2e-3] * 4, *[2e-3] * 2]
+)
+_OF_RIGHT = {"cu": "right_cu", "cv": "right_cv", "fu": "right_fu", "fv": "right_fv"}  # in `stereo_field.PARAMETERS`
+_FREE = tuple(name for name in PARAMETERS if _OF_RIGHT.get(name, name) in NAMES)  # those estimated here
+INTRINSICS = ("focal", "aspect", "cu", "cv")
+# What lens models leave, beside the scatter: this and the sliding window differ by so much on the same drives.
+_LENS_DEG, _LENS_DIRECTION_DEG = 0.01, 0.3
+_HELD = 1e-9  # standard deviation of what is not free
+_STEPS = 30  # of Levenberg-Marquardt, at most
+_FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-10  # over the diagonal of the information
+_SETTLED = 1e-6  # relative decrease of the cost at which the steps end
+_LARGEST_RESIDUAL_PX = 1.5  # robust standard deviation above which the tracks are not of one rigid scene and rig
+_STEP = 1e-6  # of numeric derivatives: by rays and parameters, which have the size of radians
+_CAUCHY = 2.0  # residuals of so many standard deviations count half
+_GATE = 5.0  # rows with larger residuals, in standard deviations, are left out
+_ROUNDING = 1e-12  # of a point's information, against rounding; more of it passes for knowledge of depths
+_CELLS = (8, 4)  # regions of the image, along u and v
+_LEAST_RESIDUAL_PX = 0.02  # of exact tracks, so that weights stay finite
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """Keyframes of a piece of video, with points and their rows."""
+
+    T_world_cam0: FloatArray  # (K, 4, 4)
+    tracks: PointTracks
+
+
+@dataclass(frozen=True, slots=True)
+class SelfCalibration:
+    """What the calibration is off by."""
+
+    values: FloatArray  # (18,) in the order and units of `NAMES`
+    sigmas: FloatArray  # (18,) standard deviations; those of the prior where the motion tells nothing
+    covariance: FloatArray  # (18, 18)
+    told: FloatArray  # (18,) share of the prior's variance that the data removed
+    stretches: int
+    points: int
+    residual_px: float  # robust standard deviation of a pixel coordinate
+
+    def right_camera(self) -> tuple[FloatArray, FloatArray, float, float]:
+        """Return how the right camera lies as far as the image's centre tells, with standard deviations.
+
+        A turn about the vertical or horizontal axis, a principal point and a tangential distortion move pixels almost
+        alike; the turn that moves the image's centre as all of them do together is well determined, and is returned.
+
+        Returns:
+            `R_cam1_cam0` (3, 3) and the unit direction (3,) from cam0 to cam1 in cam0, rectified; standard deviations
+            of both in degrees.
+        """
+        combine = np.zeros((5, len(NAMES)))
+        for row, name, sign in (
+            *((0, "wx", 1), (0, "right_cv", -1), (1, "wy", 1), (1, "right_cu", 1), (2, "wz", 1)),
+            *((3, "ty", 1), (4, "tz", 1)),
+        ):
+            combine[row, NAMES.index(name)] = sign
+        off = combine @ self.values
+        variances = np.diag(combine @ self.covariance @ combine.T)
+        direction = np.array([1.0, off[3], off[4]])
+        rotation, swing = (float(np.degrees(np.sqrt(v.sum()))) for v in (variances[:3], variances[3:]))
+        return (
+            so3_exp(off[:3]),
+            direction / np.linalg.norm(direction),
+            float(np.hypot(rotation, _LENS_DEG)),
+            float(np.hypot(swing, _LENS_DIRECTION_DEG)),
+        )
+
+    def after(self, parameters: FloatArray) -> SelfCalibration:
+        """Return the calibration of pixels as they were before a field of parameters (14,) was taken out of them."""
+        values = self.values.copy()
+        for name, value in zip(PARAMETERS, parameters, strict=True):
+            if name in _FREE:
+                values[NAMES.index(_OF_RIGHT.get(name, name))] += value
+        return replace(self, values=values)
+
+    def rig_parameters(self) -> FloatArray:
+        """Return what the right camera and both lenses are off by (14,), as `stereo_field.PARAMETERS` names it."""
+        values = [self.values[NAMES.index(_OF_RIGHT.get(name, name))] if name in _FREE else 0.0 for name in PARAMETERS]
+        return np.array(values)
+
+
+def intrinsics_of(camera: StereoCamera, found: SelfCalibration) -> Intrinsics | NotObservable:
+    """Return focal length and principal point of a calibration with free intrinsics.
+
+    Args:
+        camera: the pair as calibrated.
+        found: by `self_calibrate` with `intrinsics`.
+    """
+    focal, _, cu, cv = (float(found.values[NAMES.index(name)]) for name in INTRINSICS)
+    sigmas = [float(found.sigmas[NAMES.index(name)]) for name in INTRINSICS]
+    return judged_observable(camera, focal, sigmas[0], (cu, cv), (sigmas[2], sigmas[3]))
+
+
+def project_off(camera: StereoCamera, x: FloatArray, p: FloatArray) -> FloatArray:
+    """Pixels (N, 4) `[ul vl ur vr]` of points (N, 3) in the left camera by a pair that is off by parameters (18,)."""
+    focal, aspect, cu, cv, k, q1, q2 = x[:7]
+    ty, tz, right_cu, right_cv, right_fu, right_fv, p1, p2 = x[10:]
+    moved = (p - camera.baseline_m * np.array([1.0, ty, tz])) @ so3_exp(x[7:10]).T
+    out = np.empty((len(p), 4))
+    lenses = (
+        (p, q1, q2, focal, focal + aspect, cu, cv),
+        (moved, q1 + p1, q2 + p2, focal + right_fu, focal + aspect + right_fv, cu + right_cu, cv + right_cv),
+    )
+    for side, (points, t1, t2, fu, fv, u0, v0) in enumerate(lenses):
+        a, b = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+        r2 = a * a + b * b
+        bent_a = a * (1 + k * r2) + 2 * t1 * a * b + t2 * (r2 + 2 * a * a)
+        bent_b = b * (1 + k * r2) + t1 * (r2 + 2 * b * b) + 2 * t2 * a * b
+        out[:, 2 * side] = camera.fu * ((1 + fu) * bent_a + u0) + camera.cu
+        out[:, 2 * side + 1] = camera.fv * ((1 + fv) * bent_b + v0) + camera.cv
+    return out
+
+
+def self_calibrate(camera: StereoCamera, stretches: Sequence[Stretch], *, intrinsics: bool) -> SelfCalibration:
+    """Estimate what a rectified pair's calibration is off by, from stretches of video.
+
+    The length of the baseline is held: it is the scale.
+
+    Args:
+        camera: the pair as calibrated, with image size.
+        stretches: at least one; rows with gross outliers are weighted down and left out.
+        intrinsics: whether focal length, its ratio and the principal point are free, too; else they are as given.
+
+    Raises:
+        EstimationError: no stretch has a consistent track.
+    """
+    x = np.zeros(len(NAMES))
+    pieces = [s for s in stretches if len(s.tracks.ids)]
+    if not pieces:
+        raise EstimationError("not observable because no track is consistent over the keyframes")
+    width = np.where(np.isin(NAMES, INTRINSICS) & (not intrinsics), _HELD, _PRIOR)
+    x, pieces = _optimum(camera, x, pieces, width)
+    sigma = _spread(camera, x, pieces)
+    if sigma > _LARGEST_RESIDUAL_PX:
+        raise EstimationError(f"not observable because tracks and motion disagree by {sigma:.1f} px")
+    x, pieces = _optimum(camera, x, [_without_outliers(camera, x, piece, sigma) for piece in pieces], width)
+    return _with_covariance(camera, x, pieces, width)
+
+
+def _optimum(
+    camera: StereoCamera, x: FloatArray, pieces: list[Stretch], width: FloatArray
+) -> tuple[FloatArray, list[Stretch]]:
+    """Return parameters (18,) and stretches at the least robust cost, by Levenberg-Marquardt."""
+    damping = _FIRST_DAMPING
+    for _ in range(_STEPS):
+        sigma = _spread(camera, x, pieces)
+        prior = np.diag(1 / (width**2 + x**2))
+        solved = [_normal_equations(camera, x, piece, sigma, damping) for piece in pieces]
+        A = np.sum([n.A for n in solved], axis=0) + prior
+        dx = np.linalg.solve(A + damping * np.diag(np.diag(A)), np.sum([n.b for n in solved], axis=0) - prior @ x)
+        moved = [n.moved(piece, dx) for n, piece in zip(solved, pieces, strict=True)]
+        before, after = _cost(camera, x, pieces, sigma, width), _cost(camera, x + dx, moved, sigma, width)
+        if after < before:
+            x, pieces, damping = x + dx, moved, max(damping / 30, _LEAST_DAMPING)
+        else:
+            damping = 10 * max(damping, 1e-8)
+        if abs(before - after) < _SETTLED * before:
+            break
+    return x, pieces
+
+
+def _with_covariance(
+    camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch], width: FloatArray
+) -> SelfCalibration:
+    """Return parameters (18,) at the optimum with their sandwich covariance; the prior has a `width` (18,)."""
+    sigma, prior = _spread(camera, x, pieces), np.diag(1 / (width**2 + x**2))
+    solved = [_normal_equations(camera, x, piece, sigma, 0.0) for piece in pieces]
+    A = np.sum([n.A for n in solved], axis=0) + prior
+    scores = np.concatenate([n.scores for n in solved])
+    meat = _larger(scores.T @ scores * (len(scores) / max(len(scores) - 1, 1)) + prior, A)
+    inverse = np.linalg.inv(A)
+    covariance = np.asarray(inverse @ meat @ inverse, dtype=np.float64)
+    allowed = width**2 + x**2
+    sigmas = np.sqrt(np.minimum(np.diag(covariance), allowed))
+    points = int(sum(len(piece.tracks.ids) for piece in pieces))
+    return SelfCalibration(x, sigmas, covariance, 1 - sigmas**2 / allowed, len(pieces), points, sigma)
+
+
+def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch]) -> float:
+    """Return the robust standard deviation of a pixel coordinate."""
+    return max(robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])), _LEAST_RESIDUAL_PX)
+
+
+def _cost(camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch], sigma: float, width: FloatArray) -> float:
+    """Return what the steps decrease: Cauchy losses of rows and parameters (18,)."""
+    squares = [np.sum(_residuals(camera, x, piece)[0] ** 2, axis=1) / sigma**2 for piece in pieces]
+    rows = sum(float(np.sum(2 * _CAUCHY**2 * np.log1p(q / (4 * _CAUCHY**2)))) for q in squares)
+    return rows + 0.5 * float(np.sum(np.log1p(x**2 / width**2)))
+
+
+def _larger(A: FloatArray, B: FloatArray) -> FloatArray:
+    """Return a matrix that is not smaller than A and B (n, n) in any direction, by their joint diagonalisation."""
+    L = np.linalg.cholesky(B)
+    values, vectors = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, A).T))
+    W = L @ vectors
+    out: FloatArray = (W * np.maximum(values, 1.0)) @ W.T
+    return out
+
+
+def _residuals(camera: StereoCamera, x: FloatArray, piece: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return residuals (R, 4), zero where not measured; those measured (n,); and points in the camera (R, 3)."""
+    tracks, T = piece.tracks, se3_inverse(piece.T_world_cam0)[piece.tracks.keyframe]
+    q = np.einsum("nij,nj->ni", T[:, :3, :3], tracks.p_world[tracks.point]) + T[:, :3, 3]
+    q = np.where((q[:, 2] > MIN_DEPTH_M)[:, None], q, [0.0, 0.0, 1e3])
+    r = tracks.z - project_off(camera, x, q)
+    measured = np.repeat(tracks.has_right[:, None], 4, axis=1)
+    measured[:, :2] = True
+    r[~measured] = 0
+    return r, r[measured], q
+
+
+def _without_outliers(camera: StereoCamera, x: FloatArray, piece: Stretch, sigma: float) -> Stretch:
+    r, _, _ = _residuals(camera, x, piece)
+    kept = keep_rows(piece.tracks, np.abs(r).max(axis=1) < _GATE * sigma)
+    return replace(piece, tracks=kept) if len(kept.ids) else piece
+
+
+@dataclass(frozen=True, slots=True)
+class _Normal:
+    """Normal equations of a stretch, with its poses and points eliminated."""
+
+    A: FloatArray  # (18, 18)
+    b: FloatArray  # (18,)
+    scores: FloatArray  # (G, 18) contributions of regions of the image to b
+    dp: tuple[FloatArray, FloatArray]  # steps of the points (3M,), by poses and parameters (3M, C)
+    dpose: tuple[FloatArray, FloatArray]  # steps of the poses (6(K-1),), by the parameters (6(K-1), 18)
+
+    def moved(self, piece: Stretch, dx: FloatArray) -> Stretch:
+        """Return the stretch at the optimum after a step (18,) of the parameters."""
+        first, by_x = self.dpose
+        dpose = first - by_x @ dx
+        own, by_all = self.dp
+        dp = own - by_all @ np.concatenate([dpose, dx])
+        T_cam0_world = se3_inverse(piece.T_world_cam0)
+        T_cam0_world[1:] = se3_exp(dpose.reshape(-1, 6)) @ T_cam0_world[1:]
+        p = piece.tracks.p_world + dp.reshape(-1, 3)
+        return Stretch(se3_inverse(T_cam0_world), replace(piece.tracks, p_world=p))
+
+
+def _normal_equations(camera: StereoCamera, x: FloatArray, piece: Stretch, sigma: float, damping: float) -> _Normal:
+    tracks, K, M, X = piece.tracks, len(piece.T_world_cam0), len(piece.tracks.ids), len(NAMES)
+    r, _, q = _residuals(camera, x, piece)
+    J_q, J_x = _derivatives(camera, x, q)
+    J_q[~tracks.has_right, 2:] = 0
+    J_x[~tracks.has_right, 2:] = 0
+    root = 1 / (sigma * np.sqrt(1 + np.sum(r**2, axis=1) / (4 * _CAUCHY**2 * sigma**2)))[:, None, None]
+    r, J_q, J_x = r * root[:, 0], J_q * root, J_x * root
+    R = se3_inverse(piece.T_world_cam0)[tracks.keyframe, :3, :3]
+    J_p, J_pose = J_q @ R, np.concatenate([J_q, -J_q @ so3_hat(q)], axis=2)
+    # Dense rows of each point: by its own coordinates (3), and by poses and parameters (C).
+    C = 6 * K + X
+    H_pp, H_pc, g_p, g_c = np.zeros((M, 3, 3)), np.zeros((M, 3, C)), np.zeros((M, 3)), np.zeros((M, C))
+    Jt = np.swapaxes(J_p, 1, 2)
+    np.add.at(H_pp, tracks.point, Jt @ J_p)
+    np.add.at(g_p, tracks.point, (Jt @ r[..., None])[..., 0])
+    blocks = np.zeros((M, K, 3, 6))
+    np.add.at(blocks, (tracks.point, tracks.keyframe), Jt @ J_pose)
+    H_pc[:, :, : 6 * K] = blocks.transpose(0, 2, 1, 3).reshape(M, 3, 6 * K)
+    by_x = np.zeros((M, 3, X))
+    np.add.at(by_x, tracks.point, Jt @ J_x)
+    H_pc[:, :, 6 * K :] = by_x
+    H_cc = _reduced_blocks(J_pose, J_x, tracks.keyframe, K)
+    gradient = np.zeros((M, K, 6))
+    np.add.at(gradient, (tracks.point, tracks.keyframe), np.einsum("nai,na->ni", J_pose, r))
+    g_c[:, : 6 * K] = gradient.reshape(M, 6 * K)
+    own = np.zeros((M, X))
+    np.add.at(own, tracks.point, np.einsum("nai,na->ni", J_x, r))
+    g_c[:, 6 * K :] = own
+    H_pp += _ROUNDING * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    H_pp[:, range(3), range(3)] *= 1 + damping
+    H_cc[range(6 * K), range(6 * K)] *= 1 + damping
+    return _eliminated(H_pp, H_pc, g_p, g_c, H_cc, _regions(camera, tracks))
+
+
+def _derivatives(camera: StereoCamera, x: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return central differences of the pixels by points (R, 4, 3), in metres, and by parameters (R, 4, 18)."""
+    J_q, J_x = np.empty((len(q), 4, 3)), np.empty((len(q), 4, len(x)))
+    for k in range(3):
+        step = np.zeros_like(q)
+        step[:, k] = _STEP * q[:, 2]
+        J_q[:, :, k] = (project_off(camera, x, q + step) - project_off(camera, x, q - step)) / (2 * step[:, k : k + 1])
+    for k in range(len(x)):
+        d = np.zeros(len(x))
+        d[k] = _STEP
+        J_x[:, :, k] = (project_off(camera, x + d, q) - project_off(camera, x - d, q)) / (2 * _STEP)
+    return J_q, J_x
+
+
+def _reduced_blocks(J_pose: FloatArray, J_x: FloatArray, keyframe: IntArray, K: int) -> FloatArray:
+    """Return the information (C, C) of poses and parameters for given points."""
+    X = J_x.shape[2]
+    out = np.zeros((6 * K + X, 6 * K + X))
+    poses, cross = np.zeros((K, 6, 6)), np.zeros((K, 6, X))
+    Jt = np.swapaxes(J_pose, 1, 2)
+    np.add.at(poses, keyframe, Jt @ J_pose)
+    np.add.at(cross, keyframe, Jt @ J_x)
+    for k in range(K):
+        out[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = poses[k]
+        out[6 * k : 6 * k + 6, 6 * K :] = cross[k]
+        out[6 * K :, 6 * k : 6 * k + 6] = cross[k].T
+    flat = J_x.reshape(-1, X)
+    out[6 * K :, 6 * K :] = flat.T @ flat
+    return out
+
+
+def _regions(camera: StereoCamera, tracks: PointTracks) -> IntArray:
+    """Return the region of the image (M,) in which each point lies on average."""
+    count = np.bincount(tracks.point, minlength=len(tracks.ids))
+    u, v = (np.bincount(tracks.point, tracks.z[:, k], len(tracks.ids)) / count for k in (0, 1))
+    width, height = camera.width or float(u.max()) + 1, camera.height or float(v.max()) + 1
+    column = np.clip(_CELLS[0] * u / width, 0, _CELLS[0] - 1).astype(np.int64)
+    row = np.clip(_CELLS[1] * v / height, 0, _CELLS[1] - 1).astype(np.int64)
+    return np.asarray(_CELLS[0] * row + column, dtype=np.int64)
+
+
+def _eliminated(
+    H_pp: FloatArray, H_pc: FloatArray, g_p: FloatArray, g_c: FloatArray, H_cc: FloatArray, region: IntArray
+) -> _Normal:
+    """Eliminate points, then poses; the first pose is held."""
+    M, _, C = H_pc.shape
+    X = len(NAMES)
+    by_c = np.linalg.solve(H_pp, H_pc)
+    own = np.linalg.solve(H_pp, g_p[..., None])[..., 0]
+    S = H_cc - H_pc.reshape(-1, C).T @ by_c.reshape(-1, C)
+    scores = g_c - np.einsum("mic,mi->mc", H_pc, own)
+    regions = np.zeros((int(region.max()) + 1, C))
+    np.add.at(regions, region, scores)
+    poses, params = np.arange(6, C - X), np.arange(C - X, C)
+    S_pp = S[np.ix_(poses, poses)] + 1e-9 * np.eye(len(poses)) * np.trace(S[np.ix_(poses, poses)]) / max(len(poses), 1)
+    gain = np.linalg.solve(S_pp, S[np.ix_(poses, params)])
+    g = scores.sum(axis=0)
+    kept: BoolArray = np.bincount(region, minlength=len(regions)) > 0
+    return _Normal(
+        A=S[np.ix_(params, params)] - S[np.ix_(params, poses)] @ gain,
+        b=g[params] - gain.T @ g[poses],
+        scores=(regions[:, params] - regions[:, poses] @ gain)[kept],
+        dp=(np.asarray(own.ravel(), dtype=np.float64), np.asarray(by_c.reshape(3 * M, C)[:, 6:], dtype=np.float64)),
+        dpose=(np.linalg.solve(S_pp, g[poses]), np.asarray(gain, dtype=np.float64)),
+    )

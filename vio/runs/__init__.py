@@ -1,0 +1,1 @@
+"""A recording processed into a folder, and that folder read back."""

@@ -1,0 +1,508 @@
+"""The output folder of a run: configuration, trajectory, map, per-frame log, metrics, plot."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import platform
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vio._version import __version__
+from vio.files.atomic import atomic_folder
+from vio.calibration.stereo_field import PARAMETERS
+from vio.config import Config, to_yaml
+from vio.datasets.common import checked_transform
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.errors import CalibrationError, DataError, EvaluationError
+from vio.evaluation.trajectories import Evaluation, error_statistics, evaluate, path_length_m
+from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
+from vio.files.inputs import read_input
+from vio.runs.loop_files import write_keyframes, write_loops
+from vio.runs.mapped import MappedRun
+from vio.runs.pipeline import STAGES, FrameLog, RunResult
+from vio.files.printable import json_text, printable
+from vio.protocols import Dataset
+from vio.records import IMU_ENTRIES, Landmarks, Trajectory
+from vio.runs.recorder import UNFINISHED, GrowingFolder
+from vio.runs.tables import frames_csv
+from vio.files.tables import Records
+from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
+
+log = logging.getLogger(__name__)
+
+MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
+CALIBRATION = "camchain-imucam.yaml"  # the corrected calibration, where no other file is named for it
+REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
+_CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
+FILES = (
+    MARKER,
+    UNFINISHED,
+    "config.yaml",
+    "trajectory.tum",
+    "trajectory.kitti",
+    "map_trajectory.tum",
+    "map_causal.tum",
+    "map_covariance.npy",
+    "loops.csv",
+    "loop_matches.npz",
+    "map_keyframes.csv",
+    "estimates.npy",
+    "reference.tum",
+    "dead_reckoning.tum",
+    "landmarks.ply",
+    "frames.csv",
+    "observations.npz",
+    "trajectory.png",
+    CALIBRATION,
+    "report.html",  # of vio report
+)
+
+
+def write_run_folder(
+    folder: Path,
+    result: RunResult,
+    reference: Trajectory | None,
+    *,
+    lengths_m: Sequence[float] | None = None,
+    save_observations: bool = False,
+) -> dict[str, Any]:
+    """Write all results of a run atomically, and return the metrics.
+
+    Args:
+        folder: replaced if it is an earlier run's folder.
+        result: the run.
+        reference: ground truth; None without one.
+        lengths_m: path lengths of the drift, see `evaluate`.
+        save_observations: also write `observations.npz`; the result must contain them.
+
+    Raises:
+        VioError: the folder cannot be written, or contains something else.
+    """
+    with atomic_folder(folder, replace=True, marker=MARKER, own=FILES) as temporary:
+        np.save(temporary / "estimates.npy", result.estimates.rows)
+        return _write_files(temporary, folder, result, reference, lengths_m, save_observations=save_observations)
+
+
+def finish_run_folder(
+    folder: Path,
+    result: RunResult,
+    reference: Trajectory | None,
+    *,
+    lengths_m: Sequence[float] | None = None,
+    save_observations: bool = False,
+) -> dict[str, Any]:
+    """Write the results of a run into the folder in which it grew, and return the metrics.
+
+    What a run that ended early needs to go on stays in `unfinished/`. The arguments are those of `write_run_folder`.
+
+    Raises:
+        VioError: the folder cannot be written.
+    """
+    unfinished = folder / UNFINISHED
+    final = unfinished / "final"
+    try:
+        final.mkdir(exist_ok=True)
+        metrics = _write_files(final, folder, result, reference, lengths_m, save_observations=save_observations)
+        if result.stopped is None:
+            (unfinished / "estimates.npy").replace(folder / "estimates.npy")
+        else:
+            shutil.copyfile(unfinished / "estimates.npy", folder / "estimates.npy")
+        for name in sorted(path.name for path in final.iterdir() if path.name != MARKER):
+            (final / name).replace(folder / name)
+        (final / MARKER).replace(folder / MARKER)
+        shutil.rmtree(unfinished if result.stopped is None else final)
+    except OSError as error:
+        raise DataError(f"cannot write {folder}: {error.strerror or error}; the trajectory so far is there") from error
+    return metrics
+
+
+def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapping[str, Any]) -> GrowingFolder:
+    """Describe a run before its first frame, as its folder says it while the run goes on.
+
+    Args:
+        folder: of the run.
+        dataset: the recording.
+        config: every setting.
+        request: what `vio run --resume` needs to repeat the command.
+    """
+    recording = dataset.recording
+    metrics = {
+        "out": str(folder),
+        "complete": False,
+        "source": str(recording.path),
+        "kind": recording.kind,
+        "version": __version__,
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "T_cam0_imu": recording.T_cam0_body.tolist(),
+    }
+    texts = {
+        "config.yaml": to_yaml(config),
+        MARKER: json_text(metrics, indent=2) + "\n",
+        f"{UNFINISHED}/{REQUEST}": json.dumps(request, indent=2) + "\n",  # names of files as they are
+    }
+    return GrowingFolder(folder, texts, replaces=FILES)
+
+
+def read_request(folder: Path) -> dict[str, Any]:
+    """Read what an unfinished run was asked to do.
+
+    Raises:
+        DataError: the folder is no run's, the run is complete, or the file is damaged.
+    """
+    path = folder / UNFINISHED / REQUEST
+    if not path.is_file():
+        read_metrics(folder)
+        raise DataError(f"{folder}: its run is complete; there is nothing to go on with")
+    try:
+        request: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        request["source"], request["start"]
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise DataError(f"{path}: is damaged ({error}); repeat the run from its start") from error
+    return request
+
+
+def _write_files(
+    target: Path,
+    folder: Path,
+    result: RunResult,
+    reference: Trajectory | None,
+    lengths_m: Sequence[float] | None,
+    *,
+    save_observations: bool,
+) -> dict[str, Any]:
+    """Write all results but `estimates.npy` into `target`, and return the metrics, which name `folder`."""
+    evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
+    metrics = metrics_of(result, evaluation, dead_reckoning, folder)
+    (target / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
+    write_tum(target / "trajectory.tum", result.trajectory)
+    write_kitti(target / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
+    if evaluation is not None:
+        times_ns = result.trajectory.times_ns
+        assert times_ns is not None
+        # The poses that were compared, each at the time of its estimate: the folder alone then tells the errors.
+        write_tum(target / "reference.tum", replace(evaluation.reference, times_ns=times_ns[evaluation.rows]))
+    if result.dead_reckoning is not None:
+        write_tum(target / "dead_reckoning.tum", result.dead_reckoning)
+    if result.mapped is not None:
+        metrics["map"] = _write_mapped(target, result, result.mapped, reference)
+    write_landmarks_ply(target / "landmarks.ply", result.landmarks)
+    _write_frames(target / "frames.csv", result.frames)
+    if save_observations:
+        _write_observations(target / "observations.npz", result)
+    from vio.runs.picture import plot_run
+
+    plot_run(target / "trajectory.png", result, evaluation, dead_reckoning)
+    (target / MARKER).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
+    return metrics
+
+
+def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference: Trajectory | None) -> dict[str, Any]:
+    """Write the poses in the map and the loops, and return their metrics."""
+    final = replace(result.trajectory, T_world_body=mapped.T_map_body)
+    write_tum(target / "map_trajectory.tum", final)
+    causal = mapped.causal
+    if len(causal):
+        poses = Trajectory(np.array(causal["T_map_body"]), np.array(causal["time_ns"]), result.body)
+        write_tum(target / "map_causal.tum", poses)
+    np.save(target / "map_covariance.npy", causal["covariance"])
+    write_loops(target, mapped.loops)
+    write_keyframes(target, mapped.in_map)
+    evaluation, _ = score(replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body)
+    return {
+        "joined": mapped.joined,
+        "keyframes": mapped.keyframes,
+        "loops": len(mapped.loops),
+        "placed": len(causal) / len(final),
+        "ate_m": None if evaluation is None else evaluation.as_dict()["ate_m"],
+    }
+
+
+def score(
+    result: RunResult,
+    reference: Trajectory | None,
+    *,
+    lengths_m: Sequence[float] | None = None,
+    T_world_body: FloatArray | None = None,
+) -> tuple[Evaluation | None, Evaluation | None]:
+    """Evaluate a run's trajectory and its dead reckoning; None without a reference or dead reckoning.
+
+    A reference that cannot be compared (too short, no common time) gives a warning only. `T_world_body` (N, 4, 4)
+    takes the place of the run's own poses.
+    """
+    if reference is None:
+        return None, None
+    try:
+        truth = _with_times(reference, result)
+        poses = result.trajectory
+        poses = poses if T_world_body is None else replace(poses, T_world_body=T_world_body)
+        own = evaluate(poses, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m)
+        for note in own.notes:
+            log.warning("%s", note)
+        other = result.dead_reckoning
+        return own, None if other is None else evaluate(
+            other, truth, T_cam0_imu=result.T_cam0_body, lengths_m=lengths_m
+        )
+    except EvaluationError as error:
+        log.warning("the reference was not used: %s", error)
+        return None, None
+
+
+def metrics_of(
+    result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None, folder: Path
+) -> dict[str, Any]:
+    """Collect the metrics for `--json` and metrics.json; null where there is no reference."""
+    frames = result.frames
+    work_ms = np.array([f.total_ms for f in frames])
+    scores = None if evaluation is None else evaluation.as_dict()
+    return {
+        "out": str(folder),
+        "complete": result.stopped is None,
+        "stopped": result.stopped,
+        "source": str(result.recording.path),
+        "kind": result.recording.kind,
+        "version": __version__,
+        "python": platform.python_version(),
+        "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        "backend": result.config.backend,
+        "motion": result.motion or "none",
+        "body": result.body,
+        "frames": len(frames),
+        "first_frame": frames[0].index,
+        "last_frame": frames[-1].index,
+        "path_length_m": path_length_m(result.trajectory.positions),
+        "ms_per_frame": float(work_ms.mean()),
+        "ms_per_frame_median": float(np.median(work_ms)),
+        "ms_per_frame_95": float(np.percentile(work_ms, 95)),
+        "stages_ms": {name: float(np.mean([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES},
+        "landmarks": len(result.landmarks.ids),
+        "ate_m": None if scores is None else scores["ate_m"],
+        "rpe": None if scores is None else scores["rpe"],
+        "drift_lengths_m": [] if scores is None else scores["drift_lengths_m"],
+        "t_err_percent": None if scores is None else scores["t_err_percent"],
+        "r_err_deg_per_100m": None if scores is None else scores["r_err_deg_per_100m"],
+        "evaluation": scores,
+        "dead_reckoning": None if dead_reckoning is None else dead_reckoning.as_dict(),
+        "landmark_error": landmark_error(result, evaluation),
+        "warnings": list(result.warnings),
+        "stereo_field": stereo_field(result),
+        "stereo_scale": stereo_scale(result),
+        "scale_sigma": scale_sigma(result),
+        "camera_imu": camera_imu(result),
+        "imu": imu_calibration(result),
+        "T_cam0_imu": result.T_cam0_body.tolist(),
+        "camera": asdict(result.recording.camera),
+    }
+
+
+def stereo_field(result: RunResult) -> dict[str, Any] | None:
+    """Return what the stereo calibration was found to be off by at the end of the run; None: it was not estimated.
+
+    Coefficients of equations (R3) and (R2) of docs/math.md and their standard deviations, times the focal length; and
+    what the rig is off by, as `vio.calibration.stereo_field` names it; None where no rig of the given lens models is.
+    """
+    field = result.estimates[-1].stereo_field
+    if field is None:
+        return None
+    f = result.recording.camera.fu
+    found = None
+    if not result.recording.camera.is_cylinder:
+        try:
+            found = result.calibrated_rig()
+        except CalibrationError as error:  # the results of the run do not depend on it
+            log.warning("%s", error)
+    rig = None
+    if found is not None:
+        sigmas = found.sigmas.tolist()
+        rig = {
+            "off": dict(zip(PARAMETERS, found.parameters.tolist(), strict=True)),
+            "sigma": dict(zip(PARAMETERS, sigmas, strict=True)),
+            "not_expressed_px": found.left_px,
+            "lines": list(found.lines()),
+        }
+    return {
+        "rows_rms_px": field.rows_rms_px,
+        "coefficients_px": (f * field.coefficients).tolist(),
+        "sigma_px": (f * np.sqrt(np.diag(field.covariance))).tolist(),
+        "rows_px": None if field.rows is None else (f * field.rows).tolist(),
+        "rig": rig,
+    }
+
+
+def stereo_scale(result: RunResult) -> dict[str, Any] | None:
+    """Return by what baseline and focal length were found to differ at the end of the run; None: not estimated."""
+    scale = result.estimates[-1].stereo_scale
+    if scale is None:
+        return None
+    return {name.replace(" ", "_"): {"percent": p, "sigma_percent": s} for name, (p, s) in scale.percent().items()}
+
+
+def scale_sigma(result: RunResult) -> float | None:
+    """Return the median standard deviation of the scale over the frames, over it; None: not of one camera."""
+    known = [sigma for sigma in result.estimates.column("scale_sigma") if sigma is not None and sigma == sigma]
+    return float(np.median(known)) if known else None
+
+
+def camera_imu(result: RunResult) -> dict[str, Any] | None:
+    """Return the extrinsics and the time offset as estimated at the end of the run; None: neither was.
+
+    Rotation and translation are those of `T_given^-1 T_cam0_imu` on the IMU's side, the correction of the given one.
+    """
+    estimate = result.estimates[-1]
+    out: dict[str, Any] = {}
+    if estimate.time_offset_s is not None and estimate.time_offset_sigma_s is not None:
+        out["time_offset_ms"] = 1e3 * estimate.time_offset_s
+        out["time_offset_sigma_ms"] = 1e3 * estimate.time_offset_sigma_s
+    if estimate.T_cam0_imu is not None and estimate.T_cam0_imu_covariance is not None:
+        xi = se3_log(se3_inverse(result.T_cam0_body) @ estimate.T_cam0_imu)
+        sigma = np.sqrt(np.diag(estimate.T_cam0_imu_covariance))
+        out |= {
+            "T_cam0_imu": estimate.T_cam0_imu.tolist(),
+            "rotation_deg": np.degrees(xi[3:]).tolist(),
+            "rotation_sigma_deg": np.degrees(sigma[3:]).tolist(),
+            "translation_mm": (1e3 * xi[:3]).tolist(),
+            "translation_sigma_mm": (1e3 * sigma[:3]).tolist(),
+        }
+    return out or None
+
+
+def imu_calibration(result: RunResult) -> dict[str, Any] | None:
+    """Return scale and misalignment of the IMU as estimated at the end of the run; None: they were not.
+
+    Entries of `M - I` of equation (A1) of docs/math.md, which multiply the readings: by sensor, the scales of x, y, z
+    in %, and the others by row and column in degrees, with their standard deviations.
+    """
+    estimate = result.estimates[-1]
+    terms, sigmas = estimate.imu_terms, estimate.imu_terms_sigma
+    if terms is None or sigmas is None:
+        return None
+    out: dict[str, Any] = {}
+    for (sensor, row, column), value, sigma in zip(IMU_ENTRIES, terms.tolist(), sigmas.tolist(), strict=True):
+        own = out.setdefault(("accelerometer", "gyro")[sensor], {})
+        kind, factor = ("scale_percent", 100.0) if row == column else ("misalignment_deg", math.degrees(1.0))
+        axes = "xyz"[row] if row == column else "xyz"[row] + "xyz"[column]
+        if sigma > 0:
+            own.setdefault(kind, {})[axes] = factor * value
+            own.setdefault(f"{kind}_sigma", {})[axes] = factor * sigma
+    return out
+
+
+def landmark_error(result: RunResult, evaluation: Evaluation | None) -> dict[str, Any] | None:
+    """Compare the map with surveyed landmarks, after alignment of the trajectory; None: no such landmarks."""
+    truth = result.recording.landmarks_reference
+    if truth is None or evaluation is None:
+        return None
+    _, own, theirs = np.intersect1d(result.landmarks.ids, truth.ids, return_indices=True)
+    if len(own) == 0:
+        return None
+    aligned = transform_points(evaluation.T_ref_est, evaluation.scale * result.landmarks.p_world[own])
+    errors_m = np.linalg.norm(aligned - truth.p_world[theirs], axis=1)
+    return {
+        "matched": len(own),
+        "surveyed": len(truth.ids),
+        **{f"{name}_m": value for name, value in asdict(error_statistics(errors_m)).items()},
+    }
+
+
+def calibration_text(result: RunResult) -> str:
+    """Return the calibration with what a run found it to be off by, as Kalibr's camchain, which `vio.load_rig` reads.
+
+    Raises:
+        DataError: the recording holds features without an image size.
+        CalibrationError: no rig of the given lens models is off as the run found it.
+    """
+    found = result.calibrated_rig()
+    if found is None:
+        raise DataError(f"{result.recording.path}: states no image size, which a calibration needs; nothing was saved")
+    lines = [f"by vio run {__version__}, of {result.recording.path.name}"]
+    lines += found.lines() or ["nothing was found to be off: the calibration as given"]
+    if found.left_px:
+        lines.append(f"what this calibration cannot express of it: {found.left_px:.2f} px (rms over the images)")
+    if result.recording.camera.is_cylinder and result.estimates[-1].stereo_field is not None:
+        lines.append("left and right are as given, though found to be off; run with dataset.projection=pinhole")
+    if not result.recording.has_images:
+        lines.append("of the rectified images that the features come from")
+    return "".join(f"# {printable(line)}\n" for line in lines) + kalibr_text(found.rig)
+
+
+def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
+    """Read a trajectory file, or the trajectory and extrinsics of a run's folder.
+
+    Raises:
+        DataError: the path contains no trajectory.
+    """
+    if not path.is_dir():
+        return read_trajectory(path), None
+    _, T_cam0_imu = read_metrics(path)
+    return read_trajectory(path / "trajectory.tum"), T_cam0_imu
+
+
+def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
+    """Read the metrics of a run's folder, and `T_cam0_imu` (4, 4) from them.
+
+    Raises:
+        DataError: the folder is not a run's, or its metrics are damaged.
+    """
+    path = folder / MARKER
+    if not path.is_file():
+        raise DataError(f"{folder}: no run folder (it has no {MARKER}); give a folder that `vio run` wrote")
+    try:
+        metrics = json.loads(read_input(path))
+        T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
+    if metrics.get("complete") is False:
+        log.warning("%s: the run has not reached the end of its recording; these are its results so far", folder)
+    return metrics, checked_transform(T_cam0_imu, f"{path}, T_cam0_imu")
+
+
+def write_landmarks_ply(path: Path, landmarks: Landmarks) -> None:
+    """Write the map as a binary PLY: x y z in metres, and the largest standard deviation of any direction."""
+    count = len(landmarks.ids)
+    header = (
+        f"ply\nformat binary_little_endian 1.0\ncomment landmarks in the world frame, metres\n"
+        f"element vertex {count}\n"
+        + "".join(f"property float {name}\n" for name in ("x", "y", "z", "sigma"))
+        + "end_header\n"
+    )
+    with path.open("wb") as stream:
+        stream.write(header.encode("ascii"))
+        for start in range(0, count, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            points = np.zeros(min(_CHUNK, count - start), dtype=[(name, "<f4") for name in ("x", "y", "z", "sigma")])
+            points["x"], points["y"], points["z"] = landmarks.p_world[part].T
+            largest = np.linalg.eigvalsh(landmarks.covariance[part])[:, -1]
+            points["sigma"] = np.sqrt(np.maximum(largest, 0.0))
+            stream.write(points.tobytes())
+
+
+def _write_frames(path: Path, frames: Records[FrameLog]) -> None:
+    """Write the log of all frames as CSV; the front end's stages are the last columns."""
+    stages = sorted({name for frame in frames for name in frame.stages_ms})
+    with path.open("w", encoding="utf-8", newline="\n") as stream:
+        for start in range(0, len(frames), _CHUNK_FRAMES):
+            stream.write(frames_csv(frames[start : start + _CHUNK_FRAMES], stages, header=start == 0))
+
+
+def _with_times(reference: Trajectory, result: RunResult) -> Trajectory:
+    """Number a reference without times by frame: pose k belongs to frame k of the recording."""
+    if reference.times_ns is not None or reference.frame_indices is not None:
+        return reference
+    return replace(reference, frame_indices=np.arange(len(reference), dtype=np.int64))
+
+
+def _write_observations(path: Path, result: RunResult) -> None:
+    from vio.datasets.observation_log import write_observation_log
+
+    assert result.observations is not None
+    assert result.motion_samples is not None
+    write_observation_log(
+        path, result.recording, result.observations, result.motion_samples, run_motion=result.motion or "none"
+    )

@@ -1,0 +1,376 @@
+"""What a run leaves behind, frame by frame: in memory, or in a folder that grows while the run goes on.
+
+A folder that is being written holds `unfinished/`: the tables, and checkpoints to go on from. A process that dies
+leaves all but the last second of it readable.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+
+from vio.files.atomic import atomic_write_text
+from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
+from vio.errors import DataError
+from vio.records import FrameLog, FrameResult
+from vio.geometry.lie import FloatArray
+from vio.protocols import Dataset
+from vio.records import BodyFrame, Estimate, Landmarks, MotionSample, Observations
+from vio.runs.tables import (
+    ESTIMATE,
+    FRAME,
+    MAPPED,
+    OBSERVATION,
+    POINT,
+    SAMPLE,
+    SEEN,
+    FrameRows,
+    estimate_of,
+    estimate_row,
+    frames_csv,
+    mapped_row,
+    observation_rows,
+    sample_of,
+    sample_row,
+)
+from vio.files.tables import Records, Rows, Table
+from vio.files.trajectories import tum_text
+
+log = logging.getLogger(__name__)
+
+UNFINISHED = "unfinished"  # folder inside a run's folder, while the run goes on or can go on
+CHECKPOINT = "checkpoint"
+_FLUSH_S = 1.0
+_CHECKPOINT_S = 5.0
+_CHUNK = 100_000  # points at a time
+_POSE = np.dtype([("T", "<f8", (4, 4))])
+_TABLES = {
+    "estimates": ESTIMATE,
+    "frames": FRAME,
+    "dead_reckoning": _POSE,
+    "points": POINT,
+    "seen": SEEN,
+    "observations": OBSERVATION,
+    "samples": SAMPLE,
+    "mapped": MAPPED,
+}
+Smoothed = Callable[[int], Estimate | None]  # of a frame by its number, with all frames since
+
+
+@dataclass(frozen=True, slots=True)
+class GrowingFolder:
+    """Where a run writes while it goes on."""
+
+    path: Path
+    texts: Mapping[str, str]  # files written at the beginning, by name: what is known of the run before its first frame
+    replaces: Sequence[str] = ()  # names of an earlier run's files, removed when the first frame has been processed
+
+
+class RunRecorder:
+    """Tables of a run; with a folder they are files, and text files grow beside them."""
+
+    def __init__(
+        self, body: BodyFrame, *, lag_frames: int, keep_observations: bool, folder: GrowingFolder | None = None
+    ) -> None:
+        """Prepare; files begin with the first frame.
+
+        Args:
+            body: what the poses describe.
+            lag_frames: frames after which an estimate is final, smoothed by those.
+            keep_observations: whether observations and motion samples are kept.
+            folder: the run's folder; None: everything stays in memory.
+        """
+        self._body, self._lag, self._keep, self._folder = body, lag_frames, keep_observations, folder
+        self._rows = FrameRows()
+        self._tables: dict[str, Table] = {}
+        self._early: list[Rows] = []  # samples before the first frame
+        self._written = 0  # frames in the text files
+        self._csv_stages: list[str] | None = None  # columns of frames.csv
+        self._flushed_s = self._saved_s = time.monotonic()
+        self._savable = True
+
+    # What goes in
+
+    def sample(self, sample: MotionSample) -> None:
+        """Take a motion sample."""
+        if not self._keep:
+            return
+        if self._tables:
+            with self._writing():
+                self._tables["samples"].append(sample_row(sample))
+        else:
+            self._early.append(sample_row(sample))
+
+    def dead_reckoning(self, T_world_body: FloatArray) -> None:
+        """Take the pose (4, 4) of a frame by dead reckoning, after the frame itself."""
+        row = np.zeros(1, dtype=_POSE)
+        row["T"] = T_world_body
+        with self._writing():
+            self._tables["dead_reckoning"].append(row)
+
+    def frame(self, result: FrameResult, read_ms: float, smoothed: Smoothed) -> None:
+        """Take the result of a frame.
+
+        Args:
+            result: what the chain made of it.
+            read_ms: wall time to read it.
+            smoothed: gives the estimates of past frames with all frames since.
+
+        Raises:
+            DataError: the folder cannot be written.
+        """
+        if not self._tables:
+            self._begin()
+        estimates = self._tables["estimates"]
+        index = result.log.index
+        self.revise(smoothed, len(estimates) - self._lag, len(estimates) - self._lag + 1)
+        with self._writing():
+            estimates.append(estimate_row(index, result.estimate))
+            self._tables["frames"].append(self._rows.row(replace(result.log, read_ms=read_ms)))
+            if result.estimate.T_map_body is not None:
+                self._tables["mapped"].append(mapped_row(index, result.estimate))
+            if self._keep:
+                seen = result.output.observations
+                self._tables["observations"].append(observation_rows(seen))
+                self._tables["seen"].append(np.array([(seen.frame_index, seen.time_ns, len(seen))], dtype=SEEN))
+        if time.monotonic() - self._flushed_s > _FLUSH_S:
+            self.flush()
+
+    def revise(self, smoothed: Smoothed, first: int = 0, end: int | None = None) -> None:
+        """Replace estimates by the smoothed ones: pose, covariance, velocity and biases; without a lag, nothing."""
+        if not self._lag or not self._tables:
+            return
+        estimates = self._tables["estimates"]
+        stop = len(estimates) if end is None else end
+        for k in range(max(first, stop - self._lag, 0), stop):
+            row = estimates.rows()[k]
+            late = smoothed(int(row["index"]))
+            if late is not None:
+                now = replace(
+                    estimate_of(row),
+                    T_world_imu=late.T_world_imu,
+                    covariance=late.covariance,
+                    velocity_world=late.velocity_world,
+                    gyro_bias=late.gyro_bias,
+                    accel_bias=late.accel_bias,
+                )
+                estimates.replace(k, estimate_row(int(row["index"]), now))
+
+    def flush(self) -> None:
+        """Bring all that is final to the disk: the tables, trajectory.tum and frames.csv."""
+        if self._folder is None or not self._tables:
+            return
+        with self._writing():
+            for table in self._tables.values():
+                table.flush()
+            final = len(self._tables["frames"]) - self._lag
+            if final > self._written:
+                self._append_texts(self._folder.path, self._written, final)
+                self._written = final
+        self._flushed_s = time.monotonic()
+
+    # What comes out
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._tables["frames"]) if self._tables else 0
+
+    @property
+    def estimates(self) -> Records[Estimate]:
+        """Estimates of all frames."""
+        return Records(self._tables["estimates"], estimate_of)
+
+    @property
+    def frames(self) -> Records[FrameLog]:
+        """Logs of all frames."""
+        return Records(self._tables["frames"], self._rows.frame)
+
+    @property
+    def mapped(self) -> Rows:
+        """The poses in the map as known at the time, one row a frame that had one."""
+        return self._tables["mapped"].rows()
+
+    @property
+    def observations(self) -> Sequence[Observations] | None:
+        """Observations of all frames; None: not kept."""
+        return SeenFrames(self._tables["seen"], self._tables["observations"]) if self._keep else None
+
+    @property
+    def samples(self) -> Records[MotionSample] | None:
+        """All motion samples; None: not kept."""
+        return Records(self._tables["samples"], sample_of) if self._keep else None
+
+    def dead_reckoned(self) -> FloatArray:
+        """Poses (N, 4, 4) by dead reckoning."""
+        return np.asarray(self._tables["dead_reckoning"].rows()["T"])
+
+    def landmarks(self, newest: Landmarks) -> Landmarks:
+        """Join the points put away in the run's folder with the newest; a point that came back counts once."""
+        stored = self._tables["points"]
+        if not len(stored):
+            return newest
+        with self._writing():
+            self._put_away(newest)
+            rows = stored.rows()
+            _, last = np.unique(rows["id"][::-1], return_index=True)
+            joined = Table(POINT, self._unfinished / "landmarks.npy")  # a file, as the map of an hour fills memory
+            for part in np.array_split(len(rows) - 1 - last, 1 + len(last) // _CHUNK):
+                joined.append(rows[part])
+            joined.close()
+        rows = joined.rows()
+        return Landmarks(rows["id"], rows["p_world"], rows["covariance"])
+
+    def _put_away(self, points: Landmarks) -> None:
+        rows = np.zeros(len(points.ids), dtype=POINT)
+        rows["id"], rows["p_world"], rows["covariance"] = points.ids, points.p_world, points.covariance
+        self._tables["points"].append(rows)
+
+    # Checkpoints
+
+    @property
+    def can_save(self) -> bool:
+        """Whether there is something to save, a folder to save it in, and nothing that cannot be saved."""
+        return self._folder is not None and self._savable and bool(self._tables)
+
+    @property
+    def is_save_due(self) -> bool:
+        """Whether it is time for a checkpoint."""
+        return self.can_save and time.monotonic() - self._saved_s > _CHECKPOINT_S
+
+    def save(self, state: Any, dataset: Dataset, finished: Landmarks) -> None:
+        """Write a checkpoint, where `can_save` says so.
+
+        Args:
+            state: of the run, beside the recorder's own.
+            dataset: the recording, which is left out of it.
+            finished: points of the map that will not change any more, and that the state no longer has.
+        """
+        with self._writing():
+            self._put_away(finished)
+        self.flush()
+        own = {"counts": {name: len(table) for name, table in self._tables.items()}, "stages": self._rows.stages}
+        try:
+            save_checkpoint(self._unfinished / CHECKPOINT, {"recorder": own, "run": state}, dataset)
+        except NotSavableError as error:
+            self._savable = False
+            log.warning("this run cannot go on with --resume if it is interrupted: %s", error)
+        self._saved_s = time.monotonic()
+
+    def restore(self, dataset: Dataset) -> Any:
+        """Go on from the folder's checkpoint; return the state that `save` was given.
+
+        Raises:
+            DataError: there is none, or it is damaged.
+        """
+        assert self._folder is not None
+        state = load_checkpoint(self._unfinished / CHECKPOINT, dataset)
+        own = state["recorder"]
+        self._rows.stages = list(own["stages"])
+        self._tables = {
+            name: Table(dtype, self._unfinished / f"{name}.npy", keep=own["counts"][name])
+            for name, dtype in _TABLES.items()
+        }
+        return state["run"]
+
+    def close(self) -> None:
+        """Flush and let all files go; the tables can still be read."""
+        self.flush()
+        for table in self._tables.values():
+            with self._writing():
+                table.close()
+
+    # How
+
+    @property
+    def _unfinished(self) -> Path:
+        assert self._folder is not None
+        return self._folder.path / UNFINISHED
+
+    def _begin(self) -> None:
+        """Create the tables and, in a folder, remove what an earlier run left there."""
+        if self._folder is None:
+            self._tables = {name: Table(dtype) for name, dtype in _TABLES.items()}
+        else:
+            with self._writing():
+                self._folder.path.mkdir(parents=True, exist_ok=True)
+                texts = self._folder.texts
+                for name in [name for name in texts if not name.startswith(UNFINISHED)]:  # they say whose folder it is
+                    atomic_write_text(self._folder.path / name, texts[name])
+                _remove(self._folder.path, [UNFINISHED, *(n for n in self._folder.replaces if n not in texts)])
+                self._unfinished.mkdir()
+                for name in [name for name in texts if name.startswith(UNFINISHED)]:
+                    atomic_write_text(self._folder.path / name, texts[name])
+                self._tables = {name: Table(dtype, self._unfinished / f"{name}.npy") for name, dtype in _TABLES.items()}
+        for row in self._early:
+            self._tables["samples"].append(row)
+        self._early = []
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            where = "" if self._folder is None else f" {self._folder.path}"
+            raise DataError(f"cannot write{where}: {error.strerror or error}") from error
+
+    def _append_texts(self, folder: Path, start: int, stop: int) -> None:
+        """Append frames to trajectory.tum and frames.csv, and wait until the disk has them."""
+        rows = self._tables["estimates"].rows(start, stop)
+        frames = self.frames[start:stop]
+        if self._csv_stages is None:
+            self._csv_stages = sorted(self._rows.stages)
+        first = start == 0
+        tum = tum_text(rows["time_ns"], rows["T_world_imu"], body=self._body if first else None)
+        for name, text in (
+            ("trajectory.tum", tum),
+            ("frames.csv", frames_csv(frames, self._csv_stages, header=first)),
+        ):
+            with (folder / name).open("w" if first else "a", encoding="utf-8", newline="\n") as stream:
+                stream.write(text)
+                stream.flush()
+                os.fsync(stream.fileno())
+
+
+class SeenFrames(Sequence[Observations]):
+    """The observations of all frames in two tables."""
+
+    def __init__(self, seen: Table, rows: Table) -> None:
+        self._seen, self._rows = seen.rows(), rows
+        self._offsets = np.concatenate([[0], np.cumsum(self._seen["count"])])
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        return len(self._seen)
+
+    @overload
+    def __getitem__(self, index: int) -> Observations: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Observations]: ...
+
+    def __getitem__(self, index: int | slice) -> Observations | list[Observations]:
+        """Observations of one frame, or of some."""
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        k = range(len(self))[index]
+        rows = self._rows.rows(int(self._offsets[k]), int(self._offsets[k + 1]))
+        columns = (np.array(rows[name]) for name in ("id", "z", "has_right", "stale"))
+        return Observations(int(self._seen["index"][k]), int(self._seen["time_ns"][k]), *columns)
+
+
+def _remove(folder: Path, names: Sequence[str]) -> None:
+    for name in names:
+        path = folder / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)

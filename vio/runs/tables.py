@@ -1,0 +1,208 @@
+"""What a run keeps of each frame, as rows of tables: estimates, the frame's log, observations, motion samples.
+
+A value that is missing (None) is NaN in a row.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vio.records import FrameLog
+from vio.geometry.lie import FloatArray
+from vio.records import (
+    Estimate,
+    ImuSample,
+    MotionSample,
+    Observations,
+    StereoFieldEstimate,
+    StereoScaleEstimate,
+    VelocitySample,
+)
+from vio.files.tables import Rows
+
+ESTIMATE = np.dtype(
+    [
+        ("index", "<i8"),  # number of the frame
+        ("time_ns", "<i8"),
+        ("T_world_imu", "<f8", (4, 4)),
+        ("covariance", "<f8", (6, 6)),
+        ("velocity_world", "<f8", (3,)),
+        ("velocity_covariance", "<f8", (3, 3)),
+        ("gyro_bias", "<f8", (3,)),
+        ("gyro_bias_sigma", "<f8", (3,)),
+        ("accel_bias", "<f8", (3,)),
+        ("accel_bias_sigma", "<f8", (3,)),
+        ("gravity_world", "<f8", (3,)),
+        ("T_cam0_imu", "<f8", (4, 4)),
+        ("T_cam0_imu_covariance", "<f8", (6, 6)),
+        ("imu_terms", "<f8", (15,)),
+        ("imu_terms_sigma", "<f8", (15,)),
+        ("time_offset_s", "<f8"),
+        ("time_offset_sigma_s", "<f8"),
+        ("scale_sigma", "<f8"),
+        ("stereo_field", "<f8", (8,)),
+        ("stereo_field_covariance", "<f8", (8, 8)),
+        ("stereo_rows_rms_px", "<f8"),
+        ("stereo_rows", "<f8", (7,)),
+        ("stereo_rows_covariance", "<f8", (7, 7)),
+        ("stereo_scale", "<f8", (2,)),
+        ("stereo_scale_covariance", "<f8", (2, 2)),
+    ]
+)
+_OPTIONAL_ARRAYS = (
+    *("velocity_world", "velocity_covariance"),
+    *("gyro_bias", "gyro_bias_sigma", "accel_bias", "accel_bias_sigma", "gravity_world"),
+    *("T_cam0_imu", "T_cam0_imu_covariance", "imu_terms", "imu_terms_sigma"),
+)
+_OPTIONAL_NUMBERS = ("time_offset_s", "time_offset_sigma_s", "scale_sigma")
+
+_STAGES = 16  # of the front end, at most
+_COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")
+_TIMES = ("read_ms", "frontend_ms", "watch_ms", "select_ms", "filter_ms")
+_NUMBERS = ("innovation_median_px", "nis_per_dof")
+FRAME = np.dtype(
+    [
+        ("index", "<i8"),
+        ("time_ns", "<i8"),
+        *((name, "<f8") for name in _TIMES),
+        *((name, "<i4") for name in _COUNTS),
+        *((name, "<f8") for name in _NUMBERS),
+        ("stages_ms", "<f8", (_STAGES,)),
+    ]
+)
+OBSERVATION = np.dtype([("id", "<i8"), ("z", "<f8", (4,)), ("has_right", "?"), ("stale", "?")])
+SEEN = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("count", "<i8")])  # one row a frame: its observations
+SAMPLE = np.dtype([("time_ns", "<i8"), ("is_imu", "?"), ("values", "<f8", (6,))])
+MAPPED = np.dtype([("index", "<i8"), ("time_ns", "<i8"), ("T_map_body", "<f8", (4, 4)), ("covariance", "<f8", (6, 6))])
+POINT = np.dtype([("id", "<i8"), ("p_world", "<f8", (3,)), ("covariance", "<f8", (3, 3))])
+
+
+def mapped_row(index: int, estimate: Estimate) -> Rows:
+    """Return the place in the map of an estimate that has one as a row (1,)."""
+    row = np.zeros(1, dtype=MAPPED)
+    row["index"], row["time_ns"], row["T_map_body"] = index, estimate.time_ns, estimate.T_map_body
+    covariance = estimate.T_map_body_covariance
+    row["covariance"] = np.nan if covariance is None else covariance
+    return row
+
+
+def estimate_row(index: int, estimate: Estimate) -> Rows:
+    """Return an estimate of frame `index` as a row (1,)."""
+    row = np.zeros(1, dtype=ESTIMATE)
+    row["index"], row["time_ns"] = index, estimate.time_ns
+    row["T_world_imu"], row["covariance"] = estimate.T_world_imu, estimate.covariance
+    for name in (*_OPTIONAL_ARRAYS, *_OPTIONAL_NUMBERS):
+        value = getattr(estimate, name)
+        row[name] = np.nan if value is None else value
+    field = estimate.stereo_field
+    row["stereo_field"] = np.nan if field is None else field.coefficients
+    row["stereo_field_covariance"] = np.nan if field is None else field.covariance
+    row["stereo_rows_rms_px"] = np.nan if field is None else field.rows_rms_px
+    row["stereo_rows"] = np.nan if field is None or field.rows is None else field.rows
+    P = None if field is None else field.rows_covariance
+    row["stereo_rows_covariance"] = np.nan if P is None else P
+    scale = estimate.stereo_scale
+    row["stereo_scale"] = np.nan if scale is None else scale.logs
+    row["stereo_scale_covariance"] = np.nan if scale is None else scale.covariance
+    return row
+
+
+def estimate_of(row: np.void) -> Estimate:
+    """Return the estimate of a row."""
+    optional: dict[str, Any] = {name: _array(row[name]) for name in _OPTIONAL_ARRAYS}
+    optional |= {name: _number(row[name]) for name in _OPTIONAL_NUMBERS}
+    scale, S = _array(row["stereo_scale"]), _array(row["stereo_scale_covariance"])
+    return Estimate(
+        int(row["time_ns"]),
+        np.array(row["T_world_imu"]),
+        np.array(row["covariance"]),
+        **optional,
+        stereo_field=_stereo_field(row),
+        stereo_scale=None if scale is None or S is None else StereoScaleEstimate(scale, S),
+    )
+
+
+def _stereo_field(row: np.void) -> StereoFieldEstimate | None:
+    coefficients, P = _array(row["stereo_field"]), _array(row["stereo_field_covariance"])
+    if coefficients is None or P is None:
+        return None
+    rows, rows_P = _array(row["stereo_rows"]), _array(row["stereo_rows_covariance"])
+    return StereoFieldEstimate(coefficients, P, row["stereo_rows_rms_px"], rows, rows_P)
+
+
+class FrameRows:
+    """Frame logs as rows; the names of the front end's stages are kept beside the table."""
+
+    def __init__(self) -> None:
+        self.stages: list[str] = []  # in the order of first appearance
+
+    def row(self, frame: FrameLog) -> Rows:
+        """Return a frame's log as a row (1,)."""
+        row = np.zeros(1, dtype=FRAME)
+        for field in dataclasses.fields(frame)[:-1]:
+            value = getattr(frame, field.name)
+            row[field.name] = np.nan if value is None else value
+        row["stages_ms"] = np.nan
+        for name, ms in frame.stages_ms.items():
+            if name not in self.stages and len(self.stages) < _STAGES:
+                self.stages.append(name)
+            if name in self.stages:
+                row["stages_ms"][0, self.stages.index(name)] = ms
+        return row
+
+    def frame(self, row: np.void) -> FrameLog:
+        """Return the log of a row."""
+        values: dict[str, Any] = {name: int(row[name]) for name in ("index", "time_ns", *_COUNTS)}
+        values |= {name: float(row[name]) for name in _TIMES}
+        stages = {name: float(ms) for name, ms in zip(self.stages, row["stages_ms"], strict=False) if ms == ms}
+        innovation, nis = (_number(row[name]) for name in _NUMBERS)
+        return FrameLog(**values, innovation_median_px=innovation, nis_per_dof=nis, stages_ms=stages)
+
+
+def observation_rows(seen: Observations) -> Rows:
+    """Return the observations of a frame as rows (N,)."""
+    rows = np.zeros(len(seen), dtype=OBSERVATION)
+    rows["id"], rows["z"], rows["has_right"], rows["stale"] = seen.ids, seen.z, seen.has_right, seen.stale
+    return rows
+
+
+def sample_row(sample: MotionSample) -> Rows:
+    """Return a motion sample as a row (1,)."""
+    row = np.zeros(1, dtype=SAMPLE)
+    imu = isinstance(sample, ImuSample)
+    halves = (sample.gyro, sample.accel) if isinstance(sample, ImuSample) else (sample.linear, sample.angular)
+    row["time_ns"], row["is_imu"], row["values"] = sample.time_ns, imu, np.concatenate(halves)
+    return row
+
+
+def sample_of(row: np.void) -> MotionSample:
+    """Return the motion sample of a row."""
+    kind = ImuSample if row["is_imu"] else VelocitySample
+    return kind(int(row["time_ns"]), np.array(row["values"][:3]), np.array(row["values"][3:]))
+
+
+def frames_csv(frames: Sequence[FrameLog], stages: Sequence[str], *, header: bool = True) -> str:
+    """Return logs as CSV text; the front end's stages are the last columns."""
+    text = io.StringIO()
+    own = [field.name for field in dataclasses.fields(FrameLog)][:-1]
+    writer = csv.writer(text, lineterminator="\n")
+    if header:
+        writer.writerow([*own, *(f"frontend_{name}_ms" for name in stages)])
+    for frame in frames:
+        values = [*(getattr(frame, name) for name in own), *(frame.stages_ms.get(name) for name in stages)]
+        writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+    return text.getvalue()
+
+
+def _array(value: FloatArray) -> FloatArray | None:
+    return None if np.isnan(value).all() else np.array(value)
+
+
+def _number(value: float) -> float | None:
+    return None if value != value else float(value)

@@ -1,0 +1,1 @@
+"""Which observations enter the update."""

@@ -1,0 +1,200 @@
+"""Selectors of the observations that enter the filter's update.
+
+The paper sorts features by how often they are seen and keeps the first seventh. `visibility` does that frame by
+frame with the counts so far; `visibility_whole` counts over the whole record first, as the paper does. `information`
+keeps the features that together add most information on the camera's motion. docs/notes/selection.md compares them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from vio.errors import ConfigError
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.protocols import Selector
+from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selection
+from vio.selection.information import MotionInformation, lazy_greedy, log_det_gain, prior_information
+from vio.setting import Section, setting
+
+SelectorName = Literal["all", "visibility", "visibility_whole", "information"]
+
+
+@dataclass(frozen=True, slots=True)
+class SelectorSettings(Section):
+    """Which observations enter the update."""
+
+    section: ClassVar[str] = "selector"
+
+    name: SelectorName = setting(
+        "all",
+        "all; visibility: the most often seen so far; visibility_whole: the most often seen in the whole record, as "
+        "the paper does (precomputed features only); information: those that together add most information on the "
+        "camera's motion now and in the next frames",
+    )
+    budget: int | None = setting(None, "observations kept of a frame; null: the share below", at_least=1)
+    keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7", above=0, at_most=1)
+    minimum: int = setting(12, "keep at least this many observations of a frame (all but visibility_whole)", at_least=0)
+    sticky: bool = setting(
+        False, "a chosen feature stays chosen while it is tracked; new ones only fill the remaining budget"
+    )
+    horizon_frames: int = setting(
+        4,
+        "information: the gain is summed over the last motion, the next one and the one this many frames ahead",
+        at_least=1,
+        at_most=100,
+    )
+    pixel_sigma_px: float = setting(0.5, "information: standard deviation of one pixel coordinate", unit="px", above=0)
+
+
+class _VisibilityCount:
+    """Counts the frames in which each feature has been observed."""
+
+    def __init__(self) -> None:
+        self._count: dict[int, int] = {}
+
+    def add(self, ids: IntArray) -> FloatArray:
+        """Count one more observation of each id (N,) and return the counts (N,)."""
+        count = self._count
+        for i in ids.tolist():
+            count[i] = count.get(i, 0) + 1
+        return np.array([count[i] for i in ids.tolist()], dtype=np.float64)
+
+    def ranked_ids(self) -> list[int]:
+        """Return all ids, most often observed first; ties by id, so that the order is reproducible."""
+        return [i for i, _ in sorted(self._count.items(), key=lambda item: (-item[1], item[0]))]
+
+
+class _Budget:
+    """The number of rows to choose, and the rows kept from the last frame."""
+
+    def __init__(self, settings: SelectorSettings) -> None:
+        self._settings = settings
+        self._last: IntArray = np.zeros(0, dtype=np.int64)
+
+    def rows(self, n: int) -> int:
+        """Return how many of n rows may be chosen."""
+        s = self._settings
+        return min(n, max(int(np.ceil(n * s.keep_fraction)), s.minimum) if s.budget is None else s.budget)
+
+    def kept(self, ids: IntArray) -> BoolArray:
+        """Return the rows (N,) that stay chosen; none unless the selector is sticky."""
+        return np.isin(ids, self._last) if self._settings.sticky else np.zeros(len(ids), dtype=np.bool_)
+
+    def store(self, ids: IntArray, chosen: BoolArray) -> BoolArray:
+        """Store the chosen rows (N,) of a frame and return them."""
+        self._last = ids[chosen]
+        return chosen
+
+    def best(self, score: FloatArray, ids: IntArray) -> BoolArray:
+        """Choose the kept rows, then those of largest score; ties go to the smaller id."""
+        chosen = np.zeros(len(score), dtype=np.bool_)
+        chosen[np.lexsort((ids, -score, ~self.kept(ids)))[: self.rows(len(score))]] = True
+        return self.store(ids, chosen)
+
+
+class KeepAll:
+    """Keeps every observation."""
+
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
+        """Choose all rows."""
+        n = len(observations)
+        return Selection(np.ones(n, dtype=np.bool_), np.zeros(n), "all")
+
+
+class CausalVisibility:
+    """Ranks the features of each frame by their number of observations so far."""
+
+    def __init__(self, settings: SelectorSettings) -> None:
+        self._seen, self._budget = _VisibilityCount(), _Budget(settings)
+
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
+        """Choose the most often observed rows; ties go to the older feature."""
+        score = self._seen.add(observations.ids)
+        chosen = self._budget.best(score, observations.ids)
+        return Selection(chosen, score, f"most seen so far, {chosen.sum()} of {len(score)}")
+
+
+class WholeRecordVisibility:
+    """The paper's selection: rank all features of the record by visibility and keep the first share of them.
+
+    With a budget, the best-ranked features of each frame are kept.
+    """
+
+    def __init__(self, record: Iterable[Observations], settings: SelectorSettings) -> None:
+        counts = _VisibilityCount()
+        for frame in record:
+            counts.add(frame.ids)
+        ranked = counts.ranked_ids()
+        self._rank = {feature: position for position, feature in enumerate(ranked)}
+        self._kept = int(len(ranked) * settings.keep_fraction)
+        self._budget = None if settings.budget is None else _Budget(settings)
+
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
+        """Choose the rows whose feature is in the kept share of the whole record, or the best-ranked ones."""
+        rank = np.array([self._rank[i] for i in observations.ids.tolist()], dtype=np.float64)
+        if self._budget is not None:
+            chosen = self._budget.best(-rank, observations.ids)
+            return Selection(chosen, -rank, f"most seen in the record, {chosen.sum()} of {len(rank)}")
+        return Selection(rank < self._kept, -rank, f"most seen in the record, {self._kept} of {len(self._rank)}")
+
+
+class InformationGain:
+    """The features with the largest joint information on the last and the coming motions (docs/notes/selection.md)."""
+
+    def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
+        self._settings, self._budget = settings, _Budget(settings)
+        self._model = MotionInformation(camera, settings.horizon_frames, settings.pixel_sigma_px)
+
+    def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
+        """Choose rows greedily by their gain in the log-determinant."""
+        ids = observations.ids
+        L = self._model.add_frame(observations, motion)
+        prior = np.repeat(prior_information(motion)[None], L.shape[1], axis=0)
+        budget = self._budget.rows(len(ids))
+        kept = self._budget.kept(ids) & ~observations.stale
+        if kept.sum() > budget:
+            L[~kept], kept = 0.0, np.zeros(len(ids), dtype=np.bool_)
+        greedy = lazy_greedy(prior, L, ids, budget, kept)
+        chosen = np.zeros(len(ids), dtype=np.bool_)
+        chosen[greedy.order] = True
+        self._model.mark_used(observations, chosen)
+        self._budget.store(ids, chosen)
+        nats = log_det_gain(prior, L[chosen])
+        return Selection(chosen, greedy.gain, f"{nats:.1f} nats from {chosen.sum()} of {len(ids)}")
+
+
+def build_selector(
+    settings: SelectorSettings,
+    *,
+    whole_record: Callable[[], Iterable[Observations]] | None,
+    camera: StereoCamera | None = None,
+) -> Selector:
+    """Build the selector named in the settings.
+
+    Args:
+        settings: the selector's section of the configuration.
+        whole_record: yields all observations of the record; None where they are not available in advance.
+        camera: the rectified pair, which the information selector needs.
+
+    Raises:
+        ConfigError: the recording lacks data that the selector needs.
+    """
+    if settings.name == "visibility_whole":
+        if whole_record is None:
+            raise ConfigError(
+                "selector visibility_whole needs the whole record in advance: run once with --save-observations "
+                "and process that file, or use selector.name=visibility"
+            )
+        return WholeRecordVisibility(whole_record(), settings)
+    if settings.name == "information":
+        if camera is None:
+            raise ConfigError("selector information needs the calibration of the cameras; use visibility")
+        return InformationGain(settings, camera)
+    if settings.name == "visibility":
+        return CausalVisibility(settings)
+    return KeepAll()
