@@ -1,4 +1,4 @@
-"""The list of deliberate mistakes in `tools/mutations.py` fits the code as it is; `tools/mutate.py` makes them."""
+"""The mutations of `tools/mutations.txt` apply to the present code; `tools/mutate.py` runs the tests on them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.mutate import MutationError, mutated, run_tests
-from tools.mutations import MUTATIONS, Mutation
+from tools.mutate import MUTATIONS, Mutation, MutationError, mutated, read_mutations, run_tests
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -25,7 +24,6 @@ def test_every_mistake_can_still_be_made(mutation: Mutation) -> None:
     text, tree = _read(mutation.file)
     spoiled = mutated(mutation, text)  # the old text occurs exactly once
     assert ast.dump(ast.parse(spoiled)) != tree, "a mistake in a comment is none"
-    assert "\n" not in mutation.old
     missing = [name for name in mutation.tests if not (ROOT / name).is_file()]
     assert not missing
 
@@ -33,6 +31,13 @@ def test_every_mistake_can_still_be_made(mutation: Mutation) -> None:
 def test_names_tell_the_mistakes_apart() -> None:
     assert len({m.name for m in MUTATIONS}) == len(MUTATIONS)
     assert len({(m.file, m.old, m.new) for m in MUTATIONS}) == len(MUTATIONS)
+
+
+def test_a_list_without_old_and_new_text_is_an_error() -> None:
+    one = "vio/a.py: lie\n  name\n  - 1\n  + 2\n"
+    assert read_mutations(one) == (Mutation("name", "vio/a.py", "1", "2", ("tests/test_lie.py",)),)
+    with pytest.raises(MutationError, match="'name' needs a line"):
+        read_mutations(one.replace("- 1", "1"))
 
 
 @pytest.mark.parametrize("text", ["a = 2\n", "a = 1\nb = 1\n"])

@@ -1,10 +1,10 @@
-"""Break the code on purpose, one line at a time, and name the test that notices.
+"""Break the estimator's algebra on purpose, one line at a time, and name the test that detects it.
 
     python -m tools.mutate [WORD …] [--list]
 
-Each mutation of `tools/mutations.py` (with WORDs, those whose name or file contains one) is applied to a copy of the
+Each mutation of `tools/mutations.txt` (with WORDs, those whose name or file contains one) is applied to a copy of the
 repository, and its test files run there until the first failure. The table says which test that was. A mutation that
-no test notices is a survivor: the exit status is then 1, and a test is missing. At the end the tests that caught
+no test detects is a survivor: the exit status is then 1, and a test is missing. At the end the tests that detected
 something run on an unchanged copy, where all must pass. Recordings are taken from VIO_DATA.
 """
 
@@ -20,9 +20,8 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-
-from tools.mutations import MUTATIONS, Mutation
 
 ROOT = Path(__file__).resolve().parent.parent
 _COPIED = ("configs", "docs", "frontend", "tests", "tools", "vio", "Makefile", "README.md", "pyproject.toml")
@@ -35,6 +34,35 @@ class MutationError(Exception):
     """The list or the repository is not fit for mutations; the message says what to mend."""
 
 
+@dataclass(frozen=True, slots=True)
+class Mutation:
+    """One deliberate mistake."""
+
+    name: str  # what goes wrong, in a few words
+    file: str  # relative to the repository
+    old: str  # text that occurs exactly once in the file
+    new: str
+    tests: tuple[str, ...]  # test files that may detect it, the quickest first
+
+
+def read_mutations(text: str) -> tuple[Mutation, ...]:
+    """Read a list of mutations, in the form that `tools/mutations.txt` explains."""
+    out, file, tests = list[Mutation](), "", tuple[str, ...]()
+    lines = [line for line in text.splitlines() if line and not line.startswith("#")]
+    while lines:
+        if not lines[0].startswith("  "):
+            file, _, names = lines.pop(0).partition(": ")
+            tests = tuple(f"tests/test_{name}.py" for name in names.split())
+        name, old, new, *lines = lines
+        if not (old.startswith("  - ") and new.startswith("  + ")):
+            raise MutationError(f"{name.strip()!r} needs a line '  - old' and a line '  + new'")
+        out.append(Mutation(name.strip(), file, old[4:], new[4:], tests))
+    return tuple(out)
+
+
+MUTATIONS = read_mutations(Path(__file__).with_name("mutations.txt").read_text(encoding="utf-8"))
+
+
 def mutated(mutation: Mutation, text: str) -> str:
     """Return the text of the mutation's file with the mistake in it.
 
@@ -44,7 +72,7 @@ def mutated(mutation: Mutation, text: str) -> str:
     count = text.count(mutation.old)
     if count != 1:
         raise MutationError(
-            f"{mutation.name!r}: {mutation.old!r} occurs {count} times in {mutation.file}; mend tools/mutations.py"
+            f"{mutation.name!r}: {mutation.old!r} occurs {count} times in {mutation.file}; mend tools/mutations.txt"
         )
     return text.replace(mutation.old, mutation.new)
 
@@ -115,28 +143,28 @@ def main() -> int:
 
 
 def _run(chosen: Sequence[Mutation]) -> int:
-    for mutation in chosen:  # a list that has rotted is told before an hour is spent
+    for mutation in chosen:  # an entry that no longer applies is reported before an hour is spent
         mutated(mutation, (ROOT / mutation.file).read_text(encoding="utf-8"))
-    print("| mutation | file | caught by | s |\n|---|---|---|---:|", flush=True)
-    caught, survivors = set[str](), list[str]()
+    print("| mutation | file | detected by | s |\n|---|---|---|---:|", flush=True)
+    detected, survivors = set[str](), list[str]()
     for mutation in chosen:
         with repository_copy() as copy:
             file = copy / mutation.file
             file.write_text(mutated(mutation, file.read_text(encoding="utf-8")), encoding="utf-8")
             failed, seconds = run_tests(copy, mutation.tests, "-x")
-        caught.update(failed)
+        detected.update(failed)
         if not failed:
             survivors.append(mutation.name)
         by = f"`{failed[0].removeprefix('tests/')}`" if failed else "**nothing**"
         print(f"| {mutation.name} | `{mutation.file}` | {by} | {seconds:.0f} |", flush=True)
     print(f"\n{len(chosen)} mutations, {len(survivors)} survived" + "".join(f"\n- {name}" for name in survivors))
-    if caught:
+    if detected:
         with repository_copy() as copy:
-            failed, _ = run_tests(copy, sorted(caught))
+            failed, _ = run_tests(copy, sorted(detected))
         if failed:
             print("these fail without any mutation: " + ", ".join(failed))
             return 1
-        print(f"the {len(caught)} tests that caught them pass on the unchanged code")
+        print(f"the {len(detected)} tests that detected them pass on the unchanged code")
     return 1 if survivors else 0
 
 
