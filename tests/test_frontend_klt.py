@@ -232,7 +232,7 @@ def test_moving_features_without_depth_are_rejected(with_prior: bool, monkeypatc
         return float(np.median(error)), int((error < 1).sum()), int((error > 4).sum())
 
     median, good, wrong = jumped()
-    monkeypatch.setattr("frontend.outliers.bearing_consensus", lambda *_: None)
+    monkeypatch.setattr("vio.frontend.outliers.bearing_consensus", lambda *_: None)
     _, all_good, all_wrong = jumped()
     assert all_wrong >= 15  # control: without rejection there are outliers
     assert wrong <= 0.15 * all_wrong

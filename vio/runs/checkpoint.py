@@ -21,11 +21,11 @@ from vio.errors import DataError
 from vio.protocols import Dataset
 
 _FORMAT = "stereo-vio checkpoint"
-_PACKAGES = ("vio.filters.", "vio.geometry.", "vio.mapping.", "vio.monitor.", "vio.frontend.")
-_MODULES = (
-    *("vio.live.chain", "vio.config", "vio.datasets.settings", "vio.live.event_order", "vio.datasets.frame_rate", "vio.imu.faults"),
-    *("vio.records", "vio.live.odometry", "vio.runs.pipeline", "vio.live.prediction", "vio.records", "vio.selection.selectors"),
+_PACKAGES = (
+    *("vio.filters.", "vio.frontend.", "vio.geometry.", "vio.imu.", "vio.live.", "vio.mapping.", "vio.monitor."),
+    "vio.selection.",
 )
+_MODULES = ("vio.config", "vio.datasets.frame_rate", "vio.datasets.settings", "vio.records", "vio.runs.pipeline")
 _OTHERS = {
     ("collections", "deque"),
     ("builtins", "set"),
