@@ -12,11 +12,12 @@ import numpy.typing as npt
 from vio.frontend.align import align, cut_patches, on_peak, rounded, shift_warps, template_points, templates
 from vio.frontend.columns import joined, take
 from vio.frontend.detect import spread_evenly
-from vio.frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from vio.frontend.frames import FrameValidator, Stopwatch, make_output
 from vio.frontend.outliers import RansacProblem, predicted_motion, static_tracks
 from vio.frontend.patches import inside
 from vio.frontend.prediction import moved_pixels, prior_pixels, usable_prior
 from vio.frontend.settings import FrontendSettings, MatchSettings
+from vio.frontend.swap import SwapDetector
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, triangulate
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame, TrackPrior

@@ -246,8 +246,8 @@ def load_mask(path: Path) -> Image:
         ) from error
 
 
-def half_mask(mask: Image, shape: tuple[int, ...], half_shape: tuple[int, ...]) -> BoolArray:
-    """The mask (H, W) at half resolution: True where all neighbouring pixels are allowed.
+def half_mask(mask: Image, shape: tuple[int, ...]) -> BoolArray:
+    """The mask (H, W) at half resolution, (H/2, W/2): True where all neighbouring pixels are allowed.
 
     Raises:
         ConfigError: the mask has another shape than the images.
@@ -258,7 +258,7 @@ def half_mask(mask: Image, shape: tuple[int, ...], half_shape: tuple[int, ...]) 
             "give a mask of the recording's size"
         )
     solid = np.asarray(cv2.erode(mask, np.ones((3, 3), np.uint8)))
-    return np.asarray(solid[::2, ::2][: half_shape[0], : half_shape[1]] > 0)
+    return np.asarray(solid[::2, ::2] > 0)
 
 
 def _peak_offset(response: Response, pixels: IntArray) -> FloatArray:

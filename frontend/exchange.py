@@ -15,6 +15,8 @@ from typing import Literal, TypeAlias
 import cv2
 import numpy as np
 
+from vio.frontend.image_check import FrameImages, ImageCheck
+from vio.frontend.patches import inside
 from vio.frontend.right_camera import image_change
 from vio.records import Image
 
@@ -22,6 +24,7 @@ Order: TypeAlias = Literal["given", "exchanged", "refused"]
 
 _THUMBNAIL = (48, 30)  # width and height, so coarse that a shift of the image by some pixels changes little
 _BLOCK = 4  # averaged first: OpenCV averages whole pixels five times as fast as fractions of them
+_POINTS = 80  # that matches of either sign are counted at, at most
 _LEAST_POINTS = 20
 _MANY = 0.4  # share of points with a negative disparity that proves an exchange
 _SOME = 0.2  # share of them above which a frame that looks exchanged is refused: its rows do not fit when put back
@@ -36,18 +39,24 @@ class MatchCounts:
     negative: int
 
 
-class ExchangeDetector:
-    """Compares the images of consecutive frames, and collects lines for the log."""
+class ExchangeDetector(ImageCheck):
+    """Compares the images of consecutive frames."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._last: tuple[Image, Image] | None = None  # left and right, sparsely sampled, in their right order
         self._since: int | None = None  # first frame of a run of exchanged ones
-        self._lines: list[str] = []
 
-    def take_lines(self) -> tuple[str, ...]:
-        """Return the lines since the last call."""
-        lines, self._lines = tuple(self._lines), []
-        return lines
+    def inspect(self, images: FrameImages) -> FrameImages | None:
+        """Return the images in their right order; None: they do not fit each other."""
+        left, right = images.views
+        suspicious = not images.right_trusted
+        order = self.order(
+            images.frame.index, left.half, right.half, lambda: _count_matches(images), suspicious=suspicious
+        )
+        if order == "refused":
+            return None
+        return images if order == "given" else images.with_raw(images.raw[::-1])
 
     def order(
         self, index: int, left: Image, right: Image, count: Callable[[], MatchCounts], *, suspicious: bool
@@ -88,6 +97,18 @@ class ExchangeDetector:
                 f"frame {index}: left and right images are exchanged from here on, as they match with negative "
                 f"disparities only; {done}"
             )
+
+
+def _count_matches(images: FrameImages) -> MatchCounts:
+    """Count matches of either sign, at the points that the other camera saw last."""
+    if images.previous is None:
+        return MatchCounts(0, 0, 0)
+    left, right = images.views
+    tracks = images.previous.tracks
+    points = np.where(tracks.has_right[:, None], tracks.right, tracks.left)
+    points = points[inside(left.full, points, 0.0)][:_POINTS]
+    positive = int(images.stereo.search(left, right, points)[1].sum())
+    return MatchCounts(len(points), positive, images.stereo.count_mirrored(left, right, points))
 
 
 def _thumbnail(image: Image) -> Image:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from vio.frontend.image_check import FrameImages, ImageCheck
 from vio.frontend.patches import mean_and_contrast
 from vio.geometry.lie import FloatArray
 from vio.records import Image
@@ -24,21 +25,21 @@ _STRIDE = 8  # of the pixels that the contrast is computed from
 _SMOOTH_ROWS = 3.0  # standard deviation: bands are wider, and horizontal edges of the scene are narrower
 
 
-class BandRemoval:
-    """Detects bands and takes them out from then on, and collects a line for the log."""
+class BandRemoval(ImageCheck):
+    """Detects bands and takes them out from then on."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._last: FloatArray | None = None  # (H,) difference of row means in the last frame
         self._changed: list[int] = []  # frames with a change beyond the limit
         self._active = False
-        self._lines: list[str] = []
 
-    def take_lines(self) -> tuple[str, ...]:
-        """Return the lines since the last call."""
-        lines, self._lines = tuple(self._lines), []
-        return lines
+    def inspect(self, images: FrameImages) -> FrameImages:
+        """Return the images without bands."""
+        left, right = images.raw
+        return images.with_raw(self.flatten(images.frame.index, left, right))
 
-    def __call__(self, index: int, left: Image, right: Image) -> tuple[Image, Image]:
+    def flatten(self, index: int, left: Image, right: Image) -> tuple[Image, Image]:
         """Return both images (H, W) of a frame, without bands where there are such."""
         rows_left, rows_right = _row_means(left), _row_means(right)
         contrast = sorted(mean_and_contrast(image, _STRIDE)[1] for image in (left, right))

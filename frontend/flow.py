@@ -16,7 +16,6 @@ _RETRY_SHARE = 0.25  # share of lost points above which tracking is repeated wit
 _LOST_SHARE = 0.5  # the same for the last attempt, which starts from the old pixels
 _STRIDE = 4  # brightness is computed from every fourth pixel of the half image
 _MIN_CONTRAST = 1.0  # gray levels, lower bound of the contrast in the gain
-_LOST_CONTRAST_SHARE = 0.1  # share of the last image's contrast below which the contrast counts as lost
 _MAX_CONTRAST_CHANGE = 0.06  # relative change of contrast, and
 _MAX_MEAN_CHANGE = 6.0  # change of the mean gray level, up to which images are not adjusted
 _MAX_GAIN = 4.0
@@ -53,11 +52,6 @@ def track_with_retries(
             last, view, points[retry], start[retry], settings.pyramid_levels, settings, trusted=False
         )
     return found, good
-
-
-def lost_contrast(image: Image, last: Image) -> bool:
-    """Whether an image (H, W) has almost no contrast although the last one had: black, saturated or covered."""
-    return mean_and_contrast(image, _STRIDE)[1] < _LOST_CONTRAST_SHARE * mean_and_contrast(last, _STRIDE)[1]
 
 
 def match_brightness(image: Image, other: Image) -> Image:

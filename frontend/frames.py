@@ -1,9 +1,8 @@
-"""Parts shared by all image-based front ends: frame validation, a stopwatch, swap detection, the output."""
+"""Parts shared by all image-based front ends: frame validation, a stopwatch, the output."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -13,10 +12,6 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, Image, IntArray, Observations, StereoFrame
-
-_SWAP_FRAMES = 3  # consecutive suspicious frames before an error is raised
-_SWAP_MIN_POINTS = 20  # with fewer features the check is skipped
-_SWAP_MANY = 0.4  # share of features matched in the mirrored images that indicates a swap
 
 
 @dataclass(slots=True)
@@ -59,8 +54,8 @@ class FrameValidator:
         self._check(frame, {"left": frame.left, "right": frame.right})
         return frame.left, frame.right
 
-    def validate_one(self, frame: StereoFrame, *, depth: bool) -> Image:
-        """Check a frame of one camera, with depths or without, and return its image, (H, W) uint8.
+    def validate_one(self, frame: StereoFrame) -> tuple[Image]:
+        """Check a frame of one camera, with its depths where it has such, and return its image, (H, W) uint8.
 
         Raises:
             DataError: as `validate`; or depths that are missing, or of another size or type.
@@ -70,13 +65,13 @@ class FrameValidator:
         if frame.left is None:
             raise DataError(f"frame {frame.index} has no image, but the {self.name} front end needs one")
         self._check(frame, {"left": frame.left})
-        if depth and (frame.depth is None or frame.depth.shape != frame.left.shape):
+        if self.camera.kind == "rgbd" and (frame.depth is None or frame.depth.shape != frame.left.shape):
             found = "no depths" if frame.depth is None else f"depths of {frame.depth.shape[1]}x{frame.depth.shape[0]}"
             raise DataError(
                 f"frame {frame.index} has {found}; a camera with depth images needs metres for each pixel of the "
                 f"image, {frame.left.shape[1]}x{frame.left.shape[0]}, 0 where there is none"
             )
-        return frame.left
+        return (frame.left,)
 
     def _check(self, frame: StereoFrame, images: dict[str, Image]) -> None:
         """Check time and images of a frame, the left one first, and note them."""
@@ -107,39 +102,6 @@ class FrameValidator:
                     "all images of a recording must have one size"
                 )
         self._index, self._time_ns, self._shape = frame.index, frame.time_ns, images["left"].shape
-
-
-@dataclass(slots=True)
-class SwapDetector:
-    """Detects a recording with swapped left and right images: few matches, but many in the mirrored images.
-
-    Several frames must show it. Once a frame was in order, its recording is: what comes later is for others to say.
-    """
-
-    few: float  # share of features with a match, below which the mirrored images are checked
-    _suspicious: int = 0
-    _in_order: int = 0  # frames
-
-    def check(self, frame: StereoFrame, features: int, matched: int, count_mirrored: Callable[[], int]) -> None:
-        """Check the number of matched features; `count_mirrored` counts the matches in the mirrored images.
-
-        Raises:
-            DataError: left and right look swapped.
-        """
-        if features < _SWAP_MIN_POINTS or matched >= self.few * features:
-            self._suspicious = 0
-            self._in_order += features >= _SWAP_MIN_POINTS
-            return
-        if self._in_order >= _SWAP_FRAMES:
-            return
-        mirrored = count_mirrored()
-        self._suspicious = self._suspicious + 1 if mirrored >= max(_SWAP_MANY * features, 2 * matched) else 0
-        if self._suspicious >= _SWAP_FRAMES:
-            raise DataError(
-                f"frame {frame.index}: left and right images look swapped ({mirrored} of {features} features match "
-                f"with a negative disparity, {matched} with a positive one, in {_SWAP_FRAMES} frames); exchange the "
-                "image folders or the cameras' calibration"
-            )
 
 
 class Features(Protocol):

@@ -8,28 +8,30 @@ import cv2
 import numpy as np
 
 from vio.frontend.anchor_fit import AnchorFit
+from vio.frontend.contrast import LostContrast
 from vio.frontend.detect import detect_corners, half_mask, load_mask
-from vio.frontend.exchange import ExchangeDetector, MatchCounts
+from vio.frontend.exchange import ExchangeDetector
 from vio.frontend.flicker import BandRemoval
-from vio.frontend.flow import lost_contrast, track_with_retries
-from vio.frontend.frames import FrameValidator, Stopwatch, SwapDetector, make_output
+from vio.frontend.flow import track_with_retries
+from vio.frontend.frames import FrameValidator, Stopwatch, make_output
+from vio.frontend.image_check import FrameImages, ImageCheck
 from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
-from vio.frontend.patches import View, half_image, inside
+from vio.frontend.patches import View, half_image
 from vio.frontend.prediction import guessed_pixels, prior_rows, usable_prior
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import RightDelay
-from vio.frontend.right_match import PreviousFrame, RightMatcher
+from vio.frontend.right_match import RightMatcher
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.stereo_fit import StereoFit
-from vio.frontend.tracks import AnchorBank, Tracks, no_tracks
+from vio.frontend.swap import SwapDetector
+from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, Image, StereoFrame, TrackPrior
 
-_EXCHANGE_POINTS = 80  # points that matches of either sign are counted at
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
 _FEW_MISSING = 0.1  # share of the features; detection takes more time than it is worth for fewer
 _VERY_FEW = 0.25  # share of the target below which new features are output at once
@@ -53,13 +55,12 @@ class KltFrontend:
         self._clahe = cv2.createCLAHE(2.0, (8, 8)) if self._settings.equalise == "clahe" else None
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._validator = FrameValidator(camera, "klt")
-        self._swap = SwapDetector(_SWAP_FEW)
-        self._bands = BandRemoval()
-        self._exchange = ExchangeDetector()
-        self._right = RightCamera()
-        self._delay = RightDelay(camera)
-        self._objects = ObjectReport()
-        self._lines: list[str] = []  # of the frame, for the log
+        self._right, self._delay, self._objects = RightCamera(), RightDelay(camera), ObjectReport()
+        contrast = LostContrast(self._settings.max_blind_frames)
+        self._checks: tuple[ImageCheck, ...] = (contrast, self._objects)  # in this order
+        if camera.kind == "stereo":
+            pair = (ExchangeDetector(), self._right, self._delay, self._objects, SwapDetector(_SWAP_FEW))
+            self._checks = (BandRemoval(), contrast, *pair)
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, self._settings.anchor_radius_px)
         self._anchor_fit = AnchorFit(camera, self._settings, self._grid, self._bank)
         self._new_features = NewFeatures(camera, self._settings, self._grid, self._bank)
@@ -68,7 +69,6 @@ class KltFrontend:
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
         self._next_id = 0
         self._rested = False  # whether the last frame was one in which no corners were detected
-        self._skipped = 0  # frames in a row
         self._step_ns: int | None = None  # between the last two frames
 
     def process(self, frame: StereoFrame, prior: TrackPrior | None = None) -> FrontendOutput:
@@ -77,74 +77,34 @@ class KltFrontend:
         Raises:
             ConfigError: the mask is not of the images' size.
         """
-        if self._camera.kind != "stereo":
-            return self._process_one(frame, prior)
-        watch = Stopwatch()
-        images = self._validator.validate(frame)
-        left, right = (self._view(image) for image in self._bands(frame.index, *images))
-        stereo, allowed = self._set_up(left)
+        watch, kind = Stopwatch(), self._camera.kind
+        raw = self._validator.validate(frame) if kind == "stereo" else self._validator.validate_one(frame)
+        stereo, allowed = self._set_up(raw[0].shape)
+        images = FrameImages(frame, raw, self._view, self._previous, stereo, self._right.usable)
+        for check in self._checks:
+            checked = check.inspect(images)
+            if checked is None:
+                return make_output(frame, no_tracks(), 0, watch, self._take_lines())
+            images = checked
+        left, right = images.left, images.right
         watch.lap("prepare")
-        if self._contrast_lost(left):
-            return make_output(frame, no_tracks(), 0, watch)
-        order = self._exchange.order(
-            frame.index,
-            left.half,
-            right.half,
-            lambda: self._count_matches(left, right, stereo),
-            suspicious=not self._right.usable,
-        )
-        if order == "refused":
-            return make_output(frame, no_tracks(), 0, watch, self._take_lines())
-        if order == "exchanged":
-            left, right = right, left
-        if self._right.left_is_frozen(frame.index, left.half, right.half):
-            return make_output(frame, no_tracks(), 0, watch, self._take_lines())
-        tracks, motion = self._track(frame, left, right, usable_prior(prior), stereo, watch)
+        tracks, motion = self._track(images, usable_prior(prior), watch)
         wanted = self._wanted_corners(len(tracks))
         corners = detect_corners(left.half, tracks.left, wanted, self._grid, self._settings, allowed)
         watch.lap("detect")
-        usable, delayed = right if self._right.usable else None, self._delay.frames != 0.0
+        # Without a second camera no corner is searched along the row; `delayed` takes them without a depth.
+        usable, delayed = right if self._right.usable else None, right is None or self._delay.frames != 0.0
         tracks = self._new_features.add(left, usable, tracks, corners, motion, stereo, delayed=delayed)
         if usable is not None and not delayed:
             stereo.update_rows(tracks)
-        watch.lap("stereo")
-        points, matched = tracks.left, int(tracks.has_right.sum())
-        self._swap.check(frame, len(points), matched, lambda: stereo.count_mirrored(left, right, points))
-        return self._output(frame, left, right.half, tracks, motion, watch)
-
-    def _process_one(self, frame: StereoFrame, prior: TrackPrior | None) -> FrontendOutput:
-        """Track and detect in the image of one camera; right pixels are those of its depth image, if there is one."""
-        watch, with_depth = Stopwatch(), self._camera.kind == "rgbd"
-        left = self._view(self._validator.validate_one(frame, depth=with_depth))
-        stereo, allowed = self._set_up(left)
-        watch.lap("prepare")
-        if self._contrast_lost(left):
-            return make_output(frame, no_tracks(), 0, watch)
-        tracks, motion = self._track(frame, left, None, usable_prior(prior), stereo, watch)
-        corners = detect_corners(
-            left.half, tracks.left, self._wanted_corners(len(tracks)), self._grid, self._settings, allowed
-        )
-        watch.lap("detect")
-        # No corner is searched along the row; `delayed` takes them without a depth.
-        tracks = self._new_features.add(left, None, tracks, corners, motion, stereo, delayed=True)
-        if with_depth and frame.depth is not None:
+        if kind == "rgbd" and frame.depth is not None:
             tracks = with_depths(self._camera, tracks, frame.depth)
-        watch.lap("depth")
-        return self._output(frame, left, None, tracks, motion, watch)
-
-    def _output(
-        self,
-        frame: StereoFrame,
-        left: View,
-        right_half: Image | None,
-        tracks: Tracks,
-        motion: Consensus | None,
-        watch: Stopwatch,
-    ) -> FrontendOutput:
-        """Return the features that are output in a frame, and store what the next one needs."""
+        watch.lap("stereo")
+        for check in self._checks:
+            check.conclude(images, tracks)
         tracked = int(tracks.shown.sum())  # those shown now that were shown before
         tracks = self._promote(tracks)
-        self._store(frame, left, right_half, tracks, motion)
+        self._store(images, tracks, motion)
         watch.lap("check")
         return make_output(frame, tracks, tracked, watch, self._take_lines(), shown=tracks.shown)
 
@@ -162,17 +122,7 @@ class KltFrontend:
 
     def _take_lines(self) -> tuple[str, ...]:
         """Return what the frame says of the images, one line an event."""
-        lines, self._lines = (
-            (
-                *self._bands.take_lines(),
-                *self._exchange.take_lines(),
-                *self._right.take_lines(),
-                *self._delay.take_lines(),
-                *self._lines,
-            ),
-            [],
-        )
-        return lines
+        return tuple(line for check in self._checks for line in check.take_lines())
 
     def _view(self, image: Image) -> View:
         """Equalise and convert an image; the result may share memory with it."""
@@ -180,43 +130,18 @@ class KltFrontend:
             image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
         return View(image, half_image(image))
 
-    def _set_up(self, left: View) -> tuple[StereoFit, BoolArray | None]:
-        """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame."""
+    def _set_up(self, shape: tuple[int, ...]) -> tuple[StereoFit, BoolArray | None]:
+        """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame's shape."""
         if self._setup is None:
-            height, width = left.full.shape
-            allowed = None if self._mask is None else half_mask(self._mask, left.full.shape, left.half.shape)
+            height, width = shape
+            allowed = None if self._mask is None else half_mask(self._mask, shape)
             stereo = StereoFit(self._camera, self._settings, self._disparity, self._bank, (width, height))
             self._setup = stereo, allowed
         return self._setup
 
-    def _contrast_lost(self, left: View) -> bool:
-        """Whether the image has no contrast although the previous one had: black, saturated or covered for a moment.
-
-        Such a frame is skipped and tracking continues from the one before, for at most `max_blind_frames` frames.
-        """
-        previous, before = self._previous, self._skipped
-        self._skipped = 0
-        if previous is None or len(previous.tracks) == 0 or before >= self._settings.max_blind_frames:
-            return False
-        if lost_contrast(left.half, previous.left.half):
-            self._skipped = before + 1
-        return self._skipped > 0
-
-    def _count_matches(self, left: View, right: View, stereo: StereoFit) -> MatchCounts:
-        """Count matches of either sign, at the points that the other camera saw last."""
-        previous = self._previous
-        if previous is None:
-            return MatchCounts(0, 0, 0)
-        tracks = previous.tracks
-        points = np.where(tracks.has_right[:, None], tracks.right, tracks.left)
-        points = points[inside(left.full, points, 0.0)][:_EXCHANGE_POINTS]
-        positive = int(stereo.search(left, right, points)[1].sum())
-        return MatchCounts(len(points), positive, stereo.count_mirrored(left, right, points))
-
-    def _store(
-        self, frame: StereoFrame, left: View, right_half: Image | None, tracks: Tracks, motion: Consensus | None
-    ) -> None:
+    def _store(self, images: FrameImages, tracks: Tracks, motion: Consensus | None) -> None:
         """Store the state that the next frame needs."""
+        frame, left, right = images.frame, images.left, images.right
         self._bank.keep_only(tracks.slot)
         before = self._previous
         self._step_ns = None if before is None else frame.time_ns - before.time_ns
@@ -224,21 +149,17 @@ class KltFrontend:
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
         left = View(left.full.copy(), left.half)  # a reader may reuse its buffer
+        right_half = None if right is None else right.half
         self._previous = PreviousFrame(frame.time_ns, left, right_half, tracks, twist, motion is not None)
 
     def _track(
-        self,
-        frame: StereoFrame,
-        left: View,
-        right: View | None,
-        prior: TrackPrior | None,
-        stereo: StereoFit,
-        watch: Stopwatch,
+        self, images: FrameImages, prior: TrackPrior | None, watch: Stopwatch
     ) -> tuple[Tracks, Consensus | None]:
         """Track the features of the previous frame; return those kept and the consensus motion.
 
         They are matched in the right image, if there is one.
         """
+        frame, left, right, stereo = images.frame, images.left, images.right, images.stereo
         previous = self._previous
         if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
             return no_tracks(), None
@@ -302,7 +223,7 @@ class KltFrontend:
             if stereo.rows_are_off and one_motion_explains(problem, chosen, before[has_depth], after[has_depth]):
                 chosen = replace(chosen, object_share=0.0)
             motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
-            self._lines += self._objects.frame(index, chosen)
+            self._objects.frame(index, chosen)
         if motion is not None and not has_depth.all():
             near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
             distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)

@@ -16,6 +16,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.frontend.image_check import ImageCheck
 from vio.frontend.outliers import Consensus, RansacProblem, bearing_consensus, best_motion, pixel_errors
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, z_D_p_cam
@@ -120,10 +121,11 @@ def _agrees(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: 
     return squared <= float(chi_square_quantile(_PROBABILITY, 6))
 
 
-class ObjectReport:
-    """Says once per event that an object covers much of the image, and what decided which motion is the camera's."""
+class ObjectReport(ImageCheck):
+    """Reports once per event that an object covers much of the image, and what decided which motion is the camera's."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._frames = self._clear = 0  # in a row
         self._said = self._active = False
 
@@ -132,27 +134,28 @@ class ObjectReport:
         """Whether the prediction has told an object from the scene in some of the last frames."""
         return self._active
 
-    def frame(self, index: int, motions: TwoMotions | None) -> tuple[str, ...]:
-        """Return the line of a frame, if any; None: no motion was found."""
-        if motions is None or motions.object_share == 0.0:
+    def frame(self, index: int, motions: TwoMotions) -> None:
+        """Take the motions of a frame."""
+        if motions.object_share == 0.0:
             self._frames, self._clear = 0, self._clear + 1
             self._said = self._said and self._clear < _CLEAR_FRAMES
             self._active = self._active and self._clear < _FRAMES
-            return ()
+            return
         self._frames, self._clear = self._frames + 1, 0
         self._active = self._active or (self._frames >= _FRAMES and motions.decision == "predicted")
         if self._frames < _FRAMES or self._said:
-            return ()
+            return
         self._said = True
         share = round(100 * motions.object_share)
-        if motions.decision == "predicted":
-            return (
-                f"frame {index}: {share} % of the points move together, but not as the camera does by its predicted "
-                "motion: an object that moves on its own covers much of the image; its points are left out",
-            )
-        rest = round(100 * float(motions.motion.inliers.mean()))
-        return (
-            f"frame {index}: two groups of points move differently, {rest} % and {share} % of all: an object that "
-            "moves on its own covers much of the image, and the predicted motion does not tell which group it is; the "
-            "larger one is taken for the scene",
+        line = (
+            f"frame {index}: {share} % of the points move together, but not as the camera does by its predicted "
+            "motion: an object that moves on its own covers much of the image; its points are left out"
         )
+        if motions.decision != "predicted":
+            rest = round(100 * float(motions.motion.inliers.mean()))
+            line = (
+                f"frame {index}: two groups of points move differently, {rest} % and {share} % of all: an object that "
+                "moves on its own covers much of the image, and the predicted motion does not tell which group it is; "
+                "the larger one is taken for the scene"
+            )
+        self._lines.append(line)

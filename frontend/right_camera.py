@@ -13,6 +13,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.frontend.image_check import FrameImages, ImageCheck
 from vio.frontend.patches import mean_and_contrast, statistics
 from vio.numerics.compiled import compiled_sums
 from vio.records import BoolArray, Image
@@ -49,10 +50,11 @@ class _Pair:
     right: Image
 
 
-class RightCamera:
-    """Decides frame by frame whether the right image may be used, and collects lines for the log."""
+class RightCamera(ImageCheck):
+    """Decides frame by frame whether the right image may be used."""
 
     def __init__(self) -> None:
+        super().__init__()
         self._last: _Pair | None = None  # the last frame in which no image was frozen
         self._ratio = 1.0  # usual change of the right image over that of the left one
         self._cause: Cause | None = None  # why the right image is not used
@@ -60,7 +62,6 @@ class RightCamera:
         self._count = self._agreeing = self._untested = 0  # frames in a row
         self._left_frozen = 0  # frames in a row
         self._said = False
-        self._lines: list[str] = []
 
     @property
     def contradicts(self) -> bool:
@@ -81,10 +82,10 @@ class RightCamera:
         self._cause, self._said = None, False
         self._count = self._agreeing = self._untested = 0
 
-    def take_lines(self) -> tuple[str, ...]:
-        """Return the lines since the last call."""
-        lines, self._lines = tuple(self._lines), []
-        return lines
+    def inspect(self, images: FrameImages) -> FrameImages | None:
+        """Skip frames whose left image is frozen."""
+        left, right = images.views
+        return None if self.left_is_frozen(images.frame.index, left.half, right.half) else images
 
     def left_is_frozen(self, index: int, left: Image, right: Image) -> bool:
         """Compare the images (H/2, W/2) of a frame with those before; return whether the left one is frozen.

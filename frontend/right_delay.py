@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.frontend.image_check import ImageCheck
 from vio.frontend.tracks import Tracks
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
@@ -42,24 +43,19 @@ class PairingCounts:
     early: int  # this left image, and the right one before
 
 
-class RightDelay:
-    """Estimates the right camera's delay from the matches of all frames, and collects lines for the log."""
+class RightDelay(ImageCheck):
+    """Estimates the right camera's delay from the matches of all frames."""
 
     def __init__(self, camera: StereoCamera) -> None:
+        super().__init__()
         self._camera = camera
         self._normal: FloatArray = np.zeros((_TERMS + 1, _TERMS + 1))
         self._moment: FloatArray = np.zeros(_TERMS + 1)
         self._square = self._count = 0.0  # sums of squared rows and of weights
         self._frames = 0
         self._solution: FloatArray = np.zeros(_TERMS + 1)
-        self._lines: list[str] = []
         self._suspected = (0.0, 0)  # delay by the pairings, and in how many frames in a row
         self.frames = 0.0  # the delay in frames to be taken out; 0: none is significant
-
-    def take_lines(self) -> tuple[str, ...]:
-        """Return the lines since the last call."""
-        lines, self._lines = tuple(self._lines), []
-        return lines
 
     def update(self, index: int, left: FloatArray, flow: FloatArray, rows: FloatArray, frame_s: float) -> bool:
         """Learn from the matches of a frame; return whether a delay has just begun or ended.

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from vio.frontend.one_camera import with_prior_depths
@@ -12,24 +10,12 @@ from vio.frontend.patches import View
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
 from vio.frontend.stereo_fit import StereoFit
-from vio.frontend.tracks import Tracks, no_tracks
+from vio.frontend.tracks import PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.records import Image, IntArray, StereoFrame, TrackPrior
+from vio.records import IntArray, StereoFrame, TrackPrior
 
 _PAIRING_POINTS = 150  # features that are tried with images of other frames
-
-
-@dataclass(frozen=True, slots=True)
-class PreviousFrame:
-    """State kept from the previous frame."""
-
-    time_ns: int
-    left: View
-    right_half: Image | None  # None: there is no right camera
-    tracks: Tracks
-    twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus
-    trusted: bool  # the last motion had a consensus
 
 
 class RightMatcher:

@@ -29,7 +29,7 @@ def test_images_without_bands_are_returned_as_they_are() -> None:
     for k in range(12):
         left, right = pair(k)
         right = dark if k % 3 == 2 else right  # a camera that loses frames makes no bands
-        assert removal(k, left, right)[0] is left
+        assert removal.flatten(k, left, right)[0] is left
     assert removal.take_lines() == ()
 
 
@@ -39,7 +39,7 @@ def test_a_late_right_camera_makes_no_bands() -> None:
     removal = BandRemoval()
     for k in range(12):
         left, right = (rows[12 * j : 12 * j + 150].astype(np.uint8) for j in (k + 1, k))
-        assert removal(k, left, right)[0] is left
+        assert removal.flatten(k, left, right)[0] is left
     assert removal.take_lines() == ()
 
 
@@ -47,7 +47,7 @@ def test_bands_are_named_once_and_taken_out() -> None:
     removal, lines = BandRemoval(), []
     for k in range(12):
         images = tuple(banded(image, k, camera) for camera, image in enumerate(pair(k)))
-        out = removal(k, *images)
+        out = removal.flatten(k, *images)
         lines += removal.take_lines()
     (line,) = lines
     assert line.startswith("frame 3: bands of brightness move through the images")
@@ -59,7 +59,7 @@ def test_bands_are_named_once_and_taken_out() -> None:
 @pytest.mark.parametrize("removed", [True, False], ids=["removed", "control"])
 def test_features_are_tracked_through_bands(removed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not removed:
-        monkeypatch.setattr(BandRemoval, "__call__", lambda self, index, left, right: (left, right))
+        monkeypatch.setattr(BandRemoval, "flatten", lambda self, index, left, right: (left, right))
     frontend = KltFrontend(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
 
     def process(frame: StereoFrame) -> FrontendOutput:

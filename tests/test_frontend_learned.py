@@ -53,7 +53,7 @@ def small_frame(index: int, pose: FloatArray) -> StereoFrame:
 
 
 def test_importing_the_packages_does_not_import_torch() -> None:
-    modules = "vio, frontend, frontend.klt, frontend.descriptors, frontend.learned"
+    modules = "vio, vio.frontend, vio.frontend.klt, vio.frontend.descriptors, vio.frontend.learned"
     code = f"import sys, {modules}; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 

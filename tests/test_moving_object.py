@@ -11,7 +11,6 @@ from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, s
 from vio.frontend.klt import KltFrontend
 from vio.frontend.moving_object import ObjectReport, TwoMotions, choose_motion, one_motion_explains
 from vio.frontend.outliers import Consensus, rigid_consensus
-from vio.frontend.patches import View
 from vio.frontend.prediction import usable_prior
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.tracks import new_tracks
@@ -98,18 +97,23 @@ def test_an_object_is_reported_once_per_event_with_what_decided() -> None:
     everything = Consensus(np.eye(4), np.arange(10) < 6)
     nothing, object_ = TwoMotions(everything, 0.0, None), TwoMotions(everything, 0.4, "predicted")
     report = ObjectReport()
-    for k in range(4):
-        assert report.frame(k, object_) == ()
-    assert report.frame(4, nothing) == ()
+
+    def lines_of(frames: range, motions: TwoMotions) -> list[str]:
+        for k in frames:
+            report.frame(k, motions)
+        return list(report.take_lines())
+
+    assert lines_of(range(4), object_) == []
+    assert lines_of(range(4, 5), nothing) == []
     assert not report.active
-    lines = [line for k in range(5, 40) for line in report.frame(k, object_)]
+    lines = lines_of(range(5, 40), object_)
     assert [line[:36] for line in lines] == ["frame 9: 40 % of the points move tog"]
     assert "its points are left out" in lines[0]
     assert report.active
-    assert [line for k in range(40, 70) for line in report.frame(k, nothing)] == []
+    assert lines_of(range(40, 70), nothing) == []
     assert not report.active
     undecided = TwoMotions(everything, 0.4, "undecided")
-    (line,) = [line for k in range(70, 80) for line in report.frame(k, undecided)]
+    (line,) = lines_of(range(70, 80), undecided)
     assert "60 % and 40 % of all" in line
     assert "does not tell which group it is; the larger one is taken for the scene" in line
 
@@ -119,8 +123,8 @@ def _lines(p: FloatArray, z: FloatArray, uv: FloatArray) -> list[str]:
 
     Features at stereo pixels z (N, 4), taken for points p (N, 3), move to left pixels uv (N, 2).
     """
-    frontend, blank = KltFrontend(CAMERA, FrontendSettings()), np.zeros((480, 1220), dtype=np.uint8)
-    stereo, _ = frontend._set_up(View(blank, blank[::2, ::2]))
+    frontend = KltFrontend(CAMERA, FrontendSettings())
+    stereo, _ = frontend._set_up((480, 1220))
     everything = np.ones(len(p), dtype=np.bool_)
     new = new_tracks(z[:, :2].copy(), np.zeros(len(p), dtype=np.int64))
     tracks = replace(new, right=z[:, 2:], has_right=everything, point=p, has_point=everything)
