@@ -1,4 +1,4 @@
-"""Parts that need torch (extra `learned`): the front end `kornia`, and batched Lucas-Kanade.
+"""Parts that need torch (extra `learned`): the front end `kornia`.
 
 Nothing is ever downloaded: networks are built without weights and loaded from a file with `weights_only=True`.
 Detectors gftt and harris with descriptor sift need no weights. torch and kornia are imported only when a part that
