@@ -22,15 +22,13 @@ def _build_klt(camera: StereoCamera, settings: FrontendSettings, dataset: Datase
 def _build_orb(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
     from vio.frontend.descriptors import DescriptorFrontend, MutualNearest, orb_extractor
 
-    match = settings.match
-    return DescriptorFrontend(camera, settings, "orb", orb_extractor(match), MutualNearest(match.ratio))
+    return DescriptorFrontend(camera, settings, "orb", orb_extractor(settings.match), MutualNearest())
 
 
 def _build_sift(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:
     from vio.frontend.descriptors import DescriptorFrontend, MutualNearest, sift_extractor
 
-    match = settings.match
-    return DescriptorFrontend(camera, settings, "sift", sift_extractor(match), MutualNearest(match.ratio))
+    return DescriptorFrontend(camera, settings, "sift", sift_extractor(settings.match), MutualNearest())
 
 
 def _build_kornia(camera: StereoCamera, settings: FrontendSettings, dataset: Dataset | None) -> Frontend:

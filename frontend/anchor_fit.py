@@ -12,15 +12,17 @@ from vio.frontend.detect import min_distance_px
 from vio.frontend.outliers import Consensus, pixel_errors
 from vio.frontend.patches import View, inside
 from vio.frontend.prediction import moved_pixels
-from vio.frontend.settings import GridSettings, KltSettings
-from vio.frontend.tracks import AnchorBank, Tracks
+from vio.frontend.settings import GridSettings
+from vio.frontend.tracks import ANCHOR_RADIUS_PX, INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, IntArray
 
 _ITERATIONS = 5
-_ANCHOR_LOST = 0.5  # correlation with the anchor below which a feature is lost
+_MIN_CORRELATION = 0.8  # normalised, with the anchor; below, the anchor is replaced
+_ANCHOR_LOST = 0.5  # below, the feature is lost
+_MAX_SCALE = 1.25  # change of scale at which the anchor is replaced
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,9 +38,9 @@ class _Start:
 class AnchorFit:
     """Align features with their anchors, and replace anchors that no longer fit."""
 
-    def __init__(self, camera: StereoCamera, settings: KltSettings, grid: GridSettings, bank: AnchorBank) -> None:
+    def __init__(self, camera: StereoCamera, grid: GridSettings, bank: AnchorBank) -> None:
         """Prepare; the bank contains the features' anchors."""
-        self._camera, self._settings, self._grid, self._bank = camera, settings, grid, bank
+        self._camera, self._grid, self._bank = camera, grid, bank
 
     def track(
         self, old: Tracks, before: View, left: View, found: FloatArray, seen: BoolArray, motion: Consensus | None
@@ -56,7 +58,6 @@ class AnchorFit:
             seen: mask (N,) of the static features that it found.
             motion: consensus motion since the previous frame, if there is one.
         """
-        settings = self._settings
         start = self._start(old, left, found, seen, motion)
         rows = np.flatnonzero(start.tried)
         warp = old.warp[rows]
@@ -64,19 +65,17 @@ class AnchorFit:
         warp[:, :, 2] = start.pixels[rows]
         warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _ITERATIONS)
         change = np.abs(np.log(scale_change(warp)))
-        good = (score >= settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.pixels[rows])
-        good &= change <= np.log(2 * settings.max_anchor_scale)
+        good = (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start.pixels[rows])
+        good &= change <= np.log(2 * _MAX_SCALE)
         kept, has_point = good.copy(), old.has_point.copy()
         retry = np.flatnonzero(~good & seen[rows] & (score >= _ANCHOR_LOST))
         if len(retry):
             warp[retry], kept[retry] = self._realign(old, before, left, rows[retry], start)
         if motion is not None:
-            deviates = (
-                pixel_errors(self._camera, motion.T_curr_prev, old.point[rows], warp[:, :, 2]) > settings.consensus_px
-            )
+            deviates = pixel_errors(self._camera, motion.T_curr_prev, old.point[rows], warp[:, :, 2]) > INLIER_PX
             kept &= ~(deviates & old.has_point[rows] & old.has_right[rows])
             has_point[rows[deviates]] = False  # its depth was propagated without a measurement, and was wrong
-        rescaled = good & (change > np.log(settings.max_anchor_scale))
+        rescaled = good & (change > np.log(_MAX_SCALE))
         rows, warp, rescaled = rows[kept], warp[kept], rescaled[kept]
         if rescaled.any():
             centres = rounded(warp[rescaled, :, 2])
@@ -100,7 +99,7 @@ class AnchorFit:
             return _Start(found, np.ones(len(old)), old.point, seen)
         point = transform_points(motion.T_curr_prev, old.point)
         predicted = moved_pixels(self._camera, motion.T_curr_prev, old.point, old.left)
-        margin = self._settings.anchor_radius_px + 2.0
+        margin = ANCHOR_RADIUS_PX + 2.0
         depth, before = depth_of(self._camera, point), depth_of(self._camera, old.point)
         ahead = old.has_point & (depth > 0.1)
         return _Start(
@@ -121,7 +120,7 @@ class AnchorFit:
         warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _ITERATIONS)
         # The anchor was cut at a rounded pixel; correct the offset to the feature.
         warp[:, :, 2] = template_points(warp, old.left[rows] - centres)
-        return warp, (score >= self._settings.min_anchor_correlation) & on_peak(warp[:, :, 2], start.pixels[rows])
+        return warp, (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start.pixels[rows])
 
 
 def _spaced(points: FloatArray, distance: float) -> BoolArray:

@@ -17,6 +17,7 @@ from vio.frontend.outliers import RansacProblem, predicted_motion, static_tracks
 from vio.frontend.patches import inside
 from vio.frontend.prediction import moved_pixels, prior_pixels, usable_prior
 from vio.frontend.settings import FrontendSettings, MatchSettings
+from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX
 from vio.frontend.swap import SwapDetector
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, triangulate
@@ -24,6 +25,10 @@ from vio.records import BoolArray, FrontendOutput, Image, IntArray, StereoFrame,
 
 Descriptors: TypeAlias = npt.NDArray[np.float32] | npt.NDArray[np.uint8]
 
+_MAX_RATIO = 0.8  # of a descriptor's distance to that of the second-nearest
+_SEARCH_RADIUS = 0.06  # half side of the search window around the predicted pixel, over the image width
+_MAX_ROW_DIFFERENCE_PX = 1.5  # of a stereo match
+_INLIER_PX = 1.5  # largest reprojection error of a static feature under the consensus motion
 _REFINE_RADIUS = 6  # half side of the patches, pixels
 _REFINE_ITERATIONS = 6
 _REFINE_MIN_CORRELATION = 0.8
@@ -74,7 +79,7 @@ class MutualNearest:
     Reference: Lowe, Distinctive image features from scale-invariant keypoints, IJCV (2004), section 7.1.
     """
 
-    ratio: float  # largest distance over that of the second-nearest
+    ratio: float = _MAX_RATIO  # largest distance over that of the second-nearest
 
     def __call__(self, a: Keypoints, b: Keypoints, allowed: BoolArray) -> IntArray:
         """Return pairs (K, 2); see `Matcher`."""
@@ -166,8 +171,7 @@ class DescriptorFrontend:
         self, camera: StereoCamera, settings: FrontendSettings, name: str, extract: Extractor, match: Matcher
     ) -> None:
         self._camera = camera
-        self._settings, self._grid = settings.match, settings.grid
-        self._disparity, self._consensus = settings.disparity, settings.consensus
+        self._grid, self._disparity, self._seed = settings.grid, settings.disparity, settings.consensus.seed
         self._extract = extract
         self._match = match
         self._validator = FrameValidator(camera, name)
@@ -204,12 +208,11 @@ class DescriptorFrontend:
 
     def _allowed(self, left: Keypoints, right: Keypoints, width: int) -> BoolArray:
         """Pairs (N, M) near one row with a disparity in range."""
-        limits = self._disparity
         disparity = left.pixels[:, :1] - right.pixels[:, 0]
         return np.asarray(
-            (np.abs(left.pixels[:, 1:] - right.pixels[:, 1]) <= self._settings.max_epipolar_px)
-            & (disparity >= limits.min_disparity_px)
-            & (disparity <= limits.max_disparity * width)
+            (np.abs(left.pixels[:, 1:] - right.pixels[:, 1]) <= _MAX_ROW_DIFFERENCE_PX)
+            & (disparity >= MIN_MATCH_DISPARITY_PX)
+            & (disparity <= self._disparity.max_disparity * width)
         )
 
     def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[Image, Image]) -> _Pair:
@@ -220,7 +223,7 @@ class DescriptorFrontend:
         target = right.pixels[pairs[:, 1]]
         right_pixels[rows], alike = self._refine(views[0], left.pixels[rows], views[1], target, target[:, 1])
         disparity = left.pixels[rows, 0] - right_pixels[rows, 0]
-        has_right[rows] = alike & (disparity >= self._disparity.min_disparity_px)
+        has_right[rows] = alike & (disparity >= MIN_MATCH_DISPARITY_PX)
         return _Pair(left, right_pixels, has_right)
 
     def _refine(
@@ -232,7 +235,7 @@ class DescriptorFrontend:
         rows: FloatArray | None = None,
     ) -> tuple[FloatArray, BoolArray]:
         """Align the patches around source points with the target; return pixels (N, 2) and a mask (N,) of good fits."""
-        if self._settings.refine == "none" or len(points) == 0:
+        if len(points) == 0:
             return start, np.ones(len(start), dtype=np.bool_)
         centres = rounded(points)
         offset = points - centres
@@ -271,8 +274,8 @@ class DescriptorFrontend:
             named, predicted = prior_pixels(old.ids[has_depth], prior)
             R_prior = prior.R_cam_prev
             T_prior = predicted_motion(self._camera, p_prev[has_depth][named], predicted, expected)
-        rng = np.random.default_rng((self._consensus.seed, frame.index))
-        problem = RansacProblem(self._camera, self._consensus, self._settings.consensus_px, rng)
+        rng = np.random.default_rng((self._seed, frame.index))
+        problem = RansacProblem(self._camera, _INLIER_PX, rng)
         known, p_rows = has_depth[rows], p_prev[rows]
         keep, motion = static_tracks(problem, old.left[rows], p_rows, known, pixels, expected, R_prior, T_prior)
         # The right pixel belongs to the key point; it is shifted by the refinement.
@@ -284,7 +287,7 @@ class DescriptorFrontend:
             depth = depth_of(self._camera, transform_points(motion.T_curr_prev, p_rows))
             depth = np.maximum(depth, _MIN_DEPTH_M)
             change = np.abs(pixels[:, 0] - right[:, 0] - self._camera.fu * self._camera.baseline_m / depth)
-            agrees = agrees & (~known | (change <= self._settings.consensus_px))
+            agrees = agrees & (~known | (change <= _INLIER_PX))
         rows, found = rows[keep], found[keep]
         used[found] = True
         return _Tracks(old.ids[rows], pixels[keep], right[keep], agrees[keep], take(pair.keypoints, found)), twist, used
@@ -301,7 +304,7 @@ class DescriptorFrontend:
 
     def _near_guess(self, old: _Tracks, guess: FloatArray, points: FloatArray, width: int) -> BoolArray:
         """Pairs (N, M) of tracks and left key points (M, 2) close to the predicted (N, 2) or the old pixel."""
-        reach = self._settings.search_radius * width
+        reach = _SEARCH_RADIUS * width
         near = np.zeros((len(old), len(points)), dtype=np.bool_)
         # The last motion may be wrong, so the old pixel is a second centre of the search.
         for centre in (guess, old.left):

@@ -10,13 +10,21 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import ConfigError
-from vio.frontend.settings import GridSettings, KltSettings
+from vio.frontend.settings import GridSettings
+from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image, IntArray
 
 Response = npt.NDArray[np.float32]
 
+_CELL_FEATURES = 4  # target number of features per grid cell; determines the cell size
+_MIN_DISTANCE = 0.15  # between features, over the spacing of a uniform grid of them
+_MIN_GRADIENT = 1.0  # of a corner in its weakest direction, gray levels per pixel: root mean square over 6x6 pixels
+_MIN_RELATIVE_GRADIENT = 0.15  # the same, over that of the strongest corner of its grid cell
+_MIN_GRADIENT_OVER_NOISE = 5.0  # where corners are few: down to so many times the gradient of the image noise
+# The outermost pixels of the half image have no corners: their anchor would not fit into the full image.
+_BORDER_PX = ANCHOR_RADIUS_PX // 2 + 2
 _BLOCK_PX = 3
 _GRADIENT_PX = 3
 # cornerMinEigenVal takes gray levels as fractions of 255 and makes the Sobel derivative twice the gradient.
@@ -34,12 +42,12 @@ def feature_spacing(width: int, height: int, grid: GridSettings) -> float:
 
 def min_distance_px(width: int, height: int, grid: GridSettings) -> int:
     """Least distance in pixels between features in an image of this size."""
-    return max(2, round(grid.min_distance * feature_spacing(width, height, grid)))
+    return max(2, round(_MIN_DISTANCE * feature_spacing(width, height, grid)))
 
 
 def grid_shape(width: int, height: int, grid: GridSettings) -> tuple[int, int]:
-    """Rows and columns of the balancing grid: nearly square cells that hold `cell_features` features each."""
-    cell = feature_spacing(width, height, grid) * math.sqrt(grid.cell_features)
+    """Rows and columns of the balancing grid: nearly square cells that hold `_CELL_FEATURES` features each."""
+    cell = feature_spacing(width, height, grid) * math.sqrt(_CELL_FEATURES)
     return max(1, round(height / cell)), max(1, round(width / cell))
 
 
@@ -124,7 +132,6 @@ def detect_corners(
     occupied: FloatArray,
     wanted: int,
     grid: GridSettings,
-    settings: KltSettings,
     allowed: BoolArray | None = None,
 ) -> FloatArray:
     """Find up to `wanted` new corners (K, 2), sub-pixel, where the grid has few tracked points `occupied` (N, 2).
@@ -138,55 +145,47 @@ def detect_corners(
         half: image (H/2, W/2) at half resolution.
         occupied: tracked points in pixels of the full image.
         wanted: largest number of corners.
-        grid: density and spacing of the features.
-        settings: thresholds of a corner.
+        grid: number of features.
         allowed: mask (H/2, W/2) of pixels that may be corners; None: all.
 
     Returns:
         Corners in pixels of the full image, best first.
     """
     height, width = half.shape
-    if wanted <= 0 or min(height, width) <= 4 * _border(settings):
+    if wanted <= 0 or min(height, width) <= 4 * _BORDER_PX:
         return np.zeros((0, 2))
     # A gradient per pixel of the full image is half of one per pixel of the half image.
     response = corner_response(half)
     response /= np.float32(4.0)
     if allowed is not None:
         response = np.where(allowed, response, np.float32(0.0))
-    corners = _candidates(half, response, occupied, grid, settings)
+    corners = _candidates(half, response, occupied, grid)
     shape = grid_shape(2 * width, 2 * height, grid)
     cell = cell_index(2 * corners.astype(np.float64), 2 * width, 2 * height, shape)
     strength = response[corners[:, 1], corners[:, 0]]
     strongest = np.zeros(shape[0] * shape[1], dtype=np.float32)
     np.maximum.at(strongest, cell, strength)
-    kept = np.flatnonzero(strength >= settings.min_relative_gradient**2 * strongest[cell])
+    kept = np.flatnonzero(strength >= _MIN_RELATIVE_GRADIENT**2 * strongest[cell])
     # Ties are ordered by cell, so that equal images give equal corners.
     kept = kept[np.lexsort((corners[kept, 0], corners[kept, 1], cell[kept], -strength[kept]))]
     level = _filling(cell[kept], cell_index(occupied, 2 * width, 2 * height, shape), len(strongest))
     order = np.argsort(level, kind="stable")
-    chosen = corners[kept[order[level[order] < 2 * grid.cell_features][:wanted]]]
+    chosen = corners[kept[order[level[order] < 2 * _CELL_FEATURES][:wanted]]]
     return 2.0 * (chosen + _peak_offset(response, chosen))
 
 
-def _border(settings: KltSettings) -> int:
-    """Width of the border of the half image without corners: their anchor would not fit into the full image."""
-    return settings.anchor_radius_px // 2 + 2
-
-
-def _candidates(
-    half: Image, response: Response, occupied: FloatArray, grid: GridSettings, settings: KltSettings
-) -> IntArray:
+def _candidates(half: Image, response: Response, occupied: FloatArray, grid: GridSettings) -> IntArray:
     """Corner pixels (K, 2) of the half image; if these are too few, weaker ones, strongest first."""
     height, width = half.shape
     distance = max(1, min_distance_px(2 * width, 2 * height, grid) // 2)
-    found = local_maxima(response, occupied / 2, distance, _border(settings), settings.min_gradient**2)
+    found = local_maxima(response, occupied / 2, distance, _BORDER_PX, _MIN_GRADIENT**2)
     missing = grid.target_features - len(occupied)
     if len(found) >= missing:
         return found
-    floor = settings.min_gradient_over_noise * noise_gradient(half) / 2.0
-    if floor >= settings.min_gradient:
+    floor = _MIN_GRADIENT_OVER_NOISE * noise_gradient(half) / 2.0
+    if floor >= _MIN_GRADIENT:
         return found
-    weaker = local_maxima(response, occupied / 2, distance, _border(settings), floor**2)
+    weaker = local_maxima(response, occupied / 2, distance, _BORDER_PX, floor**2)
     return weaker[np.argsort(-response[weaker[:, 1], weaker[:, 0]], kind="stable")[:missing]]
 
 

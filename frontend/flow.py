@@ -6,10 +6,14 @@ import cv2
 import numpy as np
 
 from vio.frontend.patches import View, inside, mean_and_contrast
-from vio.frontend.settings import KltSettings
+from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image
 
+_WINDOW_PX = 11  # side of the window, of the half-resolution image
+_TRUSTED_LEVELS = 1  # pyramid levels above half resolution where the pixels are predicted
+_ITERATIONS = 20  # per level
+_MAX_FORWARD_BACKWARD_PX = 1.5
 _LK_EPSILON_PX = 0.02  # of the half-resolution image
 _LK_MIN_EIGENVALUE = 1e-4  # as OpenCV's own default
 _RETRY_SHARE = 0.25  # share of lost points above which tracking is repeated with all pyramid levels
@@ -22,7 +26,7 @@ _MAX_GAIN = 4.0
 
 
 def track_with_retries(
-    last: Image, view: View, points: FloatArray, guess: FloatArray, trusted: bool, settings: KltSettings
+    last: Image, view: View, points: FloatArray, guess: FloatArray, trusted: bool, levels: int
 ) -> tuple[FloatArray, BoolArray]:
     """Track points from the last image into the current one; repeat with a wider search where many are lost.
 
@@ -35,21 +39,21 @@ def track_with_retries(
         points: pixels (N, 2) in the last image.
         guess: pixels (N, 2) in the current image to start from.
         trusted: whether the guess comes from a prior or from a motion with consensus.
-        settings: of the tracking.
+        levels: pyramid levels above half resolution.
 
     Returns:
         Pixels (N, 2), and a mask (N,) of those found.
     """
     last = match_brightness(last, view.half)
-    few = min(settings.trusted_levels, settings.pyramid_levels) if trusted else settings.pyramid_levels
-    found, good = _track_forward_backward(last, view, points, guess, few, settings, trusted=trusted)
+    few = min(_TRUSTED_LEVELS, levels) if trusted else levels
+    found, good = _track_forward_backward(last, view, points, guess, few, trusted=trusted)
     attempts = [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
     for start, share in attempts:
         retry = np.flatnonzero(~good)
         if len(retry) <= share * len(points):
             break
         found[retry], good[retry] = _track_forward_backward(
-            last, view, points[retry], start[retry], settings.pyramid_levels, settings, trusted=False
+            last, view, points[retry], start[retry], levels, trusted=False
         )
     return found, good
 
@@ -71,7 +75,6 @@ def _track_forward_backward(
     points: FloatArray,
     guess: FloatArray,
     levels: int,
-    settings: KltSettings,
     *,
     trusted: bool,
 ) -> tuple[FloatArray, BoolArray]:
@@ -80,20 +83,20 @@ def _track_forward_backward(
     Points found where a trusted guess expects them, to the same tolerance, are not tracked backward: two independent
     sources agree on them, and alignment with the anchor is to come.
     """
-    forward, good = _flow(last, view.half, points, guess, levels, settings)
-    good &= inside(view.full, forward, settings.anchor_radius_px + 2)
-    tolerance = settings.max_forward_backward_px
+    forward, good = _flow(last, view.half, points, guess, levels)
+    good &= inside(view.full, forward, ANCHOR_RADIUS_PX + 2)
+    tolerance = _MAX_FORWARD_BACKWARD_PX
     expected = np.linalg.norm(forward - guess, axis=1) <= tolerance
     doubtful = np.flatnonzero(good & ~expected if trusted else good)
     if len(doubtful):
-        backward, seen_back = _flow(view.half, last, forward[doubtful], points[doubtful], levels, settings)
+        backward, seen_back = _flow(view.half, last, forward[doubtful], points[doubtful], levels)
         error = np.linalg.norm(backward - points[doubtful], axis=1)
         good[doubtful] = seen_back & (error <= tolerance)
     return forward, good
 
 
 def _flow(
-    source: Image, target: Image, points: FloatArray, guess: FloatArray, levels: int, settings: KltSettings
+    source: Image, target: Image, points: FloatArray, guess: FloatArray, levels: int
 ) -> tuple[FloatArray, BoolArray]:
     """Track points (N, 2) between half-resolution images, all in pixels of the full image.
 
@@ -105,9 +108,9 @@ def _flow(
         target,
         points / 2,
         guess / 2,
-        window_px=settings.window_px,
+        window_px=_WINDOW_PX,
         levels=levels,
-        iterations=settings.iterations,
+        iterations=_ITERATIONS,
         epsilon_px=_LK_EPSILON_PX,
     )
     return np.where(seen[:, None], 2 * half, points), seen

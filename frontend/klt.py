@@ -27,11 +27,13 @@ from vio.frontend.right_match import RightMatcher
 from vio.frontend.settings import FrontendSettings
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.swap import SwapDetector
-from vio.frontend.tracks import AnchorBank, PreviousFrame, Tracks, no_tracks
+from vio.frontend.tracks import ANCHOR_RADIUS_PX, INLIER_PX, AnchorBank, PreviousFrame, Tracks, no_tracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_log
 from vio.geometry.stereo import StereoCamera
 from vio.records import BoolArray, FrontendOutput, Image, StereoFrame, TrackPrior
 
+_SPARE_CORNERS = 1.5  # extra corners tried, over the number of missing features; the best stereo matches are kept
+_PROBATION_FRAMES = 1  # for which a new corner must be tracked, in time and stereo, before it is output
 _SWAP_FEW = 0.3  # share of matches below which left and right may be swapped
 _FEW_MISSING = 0.1  # share of the features; detection takes more time than it is worth for fewer
 _VERY_FEW = 0.25  # share of the target below which new features are output at once
@@ -50,20 +52,20 @@ class KltFrontend:
     def __init__(self, camera: StereoCamera, settings: FrontendSettings | None = None) -> None:
         settings = FrontendSettings() if settings is None else settings
         self._settings, self._grid = settings.klt, settings.grid
-        self._consensus, self._disparity = settings.consensus, settings.disparity
+        self._seed, self._disparity = settings.consensus.seed, settings.disparity
         self._camera = camera
         self._clahe = cv2.createCLAHE(2.0, (8, 8)) if self._settings.equalise == "clahe" else None
         self._mask = None if self._settings.mask is None else load_mask(self._settings.mask)
         self._validator = FrameValidator(camera, "klt")
         self._right, self._delay, self._objects = RightCamera(), RightDelay(camera), ObjectReport()
-        contrast = LostContrast(self._settings.max_blind_frames)
+        contrast = LostContrast()
         self._checks: tuple[ImageCheck, ...] = (contrast, self._objects)  # in this order
         if camera.kind == "stereo":
             pair = (ExchangeDetector(), self._right, self._delay, self._objects, SwapDetector(_SWAP_FEW))
             self._checks = (BandRemoval(), contrast, *pair)
-        self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, self._settings.anchor_radius_px)
-        self._anchor_fit = AnchorFit(camera, self._settings, self._grid, self._bank)
-        self._new_features = NewFeatures(camera, self._settings, self._grid, self._bank)
+        self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, ANCHOR_RADIUS_PX)
+        self._anchor_fit = AnchorFit(camera, self._grid, self._bank)
+        self._new_features = NewFeatures(camera, self._grid, self._bank)
         self._matcher = RightMatcher(camera, self._right, self._delay)
         self._previous: PreviousFrame | None = None
         self._setup: tuple[StereoFit, BoolArray | None] | None = None  # made with the image size of the first frame
@@ -90,7 +92,7 @@ class KltFrontend:
         watch.lap("prepare")
         tracks, motion = self._track(images, usable_prior(prior), watch)
         wanted = self._wanted_corners(len(tracks))
-        corners = detect_corners(left.half, tracks.left, wanted, self._grid, self._settings, allowed)
+        corners = detect_corners(left.half, tracks.left, wanted, self._grid, allowed)
         watch.lap("detect")
         # Without a second camera no corner is searched along the row; `delayed` takes them without a depth.
         usable, delayed = right if self._right.usable else None, right is None or self._delay.frames != 0.0
@@ -118,7 +120,7 @@ class KltFrontend:
         target = self._grid.target_features
         missing = target - active
         self._rested = not self._rested and missing <= _FEW_MISSING * target
-        return 0 if self._rested else round(missing * (1.0 + self._settings.spare_corners))
+        return 0 if self._rested else round(missing * (1.0 + _SPARE_CORNERS))
 
     def _take_lines(self) -> tuple[str, ...]:
         """Return what the frame says of the images, one line an event."""
@@ -135,7 +137,7 @@ class KltFrontend:
         if self._setup is None:
             height, width = shape
             allowed = None if self._mask is None else half_mask(self._mask, shape)
-            stereo = StereoFit(self._camera, self._settings, self._disparity, self._bank, (width, height))
+            stereo = StereoFit(self._camera, self._disparity, self._bank, (width, height))
             self._setup = stereo, allowed
         return self._setup
 
@@ -163,14 +165,14 @@ class KltFrontend:
         previous = self._previous
         if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
             return no_tracks(), None
-        old, settings = previous.tracks, self._settings
+        old, levels = previous.tracks, self._settings.pyramid_levels
         expected = se3_exp(previous.twist_per_s * ((frame.time_ns - previous.time_ns) * 1e-9))
         guess = guessed_pixels(self._camera, old, prior, expected, left.full)
         trusted = prior is not None or previous.trusted
-        found, seen = track_with_retries(previous.left.half, left, old.left, guess, trusted, settings)
+        found, seen = track_with_retries(previous.left.half, left, old.left, guess, trusted, levels)
         watch.lap("track")
-        rng = np.random.default_rng((self._consensus.seed, frame.index))
-        problem = RansacProblem(self._camera, self._consensus, settings.consensus_px, rng)
+        rng = np.random.default_rng((self._seed, frame.index))
+        problem = RansacProblem(self._camera, INLIER_PX, rng)
         seen, motion = self._reject_outliers(problem, old, found, seen, prior, expected, stereo, frame.index)
         watch.lap("reject")
         tracks = self._anchor_fit.track(old, previous.left, left, found, seen, motion)
@@ -235,7 +237,7 @@ class KltFrontend:
     def _promote(self, tracks: Tracks) -> Tracks:
         """Output features that passed their probation from now on, under new ids; all features if these are few."""
         proven = tracks.has_right | (not self._needs_right)
-        proven = tracks.shown | ((tracks.age >= self._settings.probation_frames) & proven)
+        proven = tracks.shown | ((tracks.age >= _PROBATION_FRAMES) & proven)
         if proven.sum() < _VERY_FEW * self._grid.target_features:
             proven[:] = True
         ids, first = tracks.ids.copy(), proven & ~tracks.shown

@@ -10,13 +10,16 @@ from vio.frontend.align import rounded
 from vio.frontend.columns import joined, take
 from vio.frontend.outliers import Consensus
 from vio.frontend.patches import View, inside
-from vio.frontend.settings import GridSettings, KltSettings
+from vio.frontend.settings import GridSettings
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import AnchorBank, Tracks, new_tracks
 from vio.geometry.lie import FloatArray, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
 from vio.records import BoolArray, Image, IntArray
 
+_LEAST_FEATURES = 0.7  # share of the target below which corners that leave the image sooner are added, too
+_WANTED_LIFE_FRAMES = 7  # for which a new corner should stay in the image
+_MAX_LEFT_ONLY_FRAMES = 10  # in a row without a right match, before a feature is dropped
 _FEW = 0.5  # share of the least number of features below which corners without depth are added
 _TRIED = 1.5  # corners aligned per missing feature
 
@@ -24,9 +27,9 @@ _TRIED = 1.5  # corners aligned per missing feature
 class NewFeatures:
     """Search right matches for new corners and for features without one; add the best new corners."""
 
-    def __init__(self, camera: StereoCamera, settings: KltSettings, grid: GridSettings, bank: AnchorBank) -> None:
+    def __init__(self, camera: StereoCamera, grid: GridSettings, bank: AnchorBank) -> None:
         """Prepare; the bank receives the new features' anchors."""
-        self._camera, self._settings, self._grid, self._bank = camera, settings, grid, bank
+        self._camera, self._grid, self._bank = camera, grid, bank
 
     def add(
         self,
@@ -101,7 +104,7 @@ class NewFeatures:
     def _without_old_left_only(self, tracks: Tracks) -> Tracks:
         """Count frames without a right match, and drop the features that had none for too long."""
         tracks = replace(tracks, left_only_frames=np.where(tracks.has_right, 0, tracks.left_only_frames + 1))
-        return take(tracks, tracks.left_only_frames <= self._settings.max_left_only_frames)
+        return take(tracks, tracks.left_only_frames <= _MAX_LEFT_ONLY_FRAMES)
 
     def _select_corners(
         self, tracks: Tracks, unique: BoolArray, stays: BoolArray, delayed: bool
@@ -113,7 +116,7 @@ class NewFeatures:
         of that number.
         """
         target, matched = self._grid.target_features, int(tracks.has_right.sum())
-        room, least = max(0, target - len(tracks)), self._settings.least_features * target
+        room, least = max(0, target - len(tracks)), _LEAST_FEATURES * target
         tried = round(_TRIED * room)
         staying, leaving = np.flatnonzero(unique & stays)[:tried], np.flatnonzero(unique & ~stays)[:tried]
         leaving = leaving[: max(0, round(_TRIED * (least - matched - len(staying) / _TRIED)))]
@@ -126,9 +129,9 @@ class NewFeatures:
         self, corners: FloatArray, disparity: FloatArray, motion: Consensus | None, image: Image
     ) -> BoolArray:
         """Mask (K,) of corners that stay in the image for a while if the camera motion continues."""
-        if motion is None or self._settings.wanted_life_frames == 0:
+        if motion is None:
             return np.ones(len(corners), dtype=np.bool_)
-        T = np.linalg.matrix_power(motion.T_curr_prev, self._settings.wanted_life_frames)
+        T = np.linalg.matrix_power(motion.T_curr_prev, _WANTED_LIFE_FRAMES)
         depth = self._camera.fu * self._camera.baseline_m / np.maximum(disparity, 0.1)
         moved = transform_points(T, left_rays(self._camera, corners) * depth[:, None])
         ahead = depth_of(self._camera, moved) > 0.5

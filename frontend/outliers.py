@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 
 from vio.frontend.lens import Lens, lens_of, moved_pixel
-from vio.frontend.settings import ConsensusSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project
 from vio.numerics.compiled import compiled, move_by_twist, solve_positive
@@ -26,6 +25,10 @@ from vio.numerics.robust import median
 from vio.records import BoolArray, IntArray
 
 _MIN_DEPTH_M = 0.05
+_SAMPLES = 96  # random minimal sets of RANSAC
+_SURE_SHARE = 0.7  # share of inliers of the refined expected motion above which RANSAC is skipped
+_PRIOR_MAX_DEVIATION_DEG = 1.0  # of the consensus rotation from the prior, before a motion near the prior is tried
+_PRIOR_MIN_SUPPORT = 0.4  # inliers of the prior motion only, over the consensus', above which it replaces the consensus
 _MIN_POINTS = 8  # with fewer points, a consensus may be chance
 _MIN_SHARE = 0.2  # smallest share of inliers of a consensus
 _PRIOR_POINTS = 64  # predicted pixels that are used
@@ -44,10 +47,9 @@ _LEAST_FORWARD = 0.5  # of a cylinder's ray: beyond 60 degrees off the axis a pi
 
 @dataclass(frozen=True, slots=True)
 class RansacProblem:
-    """Camera, settings, threshold and random generator of a RANSAC run."""
+    """Camera, threshold and random generator of a RANSAC run."""
 
     camera: StereoCamera
-    settings: ConsensusSettings
     limit_px: float  # inlier threshold on the reprojection error
     rng: np.random.Generator  # source of the samples; the same state gives the same result to the bit
 
@@ -211,9 +213,9 @@ def _ransac(
     begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
     refined = _refine(camera, begin, p_prev, pixels, limit / 2, free)
     inliers = pixel_errors(camera, refined, p_prev, pixels) <= limit
-    if inliers.mean() >= problem.settings.sure_share:
+    if inliers.mean() >= _SURE_SHARE:
         return refined, inliers
-    sets = problem.rng.integers(0, len(p_prev), size=(problem.settings.samples, 3))
+    sets = problem.rng.integers(0, len(p_prev), size=(_SAMPLES, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
     T = _gauss_newton(
         camera, T, p_prev[sets], pixels[sets], np.ones(sets.shape), iterations=_SAMPLE_ITERATIONS, free=free
@@ -310,7 +312,7 @@ def rigid_consensus(
         starts.append(T_prior)
     T, inliers = _ransac(problem, p_prev, pixels, np.stack(starts), slice(0, 6))
     # Only outliers of the consensus support another motion: a prior that agrees with the consensus is not tried.
-    needed = max(_MIN_POINTS, problem.settings.prior_min_support * inliers.sum())
+    needed = max(_MIN_POINTS, _PRIOR_MIN_SUPPORT * inliers.sum())
     if (~inliers).sum() >= needed:
         for T_near in _prior_candidates(problem, p_prev, pixels, T, expected, R_prior, T_prior):
             kept = pixel_errors(problem.camera, T_near, p_prev, pixels) <= problem.limit_px
@@ -336,7 +338,7 @@ def _prior_candidates(
     near: list[FloatArray] = []
     if T_prior is not None and not _motions_agree(problem.camera, T, T_prior, p_prev):
         near.append(_refine(problem.camera, T_prior, p_prev, pixels, problem.limit_px, slice(0, 6)))
-    if R_prior is not None and _rotation_difference_deg(T, R_prior) > problem.settings.prior_max_deviation_deg:
+    if R_prior is not None and _rotation_difference_deg(T, R_prior) > _PRIOR_MAX_DEVIATION_DEG:
         fixed = np.stack([se3_from_parts(R_prior, t) for t in (expected[:3, 3], np.zeros(3))])
         near.append(_ransac(problem, p_prev, pixels, fixed, slice(0, 3))[0])
     return near
@@ -454,7 +456,7 @@ def bearing_consensus(
     """
     if len(previous) < _MIN_POINTS:
         return None
-    camera, settings = problem.camera, problem.settings
+    camera = problem.camera
     seen = _TwoViews(left_rays(camera, previous), current, left_rays(camera, current))
     near_prior = None
     if R_prior is not None:
@@ -467,10 +469,10 @@ def bearing_consensus(
     if (
         R_prior is not None
         and near_prior is not None
-        and _rotation_difference_deg(T, R_prior) > settings.prior_max_deviation_deg
+        and _rotation_difference_deg(T, R_prior) > _PRIOR_MAX_DEVIATION_DEG
     ):
         # A wrong prior shares some inliers with the consensus: only outliers of the consensus support the prior.
-        supported = (near_prior & ~kept).sum() >= max(_MIN_POINTS, settings.prior_min_support * kept.sum())
+        supported = (near_prior & ~kept).sum() >= max(_MIN_POINTS, _PRIOR_MIN_SUPPORT * kept.sum())
         kept = near_prior if supported else kept
     return kept if kept.sum() >= max(_MIN_POINTS, _MIN_BEARING_SHARE * len(kept)) else None
 
@@ -567,7 +569,7 @@ def _pure_rotation(problem: RansacProblem, seen: _TwoViews) -> FloatArray:
 
 def _pairs(count: int, problem: RansacProblem) -> IntArray:
     """Random pairs (H, 2) of different indices below `count`."""
-    first = problem.rng.integers(0, count, size=problem.settings.samples)
+    first = problem.rng.integers(0, count, size=_SAMPLES)
     return np.stack([first, (first + problem.rng.integers(1, count, size=len(first))) % count], axis=1)
 
 
@@ -590,7 +592,7 @@ def _five_point(problem: RansacProblem, previous: FloatArray, current: FloatArra
     params = cv2.UsacParams()
     params.confidence = _FIVE_POINT_CONFIDENCE
     params.threshold = problem.limit_px
-    params.maxIterations = 10 * problem.settings.samples
+    params.maxIterations = 10 * _SAMPLES
     params.randomGeneratorState = int(problem.rng.integers(0, 2**31 - 1))
     params.isParallel = False
     none = np.zeros(4)

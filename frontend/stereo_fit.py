@@ -14,16 +14,19 @@ from vio.frontend.align import align, on_peak
 from vio.frontend.columns import take
 from vio.frontend.lens import Lens, lens_of, point_at
 from vio.frontend.patches import View
-from vio.frontend.settings import DisparitySettings, KltSettings
-from vio.frontend.stereo_match import RowField, match_rows, shifted_rows
-from vio.frontend.tracks import AnchorBank, Tracks
+from vio.frontend.settings import DisparitySettings
+from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, RowField, match_rows, shifted_rows
+from vio.frontend.tracks import INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, depth_of
 from vio.numerics.compiled import compiled
 from vio.records import BoolArray, Image, IntArray
 
 _ITERATIONS = 5
-_MAX_STRETCH = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
+_MIN_CORRELATION = 0.8  # normalised, of a match
+_MIN_PEAK_MARGIN = 0.03  # lead in correlation over the second-best match in the row
+_MAX_ROW_DIFFERENCE_PX = 1.0  # of a match, after the estimated row differences are subtracted
+_MAX_SKEW = 0.8  # change of disparity per pixel; the road under a car reaches about 0.4
 _COARSE_SLACK = 0.2  # how much lower the correlation of the coarse search may be than that of the alignment
 _MIN_DEPTH_M = 0.05
 _MIN_DISPARITY_PX = 0.1  # below, a point is too far away to be located
@@ -41,16 +44,13 @@ class StereoFit:
     def __init__(
         self,
         camera: StereoCamera,
-        settings: KltSettings,
         disparity: DisparitySettings,
         bank: AnchorBank,
         size: tuple[int, int],
     ) -> None:
         """Prepare for images of one size (width, height); the bank contains the features' anchors."""
         self.max_disparity_px = disparity.max_disparity * size[0]
-        self._min_disparity_px = disparity.min_disparity_px
         self._camera = camera
-        self._settings = settings
         self._bank = bank
         self._rows = RowField(*size)
         self._unmatched = 0  # frames in a row with hardly any match
@@ -69,7 +69,7 @@ class StereoFit:
         expected = self._camera.fu * self._camera.baseline_m / depth[rows]
         pixels, skew, valid = self._fit(known, right, expected)
         if moved:
-            valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= self._settings.consensus_px
+            valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= INLIER_PX
         return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
 
     def match_near(self, tracks: Tracks, right: View, rows: IntArray, disparity: FloatArray) -> Tracks:
@@ -84,7 +84,7 @@ class StereoFit:
         offset = round(self._rows.offset_px / 2)
         if self._unmatched % _ROW_SEARCH_FRAMES == 1:
             offset = self._best_offset(left, right, points, offset)
-        correlation = self._settings.min_correlation - _COARSE_SLACK
+        correlation = _MIN_CORRELATION - _COARSE_SLACK
         return self._search(left.half, shifted_rows(right.half, offset), points, correlation)
 
     def _best_offset(self, left: View, right: View, points: FloatArray, offset: int) -> int:
@@ -106,7 +106,7 @@ class StereoFit:
         """Count the left pixels (N, 2) that have a match with a negative disparity."""
         a, b = (np.ascontiguousarray(view.half[:, ::-1]) for view in (left, right))
         flipped = points * [-1.0, 1.0] + [2.0 * (a.shape[1] - 1), 0.0]
-        disparity, unique = self._search(a, b, flipped, self._settings.min_correlation)
+        disparity, unique = self._search(a, b, flipped, _MIN_CORRELATION)
         return int((unique & (disparity >= 1.0)).sum())
 
     def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:
@@ -136,8 +136,7 @@ class StereoFit:
     def _search(
         self, left_half: Image, right_half: Image, points: FloatArray, min_correlation: float
     ) -> tuple[FloatArray, BoolArray]:
-        margin = self._settings.min_peak_margin
-        return match_rows(left_half, right_half, points, self.max_disparity_px, min_correlation, margin)
+        return match_rows(left_half, right_half, points, self.max_disparity_px, min_correlation, _MIN_PEAK_MARGIN)
 
     def _fit(self, tracks: Tracks, right: View, disparity: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Align anchors with the right image near expected disparities (N,).
@@ -155,11 +154,11 @@ class StereoFit:
         pixels, skew = warp[:, :, 2], warp[:, :, :2] - tracks.warp[:, :, :2]
         found = tracks.left[:, 0] - pixels[:, 0]
         valid = (
-            (score >= self._settings.min_correlation)
+            (score >= _MIN_CORRELATION)
             & on_peak(pixels, start)
-            & (np.abs(skew).max(axis=(1, 2)) <= _MAX_STRETCH)
-            & (np.abs(rows - pixels[:, 1]) <= self._settings.max_epipolar_px)
-            & (found >= self._min_disparity_px)
+            & (np.abs(skew).max(axis=(1, 2)) <= _MAX_SKEW)
+            & (np.abs(rows - pixels[:, 1]) <= _MAX_ROW_DIFFERENCE_PX)
+            & (found >= MIN_MATCH_DISPARITY_PX)
             & (found <= self.max_disparity_px)
         )
         return pixels, skew, valid

@@ -17,6 +17,7 @@ from vio.geometry.lie import FloatArray
 from vio.numerics.compiled import compiled, solve_positive
 from vio.records import BoolArray, Image, IntArray
 
+MIN_MATCH_DISPARITY_PX = 0.3  # smallest disparity of a stereo match
 _RADIUS = 4  # pixels of the half-resolution image
 _PEAK_HALF_WIDTH = 2  # neighbours of the best candidate that count as the same peak
 _FIELD_MEMORY = 0.95  # forgetting factor of previous frames, per frame

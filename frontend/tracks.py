@@ -12,6 +12,9 @@ from vio.frontend.patches import View
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
+ANCHOR_RADIUS_PX = 7  # half side of the anchor patch that a feature is aligned with
+INLIER_PX = 1.0  # largest reprojection error of a static feature under the consensus motion
+
 
 @dataclass(frozen=True, slots=True)
 class Tracks:

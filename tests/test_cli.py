@@ -380,7 +380,7 @@ def test_config_shows_every_setting_with_unit_and_default(capsys: pytest.Capture
     assert main(["config", "--all"]) == 0
     out = capsys.readouterr().out
     assert "vislam.pixel_sigma_px = 0.75 px" in out
-    assert "frontend.klt.window_px" in out
+    assert "frontend.klt.pyramid_levels" in out
     assert "one of: consistent, literal" in out
 
 

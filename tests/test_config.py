@@ -61,8 +61,10 @@ def test_empty_file_changes_nothing(tmp_path: Path) -> None:
         ("visalm:\n  iterations: 2\n", r"did you mean 'vislam'"),
         ("zzzzqq: 1\n", r"valid here: motion, backend"),
         ("frontend:\n  klt:\n    target_features: 300\n", r"did you mean 'frontend\.grid\.target_features'"),
-        ("frontend:\n  match:\n    consensus_samples: 9\n", r"did you mean 'frontend\.consensus\.samples'"),
-        ("frontend:\n  match:\n    epipolar_band_px: 2\n", r"did you mean 'frontend\.match\.max_epipolar_px'"),
+        ("frontend:\n  match:\n    consensus_seed: 9\n", r"did you mean 'frontend\.consensus\.seed'"),
+        ("frontend:\n  match:\n    max_points: 2\n", r"did you mean 'frontend\.match\.max_keypoints'"),
+        ("frontend:\n  klt:\n    window_px: 21\n", r"'frontend\.klt\.window_px'; it is fixed since 0\.3"),
+        ("msckf:\n  calibrate: both\n", r"'msckf\.calibrate'; it is 'msckf\.calibrate_camera_imu' since 0\.3"),
         ("target_features: 300\n", r"did you mean 'frontend\.grid\.target_features'"),
         ("vislam: 3\n", r"'vislam' is a section"),
         ("vislam:\n  iterations: 2.5\n", r"vislam\.iterations takes a whole number, got 2\.5"),
@@ -145,8 +147,8 @@ def test_rejects_infinite_numbers_and_checks_ranges_in_code() -> None:
         load_config(None, ["msckf.gravity_mps2=.inf"])
     with pytest.raises(ConfigError, match=r"msckf\.clones must be at least 3 and at most 100, got 2"):
         MsckfSettings(clones=2)
-    with pytest.raises(ConfigError, match=r"pixel_sigma_min_px, 3, must not be above"):
-        MsckfSettings(pixel_sigma_min_px=3.0)
+    with pytest.raises(ConfigError, match=r"msckf\.pixel_sigma_max_px must be above 0, got -3"):
+        MsckfSettings(pixel_sigma_max_px=-3.0)
 
 
 def test_preset_is_found_by_its_name_and_is_packaged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from vio.filters import imu_start, navigation
 from vio.filters.msckf import Msckf
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
@@ -258,7 +259,9 @@ WALK = Course(20, 2.0, velocity=(0.5, 0.3, 0.0), yaw_rate=0.3, depth=(2.0, 6.0),
 
 
 @pytest.mark.parametrize("motion", [None, "imu"])
-def test_a_field_of_row_errors_in_the_right_image_changes_no_bit(motion: MotionSource | None) -> None:
+def test_a_field_of_row_errors_in_the_right_image_changes_no_bit(
+    motion: MotionSource | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`vl - vr = -7 xn yn` pixels, as a pair whose calibration is off shows it: `v` is measured once, on the left."""
 
     def field_of_rows(k: int, seen: Observations) -> Observations:
@@ -267,7 +270,8 @@ def test_a_field_of_row_errors_in_the_right_image_changes_no_bit(motion: MotionS
         return replace(seen, z=z)
 
     # With more tilt, yaw about two verticals would be compared.
-    settings = replace(SETTINGS, start_tilt_sigma_deg=1.0, calibrate_stereo="off")
+    monkeypatch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
+    settings = replace(SETTINGS, calibrate_stereo="off")
     plain, bent = fly(WALK, motion, settings), fly(WALK, motion, settings, spoil=field_of_rows)
     for a, b in zip(plain.estimates, bent.estimates, strict=True):
         np.testing.assert_array_equal(a.T_world_imu, b.T_world_imu)
@@ -375,13 +379,17 @@ def test_gated_tracks_do_not_steer(walked: Run, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("motion", [None, "imu"])
-def test_smoothed_estimates_carry_their_own_covariance_and_velocity(motion: MotionSource | None) -> None:
+def test_smoothed_estimates_carry_their_own_covariance_and_velocity(
+    motion: MotionSource | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Five frames later a pose is known better, by as much as its covariance says: NEES over ten seeded runs.
 
     Velocities: images alone know them better from both sides. With an IMU the newest velocity is carried back, which
     adds the accelerometer's noise over the lag and no more.
     """
-    runs, lag, settings = 10, 5, replace(SETTINGS, start_tilt_sigma_deg=1.0, start_velocity_sigma_mps=2.0)
+    monkeypatch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
+    monkeypatch.setattr(navigation, "START_VELOCITY_SIGMA_MPS", 2.0)
+    runs, lag, settings = 10, 5, SETTINGS
     course = replace(WALK, seconds=1.5, bias=(0.01, -0.02, 0.01, 0.05, -0.03, 0.02))
     nees, causal_mps, smoothed_mps = [], [], []
     for seed in range(runs):

@@ -146,7 +146,9 @@ def _difference(a: Window, b: Window) -> tuple[FloatArray, ...]:
     return poses, a.nav.velocity - b.nav.velocity, a.landmarks - b.landmarks
 
 
-@pytest.mark.parametrize("settings", [OFF, replace(OFF, calibrate_stereo="on"), replace(OFF, calibrate="time_offset")])
+@pytest.mark.parametrize(
+    "settings", [OFF, replace(OFF, calibrate_stereo="on"), replace(OFF, calibrate_camera_imu="time_offset")]
+)
 def test_errors_depend_on_the_focal_length_as_a_filter_with_another_one_shows(settings: MsckfSettings) -> None:
     """Two filters whose focal lengths differ by a hundred-thousandth: what is followed is the difference."""
     by = 1e-5

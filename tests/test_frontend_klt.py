@@ -12,11 +12,12 @@ import pytest
 
 from tests.test_frontend_scene import CAMERA, SLANTED, Wall, eight_bit, flight, right_of, stereo_frame, truth, view
 from vio.errors import ConfigError, DataError
-from vio.frontend import one_opencv_thread
+from vio.frontend import contrast, detect, flow, klt, new_features, one_opencv_thread, stereo_fit
 from vio.frontend.detect import cell_index, grid_shape, min_distance_px
 from vio.frontend.klt import KltFrontend
 from vio.frontend.outliers import fit_motion
 from vio.frontend.settings import FrontendSettings, GridSettings, KltSettings
+from vio.frontend.tracks import INLIER_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.records import FrontendOutput, StereoFrame, TrackPrior
@@ -115,7 +116,7 @@ def test_stereo_matches_have_positive_disparity_on_one_row(outputs: list[Fronten
     for output in outputs:
         z = output.observations.z[output.observations.has_right]
         assert (z[:, 0] - z[:, 2] > 0).all()
-        assert (np.abs(z[:, 1] - z[:, 3]) <= SETTINGS.klt.max_epipolar_px).all()
+        assert (np.abs(z[:, 1] - z[:, 3]) <= stereo_fit._MAX_ROW_DIFFERENCE_PX).all()
 
 
 def _with_black_frames(n: int) -> list[StereoFrame]:
@@ -140,9 +141,10 @@ def test_tracks_are_dropped_when_the_camera_stays_black() -> None:
     assert outputs[-1].observations.ids.min() > outputs[1].observations.ids.max()
 
 
-def test_ids_are_never_reused() -> None:
+def test_ids_are_never_reused(monkeypatch: pytest.MonkeyPatch) -> None:
     """A black frame ends every track; features found afterwards are new, even in the same image."""
-    outputs = run(_with_black_frames(1), with_klt(max_blind_frames=0))
+    monkeypatch.setattr(contrast, "_MAX_FRAMES", 0)
+    outputs = run(_with_black_frames(1))
     assert len(outputs[2].observations) == 0
     early = np.concatenate([output.observations.ids for output in outputs[:2]])
     assert len(outputs[3].observations) > 100
@@ -174,13 +176,13 @@ def test_features_keep_their_distance_and_fill_the_grid(outputs: list[FrontendOu
         np.fill_diagonal(gap, np.inf)
         assert gap.min() >= 0.5 * min_distance_px(480, 300, GRID)
         held = np.bincount(cell_index(left, 480, 300, shape), minlength=shape[0] * shape[1])
-        assert held.max() <= 3 * GRID.cell_features
+        assert held.max() <= 3 * detect._CELL_FEATURES
         assert np.mean(held > 0) > 0.85
 
 
-def test_features_without_right_match_stay_as_left_only_rows() -> None:
-    """A part of the right image is covered; its tracks continue in the left one for the configured number of frames."""
-    settings = with_klt(max_left_only_frames=2)
+def test_features_without_right_match_stay_as_left_only_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A part of the right image is covered; its tracks continue in the left one for a limited number of frames."""
+    monkeypatch.setattr(new_features, "_MAX_LEFT_ONLY_FRAMES", 2)
 
     def covered(frame: StereoFrame) -> StereoFrame:
         assert frame.right is not None
@@ -188,7 +190,7 @@ def test_features_without_right_match_stay_as_left_only_rows() -> None:
         right[:120] = 128
         return replace(frame, right=right)
 
-    outputs = run([FRAMES[0], *(covered(frame) for frame in FRAMES[1:5])], settings)
+    outputs = run([FRAMES[0], *(covered(frame) for frame in FRAMES[1:5])])
     seen = outputs[0].observations
     upper = seen.ids[seen.has_right & (seen.z[:, 1] < 100)]
     assert len(upper) > 30
@@ -200,10 +202,11 @@ def test_features_without_right_match_stay_as_left_only_rows() -> None:
     assert not later.has_right[np.isin(later.ids, upper)].any()
 
 
-def test_tracks_outlast_a_right_camera_that_loses_its_contrast() -> None:
+def test_tracks_outlast_a_right_camera_that_loses_its_contrast(monkeypatch: pytest.MonkeyPatch) -> None:
     """The limit on frames without a right match is for features, not for a camera: tracks continue in the left one."""
+    monkeypatch.setattr(new_features, "_MAX_LEFT_ONLY_FRAMES", 2)
     gray = np.full_like(FRAMES[0].right, 128)
-    outputs = run([FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:5])], with_klt(max_left_only_frames=2))
+    outputs = run([FRAMES[0], *(replace(frame, right=gray) for frame in FRAMES[1:5])])
     seen, later = outputs[0].observations, outputs[4].observations
     assert np.isin(seen.ids[seen.has_right], later.ids).mean() > 0.8
     assert not later.has_right.any()
@@ -282,14 +285,15 @@ def test_prior_bridges_a_jump_too_large_for_tracking_alone() -> None:
         assert np.median(track_errors(FrontendOutput(seen, 0, 0, 0), output, first, second)) < 0.08
 
 
-def test_last_motion_is_scaled_by_time() -> None:
+def test_last_motion_is_scaled_by_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three frames 10 ms apart, the next one 150 ms later: 50 pixels that only the last motion predicts."""
     step = np.array([0.4, -0.1, 0.1, 0.01, -0.02, 0.01])
     frames = [
         replace(stereo_frame(k, se3_exp(share * step)), time_ns=ms * 1_000_000)
         for k, (share, ms) in enumerate([(0.0, 0), (0.1, 10), (0.2, 20), (1.7, 170)])
     ]
-    outputs = run(frames, with_klt(pyramid_levels=0, trusted_levels=0))
+    monkeypatch.setattr(flow, "_TRUSTED_LEVELS", 0)
+    outputs = run(frames, with_klt(pyramid_levels=0))
     assert outputs[-1].tracked > 0.7 * outputs[-2].tracked
 
 
@@ -306,8 +310,9 @@ def test_features_are_not_followed_across_a_long_gap_without_a_prediction() -> N
     assert frontend.process(late, prior).tracked > 100
 
 
-def test_features_failing_the_forward_backward_check_are_dropped() -> None:
-    assert run(FRAMES[:2], with_klt(max_forward_backward_px=1e-4))[1].tracked < 10
+def test_features_failing_the_forward_backward_check_are_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flow, "_MAX_FORWARD_BACKWARD_PX", 1e-4)
+    assert run(FRAMES[:2])[1].tracked < 10
 
 
 def test_swapped_images_are_detected() -> None:
@@ -379,10 +384,12 @@ def test_images_may_be_overwritten_after_the_call(outputs: list[FrontendOutput])
     np.testing.assert_array_equal(frontend.process(FRAMES[1]).observations.z, outputs[1].observations.z)
 
 
-def test_new_features_are_output_after_probation(outputs: list[FrontendOutput]) -> None:
+def test_new_features_are_output_after_probation(monkeypatch: pytest.MonkeyPatch) -> None:
     """A feature with a new id was detected at least one frame earlier."""
-    held = run(FRAMES, replace(with_klt(probation_frames=1), grid=GridSettings(target_features=300)))
-    free = run(FRAMES, replace(with_klt(probation_frames=0), grid=GridSettings(target_features=300)))
+    settings = FrontendSettings(grid=GridSettings(target_features=300))
+    held = run(FRAMES, settings)
+    monkeypatch.setattr(klt, "_PROBATION_FRAMES", 0)
+    free = run(FRAMES, settings)
     late = [later.observations.ids[later.observations.ids > held[0].observations.ids.max()] for later in held[1:]]
     assert sum(map(len, late)) > 0
     assert held[1].detected <= free[1].detected + free[0].detected
@@ -442,11 +449,12 @@ def at_night(share: float, read_noise: float) -> list[StereoFrame]:
     return frames
 
 
-def test_tracks_in_the_dark_where_noise_is_low() -> None:
+def test_tracks_in_the_dark_where_noise_is_low(monkeypatch: pytest.MonkeyPatch) -> None:
     """Mean gray level 6: weak corners are usable if they exceed the noise."""
     frames = at_night(0.05, 0.5)
-    absolute = run(frames, with_klt(min_gradient_over_noise=1e6))
     outputs = run(frames)
+    monkeypatch.setattr(detect, "_MIN_GRADIENT_OVER_NOISE", 1e6)
+    absolute = run(frames)
     assert max(output.matched for output in absolute) < 0.4 * GRID.target_features
     for k in range(3):
         assert outputs[k + 1].matched > 0.6 * GRID.target_features
@@ -456,8 +464,11 @@ def test_tracks_in_the_dark_where_noise_is_low() -> None:
         assert np.mean(error > 1) < 0.03
 
 
-def test_noise_threshold_is_inactive_in_good_light(outputs: list[FrontendOutput]) -> None:
-    for a, b in zip(outputs, run(FRAMES, with_klt(min_gradient_over_noise=1e6)), strict=True):
+def test_noise_threshold_is_inactive_in_good_light(
+    outputs: list[FrontendOutput], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(detect, "_MIN_GRADIENT_OVER_NOISE", 1e6)
+    for a, b in zip(outputs, run(FRAMES), strict=True):
         np.testing.assert_array_equal(a.observations.z, b.observations.z)
 
 
@@ -531,7 +542,7 @@ def test_real_drive_agrees_with_ground_truth(data_dir: Path) -> None:
         p, valid = triangulate(camera, before)
         assert valid.all()
         T_true = se3_inverse(poses[k + 1]) @ poses[k]
-        T = fit_motion(camera, p, after[:, :2], T_true, SETTINGS.klt.consensus_px)
+        T = fit_motion(camera, p, after[:, :2], T_true, INLIER_PX)
         assert T is not None
         difference = se3_log(T @ se3_inverse(T_true))
         assert np.linalg.norm(difference[:3]) < 0.08
@@ -569,8 +580,9 @@ def test_only_doubtful_points_are_tracked_backward(monkeypatch: pytest.MonkeyPat
     assert outputs.tracked > 0.8 * GRID.target_features
 
 
-def test_corners_are_detected_in_every_other_frame_while_few_are_missing() -> None:
-    frontend = KltFrontend(CAMERA, with_klt(spare_corners=0.0))
+def test_corners_are_detected_in_every_other_frame_while_few_are_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(klt, "_SPARE_CORNERS", 0.0)
+    frontend = KltFrontend(CAMERA, SETTINGS)
     few, many = GRID.target_features - 10, GRID.target_features // 2
     assert [frontend._wanted_corners(active) for active in (few, few, few, many, many, few)] == [0, 10, 0, 100, 100, 0]
 

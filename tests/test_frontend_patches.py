@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from vio.frontend import detect
 from vio.frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
 from vio.frontend.columns import joined, take
 from vio.frontend.detect import (
@@ -22,7 +23,7 @@ from vio.frontend.detect import (
 )
 from vio.frontend.patches import half_image, inside
 from vio.frontend.prediction import moved_pixels, prior_pixels
-from vio.frontend.settings import GridSettings, KltSettings
+from vio.frontend.settings import GridSettings
 from vio.frontend.stereo_match import RowField, match_rows, row_correlation
 from vio.frontend.tracks import AnchorBank
 from vio.geometry.lie import FloatArray, se3_exp
@@ -224,9 +225,9 @@ HALF = half_image(PLAIN)
 
 def test_new_corners_go_where_tracks_are_missing() -> None:
     grid = GridSettings(target_features=120)
-    left_side = detect_corners(HALF, np.zeros((0, 2)), 120, grid, KltSettings())
+    left_side = detect_corners(HALF, np.zeros((0, 2)), 120, grid)
     left_side = left_side[left_side[:, 0] < 150]
-    new = detect_corners(HALF, left_side, 30, grid, KltSettings())
+    new = detect_corners(HALF, left_side, 30, grid)
     assert len(new) == 30
     assert np.mean(new[:, 0] > 150) > 0.9
 
@@ -237,7 +238,7 @@ def test_corners_are_found_at_corners_of_squares() -> None:
     for v in range(30, 170, 50):
         for u in range(30, 270, 60):
             image[v : v + 20, u : u + 24] = 200
-    found = detect_corners(half_image(image), np.zeros((0, 2)), 200, GridSettings(target_features=200), KltSettings())
+    found = detect_corners(half_image(image), np.zeros((0, 2)), 200, GridSettings(target_features=200))
     true = np.array(
         [
             [u + a, v + b]
@@ -255,33 +256,35 @@ def test_corners_are_found_at_corners_of_squares() -> None:
 def test_mask_excludes_corners() -> None:
     allowed = np.ones(HALF.shape, dtype=np.bool_)
     allowed[:, :75] = False
-    found = detect_corners(HALF, np.zeros((0, 2)), 200, GridSettings(), KltSettings(), allowed)
+    found = detect_corners(HALF, np.zeros((0, 2)), 200, GridSettings(), allowed)
     assert len(found) > 20
     assert found[:, 0].min() >= 149.0
 
 
-def test_weak_corner_next_to_a_strong_one_is_dropped() -> None:
+def test_weak_corner_next_to_a_strong_one_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
     image = np.full((200, 300), 60, dtype=np.uint8)
     image[60:80, 60:80] = 250
     image[60:80, 100:120] = 75
     nothing = np.zeros((0, 2))
-    wide = GridSettings(target_features=4, min_distance=0.05)  # one cell is nearly half of the image
-    strict = detect_corners(half_image(image), nothing, 50, wide, KltSettings())
-    loose = detect_corners(half_image(image), nothing, 50, wide, KltSettings(min_relative_gradient=0.0))
+    wide = GridSettings(target_features=4)  # one cell is nearly half of the image
+    monkeypatch.setattr(detect, "_MIN_DISTANCE", 0.05)
+    strict = detect_corners(half_image(image), nothing, 50, wide)
+    monkeypatch.setattr(detect, "_MIN_RELATIVE_GRADIENT", 0.0)
+    loose = detect_corners(half_image(image), nothing, 50, wide)
     assert np.abs(strict - [70, 70]).max(axis=1).max() < 16
     assert np.mean(np.abs(loose - [110, 70]).max(axis=1) < 16) > 0.3
 
 
 def test_no_corners_if_none_wanted_or_image_tiny() -> None:
-    assert detect_corners(HALF, POINTS, 0, GridSettings(), KltSettings()).shape == (0, 2)
-    assert detect_corners(HALF[:10, :10], np.zeros((0, 2)), 10, GridSettings(), KltSettings()).shape == (0, 2)
+    assert detect_corners(HALF, POINTS, 0, GridSettings()).shape == (0, 2)
+    assert detect_corners(HALF[:10, :10], np.zeros((0, 2)), 10, GridSettings()).shape == (0, 2)
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 360), (752, 480), (1242, 375)])
 def test_defaults_scale_with_the_image(width: int, height: int) -> None:
     grid = GridSettings()
     rows, columns = grid_shape(width, height, grid)
-    assert rows * columns * grid.cell_features == pytest.approx(grid.target_features, rel=0.15)
+    assert rows * columns * detect._CELL_FEATURES == pytest.approx(grid.target_features, rel=0.15)
     assert 0.75 < (width / columns) / (height / rows) < 1.35
     assert min_distance_px(width, height, grid) < 0.5 * feature_spacing(width, height, grid)
     corners = np.array([[0.0, 0.0], [width - 1.0, height - 1.0]])
@@ -305,14 +308,15 @@ def test_noise_gradient_is_estimated_from_the_image(sigma: float) -> None:
     assert noise_gradient(sloped) == pytest.approx(noise_gradient(noisy(100, sigma, 1)), rel=0.1)
 
 
-def test_noise_in_the_dark_gives_few_corners() -> None:
+def test_noise_in_the_dark_gives_few_corners(monkeypatch: pytest.MonkeyPatch) -> None:
     """The threshold decreases with the noise, but stays above the gradient of the noise."""
     for sigma in (0.5, 1.5, 3.0):
         half = half_image(noisy(8, sigma, 2))
-        assert len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings(), KltSettings())) <= 3
-        loose = KltSettings(min_gradient_over_noise=1.0)
-        found = len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings(), loose))
-        assert found > (30 if sigma > 1 else 3)  # control: without the setting there are corners
+        assert len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings())) <= 3
+        with monkeypatch.context() as patch:
+            patch.setattr(detect, "_MIN_GRADIENT_OVER_NOISE", 1.0)
+            found = len(detect_corners(half, np.zeros((0, 2)), 1000, GridSettings()))
+        assert found > (30 if sigma > 1 else 3)  # control: without the threshold there are corners
 
 
 # --- records, anchors, predictions ------------------------------------------------------------------------------------
@@ -374,10 +378,12 @@ def test_prior_pixels_are_matched_by_id() -> None:
     assert dict(zip(rows.tolist(), predicted.tolist(), strict=True)) == {0: [8.0, 9.0], 2: [0.0, 1.0]}
 
 
-def test_spread_evenly_equals_a_greedy_loop() -> None:
+def test_spread_evenly_equals_a_greedy_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(12)
     points, occupied = rng.uniform([0, 0], [400, 300], (120, 2)), rng.uniform([0, 0], [400, 300], (10, 2))
-    grid = GridSettings(target_features=60, cell_features=3, min_distance=0.0)
+    monkeypatch.setattr(detect, "_CELL_FEATURES", 3)
+    monkeypatch.setattr(detect, "_MIN_DISTANCE", 0.0)
+    grid = GridSettings(target_features=60)
     rows = spread_evenly(points, occupied, (400, 300), grid)
     shape = grid_shape(400, 300, grid)
     cell = cell_index(points, 400, 300, shape)

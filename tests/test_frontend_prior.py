@@ -10,10 +10,10 @@ import pytest
 
 from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
 from tools.frontend_accuracy import accuracy_scenario
-from vio.frontend import FrontendSettings, build_frontend
+from vio.frontend import FrontendSettings, build_frontend, descriptors, outliers
 from vio.frontend.outliers import pixel_errors, predicted_motion, rigid_consensus
 from vio.frontend.prediction import usable_prior
-from vio.frontend.settings import ConsensusSettings, GridSettings, MatchSettings
+from vio.frontend.settings import GridSettings, MatchSettings
 from vio.geometry.distortion import rectified_camera
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse
 from vio.records import FrontendOutput, Observations, StereoFrame, TrackPrior
@@ -149,15 +149,16 @@ def test_prior_of_any_kind_does_not_degrade_tracks(name: str, kind: str, clip: C
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_prior_bridges_a_gap_too_wide_for_tracking_alone(name: str, clip: Clip) -> None:
+def test_prior_bridges_a_gap_too_wide_for_tracking_alone(
+    name: str, clip: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Five consecutive frames are lost; Lucas-Kanade has one level, and the search radius of descriptors is small."""
     simulation = replace(
         clip.simulation, taken_ns=clip.simulation.taken_ns[::6], stamps_ns=clip.simulation.stamps_ns[::6]
     )
     apart = Clip(simulation, [replace(clip.frames[k], index=i) for i, k in enumerate((0, 6))])
-    settings = replace(
-        SETTINGS, klt=replace(SETTINGS.klt, pyramid_levels=0), match=replace(SETTINGS.match, search_radius=0.02)
-    )
+    monkeypatch.setattr(descriptors, "_SEARCH_RADIUS", 0.02)
+    settings = replace(SETTINGS, klt=replace(SETTINGS.klt, pyramid_levels=0))
     kept = []
     for with_prior in (False, True):
         frontend = build_frontend(name, rectified_camera(simulation.rig), settings, SimulatedRecording(simulation))
@@ -197,9 +198,9 @@ def test_predicted_motion_reuses_an_expected_motion_that_fits() -> None:
 
 
 @pytest.mark.parametrize("share", [0.5, 0.65, 0.75])
-def test_prior_overrides_truck_of_any_size_with_enough_support(share: float) -> None:
+def test_prior_overrides_truck_of_any_size_with_enough_support(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a required support of 30 %, a third of the truck's points is enough."""
-    settings = ConsensusSettings(prior_min_support=0.3)
+    monkeypatch.setattr(outliers, "_PRIOR_MIN_SUPPORT", 0.3)
     wall, truck = scene(200, 32, (15.0, 40.0)), scene(200, 33, (7.0, 8.0))
     still, passing = round(200 * (1 - share)), round(200 * share)
     p = np.concatenate([wall[:still], truck[:passing]])
@@ -208,7 +209,7 @@ def test_prior_overrides_truck_of_any_size_with_enough_support(share: float) -> 
     )
     predicted = se3_exp([0.05, 0.0, -0.1, 0.0, 0.002, 0.0])
     for R_prior, T_prior in ((np.eye(3), None), (None, predicted)):
-        found = rigid_consensus(make_problem(settings=settings), p, uv, np.eye(4), R_prior, T_prior)
+        found = rigid_consensus(make_problem(), p, uv, np.eye(4), R_prior, T_prior)
         assert found is not None
         assert found.inliers[:still].mean() > 0.95
         assert not found.inliers[still:].any()

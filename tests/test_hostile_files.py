@@ -240,7 +240,8 @@ def test_huge_and_vanishing_settings_are_refused(info: SettingInfo) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"clones": "11"}, {"clones": 5.5}, {"clones": True}, {"zero_velocity": 1}, {"calibrate": "all"}]
+    "wrong",
+    [{"clones": "11"}, {"clones": 5.5}, {"clones": True}, {"zero_velocity": 1}, {"calibrate_camera_imu": "all"}],
 )
 def test_settings_built_in_python_are_checked(wrong: dict[str, object]) -> None:
     (name,) = wrong

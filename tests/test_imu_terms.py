@@ -17,6 +17,7 @@ from tests.test_online_calibration import Shaking, fly_with
 from vio.cli.running import _calibration_rows
 from vio.config import Config
 from vio.errors import ConfigError
+from vio.filters import imu_terms
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, accel_D_terms, gyro_D_terms, significant
 from vio.filters.late_imu import LateImuMsckf
 from vio.filters.msckf import Msckf
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
     from vio.runs.pipeline import RunResult
 
 T_IMU_CAM0 = se3_inverse(T_CAM0_IMU)
-OFF = MsckfSettings(calibrate="none")
-FULL = MsckfSettings(calibrate="none", calibrate_imu="full")  # the terms alone
+OFF = MsckfSettings(calibrate_camera_imu="none")
+FULL = MsckfSettings(calibrate_camera_imu="none", calibrate_imu="full")  # the terms alone
 GRAVITY = np.array([0.0, 0.0, -9.81])
 TERMS = np.random.default_rng(3).normal(0, 0.02, IMU_TERMS)
 MOVING = replace(WITHOUT_TERMS, imu_terms=TERMS)
@@ -266,7 +267,7 @@ def test_noise_is_no_lever() -> None:
 
 def test_all_that_can_be_off_is_found_beside_the_terms() -> None:
     """Of the IMU half a degree, 1 cm, 4 ms, 1 % and half a degree of misalignment, while the stereo field is zero."""
-    both = replace(FULL, calibrate="both", calibrate_stereo="on")
+    both = replace(FULL, calibrate_camera_imu="both", calibrate_stereo="on")
     xi = np.concatenate([0.01 * np.array([0.6, -0.6, 0.5]), np.radians(0.5) * np.array([0.6, 0.6, -0.5])])
     run = _fly(Shaking(140), both, OFF_BY_1_PERCENT, T_cam0_imu=T_CAM0_IMU @ se3_exp(xi), offset_ns=4_000_000)
     terms, sigmas = run.terms
@@ -302,10 +303,13 @@ def test_a_stereo_field_that_begins_later_finds_its_place_behind_the_terms() -> 
 # On and off
 
 
-def test_terms_that_are_known_are_no_error_and_scales_alone_no_misalignment() -> None:
+def test_terms_that_are_known_are_no_error_and_scales_alone_no_misalignment(monkeypatch: pytest.MonkeyPatch) -> None:
     """With priors of zero the flight is that without terms; `scale` leaves misalignments where they are."""
-    known = replace(FULL, imu_scale_sigma=0.0, imu_misalignment_sigma_deg=0.0)
-    off, on = (_fly(Shaking(20), settings, np.zeros(15)) for settings in (OFF, known))
+    off = _fly(Shaking(20), OFF, np.zeros(15))
+    with monkeypatch.context() as patch:
+        patch.setattr(imu_terms, "_SCALE_SIGMA", 0.0)
+        patch.setattr(imu_terms, "_MISALIGNMENT_SIGMA_DEG", 0.0)
+        on = _fly(Shaking(20), FULL, np.zeros(15))
     np.testing.assert_allclose(on.estimates[-1].T_world_imu, off.estimates[-1].T_world_imu, atol=1e-6)
     np.testing.assert_allclose(on.estimates[-1].covariance, off.estimates[-1].covariance, rtol=1e-3, atol=1e-9)
     assert off.estimates[-1].imu_terms is None

@@ -10,6 +10,7 @@ import pytest
 from tests.numerics import numeric_jacobian
 from vio.errors import ConfigError, DivergedError, EstimationError
 from vio.evaluation.trajectories import nees, nees_bounds
+from vio.filters import imu_start
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import (
     Residuals,
@@ -509,7 +510,7 @@ class Flight:
 @pytest.mark.parametrize("motion", [None, "imu"])
 def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion: str | None) -> None:
     """What is told then is the last covariance carried by each step's transition, and each step's noise on top."""
-    flight, settings = Flight(frames=6), MsckfSettings(calibrate="none")
+    flight, settings = Flight(frames=6), MsckfSettings(calibrate_camera_imu="none")
     _, _, filt = flight.run(settings, motion)
     window, noise = filt._window, np.random.default_rng(1)
     assert window is not None
@@ -598,14 +599,15 @@ def test_flight_that_starts_in_motion_is_followed(motion: str | None) -> None:
 
 
 @pytest.mark.parametrize("motion", [None, "velocity", "imu"])
-def test_covariance_can_be_believed(motion: str | None) -> None:
+def test_covariance_can_be_believed(motion: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """NEES of the pose over 20 seeded runs: inside its 95 % band in at least 90 % of the steps.
 
     The first tilt is doubted by one degree only: with more, yaw about the true and about the estimated vertical
     differ to second order, and the comparison would measure that instead.
     """
     runs, frames = 20, 20
-    settings = MsckfSettings(start_tilt_sigma_deg=1.0)
+    monkeypatch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
+    settings = MsckfSettings()
     values = []
     for seed in range(runs):
         bias = np.random.default_rng(1000 + seed).normal(0, [0.02] * 3 + [0.05] * 3)
@@ -785,8 +787,8 @@ def test_covariance_can_be_believed_where_depth_is_hard_to_tell(world: str, monk
         with monkeypatch.context() as patch:
             _start_in_flight(patch, flight, seed)
             bias = np.random.default_rng(1000 + seed).normal(0, [0.02] * 3 + [0.05] * 3)
-            settings = MsckfSettings(start_tilt_sigma_deg=1.0)
-            errors, covariances, _ = flight.run(settings, "imu", seed, bias=bias, limit=40, spoil=spoil)
+            patch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
+            errors, covariances, _ = flight.run(MsckfSettings(), "imu", seed, bias=bias, limit=40, spoil=spoil)
         values.append(nees(errors[1:], covariances[1:]))
     mean = np.mean(values, axis=0)
     low, high = nees_bounds(6, runs)
@@ -852,8 +854,11 @@ def test_settings_out_of_range(change: dict[str, int]) -> None:
 
 
 @pytest.mark.parametrize("motion", [None, "imu"])
-def test_restarts_from_the_last_good_pose_after_a_divergence(motion: str | None) -> None:
+def test_restarts_from_the_last_good_pose_after_a_divergence(
+    motion: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Frame 12 leaves a state of NaN: the filter raises, restarts, and its error stays within its covariance."""
+    monkeypatch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
     flight = Flight(frames=40)
     events: list[str] = []
 
@@ -868,7 +873,7 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(motion: str | None)
                 events.append(str(error))
                 return self.restart(observations)
 
-    errors, covariances, filt = flight.run(MsckfSettings(start_tilt_sigma_deg=1.0), motion, filter_class=Fragile)
+    errors, covariances, filt = flight.run(MsckfSettings(), motion, filter_class=Fragile)
     assert [event[:27] for event in events] == ["msckf diverged at frame 12:"]
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.15
     assert np.sqrt(covariances[12, 0, 0]) > 3 * np.sqrt(covariances[11, 0, 0])

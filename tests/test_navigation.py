@@ -9,6 +9,7 @@ import pytest
 
 from tests.numerics import numeric_jacobian
 from vio.errors import EstimationError
+from vio.filters.imu_start import START_TILT_SIGMA_DEG
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp
@@ -141,7 +142,7 @@ def test_start_turns_the_accelerometers_up_to_the_worlds(up: list[float]) -> Non
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) > 0
     from_bias = SETTINGS.accel_bias_sigma_mps2 / SETTINGS.gravity_mps2
-    np.testing.assert_allclose(np.diag(P)[3:5], np.radians(SETTINGS.start_tilt_sigma_deg) ** 2 + from_bias**2)
+    np.testing.assert_allclose(np.diag(P)[3:5], np.radians(START_TILT_SIGMA_DEG) ** 2 + from_bias**2)
 
 
 def test_an_accelerometer_that_reads_nothing_is_named() -> None:

@@ -11,6 +11,7 @@ import pytest
 from tests.numerics import numeric_jacobian
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight, _world_points
 from vio.errors import ConfigError
+from vio.filters import online_calibration
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, ImuMotion, NavState, Transition
 from vio.filters.online_calibration import Twist, body_twist, first_calibration
@@ -30,14 +31,15 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, ImuSample
 
-# Constants do not walk.
-BOTH = MsckfSettings(
-    calibrate="both",
-    extrinsic_rotation_walk=0.0,
-    extrinsic_translation_walk=0.0,
-    time_offset_walk=0.0,
-)
-OFF = MsckfSettings(calibrate="none")
+BOTH = MsckfSettings(calibrate_camera_imu="both")
+OFF = MsckfSettings(calibrate_camera_imu="none")
+
+
+@pytest.fixture
+def no_walk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Estimate the calibration as constants."""
+    for name in ("_EXTRINSIC_ROTATION_WALK_DEG", "_EXTRINSIC_TRANSLATION_WALK_M", "_TIME_OFFSET_WALK_S"):
+        monkeypatch.setattr(online_calibration, name, 0.0)
 
 
 class Shaking(Flight):
@@ -346,6 +348,7 @@ def test_pose_at_an_exposure_follows_the_time_offset() -> None:
 # On exact flights
 
 
+@pytest.mark.usefixtures("no_walk")
 @pytest.mark.parametrize("seed", range(2))
 def test_wrong_calibration_is_found(seed: int) -> None:
     """One degree, two centimetres, eight milliseconds, either way round, after 10 s of motion about all axes."""
@@ -363,6 +366,7 @@ def test_wrong_calibration_is_found(seed: int) -> None:
     assert run.rms_m < 0.8 * without.rms_m
 
 
+@pytest.mark.usefixtures("no_walk")
 def test_a_baseline_that_is_off_by_10_percent_is_found_where_it_is_in_doubt() -> None:
     """The accelerometer tells the scale; without landmarks until it does, as they bias what is open."""
     wide = replace(BOTH, stereo_baseline_sigma=0.05)
@@ -375,6 +379,7 @@ def test_a_baseline_that_is_off_by_10_percent_is_found_where_it_is_in_doubt() ->
     assert percent > 5 * sigma
 
 
+@pytest.mark.usefixtures("no_walk")
 def test_covariance_of_the_calibration_can_be_believed() -> None:
     """Errors drawn from the prior: NEES of all seven, which should be 7 on average."""
     values = []
@@ -386,12 +391,14 @@ def test_covariance_of_the_calibration_can_be_believed() -> None:
     assert np.median(values) > 0.5, values
 
 
+@pytest.mark.usefixtures("no_walk")
 def test_right_calibration_is_not_made_worse() -> None:
     flight = Shaking(160)
     on, off = (_fly(flight, s, 3, xi=np.zeros(6), offset_s=0.0).rms_m for s in (BOTH, OFF))
     assert on < 1.3 * off
 
 
+@pytest.mark.usefixtures("no_walk")
 def test_standing_still_says_nothing_of_camera_and_imu() -> None:
     """Neither arm nor mount nor clock shows without motion, and no correction of the first tilt stands in for it."""
     run = _fly(Shaking(100, still=True), BOTH, 0, xi=np.zeros(6), offset_s=0.0, sigma=0.1)
@@ -410,7 +417,7 @@ def test_standing_still_says_nothing_of_camera_and_imu() -> None:
     ("calibrate", "extrinsics", "timing"), [("extrinsics", True, False), ("time_offset", False, True)]
 )
 def test_each_alone(calibrate: str, extrinsics: bool, timing: bool) -> None:
-    settings = MsckfSettings(calibrate=calibrate)  # type: ignore[arg-type]
+    settings = MsckfSettings(calibrate_camera_imu=calibrate)  # type: ignore[arg-type]
     xi = _off_by(0) if extrinsics else np.zeros(6)
     run = _fly(Shaking(140), settings, 0, xi=xi, offset_s=0.008 * timing)
     e = run.estimates[-1]
@@ -431,12 +438,13 @@ def test_off_tells_nothing_and_needs_an_imu_when_on() -> None:
 
 
 def test_auto_estimates_the_time_offset_where_there_is_an_imu() -> None:
-    run = _fly(Shaking(3), MsckfSettings(calibrate="auto"), 0, xi=np.zeros(6), offset_s=0.0)
+    run = _fly(Shaking(3), MsckfSettings(calibrate_camera_imu="auto"), 0, xi=np.zeros(6), offset_s=0.0)
     assert run.estimates[-1].T_cam0_imu is None
     assert run.estimates[-1].time_offset_sigma_s is not None
-    assert not first_calibration(T_CAM0_IMU, MsckfSettings(calibrate="auto"), None).moves_camera
+    assert not first_calibration(T_CAM0_IMU, MsckfSettings(calibrate_camera_imu="auto"), None).moves_camera
 
 
+@pytest.mark.usefixtures("no_walk")
 def test_constant_velocity_says_nothing_of_the_clocks() -> None:
     """The first velocities are not known, and their product with the offset's error is no measurement of it.
 

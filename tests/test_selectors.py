@@ -11,6 +11,7 @@ from vio.errors import ConfigError
 from vio.geometry.lie import se3_exp, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import MotionPrior, Observations, observations
+from vio.selection import selectors
 from vio.selection.selectors import Selector, SelectorSettings, build_selector
 
 CAMERA = StereoCamera(430.0, 430.0, 320.0, 180.0, 0.11, 640, 360)
@@ -34,11 +35,12 @@ def _build(
     settings = SelectorSettings(
         name=name,  # type: ignore[arg-type]
         keep_fraction=fraction,
-        minimum=minimum,
         budget=budget,
         sticky=sticky,
     )
-    return build_selector(settings, whole_record=lambda: record, camera=CAMERA)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(selectors, "_LEAST_KEPT", minimum)
+        return build_selector(settings, whole_record=lambda: record, camera=CAMERA)
 
 
 def _scene(frames: int, points: int = 120, seed: int = 0) -> list[Observations]:
@@ -190,7 +192,7 @@ def test_information_without_calibration_states_the_remedy() -> None:
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"budget": 0}, "budget"), ({"horizon_frames": 0}, "horizon_frames"), ({"pixel_sigma_px": 0.0}, "pixel_sigma_px")],
+    [({"budget": 0}, "budget"), ({"keep_fraction": 0.0}, "keep_fraction")],
 )
 def test_settings_out_of_range(change: dict[str, float], message: str) -> None:
     with pytest.raises(ConfigError, match=message):

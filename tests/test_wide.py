@@ -26,7 +26,6 @@ from vio.filters.multiview import Views
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import TERMS, RowField, StereoField, field_jacobian
 from vio.frontend.outliers import RansacProblem, bearing_consensus, epipolar_distance
-from vio.frontend.settings import ConsensusSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.rectify import PINHOLE_REACH
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
@@ -160,7 +159,7 @@ def test_consensus_without_depth_holds_beyond_ninety_degrees() -> None:
     T = se3_exp([0.15, 0.05, -0.08, 0.05, 0.1, -0.06])
     now = project(CYLINDER, transform_points(T, p))[:, :2] + np.random.default_rng(1).normal(0, 0.2, (150, 2))
     now[:30] += 40.0
-    problem = RansacProblem(CYLINDER, ConsensusSettings(), 1.5, np.random.default_rng(2))
+    problem = RansacProblem(CYLINDER, 1.5, np.random.default_rng(2))
     kept = bearing_consensus(problem, pixels, now, np.eye(3), None)
     assert kept is not None
     assert kept[30:].mean() > 0.95

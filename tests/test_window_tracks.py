@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from vio.filters.multiview import Residuals, eliminate_points, point_D_pose
 from vio.filters.settings import MsckfSettings
-from vio.filters.window_tracks import WindowTracks
+from vio.filters.window_tracks import LEAST_PIXEL_SIGMA_PX, WindowTracks
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import observations
@@ -127,7 +127,7 @@ def test_pixel_noise_stays_in_its_bounds() -> None:
     assert tracks.variance == SETTINGS.pixel_sigma_max_px**2
     for _ in range(500):
         tracks.update_pixel_noise(np.zeros(20), np.full(20, 5))
-    assert tracks.variance == SETTINGS.pixel_sigma_min_px**2
+    assert tracks.variance == LEAST_PIXEL_SIGMA_PX**2
 
 
 def test_tracks_that_end_come_first_then_the_longest() -> None:

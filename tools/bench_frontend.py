@@ -544,7 +544,7 @@ def main() -> int:
     parser.add_argument("--real-frames", type=int, help="frames of each KITTI clip (default: all)")
     parser.add_argument("--repeat", type=int, default=1, help="repetitions, for the times")
     parser.add_argument(
-        "--set", action="append", default=[], help="setting below `frontend.`, such as klt.window_px=21"
+        "--set", action="append", default=[], help="setting below `frontend.`, such as grid.target_features=800"
     )
     parser.add_argument("--edges", action="store_true", help="also report the errors near depth steps (rendered)")
     parser.add_argument("--json", type=Path)

@@ -30,6 +30,7 @@ from vio.errors import VioError
 from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.msckf import Msckf
+from vio.filters.online_calibration import STEREO_YAW_SIGMA_DEG
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.geometry.stereo import left_rays
@@ -74,9 +75,9 @@ def settings_of(rig: Rig, pixel_sigma_px: float) -> MsckfSettings:
     if rig == "IMU":
         return replace(known, calibrate_imu="full")
     if rig == "camera-IMU and IMU":
-        return replace(known, calibrate="both", calibrate_imu="full")
+        return replace(known, calibrate_camera_imu="both", calibrate_imu="full")
     if rig == "camera-IMU":
-        return replace(known, calibrate="both")
+        return replace(known, calibrate_camera_imu="both")
     if rig == "baseline":
         return replace(known, stereo_baseline_sigma=_BASELINE_SIGMA)
     return replace(known, calibrate_stereo="on")
@@ -86,22 +87,28 @@ def drawn(rig: Rig, settings: MsckfSettings, noise: np.random.Generator) -> Off:
     """Draw what a rig is off by from the priors of the settings; turns about all axes from that about the vertical."""
     s, right = settings, Off(np.zeros(6), 0.0, np.zeros(3), 0.0)
     if rig == "IMU":
-        return replace(right, imu=noise.normal(0, term_sigmas(s)))
+        return replace(right, imu=noise.normal(0, term_sigmas()))
     if rig == "camera-IMU and IMU":
-        return replace(drawn("camera-IMU", s, noise), imu=noise.normal(0, term_sigmas(s)))
+        return replace(drawn("camera-IMU", s, noise), imu=noise.normal(0, term_sigmas()))
     if rig == "camera-IMU":
         sigmas = np.repeat([s.extrinsic_translation_sigma_m, np.radians(s.extrinsic_rotation_sigma_deg)], 3)
         return replace(right, xi=noise.normal(0, sigmas), offset_s=float(noise.normal(0, s.time_offset_sigma_s)))
     if rig == "baseline":
         return replace(right, baseline=float(noise.normal(0, s.stereo_baseline_sigma)))
-    return replace(right, turn=noise.normal(0, np.radians(s.stereo_yaw_sigma_deg), 3))
+    return replace(right, turn=noise.normal(0, np.radians(STEREO_YAW_SIGMA_DEG), 3))
 
 
 def fly(
     rig: Rig, start: Start, seed: int, *, seconds: float = 10.0, pixel_sigma_px: float = 0.5
 ) -> list[dict[str, float]]:
     """Fly once; return NEES by what is estimated, halfway and at the end."""
-    scenario, flight = Scenario(seconds, pixel_sigma_px), Flight() if start == "motion" else FromStandstill()
+    scenario = Scenario(seconds, pixel_sigma_px)
+    with scenario.priors(learn_noise=False):
+        return _fly(rig, start, seed, scenario)
+
+
+def _fly(rig: Rig, start: Start, seed: int, scenario: Scenario) -> list[dict[str, float]]:
+    pixel_sigma_px, flight = scenario.pixel_sigma_px, Flight() if start == "motion" else FromStandstill()
     settings, noise = settings_of(rig, pixel_sigma_px), np.random.default_rng(seed)
     off = drawn(rig, settings, np.random.default_rng(10_000 + seed))
     filt = Msckf(CAMERA, T_CAM0_IMU @ se3_inverse(se3_exp(off.xi)), settings, motion="imu")
@@ -147,7 +154,7 @@ def imu_samples(
 
 def walked_terms(off: Off, count: int, settings: MsckfSettings, noise: np.random.Generator) -> FloatArray:
     """Return the IMU's terms (count, 15) at each sample, which walk as the filter has it where they are not zero."""
-    steps = noise.normal(0, 1, (count, IMU_TERMS)) * term_sigmas(settings) * IMU_WALK * np.sqrt(1e-9 * _IMU_NS)
+    steps = noise.normal(0, 1, (count, IMU_TERMS)) * term_sigmas() * IMU_WALK * np.sqrt(1e-9 * _IMU_NS)
     return off.imu + np.cumsum(steps * (off.imu != 0), axis=0)
 
 

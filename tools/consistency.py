@@ -26,11 +26,13 @@ from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from unittest.mock import patch
 
 import numpy as np
 
 from vio.errors import VioError
 from vio.evaluation.trajectories import nees, nees_bounds
+from vio.filters import imu_start, navigation, window_tracks
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import Residuals
 from vio.filters.navigation import DIM, ImuMotion, NavState, Transition
@@ -334,16 +336,24 @@ class Scenario:
         s = MsckfSettings(
             max_landmarks=self.landmarks,
             pixel_sigma_px=self.pixel_sigma_px,
-            start_tilt_sigma_deg=1.0,
-            start_velocity_sigma_mps=2.0,
             gyro_bias_sigma_radps=0.02,
             accel_bias_sigma_mps2=0.05,
-            rate_bias_sigma_radps=0.02,
-            calibrate="none",  # the other variants know the errors of the motion alone
+            calibrate_camera_imu="none",  # the other variants know the errors of the motion alone
         )
         if learn_noise:
             return s
-        return replace(s, pixel_sigma_min_px=self.pixel_sigma_px, pixel_sigma_max_px=self.pixel_sigma_px)
+        return replace(s, pixel_sigma_max_px=self.pixel_sigma_px)
+
+    @contextmanager
+    def priors(self, *, learn_noise: bool) -> Iterator[None]:
+        """Inside the block, use the priors of these flights and, unless it is learned, the true pixel noise."""
+        least_px = window_tracks.LEAST_PIXEL_SIGMA_PX if learn_noise else self.pixel_sigma_px
+        with (
+            patch.object(imu_start, "START_TILT_SIGMA_DEG", 1.0),
+            patch.object(navigation, "START_VELOCITY_SIGMA_MPS", 2.0),
+            patch.object(window_tracks, "LEAST_PIXEL_SIGMA_PX", least_px),
+        ):
+            yield
 
 
 class Flight:
@@ -403,7 +413,7 @@ class Flight:
         t = _times(frames)
         R, _, v = self.state(t)
         linear = (np.swapaxes(R, 1, 2) @ v[..., None])[..., 0] + noise.normal(0, s.linear_velocity_sigma_mps, v.shape)
-        bias = noise.normal(0, s.rate_bias_sigma_radps, 3)
+        bias = noise.normal(0, navigation.RATE_BIAS_SIGMA_RADPS, 3)
         angular = self.rates(t)[0] + bias + noise.normal(0, s.angular_rate_sigma_radps, v.shape)
         return [VelocitySample(k * _FRAME_NS, linear[k], angular[k]) for k in range(frames)]
 
@@ -453,8 +463,13 @@ class Record:
 
 def fly(job: Job) -> Record:
     """Fly once."""
-    scenario, flight = job.scenario, Flight()
     learn = job.variant == "right-invariant, noise learned"
+    with job.scenario.priors(learn_noise=learn):
+        return _fly(job, learn)
+
+
+def _fly(job: Job, learn: bool) -> Record:
+    scenario, flight = job.scenario, Flight()
     settings = scenario.settings(learn_noise=learn)
     kind = {"standard": StandardErrors, "first estimates": FirstEstimates}.get(job.variant)
     source = None if job.motion == "none" else job.motion

@@ -1,6 +1,6 @@
 """Measure the accuracy of a front end on rendered images with known ground truth; print a table, or JSON.
 
-    python tools/frontend_accuracy.py [--frontend klt] [--set frontend.klt.window_px=21] [--json FILE]
+    python tools/frontend_accuracy.py [--frontend klt] [--set frontend.grid.target_features=800] [--json FILE]
 
 Renders a room along a hand-held flight with a rectified 752x480 rig like EuRoC's: 300 frames, then 100 under each
 effect. Errors are relative to the exact correspondence: of the pixel in the previous frame (`step`), of the first pixel

@@ -13,8 +13,7 @@ Settings come from the defaults, a YAML file that holds deviations only (`--conf
 that order. `--config fast` is a preset for small computers ([performance.md](performance.md)). `vio config --show`
 prints the basic settings, `vio config --all` every one with its range; a run's folder holds the configuration that was
 in effect. An unknown key, a wrong type or a number out of range is an error that names the file and the nearest valid
-key. This page is written by `python tools/settings_page.py`. What each setting does to the error when it is halved or
-doubled is in [notes/settings_sweep.md](notes/settings_sweep.md).
+key. This page is written by `python tools/settings_page.py`.
 """
 _HEAD = "| setting | default | unit | meaning |\n|---|---:|---|---|\n"
 _WORDS = {None: "null", True: "true", False: "false"}

@@ -34,7 +34,6 @@ BASIC = (
     "motion",
     "backend",
     "lag_frames",
-    "dataset.colour",
     "frontend.name",
     "frontend.features",
     "frontend.grid.target_features",
@@ -45,15 +44,31 @@ BASIC = (
     "selector.budget",
     "msckf.clones",
     "msckf.max_landmarks",
-    "msckf.max_features",
     "msckf.gravity_mps2",
     "msckf.gyro_noise_density",
     "msckf.accel_noise_density",
     "msckf.gyro_bias_walk",
     "msckf.accel_bias_walk",
-    "msckf.calibrate",
+    "msckf.calibrate_camera_imu",
     "msckf.calibrate_stereo",
 )
+# Former settings, for the message on an unknown one: renamed, and constants of the code today.
+_RENAMED = {"msckf.calibrate": "msckf.calibrate_camera_imu"}
+_FIXED = {
+    "frontend.grid": "cell_features min_distance",
+    "frontend.disparity": "min_disparity_px",
+    "frontend.consensus": "samples sure_share prior_max_deviation_deg prior_min_support",
+    "frontend.klt": "min_gradient min_relative_gradient min_gradient_over_noise spare_corners window_px trusted_levels "
+    "iterations max_forward_backward_px consensus_px anchor_radius_px min_anchor_correlation max_anchor_scale "
+    "max_epipolar_px min_correlation min_peak_margin probation_frames wanted_life_frames least_features "
+    "max_blind_frames max_left_only_frames",
+    "frontend.match": "ratio search_radius max_epipolar_px refine consensus_px",
+    "selector": "minimum horizon_frames pixel_sigma_px",
+    "vislam": "start_velocity_sigma_mps start_rate_sigma_radps landmark_prior_sigma_m max_landmark_distance_m",
+    "msckf": "pixel_sigma_min_px start_tilt_sigma_deg start_velocity_sigma_mps zero_velocity_sigma_mps "
+    "zero_rate_sigma_radps rate_bias_sigma_radps rate_bias_walk stereo_yaw_sigma_deg stereo_field_sigma "
+    "imu_scale_sigma imu_misalignment_sigma_deg extrinsic_rotation_walk extrinsic_translation_walk time_offset_walk",
+}
 _PRESETS = Path(__file__).parent / "presets"  # packaged configurations, by name
 _MOST_NAMED = 8  # settings in the message on an unknown one
 _MOST_SHOWN = 200  # characters of a wrong value in a message
@@ -282,6 +297,10 @@ def _suggestion(key: str, names: Sequence[str], prefix: str, root: Any) -> str:
 
     A name may be split over section and setting: `consensus_samples` is `consensus.samples`.
     """
+    if prefix + key in _RENAMED:
+        return f"; it is '{_RENAMED[prefix + key]}' since 0.3"
+    if key in _FIXED.get(prefix[:-1], "").split():
+        return "; it is fixed since 0.3: remove it"
     same_name = [row.key for row in describe(root) if f".{row.key}".replace(".", "_").endswith(f"_{key}")]
     siblings = [name for name in same_name if name.startswith(prefix[: prefix.find(".") + 1])]
     similar = [prefix + name for name in difflib.get_close_matches(key, names, 1, cutoff=0.4)]

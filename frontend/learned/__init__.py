@@ -28,7 +28,7 @@ def build_learned(camera: StereoCamera, settings: FrontendSettings) -> Descripto
     match, learned = settings.match, settings.learned
     device = pick_device(learned.device)
     extract = build_extractor(learned, match, device)
-    matcher: Matcher = MutualNearest(match.ratio)
+    matcher: Matcher = MutualNearest()
     if learned.matcher == "lightglue":
         matcher = build_lightglue(learned, camera, device)
     return DescriptorFrontend(camera, settings, "kornia", extract, matcher)

@@ -18,6 +18,7 @@ from vio.geometry.lie import FloatArray, so3_exp
 from vio.imu.standstill import NOISE_FACTOR, STANDSTILL_S, blocks_agree
 from vio.records import ImuSample
 
+START_TILT_SIGMA_DEG = 8.0  # initial standard deviation of roll and pitch
 _MOST_TILT_RAD = np.pi / 4  # beyond, the direction of gravity is unknown; a larger prior says no more
 
 
@@ -70,7 +71,7 @@ def imu_start(samples: Sequence[ImuSample], time_ns: int, settings: MsckfSetting
             True, force, gyro[-1], mean_rate, bias_sigma, float(np.hypot(shown, NOISE_FACTOR * force_noise))
         )
     scatter = float(np.sqrt(accel.var(axis=0).sum()))
-    base = s.gravity_mps2 * np.radians(s.start_tilt_sigma_deg)
+    base = s.gravity_mps2 * np.radians(START_TILT_SIGMA_DEG)
     sigma = min(float(np.linalg.norm([base, shown, scatter])), s.gravity_mps2 * float(np.tan(_MOST_TILT_RAD)))
     return ImuStart(False, force, gyro[-1], np.zeros(3), s.gyro_bias_sigma_radps, sigma)
 

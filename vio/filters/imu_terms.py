@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, so3_exp, so3_hat
 from vio.records import IMU_ENTRIES, IntArray, imu_matrices
 
@@ -23,6 +22,8 @@ IMU_TERMS = len(IMU_ENTRIES)
 # consumer IMUs' scales are off by; without it a gyro's scale moved by 0.5 % in 20 s of standstill.
 _CLEAR = 500.0
 _USUAL_S = 1.0  # over which readings are averaged: a tenth of a second of noise is a tenth of it
+_SCALE_SIGMA = 0.01  # initial standard deviation of a scale, over it
+_MISALIGNMENT_SIGMA_DEG = 0.5  # initial standard deviation of a misalignment
 _SENSOR, _ROW, _COLUMN = np.array(IMU_ENTRIES).T
 # Random walk of the terms per root second, over their initial standard deviation: by their data sheets, consumer
 # accelerometers and gyros change by 0.02 to 0.03 % a degree, so two degrees in a hundred seconds are 0.05 %.
@@ -35,10 +36,10 @@ CHOSEN: dict[ImuTerms, IntArray] = {
 }
 
 
-def term_sigmas(settings: MsckfSettings) -> FloatArray:
+def term_sigmas() -> FloatArray:
     """Return the initial standard deviations (15,) of the terms."""
-    misalignment = float(np.radians(settings.imu_misalignment_sigma_deg))
-    return np.asarray(np.where(_ROW == _COLUMN, settings.imu_scale_sigma, misalignment), dtype=np.float64)
+    misalignment = float(np.radians(_MISALIGNMENT_SIGMA_DEG))
+    return np.asarray(np.where(_ROW == _COLUMN, _SCALE_SIGMA, misalignment), dtype=np.float64)
 
 
 def calibrated(readings: FloatArray, terms: FloatArray) -> FloatArray:

@@ -25,7 +25,7 @@ class LateImuMsckf(Msckf):
     def __init__(self, camera: StereoCamera, T_cam0_imu: FloatArray, settings: MsckfSettings) -> None:
         """Prepare; the arguments are those of `Msckf`."""
         super().__init__(camera, T_cam0_imu, settings, motion="imu")
-        self._without = camera, T_cam0_imu, replace(settings, calibrate="none", calibrate_imu="off")
+        self._without = camera, T_cam0_imu, replace(settings, calibrate_camera_imu="none", calibrate_imu="off")
         self._early: Msckf | None = None  # images alone, until the first sample
         self._handover: tuple[int, Estimate] | None = None  # first frame with the IMU, and its pose by images alone
         self._T_first_world: FloatArray = np.eye(4)  # the upright world in that of the first frame

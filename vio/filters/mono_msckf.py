@@ -27,10 +27,6 @@ _LANDMARKS = 0
 # Parallax comes from motion alone, so a second of poses instead of half: EuRoC MH_01 ends at an ATE of 3.4 mm in place
 # of 4.9, its scale off by less than 0.1 % in place of 3 %.
 _LEAST_CLONES = 20
-# Pixels of a track share errors that its residuals do not show, and no right image bounds what they make of the scale:
-# over 15 s of MH_03's path with clean rendered images, position NEES is 24 of 3 at the 0.03 px that the residuals
-# suggest, 0.6 at 0.1, and ATE 6.6 mm in place of 32.
-_LEAST_PX = 0.1
 _WORLD = [0, 1, 2, 5]  # errors of position and yaw, which the start takes for the world's
 
 
@@ -137,7 +133,6 @@ class MonoMsckf(Msckf):
 
 def _for_one_camera(settings: MsckfSettings) -> MsckfSettings:
     clones = max(settings.clones, _LEAST_CLONES)
-    floor_px = max(settings.pixel_sigma_min_px, min(_LEAST_PX, settings.pixel_sigma_max_px))
     # The time offset trades against the scale, which rests on the IMU alone: estimated, it made 0.9 to 1.2 of the ATE.
-    calibrate = "none" if settings.calibrate == "auto" else settings.calibrate
-    return replace(settings, max_landmarks=_LANDMARKS, clones=clones, pixel_sigma_min_px=floor_px, calibrate=calibrate)
+    calibrate = "none" if settings.calibrate_camera_imu == "auto" else settings.calibrate_camera_imu
+    return replace(settings, max_landmarks=_LANDMARKS, clones=clones, calibrate_camera_imu=calibrate)

@@ -19,7 +19,15 @@ import numpy as np
 from vio.filters.alignment import Alignment, Bearings, FreeMotion, align, gyro_bias
 from vio.filters.imu_start import imu_start
 from vio.filters.multiview import eliminate_points
-from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState, rotation_to_up
+from vio.filters.navigation import (
+    DIM,
+    NO_STEP,
+    START_VELOCITY_SIGMA_MPS,
+    ZERO_VELOCITY_SIGMA_MPS,
+    ImuMotion,
+    NavState,
+    rotation_to_up,
+)
 from vio.filters.online_calibration import Calibration
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
@@ -114,7 +122,7 @@ class MonoStarter:
 
     def _still_start(self, motion: ImuMotion) -> MonoStart:
         nav, P = motion.start(self._frames[-1].time_ns)
-        P[6:9, 6:9] = np.eye(3) * self._settings.zero_velocity_sigma_mps**2
+        P[6:9, 6:9] = np.eye(3) * ZERO_VELOCITY_SIGMA_MPS**2
         return MonoStart(nav, P, None, self._passed - 1)
 
     def _moving_start(self, motion: ImuMotion) -> MonoStart | None:
@@ -219,7 +227,7 @@ class MonoStarter:
     def _window(self, motion: ImuMotion, views: list[Observations], begin: NavState) -> Window:
         """The window of all views, predicted from a first state, under the prior alone."""
         s = self._settings
-        sigmas = [0.0, s.start_velocity_sigma_mps, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
+        sigmas = [0.0, START_VELOCITY_SIGMA_MPS, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
         P = np.diag(np.concatenate([[0.0] * 3, [_TILT_SIGMA_RAD] * 2, np.repeat(sigmas, [1, 3, 3, 3])]) ** 2)
         window = Window(motion, begin, P, Calibration(self._T_cam0_imu))
         for k, view in enumerate(views):

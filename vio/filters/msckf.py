@@ -29,7 +29,17 @@ from vio.filters.multiview import (
     landmark_residuals,
     relative_stereo_sigma,
 )
-from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, NavState, Transition, TwistMotion
+from vio.filters.navigation import (
+    DIM,
+    NO_STEP,
+    ZERO_RATE_SIGMA_RADPS,
+    ZERO_VELOCITY_SIGMA_MPS,
+    Growth,
+    ImuMotion,
+    NavState,
+    Transition,
+    TwistMotion,
+)
 from vio.filters.noise import MotionNoise, StepErrors
 from vio.filters.online_calibration import (
     Calibration,
@@ -136,8 +146,11 @@ class Msckf:
         check_parts("msckf", camera, settings, MsckfSettings)
         if motion not in (None, *self.motion_sources):
             raise ConfigError(f"msckf has no model for motion {motion!r}; give imu, velocity or None")
-        if settings.calibrate not in ("auto", "none") and motion != "imu":
-            raise ConfigError(f"msckf.calibrate: {settings.calibrate} needs --motion imu; set it to auto or none")
+        if settings.calibrate_camera_imu not in ("auto", "none") and motion != "imu":
+            raise ConfigError(
+                f"msckf.calibrate_camera_imu: {settings.calibrate_camera_imu} needs --motion imu; "
+                "set it to auto or none"
+            )
         if settings.calibrate_imu != "off" and motion != "imu":
             raise ConfigError(f"msckf.calibrate_imu: {settings.calibrate_imu} needs --motion imu; set it to off")
         if camera.is_cylinder:  # equation (R4) is a pinhole's
@@ -716,8 +729,7 @@ class Msckf:
             return
         if window.clones[0].time_ns <= self._stationary_ns:
             return
-        limits = self._settings.zero_velocity_sigma_mps, self._settings.zero_rate_sigma_radps
-        if self._smoothed is None or not self._smoothed.is_stationary(*limits):
+        if self._smoothed is None or not self._smoothed.is_stationary(ZERO_VELOCITY_SIGMA_MPS, ZERO_RATE_SIGMA_RADPS):
             return
         measurement = self._motion.zero_velocity(window.nav, self._gyro)
         if measurement is not None:

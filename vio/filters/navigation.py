@@ -50,6 +50,11 @@ UNSCALED: FloatArray = np.ones(2)  # factors on the noise: translation, rotation
 _EXTRAPOLATE_NS = 30_000_000  # by which samples may end before an exposure and its pose is still taken from its twist
 _SAMPLE_S = 0.005  # between two samples of a usual IMU, where only one has come
 _NO_TERMS: FloatArray = np.zeros(IMU_TERMS)
+START_VELOCITY_SIGMA_MPS = 10.0  # initial standard deviation of the velocity
+ZERO_VELOCITY_SIGMA_MPS = 0.02  # standard deviation of the velocity in a zero-velocity measurement
+ZERO_RATE_SIGMA_RADPS = 0.01  # the same of the angular rate
+RATE_BIAS_SIGMA_RADPS = 0.02  # initial standard deviation of the bias of a measured angular rate
+_RATE_BIAS_WALK = 1.0e-4  # random walk of that bias, rad/s/sqrt(s)
 _START_RATE_SIGMA_RADPS = 1.0  # initial standard deviation of the angular rate without an IMU
 
 
@@ -174,7 +179,7 @@ class ImuMotion:
             [
                 np.zeros(5),
                 [_yaw_sigma(np.hypot(begin.accel_sigma_mps2, s.accel_bias_sigma_mps2) / s.gravity_mps2, known)],
-                np.full(3, s.start_velocity_sigma_mps),
+                np.full(3, START_VELOCITY_SIGMA_MPS),
                 np.full(3, begin.gyro_bias_sigma_radps),
                 np.full(3, s.accel_bias_sigma_mps2),
             ]
@@ -190,7 +195,7 @@ class ImuMotion:
     def start_covariance(self, settings: MsckfSettings) -> FloatArray:
         """Covariance (15, 15) of velocity and biases of which nothing is known; that of the pose is zero."""
         s = settings
-        sigmas = [0.0, 0.0, s.start_velocity_sigma_mps, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
+        sigmas = [0.0, 0.0, START_VELOCITY_SIGMA_MPS, s.gyro_bias_sigma_radps, s.accel_bias_sigma_mps2]
         return np.diag(np.repeat(sigmas, 3) ** 2)
 
     def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
@@ -261,7 +266,7 @@ class ImuMotion:
             return None
         s = self._settings
         turn = gyro - nav.gyro_bias
-        if np.abs(turn).max() > 3 * (s.zero_rate_sigma_radps + s.gyro_bias_sigma_radps):
+        if np.abs(turn).max() > 3 * (ZERO_RATE_SIGMA_RADPS + s.gyro_bias_sigma_radps):
             return None
         H = np.zeros((6, DIM + len(self._chosen)))
         H[:3, 3:6] = -so3_hat(nav.velocity)
@@ -269,7 +274,7 @@ class ImuMotion:
         H[3:, 9:12] = np.eye(3)
         if len(self._chosen):
             H[3:, DIM:] = -gyro_D_terms(raw_rate(gyro, nav.imu_terms))[:, self._chosen]
-        sigmas = np.repeat([s.zero_velocity_sigma_mps, s.zero_rate_sigma_radps], 3)
+        sigmas = np.repeat([ZERO_VELOCITY_SIGMA_MPS, ZERO_RATE_SIGMA_RADPS], 3)
         return Measurement(H, np.concatenate([-nav.velocity, turn]), np.diag(sigmas**2))
 
     def velocity_world(self, nav: NavState) -> FloatArray:
@@ -372,8 +377,7 @@ class TwistMotion:
 
     def start_covariance(self, settings: MsckfSettings) -> FloatArray:
         """Covariance (15, 15) of twist and rate bias of which nothing is known; that of the pose is zero."""
-        s = settings
-        sigmas = [0.0, 0.0, s.start_velocity_sigma_mps, _START_RATE_SIGMA_RADPS, s.rate_bias_sigma_radps]
+        sigmas = [0.0, 0.0, START_VELOCITY_SIGMA_MPS, _START_RATE_SIGMA_RADPS, RATE_BIAS_SIGMA_RADPS]
         return np.diag(np.repeat(sigmas, 3) ** 2)
 
     def advance(self, nav: NavState, start_ns: int, end_ns: int, factors: FloatArray = UNSCALED) -> Transition:
@@ -396,7 +400,7 @@ class TwistMotion:
             part[6:12, :6] = part[:6, 6:12].T
             part[6:12, 6:12] = D * tau
         Q = Q_parts.sum(axis=0)
-        Q[12:, 12:] = np.eye(3) * (self._settings.rate_bias_walk**2 * tau)
+        Q[12:, 12:] = np.eye(3) * (_RATE_BIAS_WALK**2 * tau)
         return Transition(replace(nav, T_world_imu=moved), Phi, Q, Q_parts)
 
     def forget_before(self, time_ns: int) -> None:
@@ -417,10 +421,9 @@ class TwistMotion:
 
     def zero_velocity(self, nav: NavState, gyro: FloatArray | None) -> Measurement:
         """Rest as a measurement: no twist."""
-        s = self._settings
         H = np.zeros((6, DIM))
         H[:, 6:12] = np.eye(6)
-        sigmas = np.repeat([s.zero_velocity_sigma_mps, s.zero_rate_sigma_radps], 3)
+        sigmas = np.repeat([ZERO_VELOCITY_SIGMA_MPS, ZERO_RATE_SIGMA_RADPS], 3)
         return Measurement(H, -np.concatenate([nav.velocity, nav.rate]), np.diag(sigmas**2))
 
     def velocity_world(self, nav: NavState) -> FloatArray:

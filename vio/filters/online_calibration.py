@@ -26,6 +26,12 @@ _ETA, _OFFSET = IMU_TERMS + TERMS + np.arange(6), np.array([IMU_TERMS + TERMS + 
 _FULL = IMU_TERMS + TERMS + 7
 _PARTS = slice(0, 3), slice(3, 6)  # of a twist
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
+# Random walks of a mount that gives and of clocks that drift, each per root second.
+_EXTRINSIC_ROTATION_WALK_DEG = 2.0e-3
+_EXTRINSIC_TRANSLATION_WALK_M = 1.0e-4
+_TIME_OFFSET_WALK_S = 2.0e-6
+STEREO_YAW_SIGMA_DEG = 0.1  # initial standard deviation of the right camera's rotation about its vertical axis
+_STEREO_FIELD_SIGMA = 2.0e-3  # the same of the other terms of the stereo field, in focal lengths
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
 _STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
 # Which coefficients are estimated, by whether those of (R3) and of (R4) are.
@@ -155,8 +161,8 @@ def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: M
 
     Of camera and IMU nothing is estimated without an IMU, and nothing metric without a metric sensor.
     """
-    extrinsics = motion == "imu" and settings.calibrate in ("extrinsics", "both")
-    timing = motion == "imu" and settings.calibrate in ("auto", "time_offset", "both")
+    extrinsics = motion == "imu" and settings.calibrate_camera_imu in ("extrinsics", "both")
+    timing = motion == "imu" and settings.calibrate_camera_imu in ("auto", "time_offset", "both")
     return Calibration(
         np.asarray(T_cam0_imu, dtype=np.float64),
         extrinsics=extrinsics,
@@ -172,23 +178,23 @@ def calibration_covariance(calibration: Calibration, settings: MsckfSettings) ->
     s = settings
     rotation = np.radians(s.extrinsic_rotation_sigma_deg)
     pose = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
-    sigmas = np.concatenate([term_sigmas(s), _stereo_sigmas(s), pose])
+    sigmas = np.concatenate([term_sigmas(), _stereo_sigmas(s), pose])
     return np.diag(sigmas[calibration.columns] ** 2)
 
 
 def calibration_walk(settings: MsckfSettings) -> FloatArray:
     """Return the variances (32,) that a second of random walk adds to `[IMU; stereo; delta; time offset]`."""
     s = settings
-    rotation = np.radians(s.extrinsic_rotation_walk)
-    pose = np.repeat([s.extrinsic_translation_walk, rotation, s.time_offset_walk], [3, 3, 1])
-    walks: FloatArray = np.concatenate([term_sigmas(s) * IMU_WALK, _stereo_sigmas(s) * _STEREO_WALK, pose])
+    rotation = np.radians(_EXTRINSIC_ROTATION_WALK_DEG)
+    pose = np.repeat([_EXTRINSIC_TRANSLATION_WALK_M, rotation, _TIME_OFFSET_WALK_S], [3, 3, 1])
+    walks: FloatArray = np.concatenate([term_sigmas() * IMU_WALK, _stereo_sigmas(s) * _STEREO_WALK, pose])
     return walks**2
 
 
 def _stereo_sigmas(settings: MsckfSettings) -> FloatArray:
     """Initial standard deviations (10,) of the coefficients of (R3) and (R4)."""
     s = settings
-    yaw, other = np.radians(s.stereo_yaw_sigma_deg), s.stereo_field_sigma
+    yaw, other = np.radians(STEREO_YAW_SIGMA_DEG), _STEREO_FIELD_SIGMA
     metric = [s.stereo_baseline_sigma, s.stereo_focal_sigma]
     right, both = [yaw, other, other, other], [_RADIAL * other, _RADIAL * other, other, other]
     return np.array([*right, *both, *metric])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-from vio.errors import ConfigError
 from vio.setting import Section, setting
 
 
@@ -40,10 +39,6 @@ class VislamSettings(Section):
     angular_acceleration_density: float = setting(
         0.1, "model 'twist': spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
     )
-    start_velocity_sigma_mps: float = setting(
-        10.0, "model 'twist': unknown velocity at the start", unit="m/s", at_least=0
-    )
-    start_rate_sigma_radps: float = setting(1.0, "model 'twist': unknown rate at the start", unit="rad/s", at_least=0)
     pixel_sigma_px: float = setting(
         0.75, "noise of one pixel coordinate; V is its square, 15 in the paper", unit="px", above=0
     )
@@ -60,7 +55,6 @@ class VislamSettings(Section):
     landmark_prior: Literal["stereo", "isotropic"] = setting(
         "stereo", "covariance of a new landmark: propagated from its first pixels and pose, or the same for all"
     )
-    landmark_prior_sigma_m: float = setting(1.0, "the isotropic prior's standard deviation", unit="m", above=0)
     iterations: int = setting(
         3,
         "Gauss-Newton iterations of the pose update; 1 is the paper's filter, more help a start in motion",
@@ -68,9 +62,6 @@ class VislamSettings(Section):
         at_most=100,
     )
     use_stale: bool = setting(False, "take in observations flagged as stale; the paper knows no such flag")
-    max_landmark_distance_m: float = setting(
-        150.0, "observations farther away are neither initialised nor used", unit="m", above=0
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +78,9 @@ class MsckfSettings(Section):
     pixel_sigma_px: float = setting(
         0.5, "noise of one pixel coordinate at the start; then estimated", unit="px", above=0
     )
-    pixel_sigma_min_px: float = setting(0.03, "the estimated noise stays above this", unit="px", above=0)
-    pixel_sigma_max_px: float = setting(2.0, "the estimated noise stays below this", unit="px", above=0)
+    pixel_sigma_max_px: float = setting(
+        2.0, "upper bound of the estimated noise of a pixel coordinate", unit="px", above=0
+    )
     gate_probability: float = setting(0.99, "tracks outside this chi-square quantile are rejected", above=0, below=1)
     gravity_mps2: float = setting(9.81, "magnitude of gravity", unit="m/s^2", above=0, at_most=100)
     gyro_noise_density: float = setting(
@@ -97,10 +89,6 @@ class MsckfSettings(Section):
     accel_noise_density: float = setting(1.2e-2, "accelerometer white noise, likewise", unit="m/s^2/sqrt(Hz)", above=0)
     gyro_bias_walk: float = setting(2.0e-5, "gyro bias random walk", unit="rad/s^2/sqrt(Hz)", at_least=0)
     accel_bias_walk: float = setting(3.0e-3, "accelerometer bias random walk", unit="m/s^3/sqrt(Hz)", at_least=0)
-    start_tilt_sigma_deg: float = setting(8.0, "initial standard deviation of roll and pitch", unit="deg", at_least=0)
-    start_velocity_sigma_mps: float = setting(
-        10.0, "initial standard deviation of the velocity", unit="m/s", at_least=0
-    )
     gyro_bias_sigma_radps: float = setting(0.1, "initial standard deviation of the gyro bias", unit="rad/s", at_least=0)
     accel_bias_sigma_mps2: float = setting(
         0.3, "initial standard deviation of the accelerometer bias", unit="m/s^2", at_least=0
@@ -108,25 +96,15 @@ class MsckfSettings(Section):
     zero_velocity: bool = setting(
         True, "measure zero velocity where the motion over the window is indistinguishable from none"
     )
-    zero_velocity_sigma_mps: float = setting(
-        0.02, "standard deviation of a zero-velocity measurement", unit="m/s", above=0
-    )
-    zero_rate_sigma_radps: float = setting(
-        0.01, "standard deviation of the rate in a zero-velocity measurement", unit="rad/s", above=0
-    )
     linear_velocity_sigma_mps: float = setting(0.5, "noise of a measured body velocity", unit="m/s", above=0)
     angular_rate_sigma_radps: float = setting(0.05, "noise of a measured angular rate", unit="rad/s", above=0)
-    rate_bias_sigma_radps: float = setting(
-        0.02, "initial standard deviation of the bias of a measured angular rate", unit="rad/s", at_least=0
-    )
-    rate_bias_walk: float = setting(1.0e-4, "random walk of that bias", unit="rad/s/sqrt(s)", at_least=0)
     acceleration_density: float = setting(
         1.0, "without IMU: spectral density of the body acceleration", unit="m/s^2/sqrt(Hz)", at_least=0
     )
     angular_acceleration_density: float = setting(
         0.3, "without IMU: spectral density of the angular acceleration", unit="rad/s^2/sqrt(Hz)", at_least=0
     )
-    calibrate: Literal["auto", "none", "extrinsics", "time_offset", "both"] = setting(
+    calibrate_camera_imu: Literal["auto", "none", "extrinsics", "time_offset", "both"] = setting(
         "auto",
         "what is estimated of camera and IMU besides the motion: T_cam0_imu, the time offset, or both; auto: the time "
         "offset, where a stereo pair has an IMU",
@@ -141,12 +119,6 @@ class MsckfSettings(Section):
         "estimate what the stereo calibration is off by, a low-order field over the image: always, never, or where the "
         "rows of left and right images show that it is off",
     )
-    stereo_yaw_sigma_deg: float = setting(
-        0.1, "initial standard deviation of the right camera's turn about its vertical axis", unit="deg", at_least=0
-    )
-    stereo_field_sigma: float = setting(
-        2.0e-3, "initial standard deviation of the other terms of the field, in focal lengths", at_least=0
-    )
     stereo_focal_sigma: float = setting(
         0.0,
         "initial standard deviation of the focal length, over it; 0: it is known; else it is estimated, with IMU or "
@@ -155,41 +127,11 @@ class MsckfSettings(Section):
     )
     stereo_baseline_sigma: float = setting(0.0, "the same of the baseline's length", at_least=0)
     extrinsic_rotation_sigma_deg: float = setting(
-        0.5, "calibrate: initial standard deviation of T_cam0_imu's rotation", unit="deg", at_least=0
+        0.5, "calibrate_camera_imu: initial standard deviation of T_cam0_imu's rotation", unit="deg", at_least=0
     )
     extrinsic_translation_sigma_m: float = setting(
-        0.01, "calibrate: initial standard deviation of T_cam0_imu's translation", unit="m", at_least=0
+        0.01, "calibrate_camera_imu: initial standard deviation of T_cam0_imu's translation", unit="m", at_least=0
     )
     time_offset_sigma_s: float = setting(
-        5.0e-3, "calibrate: initial standard deviation of the time offset", unit="s", at_least=0
+        5.0e-3, "calibrate_camera_imu: initial standard deviation of the time offset", unit="s", at_least=0
     )
-    imu_scale_sigma: float = setting(
-        0.01,
-        "calibrate_imu: initial standard deviation of a scale, over it; 1/200 of it walks per root second",
-        at_least=0,
-    )
-    imu_misalignment_sigma_deg: float = setting(
-        0.5, "calibrate_imu: initial standard deviation of a misalignment, likewise", unit="deg", at_least=0
-    )
-    extrinsic_rotation_walk: float = setting(
-        2.0e-3, "calibrate: random walk, of a mount that gives", unit="deg/sqrt(s)", at_least=0
-    )
-    extrinsic_translation_walk: float = setting(
-        1.0e-4, "calibrate: random walk, likewise", unit="m/sqrt(s)", at_least=0
-    )
-    time_offset_walk: float = setting(
-        2.0e-6, "calibrate: random walk, of clocks that drift", unit="s/sqrt(s)", at_least=0
-    )
-
-    def __post_init__(self) -> None:
-        """Check every number, and that the pixel noise's bounds leave room for it.
-
-        Raises:
-            ConfigError: a value is out of range.
-        """
-        Section.__post_init__(self)
-        if self.pixel_sigma_min_px > self.pixel_sigma_max_px:
-            raise ConfigError(
-                f"msckf.pixel_sigma_min_px, {self.pixel_sigma_min_px:g}, must not be above msckf.pixel_sigma_max_px, "
-                f"{self.pixel_sigma_max_px:g}"
-            )

@@ -32,6 +32,8 @@ from vio.records import (
 )
 
 _MIN_DEPTH_M = 0.3
+_MAX_LANDMARK_DISTANCE_M = 150.0  # observations farther away are neither initialised nor used
+_LANDMARK_PRIOR_SIGMA_M = 1.0  # standard deviation of the isotropic prior
 _MIN_FEATURES = 3  # fewer points leave a pose undetermined, and a single wrong one would steer it
 
 
@@ -309,20 +311,20 @@ class Vislam:
 
     def _in_front(self, m: FloatArray) -> BoolArray:
         depth = depth_of(self._camera, transform_points(self._T_cam0_imu @ self._state.U, m))
-        return (depth > _MIN_DEPTH_M) & (depth < self._settings.max_landmark_distance_m)
+        return (depth > _MIN_DEPTH_M) & (depth < _MAX_LANDMARK_DISTANCE_M)
 
     def _initialise(self, ids: IntArray, z: FloatArray) -> int:
         """Create landmarks from their first stereo observation, equation (P3); return how many."""
         s = self._settings
         p_cam, valid = triangulate(self._camera, z)
         depth = depth_of(self._camera, p_cam)
-        valid &= (depth > _MIN_DEPTH_M) & (depth < s.max_landmark_distance_m)
+        valid &= (depth > _MIN_DEPTH_M) & (depth < _MAX_LANDMARK_DISTANCE_M)
         ids, z, p_cam = ids[valid], z[valid], p_cam[valid]
         T_world_cam0 = se3_inverse(self._T_cam0_imu @ self._state.U)
         if s.landmark_prior == "stereo":
             J = T_world_cam0[:3, :3] @ p_cam_D_z(self._camera, z)
             P = s.pixel_sigma_px**2 * J @ np.swapaxes(J, -1, -2)
         else:
-            P = np.broadcast_to(s.landmark_prior_sigma_m**2 * np.eye(3), (len(ids), 3, 3))
+            P = np.broadcast_to(_LANDMARK_PRIOR_SIGMA_M**2 * np.eye(3), (len(ids), 3, 3))
         self._map.add(ids, transform_points(T_world_cam0, p_cam), P)
         return len(ids)

@@ -15,6 +15,9 @@ from vio.filters.settings import VislamSettings
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_left_jacobian
 from vio.records import VelocitySample
 
+_START_VELOCITY_SIGMA_MPS = 10.0  # initial standard deviation of the linear velocity
+_START_RATE_SIGMA_RADPS = 1.0  # the same of the angular rate
+
 
 @dataclass(frozen=True, slots=True)
 class PoseState:
@@ -138,7 +141,7 @@ class DriftingTwist:
         s = settings
         self._density = np.repeat([s.acceleration_density, s.angular_acceleration_density], 3) ** 2
         self._sensor = np.diag(np.repeat([s.linear_velocity_sigma_mps, s.angular_rate_sigma_radps], 3) ** 2)
-        self._start = np.repeat([s.start_velocity_sigma_mps, s.start_rate_sigma_radps], 3) ** 2
+        self._start = np.repeat([_START_VELOCITY_SIGMA_MPS, _START_RATE_SIGMA_RADPS], 3) ** 2
 
     def start(self, U: FloatArray) -> PoseState:
         """Return the state at the first frame: the world is where the body is, its twist unknown."""

@@ -21,6 +21,10 @@ from vio.records import BoolArray, IntArray, MotionPrior, Observations, Selectio
 from vio.selection.information import MotionInformation, lazy_greedy, log_det_gain, prior_information
 from vio.setting import Section, setting
 
+_LEAST_KEPT = 12  # observations of a frame, where a share of them is kept
+_HORIZON_FRAMES = 4  # the gain is summed over the last motion, the next one and the one so many frames ahead
+_PIXEL_SIGMA_PX = 0.5  # standard deviation of one pixel coordinate
+
 SelectorName = Literal["all", "visibility", "visibility_whole", "information"]
 
 
@@ -38,17 +42,9 @@ class SelectorSettings(Section):
     )
     budget: int | None = setting(None, "observations kept of a frame; null: the share below", at_least=1)
     keep_fraction: float = setting(1 / 7, "share of the features that is kept; the paper keeps 1/7", above=0, at_most=1)
-    minimum: int = setting(12, "keep at least this many observations of a frame (all but visibility_whole)", at_least=0)
     sticky: bool = setting(
         False, "a chosen feature stays chosen while it is tracked; new ones only fill the remaining budget"
     )
-    horizon_frames: int = setting(
-        4,
-        "information: the gain is summed over the last motion, the next one and the one this many frames ahead",
-        at_least=1,
-        at_most=100,
-    )
-    pixel_sigma_px: float = setting(0.5, "information: standard deviation of one pixel coordinate", unit="px", above=0)
 
 
 class _VisibilityCount:
@@ -73,13 +69,13 @@ class _Budget:
     """The number of rows to choose, and the rows kept from the last frame."""
 
     def __init__(self, settings: SelectorSettings) -> None:
-        self._settings = settings
+        self._settings, self._least = settings, _LEAST_KEPT
         self._last: IntArray = np.zeros(0, dtype=np.int64)
 
     def rows(self, n: int) -> int:
         """Return how many of n rows may be chosen."""
         s = self._settings
-        return min(n, max(int(np.ceil(n * s.keep_fraction)), s.minimum) if s.budget is None else s.budget)
+        return min(n, max(int(np.ceil(n * s.keep_fraction)), self._least) if s.budget is None else s.budget)
 
     def kept(self, ids: IntArray) -> BoolArray:
         """Return the rows (N,) that stay chosen; none unless the selector is sticky."""
@@ -147,8 +143,8 @@ class InformationGain:
     """The features with the largest joint information on the last and the coming motions (docs/notes/selection.md)."""
 
     def __init__(self, settings: SelectorSettings, camera: StereoCamera) -> None:
-        self._settings, self._budget = settings, _Budget(settings)
-        self._model = MotionInformation(camera, settings.horizon_frames, settings.pixel_sigma_px)
+        self._budget = _Budget(settings)
+        self._model = MotionInformation(camera, _HORIZON_FRAMES, _PIXEL_SIGMA_PX)
 
     def select(self, observations: Observations, motion: MotionPrior | None = None) -> Selection:
         """Choose rows greedily by their gain in the log-determinant."""
