@@ -20,9 +20,9 @@ from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import se3_from_parts, so3_exp
 from vio.geometry.upright import attitude_deg, up_of, upright_axes
 from vio.records import LoopEvent, MapKeyframes
-from vio.report.curves import curves_of
 from vio.report.page import page
 from vio.report.words import figures_of, summary
+from vio.runs.curves import curves_of
 from vio.runs.finished import read_finished_run, with_distinct_names
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")

@@ -21,6 +21,7 @@ ROOT = Path(__file__).resolve().parent.parent.parent
 _NO_FIGURE = (
     "vio/cli/",
     "vio/bench/",
+    "vio/runs/curves.py",
     "vio/runs/picture.py",
     "vio/report/",
     "vio/inspection/",

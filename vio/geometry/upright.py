@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
 
 _LEVEL = 0.1  # horizontal part of the first optical axis below which the camera looks up or down: the path then leads
 
@@ -26,6 +26,29 @@ def upright_axes(T_world_cam0: FloatArray, up_world: FloatArray | None = None) -
             break
     level = level / np.linalg.norm(level)
     return np.stack([np.cross(level, up), level, up])
+
+
+def upright_view(
+    T_world_body: FloatArray, T_cam0_body: FloatArray, motion: str | None, gravity_world: FloatArray | None = None
+) -> FloatArray:
+    """Return the transform (4, 4) from the world of a run to right, ahead and up at its first pose.
+
+    Args:
+        T_world_body: poses (N, 4, 4) of the run.
+        T_cam0_body: (4, 4) of its body in the left camera.
+        motion: see `up_of`.
+        gravity_world: see `up_of`.
+    """
+    R = upright_axes(T_world_body @ se3_inverse(T_cam0_body), up_of(motion, gravity_world))
+    return se3_from_parts(R, -R @ T_world_body[0, :3, 3])
+
+
+def rotated(R: FloatArray, P: FloatArray) -> FloatArray:
+    """Return covariances (..., 3, 3) in a frame that R (..., 3, 3) takes the vectors to.
+
+    With `T_world_body = T_hat exp(-xi)`, an error of the body's pose moves its position by R rho in the world.
+    """
+    return R @ P @ np.swapaxes(R, -1, -2)
 
 
 def up_of(motion: str | None, gravity_world: FloatArray | None) -> FloatArray | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vio.geometry.lie import FloatArray
-from vio.report.curves import Curves, Truth, thinned
+from vio.runs.curves import SIGMAS, STAGE_COLOURS, Curves, Truth, binned, stereo_curves, thinned
 from vio.runs.finished import FinishedRun
 from vio.runs.pipeline import STAGES
 
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 COLOURS = ("#1f5fbf", "#d9822b", "#2e8b57", "#a83279", "#7a5195", "#0f8b8d", "#b5533c", "#6b7280")
 _TRUTH, _POINTS, _LOOPS = "#111111", "#9aa5b1", "#c82828"
-_SIGMAS = 3.0  # half width of the bands
 _BULK = (10, 90)  # percentiles of the bands' edges that an axis shows at least
 _AXES = ("right", "ahead", "up")
 
@@ -196,14 +195,11 @@ def _biases(runs: Sequence[FinishedRun]) -> list[Section]:
 
 def _timing(runs: Sequence[FinishedRun]) -> Section:
     figure = _subplots(len(runs), 1, titles=[run.name for run in runs] if len(runs) > 1 else ())
-    shades = ("#c9d1d9", "#6aa2d8", "#b7a2d8", "#e8b04b", "#1f5fbf")
     for row, run in enumerate(runs, start=1):
-        rows = thinned(len(run.estimates), 600)
-        for stage, shade in zip(STAGES, shades, strict=True):
-            values = np.nan_to_num(run.frames[f"{stage}_ms"])
-            median = np.array([np.median(part) for part in np.array_split(values, len(rows))])
+        for stage, shade in zip(STAGES, STAGE_COLOURS, strict=True):
+            seconds, median = binned(run.seconds, np.nan_to_num(run.frames[f"{stage}_ms"]), 600)
             more: dict[str, Any] = {"stackgroup": "stages", "line": {"width": 0}, "fillcolor": shade}
-            _xy(figure, run.seconds[rows], median, stage, shade, row, **more)
+            _xy(figure, seconds, median, stage, shade, row, **more)
         figure.update_yaxes(title_text="ms a frame", row=row, col=1)
     return _over_time("Time", figure, "Wall time by stage; long runs are shown by the medians of groups of frames.")
 
@@ -218,11 +214,8 @@ def _stereo(runs: Sequence[FinishedRun]) -> list[Section]:
     figure = _subplots(1, 1)
     for run, colour in chosen:
         rows = thinned(len(run.estimates))
-        found = run.estimates[rows]
-        sigma = np.sqrt(np.maximum(found["stereo_field_covariance"][:, 0, 0], 0))
-        milli = 1e3  # of a focal length
-        values = found["stereo_field"][:, 0]
-        _band(figure, run.seconds[rows], milli * values, milli * sigma, run.name, colour, 1)
+        values, sigmas = stereo_curves(run.estimates[rows], focal=1e3)
+        _band(figure, run.seconds[rows], values[:, 0], sigmas[:, 0], run.name, colour, 1)
     figure.update_yaxes(title_text="a0 (1/1000 focal length)", row=1, col=1)
     text = "By how much right columns are off at the image's centre; three standard deviations."
     return [_over_time("Stereo calibration", figure, text)]
@@ -329,7 +322,7 @@ def _band(
 
     if np.isfinite(sigma).any():
         red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
-        edges = np.concatenate([y + _SIGMAS * sigma, (y - _SIGMAS * sigma)[::-1]])
+        edges = np.concatenate([y + SIGMAS * sigma, (y - SIGMAS * sigma)[::-1]])
         band = go.Scatter(
             x=_short(np.concatenate([x, x[::-1]])),
             y=_short(edges),

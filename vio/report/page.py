@@ -9,9 +9,9 @@ from pathlib import Path
 from vio._version import __version__
 from vio.files.atomic import atomic_write_text
 from vio.files.printable import printable
-from vio.report.curves import curves_of
 from vio.report.figures import COLOURS, Section, sections
 from vio.report.words import figures_of, summary
+from vio.runs.curves import curves_of
 from vio.runs.finished import FinishedRun
 
 _STYLE = """

@@ -16,7 +16,7 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, left_rays
-from vio.geometry.upright import up_of, upright_axes
+from vio.geometry.upright import rotated, upright_view
 from vio.records import (
     BoolArray,
     Estimate,
@@ -217,10 +217,7 @@ class RerunViewer:
         """Set the upright frame from the first pose, and draw the reference from there; return `T_view_world`."""
         import rerun as rr
 
-        T_world_cam0 = T_world_body @ se3_inverse(self._rig.T_cam0_body)
-        view = np.eye(4)
-        view[:3, :3] = upright_axes(T_world_cam0[None], up_of(self._rig.motion, None))
-        view[:3, 3] = -view[:3, :3] @ T_world_body[:3, 3]
+        view = upright_view(T_world_body[None], self._rig.T_cam0_body, self._rig.motion)
         self._stream.log("world/run", rr.Transform3D(translation=view[:3, 3], mat3x3=view[:3, :3]), static=True)
         return view
 
@@ -239,9 +236,7 @@ class RerunViewer:
         send(f"world/run/path/{self._chunks:05d}", path)
         if len(self._path) >= _CHUNK:
             self._path, self._chunks = self._path[-1:], self._chunks + 1
-        # T_world_imu = T_hat exp(-xi): an error of the pose moves the position by R rho.
-        R = T[:3, :3]
-        values, axes = np.linalg.eigh(R @ estimate.covariance[:3, :3] @ R.T)
+        values, axes = np.linalg.eigh(rotated(T[:3, :3], estimate.covariance[:3, :3]))
         axes[:, 2] *= np.sign(np.linalg.det(axes))
         send("world/run/sigma", rr.Transform3D(translation=T[:3, 3], mat3x3=axes))
         sizes = _SIGMAS * np.sqrt(np.maximum(values, 0.0))
