@@ -16,7 +16,6 @@ from vio.sim.errors import SimulationError
 from vio.sim.render import Radiance
 
 _FULL_SCALE = 255.0
-_NO_MAP = np.empty((0, 0), dtype=np.float32)  # cv2.remap's second map, where the first one holds both coordinates
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,6 +172,8 @@ def blur_along_flow(sharp: Radiance, flow_before: FloatArray, flow_after: FloatA
     for position in (np.arange(taps) + 0.5) / taps * 2 - 1:
         # The pixel's content at another time is found upstream along the flow.
         at = cv2.scaleAdd(after if position > 0 else before, -abs(float(position)), here)
-        cv2.accumulate(cv2.remap(sharp, at, _NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), total)
+        # One map of both coordinates, which OpenCV's stubs do not know.
+        moved = cv2.remap(sharp, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        cv2.accumulate(moved, total)
     total *= np.float32(1 / taps)
     return total
