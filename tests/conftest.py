@@ -28,8 +28,8 @@ def _one_blas_thread() -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
-    """The folder of real recordings named by VIO_DATA; the test is skipped where it is absent."""
-    folder = Path(os.environ.get("VIO_DATA", ROOT.parent / "shared" / "data"))
+    """The folder of real recordings named by VIO_DATA (empty: not set); the test is skipped where it is absent."""
+    folder = Path(os.environ.get("VIO_DATA") or ROOT.parent / "shared" / "data")
     if not folder.is_dir():
         pytest.skip(f"no recordings at {folder}; set VIO_DATA to the folder that holds them")
     return folder

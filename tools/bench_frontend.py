@@ -229,7 +229,7 @@ REAL = ("kitti_0039", "kitti_06_head", "tartanair2_clip")
 
 def data_folder() -> Path:
     """The folder of real recordings."""
-    return Path(os.environ.get("VIO_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    return Path(os.environ.get("VIO_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 
 
 def clips(wanted: set[str], count: int, real_count: int | None = None) -> Iterator[Clip]:

@@ -96,7 +96,7 @@ def run_tests(copy: Path, tests: Sequence[str], *options: str) -> tuple[list[str
     Raises:
         MutationError: the copy is not what is imported, or pytest could not run.
     """
-    data = os.environ.get("VIO_DATA", str(ROOT.parent / "shared" / "data"))
+    data = os.environ.get("VIO_DATA") or str(ROOT.parent / "shared" / "data")
     environment = {**os.environ, "PYTHONPATH": str(copy), "VIO_DATA": data}
     # The process that tests says which packages it would test.
     code = (
