@@ -14,7 +14,9 @@ BIN := $(VENV)/bin
 EXE :=
 endif
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
-PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+# `make test CONSTRAINTS=` installs the newest versions that pyproject.toml allows.
+CONSTRAINTS ?= constraints.txt
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(addprefix -c ,$(CONSTRAINTS))
 
 .PHONY: demo test lint unit coverage mutations bench results wheel docs clean constraints
 
@@ -52,24 +54,24 @@ results: $(VENV)/.base
 docs: $(TESTED)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-# Build the wheel, and run its demo in an environment and a folder of its own.
+# Build the wheel, and run its demo in an environment and a folder of its own, with the newest versions of what it needs.
 wheel: | $(BIN)/python$(EXE)
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
-	$(BIN)/python tools/check_wheel.py dist constraints.txt
+	$(BIN)/python tools/check_wheel.py dist
 
 $(BIN)/python$(EXE):
 	$(PYTHON) -m venv $(VENV)
 
-$(VENV)/.base: pyproject.toml constraints.txt | $(BIN)/python$(EXE)
+$(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e .
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml constraints.txt | $(BIN)/python$(EXE)
+$(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev]'
 	@touch $@ $(VENV)/.base
 
-$(VENV)/.learned: pyproject.toml constraints.txt | $(BIN)/python$(EXE)
+$(VENV)/.learned: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev,learned]'
 	@touch $@ $(VENV)/.dev $(VENV)/.base
 
