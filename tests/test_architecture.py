@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.research.draw_structure import layers, read_packages
+from tools.draw_structure import layers, read_packages
 
 ROOT = Path(__file__).resolve().parent.parent
 FILES = sorted([*(ROOT / "vio").rglob("*.py"), *(ROOT / "frontend").rglob("*.py")])

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tools.bench_schedule import simulate
 from vio.bench.compare import (
     _student_quantile,
     bootstrap_interval,
@@ -180,27 +179,3 @@ def test_the_command_ends_with_one_where_something_is_worse(tmp_path: Path, caps
 
 
 # --- the simulation of a schedule -----------------------------------------------------------------------------------
-
-
-def test_a_schedule_without_losses_takes_the_time_of_its_tasks() -> None:
-    tasks_s = np.full(100, 60.0)
-    plain = simulate(tasks_s, machines=2, cores=5, losses_per_hour=0.0, longest_first=True, seed=0)
-    assert plain.hours == pytest.approx(600 / 3600)
-    assert (plain.cpu_hours, plain.busy) == (pytest.approx(100 / 60), pytest.approx(1.0))
-    assert plain.repeated_tasks == 0
-    one_long = np.array([*[60.0] * 90, 1200.0])
-    listed, longest = (
-        simulate(one_long, machines=1, cores=10, losses_per_hour=0.0, longest_first=first, seed=0)
-        for first in (False, True)
-    )
-    assert listed.hours == pytest.approx((540 + 1200) / 3600)
-    assert longest.hours == pytest.approx(1200 / 3600)
-
-
-def test_a_schedule_repeats_what_is_lost_with_a_machine() -> None:
-    tasks_s = np.random.default_rng(0).lognormal(4, 0.8, 300)
-    lossy = simulate(tasks_s, machines=4, cores=4, losses_per_hour=3.0, longest_first=True, seed=1)
-    assert lossy.repeated_tasks > 0
-    assert lossy.cpu_hours - lossy.repeated_cpu_hours == pytest.approx(tasks_s.sum() / 3600), "all tasks are done"
-    lossless = simulate(tasks_s, machines=4, cores=4, losses_per_hour=0.0, longest_first=True, seed=1)
-    assert lossy.hours > lossless.hours

@@ -28,7 +28,7 @@ from tests.euroc_maker import (
     truth_poses,
     write_imu,
 )
-from tools.research.check_rectification import match_sift
+from tests.sift import match_sift
 from vio.cameras.rig import rectifier_of
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.euroc import pair_stamps, read_euroc

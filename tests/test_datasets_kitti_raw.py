@@ -305,7 +305,7 @@ def test_real_extrinsics_agree_with_the_odometry_folder(data_dir: Path) -> None:
 
 def test_real_rows_are_aligned_as_well_as_by_kitti(data_dir: Path) -> None:
     """KITTI's calibration of that day leaves rows half a pixel apart, in its own rectified images as in ours."""
-    from tools.research.check_rectification import match_sift
+    from tests.sift import match_sift
 
     dataset, _ = _real(data_dir)
     clip = open_dataset(data_dir / "kitti_0039")

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
-from tools.bench_frontend import kornia_options
 from vio.errors import ConfigError, DataError, MissingDependencyError
 from vio.frontend.descriptors import DescriptorFrontend, Keypoints, MutualNearest
 from vio.frontend.settings import FrontendSettings, GridSettings, LearnedSettings, MatchSettings
@@ -203,12 +202,27 @@ def test_every_network_runs_with_weights_from_a_file(torch: Any, name: str, tmp_
         assert ((seen.z[:, :2] >= 0) & (seen.z[:, :2] <= [239, 159])).all()
 
 
-@pytest.mark.parametrize("name", ["kornia-aliked-t16", "kornia-aliked-n16", "kornia-keynet-affnet-mkd"])
+WEIGHTS: dict[str, dict[str, str]] = {
+    "aliked-t16": {"detector": "aliked", "detector_weights": "aliked/aliked-t16.pth"},
+    "aliked-n16": {"detector": "aliked", "aliked_model": "aliked-n16", "detector_weights": "aliked/aliked-n16.pth"},
+    "keynet-affnet-mkd": {
+        "detector": "keynet",
+        "detector_weights": "keynet/keynet_pytorch.pth",
+        "descriptor": "mkd",
+        "descriptor_weights": "mkd/mkd-cart-64.pth",
+        "affine_weights": "affnet/AffNet.pth",
+        "orientation_weights": "affnet/OriNet.pth",
+    },
+}  # settings of `frontend.learned`, with files in the folder `weights` of VIO_DATA
+
+
+@pytest.mark.parametrize("name", list(WEIGHTS))
 def test_real_weights_track_and_match(torch: Any, data_dir: Path, name: str) -> None:
     """On the rendered wall, with known ground truth."""
-    if not (data_dir / "weights").is_dir():
+    folder = data_dir / "weights"
+    if not folder.is_dir():
         pytest.skip("no weights in VIO_DATA")
-    options: Any = kornia_options(name, data_dir / "weights")
+    options: Any = {k: folder / v if k.endswith("_weights") else v for k, v in WEIGHTS[name].items()}
     frontend = build(LearnedSettings(**options), replace(MATCH, max_keypoints=120))
     poses = flight(2)
     a, b = (frontend.process(small_frame(k, pose)).observations for k, pose in enumerate(poses))

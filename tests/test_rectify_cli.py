@@ -12,7 +12,6 @@ import pytest
 
 from tests.dataset_makers import make_kitti
 from tests.euroc_maker import RECTIFIED_RIG, camera_stamps, make_euroc, make_kitti_raw
-from tools.research.check_rectification import main as check
 from vio.cli import main
 from vio.cli.rectify import MARKER
 from vio.datasets import open_dataset
@@ -241,18 +240,3 @@ def test_run_takes_an_unrectified_folder_like_a_rectified_one(
     assert _json(capsys, "rectify", str(folder), "--out", str(tmp_path / "rect"))["frames"] == 8
     again = _json(capsys, "run", str(tmp_path / "rect"), "--out", str(tmp_path / "run2"), "--backend", "vislam")
     assert again["ate_m"] == pytest.approx(metrics["ate_m"], rel=1e-6)
-
-
-def test_check_tool_shows_the_benefit_of_rectification(capsys: pytest.CaptureFixture[str]) -> None:
-    """At one moment: stereo rows are better in rectified images, aligned tracks in time about as good."""
-    assert check(["tracking", "--moments", "1", "--json"]) == 0
-    rows = json.loads(capsys.readouterr().out)
-    error = {(row["tracker"], row["images"], row["step"]): row for row in rows}
-    raw, rectified = "raw, points undistorted", "rectified, linear"
-    for tracker in ("Lucas-Kanade", "then aligned"):
-        stereo = error[tracker, rectified, "stereo"]
-        assert stereo["points"] > 150
-        assert stereo["rows_median_px"] < error[tracker, raw, "stereo"]["rows_median_px"]
-        assert stereo["median_px"] < 0.1
-    later = error["then aligned", rectified, "50 ms"]["median_px"]
-    assert later < 1.3 * error["then aligned", raw, "50 ms"]["median_px"]

@@ -1,6 +1,6 @@
 """The figure of docs/architecture.md: every package, what it imports, and in which layer it stands.
 
-    python tools/research/draw_structure.py docs/images/structure.png [--root CHECKOUT]
+    python tools/draw_structure.py docs/images/structure.png [--root CHECKOUT]
 
 A package here is a package or a single module directly in `vio/`; `frontend/` is `vio.frontend`. It is one layer above
 the highest one that it imports. Arrows point at what is imported; those that a longer path implies are left out, and so
@@ -181,7 +181,7 @@ def main() -> int:
     """Draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="PNG to write")
-    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[2], help="the checkout")
+    parser.add_argument("--root", type=Path, default=Path(__file__).resolve().parents[1], help="the checkout")
     args = parser.parse_args()
     packages = read_packages(args.root)
     draw(packages, args.out)
