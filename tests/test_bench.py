@@ -23,7 +23,7 @@ from vio.bench import execute
 from vio.bench.bench import Place, bench, read_bench
 from vio.bench.engines import run_here
 from vio.bench.figures import coverage, figures_of, pose_nees
-from vio.bench.identity import RENDER_CODE, ROOT, InputDigests
+from vio.bench.identity import ROOT, InputDigests, imported_code
 from vio.bench.report import _as_html
 from vio.bench.store import Store
 from vio.bench.suite import Suite, config_of, read_suite, shipped_suites, suite_from
@@ -188,27 +188,25 @@ def test_a_render_is_known_by_its_arguments_and_files(tmp_path: Path) -> None:
     assert one != key("--trajectory flight.tum")
 
 
-def test_all_code_of_a_render_is_in_its_key() -> None:
-    """Of our modules, `vio render` loads only those of its key and some that write no pixel."""
+@pytest.mark.parametrize(
+    ("root", "later", "loaded"),
+    [
+        ("vio.cli.render", ("vio.cli.render", "vio.sim."), "vio.sim.export, vio.sim.scenarios, vio.sim.sequence"),
+        ("vio.bench.worker", ("vio.",), "vio.runs.pipeline, vio.frontend.klt, vio.filters.msckf, vio.mapping.session"),
+    ],
+)
+def test_all_code_that_a_task_loads_is_in_its_key(root: str, later: tuple[str, ...], loaded: str) -> None:
+    """Of our modules, only those of the command line are not; a render does not depend on the filters."""
     code = (
-        "import sys, vio.cli.render, vio.sim.export, vio.sim.scenarios, vio.sim.sequence\n"
-        "print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'vio'))"
+        f"import sys, vio.cli; before = set(sys.modules); import {root}, {loaded}\n"
+        "print(*(m.__file__ for n, m in sys.modules.items() if n.split('.')[0] == 'vio' and n not in before))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
     names = {Path(name).relative_to(ROOT).as_posix() for name in done.stdout.split()}
-    helpers = {
-        "__init__",
-        "_version",
-        "atomic",
-        "errors",
-        "frame_rate",
-        "inputs",
-        "printable",
-    }
-    helpers |= {"protocols", "unused", "yaml_text"}
-    left = {n for n in names if not n.startswith(RENDER_CODE) and Path(n).stem not in helpers}
-    assert not {n for n in left if not n.startswith("vio/cli/")}
-    assert {name for name in RENDER_CODE if name.endswith(".py")} <= names, "and nothing that it does not load"
+    known = set(imported_code(root, later))
+    assert not {name for name in names - known if not name.startswith("vio/cli/")}
+    assert ("vio/filters/msckf.py" in known) == (root == "vio.bench.worker")
+    assert not {name for name in known if name.startswith(("vio/report/", "vio/offline/", "vio/inspection/"))}
 
 
 # --- figures --------------------------------------------------------------------------------------------------------

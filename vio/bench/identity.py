@@ -7,7 +7,8 @@ import importlib.metadata
 import json
 import os
 import platform
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -17,41 +18,8 @@ from vio.files.atomic import atomic_write_text
 
 Identity = Literal["content", "stat"]
 ROOT = Path(__file__).resolve().parent.parent.parent
-# Code that changes no figure: the command line, and of the bench all but what a task runs.
-_NO_FIGURE = (
-    "vio/cli/",
-    "vio/bench/",
-    "vio/runs/curves.py",
-    "vio/runs/picture.py",
-    "vio/report/",
-    "vio/inspection/",
-    "vio/offline/colmap/",
-    "vio/offline/",
-)
-_TASK_CODE = ("vio/bench/worker.py", "vio/bench/figures.py")
-# Code on which the files that `vio render` writes depend; a test compares it with what that command loads.
-RENDER_CODE = (
-    "vio/sim/",
-    "vio/geometry/",
-    "vio/datasets/__init__.py",
-    "vio/datasets/common.py",
-    "vio/datasets/euroc_files.py",
-    "vio/datasets/image_files.py",
-    "vio/datasets/image_formats.py",
-    "vio/datasets/image_pairs.py",
-    "vio/datasets/images.py",
-    "vio/datasets/kitti.py",
-    "vio/datasets/png.py",
-    "vio/datasets/samples.py",
-    "vio/datasets/settings.py",
-    "vio/datasets/yaml_files.py",
-    "vio/records.py",
-    "vio/setting.py",
-    "vio/files/text.py",
-    "vio/files/trajectories.py",
-    "vio/cli/render.py",
-)
 _PACKAGES = ("numpy", "scipy", "opencv-python-headless", "numba")  # whose versions may change bits
+_IMPORT = re.compile(r"^( *)(?:from|import) (vio[\w.]*)(?: import (\([^)]*\)|.*))?$", re.MULTILINE)
 _BLOCK = 2**20
 
 
@@ -62,17 +30,48 @@ def digest_of(value: Any) -> str:
 
 @cache
 def code_digest() -> str:
-    """Return the digest of all code that a run's figures depend on."""
-    kept = [
-        path for path in _sources(("vio/", "vio/frontend/")) if not path.startswith(_NO_FIGURE) or path in _TASK_CODE
-    ]
-    return _digest_files(kept)
+    """Return the digest of all code that a run's figures depend on: what a task imports, at once or later."""
+    return _digest_files(imported_code("vio.bench.worker", later=("vio.",)))
 
 
 @cache
 def render_code_digest() -> str:
-    """Return the digest of all code that rendered images depend on."""
-    return _digest_files(_sources(RENDER_CODE))
+    """Return the digest of all code that rendered images depend on: what `vio render` loads."""
+    return _digest_files(imported_code("vio.cli.render", later=("vio.cli.render", "vio.sim.")))
+
+
+def imported_code(root: str, later: tuple[str, ...]) -> list[str]:
+    """Return our files that a module imports, and those that these import, relative to the installation.
+
+    Of the command line only the module itself counts.
+
+    Args:
+        root: name of the module.
+        later: prefixes of the names of modules whose imports inside functions count too.
+    """
+    found, names = set[str](), [root]
+    while names:
+        name = names.pop()
+        path = Path(ROOT, *name.split("."))
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        file = path.relative_to(ROOT).as_posix()
+        is_ours = name.split(".")[0] == "vio" and (name == root or not name.startswith("vio.cli"))
+        if is_ours and file not in found and path.is_file():
+            found.add(file)
+            names += _imports(path, inside=name.startswith(later))
+            names.append(name.rpartition(".")[0])
+    return sorted(found)
+
+
+def _imports(path: Path, *, inside: bool) -> Iterator[str]:
+    """Names that a file imports of ours, modules or what is in them; inside: in functions too.
+
+    By the lines, as parsing all files takes seconds.
+    """
+    for indent, module, names in _IMPORT.findall(path.read_text(encoding="utf-8")):
+        if inside or not indent:
+            yield module
+            yield from (f"{module}.{name}" for name in re.findall(r"\w+", names))
 
 
 def package_versions() -> dict[str, str]:
@@ -163,16 +162,6 @@ def _digest_file(file: Path) -> str:
         while block := stream.read(_BLOCK):
             digest.update(block)
     return digest.hexdigest()
-
-
-def _sources(names: Iterable[str]) -> list[str]:
-    """Our Python files under some folders (links to folders only by name) or names, relative to the installation."""
-    found: set[str] = set()
-    for name in names:
-        path = ROOT / name
-        files = sorted(path.rglob("*.py")) if name.endswith("/") else [path]
-        found.update(file.relative_to(ROOT).as_posix() for file in files)
-    return sorted(found)
 
 
 def _digest_files(names: Iterable[str]) -> str:
