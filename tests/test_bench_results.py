@@ -12,7 +12,7 @@ def test_documents_say_what_was_measured() -> None:
     benches = Benches(read_figures())
     for name in DOCUMENTS:
         text = (ROOT / name).read_text(encoding="utf-8")
-        assert with_tables(text, benches) == text, f"{name}: write its tables with python -m tools.bench_results"
+        assert with_tables(text, benches) == text, f"{name}: write its tables with make results RESULTS=--tables"
 
 
 def test_every_table_stands_in_a_document_and_a_changed_figure_is_found() -> None:

@@ -1,16 +1,13 @@
 """Take figures of benches into docs/bench_results.json, and write the tables made of them into the documents.
 
-    python -m tools.bench_results [FOLDER …]      # output folders of vio bench; none: write the tables only
-
-Tables stand between `<!-- bench: NAME -->` and `<!-- end bench -->` in docs/results.md and README.md. The suites are
-`rendered` and those of tools/suites; other systems' trajectories come from `--peers`.
+Tables stand between `<!-- bench: NAME -->` and `<!-- end bench -->` in docs/results.md and README.md; the suites are
+run by `tools/results.py`.
 """
 
 from __future__ import annotations
 
 import json
 import re
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -177,12 +174,9 @@ def with_tables(text: str, benches: Benches) -> str:
     return re.sub(r"<!-- bench: (\w+) -->\n.*?<!-- end bench -->", table, text, flags=re.DOTALL)
 
 
-def main() -> int:
-    """Take figures, write the file and the tables."""
-    figures = read_figures()
-    for folder in sys.argv[1:]:
-        name, facts = taken(Path(folder))
-        figures[name] = facts
+def write(folders: Sequence[Path]) -> None:
+    """Take the figures of output folders of vio bench, and write the file and the tables."""
+    figures = {**read_figures(), **dict(taken(folder) for folder in folders)}
     lines = ",\n".join(
         f'{json.dumps(name)}: {{"code": "{facts["code"]}", "packages": {json.dumps(facts["packages"])}, "runs": [\n'
         + ",\n".join(json.dumps(run) for run in facts["runs"])
@@ -190,12 +184,6 @@ def main() -> int:
         for name, facts in sorted(figures.items())
     )
     (ROOT / FIGURES).write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
-    benches = Benches(figures)
     for name in DOCUMENTS:
         path = ROOT / name
-        path.write_text(with_tables(path.read_text(encoding="utf-8"), benches), encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        path.write_text(with_tables(path.read_text(encoding="utf-8"), Benches(figures)), encoding="utf-8", newline="\n")

@@ -1,13 +1,15 @@
 """Measure every figure of docs/results.md and of the README's table, and write both.
 
-    python -m tools.results --data DIR --work DIR [--only SECTION …] [--speed] [--check [--tolerance X]] [--tables]
+    python -m tools.results --data DIR --work DIR [--only SECTION …] [--speed] [--benches [--peers DIR]]
+        [--check [--tolerance X]] [--tables]
 
 Runs the commands of each section in the folder of recordings (docs/results.md says what lies where), keeps each run's
 figures in WORK/measured.jsonl as they come, so that an interrupted call goes on where it stopped, and at last writes
 docs/results.json and the tables between the documents' markers. Flights are rendered into WORK where they are absent.
 A run is repeated when the code of vio/ or frontend/ has changed. `--check` writes nothing: it tells every figure that
 differs from docs/results.json as printed (or, with `--tolerance`, by more than that share), and what the documents
-say otherwise, and exits 1. Times are measured only with `--speed`, on an idle machine, and never compared.
+say otherwise, and exits 1. Times are measured only with `--speed`, on an idle machine, and never compared. `--benches`
+runs the suites of the tables beside other systems, whose trajectories `vio bench` takes from the folder of `--peers`.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from tools import bench_results
 from tools.result_tables import (
     DRIVE_METHODS,
     FIGURES,
@@ -336,6 +339,30 @@ def all_runs() -> Iterator[Run]:
         yield from section()
 
 
+SUITES = {  # by name, of `vio bench`: the suite and the folder of its recordings
+    "real": ("tools/suites/real.yaml", "data"),
+    "real_imu": ("tools/suites/real_imu.yaml", "data"),
+    "flights": ("tools/suites/flights.yaml", "work"),
+    "rendered": ("rendered", "work"),
+}
+
+
+def run_benches(place: Place, peers: Path | None) -> list[Path]:
+    """Run the suites, the flights rendered first, and return their output folders."""
+    for flight in FLIGHTS:
+        _render(place, flight)
+    for name, (suite, data) in SUITES.items():
+        options = ["--data", str(getattr(place, data)), "--out", f"WORK/bench/{name}", "--cache", "WORK/bench/cache"]
+        if name == "rendered":
+            options += ["--seeds", "0"]
+        elif peers is not None:
+            options += ["--peers", str(peers.resolve())]
+        done = place.call(shlex.join(["vio", "bench", str(ROOT / suite) if "/" in suite else suite, *options]))
+        if done.returncode:
+            raise SystemExit(f"vio bench {suite}: {done.stderr.strip()}")
+    return [place.work / "bench" / name for name in SUITES]
+
+
 # --- measuring ------------------------------------------------------------------------------------------------------
 
 
@@ -439,6 +466,8 @@ def main() -> int:
     parser.add_argument("--data", metavar="DIR", help="the recordings (make results VIO_DATA=DIR)")
     parser.add_argument("--work", type=Path, default=Path("results"), metavar="DIR", help="renders, runs, measurements")
     parser.add_argument("--only", nargs="+", choices=SECTIONS, metavar="SECTION", help=f"of {' '.join(SECTIONS)}")
+    parser.add_argument("--benches", action="store_true", help="also run the suites of vio bench")
+    parser.add_argument("--peers", type=Path, metavar="DIR", help="trajectories of other systems, for the benches")
     parser.add_argument("--speed", action="store_true", help="measure times too: on an idle machine")
     parser.add_argument(
         "--check", action="store_true", help="compare and write nothing; exit 1 where something differs"
@@ -456,6 +485,10 @@ def main() -> int:
         names = [name for name in SECTIONS if name in chosen]
         place = Place(Path(args.data).resolve(), args.work.resolve())
         runs = measure_all((run for name in names for run in SECTIONS[name]()), place)
+        if args.benches and not args.check:
+            bench_results.write(run_benches(place, args.peers))
+    if args.tables:
+        bench_results.write([])
     return check(runs, args.tolerance) if args.check else write(runs, args.work)
 
 
