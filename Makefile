@@ -1,4 +1,4 @@
-# Two commands: `make demo` shows the main job, `make test` proves it. Both create the environment they need.
+# `make demo` shows the main job, `make quick` tests the core in a minute, `make test` all. Each creates the environment it needs.
 # `make test LEARNED=1` also installs torch and kornia, and so tests the learned front ends instead of skipping them.
 PYTHON ?= python3
 VENV ?= .venv
@@ -18,10 +18,16 @@ TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 CONSTRAINTS ?= constraints.txt
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(addprefix -c ,$(CONSTRAINTS))
 
-.PHONY: demo test lint unit coverage mutations bench results wheel docs clean constraints
+.PHONY: demo quick test lint unit coverage mutations bench results wheel docs clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
+
+# Algebra, records, settings, filters, and runs on features; under a minute on two cores once the loops are compiled.
+QUICK := lie stereo_geometry distortion statistics robust jacobian_registry records config selectors information \
+	navigation multiview window window_tracks motion_noise vislam filter_inputs pipeline
+quick: $(TESTED)
+	$(BIN)/python -m pytest -q -n auto --dist loadfile $(QUICK:%=tests/test_%.py)
 
 test: lint unit
 

@@ -61,6 +61,15 @@ def _make_demo() -> None:
     assert last.endswith("/vio demo --out demo")
 
 
+def _make_quick() -> None:
+    """Tests that exist."""
+    recipe = _make("quick")[-1]
+    files = re.findall(r"tests/\w+\.py", recipe)
+    assert "-m pytest" in recipe
+    assert len(files) > 10
+    assert all((ROOT / file).is_file() for file in files)
+
+
 def _make_test() -> None:
     """Style, types, tests."""
     recipe = "\n".join(_make("test"))
@@ -79,6 +88,7 @@ def _pytest_renders() -> None:
 # Commands of the README that are no `vio …`, and what is tested of them here.
 _ELSEWHERE: dict[str, Callable[[], None]] = {
     "make demo": _make_demo,
+    "make quick": _make_quick,
     "make test": _make_test,
     "python -m pytest tests/test_frontend_renders.py": _pytest_renders,
 }
