@@ -7,6 +7,7 @@ references.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -361,6 +362,12 @@ def _field(run: Run, k: int = -1) -> tuple[FloatArray, FloatArray]:
     return field.coefficients, np.sqrt(np.diag(field.covariance))
 
 
+@cache
+def _with_a_calibrated_rig(course: Course, motion: MotionSource | None, seed: int = 0) -> Run:
+    """Fly once for all tests."""
+    return fly(course, motion, ON, seed)
+
+
 def _rms_m(run: Run) -> float:
     return float(np.sqrt(np.mean([np.sum(run.error(k)[:3] ** 2) for k in range(run.course.frames)])))
 
@@ -369,7 +376,7 @@ def _rms_m(run: Run) -> float:
 @pytest.mark.parametrize("motion", [None, "imu"])
 def test_a_turned_right_camera_is_found_and_its_harm_undone(motion: MotionSource | None) -> None:
     """0.1 deg about the vertical axis: 0.8 px of disparity, which without calibration costs 3 % of the way."""
-    level = fly(STRAIGHT, motion, ON)
+    level = _with_a_calibrated_rig(STRAIGHT, motion)
     turned = fly(STRAIGHT, motion, ON, spoil=_turn(TURN))
     ignored = fly(STRAIGHT, motion, replace(SETTINGS, calibrate_stereo="off"), spoil=_turn(TURN))
     found, sigma = _field(turned)
@@ -453,7 +460,7 @@ def test_a_calibrated_rig_stays_calibrated(course: Course) -> None:
     Linearised at the pixels that were seen, whose noise the residuals share, radial distortion ended 42 of them off.
     """
     for seed in range(2):
-        found, sigma = _field(fly(course, None, ON, seed))
+        found, sigma = _field(_with_a_calibrated_rig(course, None, seed))
         assert np.all(np.abs(found) < 3 * sigma)
 
 
