@@ -910,3 +910,28 @@ def test_rejects_invalid_nees_arguments(errors: FloatArray, covariances: FloatAr
 def test_rejects_invalid_nees_bounds(d: int, runs: int, confidence: float) -> None:
     with pytest.raises(EvaluationError, match="NEES bounds need"):
         nees_bounds(d, runs, confidence)
+
+
+def test_separates_a_scale_error_from_the_rest() -> None:
+    rng = np.random.default_rng(3)
+    T = np.array([se3_exp(rng.normal(0, 0.5, 6)) for _ in range(40)])
+    longer = T.copy()
+    longer[:, :3, 3] *= 1.05
+    score = evaluate(timed(longer), timed(T))
+    assert score.scale_free is not None
+    assert score.scale_free.scale == pytest.approx(1.05, abs=1e-9)
+    assert score.scale_free.ate_m < 1e-9 < 1e-3 < score.ate_m.rmse
+    assert score.as_dict()["scale_free"]["scale"] == score.scale_free.scale
+
+
+def test_no_scale_without_motion_or_with_two_poses() -> None:
+    still = np.tile(np.eye(4), (5, 1, 1))
+    assert evaluate(timed(still), timed(still)).scale_free is None
+    two = np.array([np.eye(4), se3_exp(np.array([1.0, 0, 0, 0, 0, 0]))])
+    assert evaluate(timed(two), timed(two)).scale_free is None
+
+
+def test_notes_an_estimate_with_few_references() -> None:
+    T = np.array([se3_exp(np.array([0.1 * k, 0, 0, 0, 0, 0])) for k in range(60)])
+    score = evaluate(timed(T), timed(T[:10]))
+    assert any("covers 15 % of the estimate" in note for note in score.notes)

@@ -32,6 +32,8 @@ def figures_of(evaluation: Evaluation, *, positions_only: bool) -> dict[str, Any
     return {
         "ate_m": scores["ate_m"],
         "ate_max_m": evaluation.ate_m.max,
+        "ate_sim3_m": None if evaluation.scale_free is None else evaluation.scale_free.ate_m,
+        "scale_error_percent": None if evaluation.scale_free is None else 100 * abs(evaluation.scale_free.scale - 1),
         "ate_deg": None if positions_only else scores["ate_deg"],
         "rpe_m": None if rpe is None else rpe.trans_rmse_m,
         "rpe_deg": None if rpe is None else rpe.rot_rmse_deg,

@@ -26,6 +26,8 @@ class Metric:
 
 METRICS = (
     Metric("ate_m", "ATE m", 3),
+    Metric("ate_sim3_m", "ATE Sim(3) m", 3),
+    Metric("scale_error_percent", "scale off %", 3),
     Metric("rpe_m", "RPE m", 3),
     Metric("drift_percent", "drift %", 3),
     Metric("drift_deg_per_100m", "deg/100 m", 3),

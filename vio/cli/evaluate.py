@@ -65,6 +65,7 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
+    from vio.errors import EvaluationError
     from vio.evaluation.trajectories import evaluate
 
     estimate, T_cam0_imu = _read(args.estimate)
@@ -84,6 +85,8 @@ def execute(args: argparse.Namespace) -> int:
         T_cam0_imu=other if T_cam0_imu is None else T_cam0_imu,
         lengths_m=args.lengths,
     )
+    if result.matched < 3:
+        raise EvaluationError(f"only {result.matched} poses match; a comparison needs at least 3")
     for note in result.notes:
         log.warning("%s", note)
     return print_result(result.as_dict(), _rows(result), as_json=args.json)
@@ -102,6 +105,9 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
     for name, errors, unit in (("ATE", result.ate_m, "m"), ("attitude", result.ate_deg, "deg")):
         rest = f"mean {errors.mean:.4g}, median {errors.median:.4g}, largest {errors.max:.4g}"
         yield name, f"{errors.rmse:.4g} {unit} (rms), {rest}"
+        if name == "ATE" and result.scale_free is not None:
+            off = 100 * (result.scale_free.scale - 1)
+            yield "scale", f"off by {off:+.3f} %; ATE {result.scale_free.ate_m:.4g} m (rms) without it, after Sim(3)"
     if result.rpe is not None:
         yield "RPE", f"{result.rpe.trans_rmse_m:.4g} m, {result.rpe.rot_rmse_deg:.4g} deg (rms) from frame to frame"
     if result.kitti is None:

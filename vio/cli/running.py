@@ -318,6 +318,9 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         against = metrics["dead_reckoning"]
         beside = "" if against is None else f"   (dead reckoning {against['ate_m']:.3f} m)"
         rows.append(("ATE", f"{metrics['ate_m']:.3f} m after SE(3) alignment{beside}"))
+        free = metrics["evaluation"]["scale_free"]
+        if free is not None:
+            rows.append(("", f"{free['ate_m']:.3f} m after Sim(3), scale off by {100 * (free['scale'] - 1):+.2f} %"))
     if metrics["t_err_percent"] is not None:
         over = lengths_text(metrics["drift_lengths_m"])
         turned = rotation_drift_text(metrics["r_err_deg_per_100m"], metrics["drift_lengths_m"])

@@ -36,6 +36,8 @@ _UNITS = {"millimetres": 1000.0, "centimetres": 100.0}
 _UNIT_SHARE = 0.1  # a ratio of path lengths so near one of these is no chance; odometry without a scale has any ratio
 _PATH_LEAST_M = 1.0  # paths below this may consist of noise
 _MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
+_MATCHED_ESTIMATE = 0.2  # span of the matched poses, of the estimate; below, the figures are those of a part
+_LEAST_POSES = 3  # that determine a scale, and make a figure
 _STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points coincide, to rounding
 
 
@@ -105,6 +107,14 @@ class Alignment:
 
 
 @dataclass(frozen=True, slots=True)
+class ScaleFree:
+    """The scale of an estimate, and its error after a similarity alignment: a wrong baseline makes the scale alone."""
+
+    scale: float  # of the estimate, over the reference's
+    ate_m: float  # root mean square after a similarity alignment
+
+
+@dataclass(frozen=True, slots=True)
 class Evaluation:
     """The evaluation of an estimate against a reference; undefined metrics are None."""
 
@@ -129,6 +139,7 @@ class Evaluation:
     errors_deg: FloatArray  # (M,) rotation angle to the reference after alignment by T_ref_est
     aligned: Trajectory  # the whole estimate (N) in the reference's world and body frame, by T_ref_est
     reference: Trajectory  # the matched poses (M) of the reference; row k matches row rows[k] of the estimate
+    scale_free: ScaleFree | None = None  # None: positions do not determine a scale
     notes: tuple[str, ...] = ()  # signs of a reference of another recording, or in other conventions
 
     def as_dict(self) -> dict[str, Any]:
@@ -146,6 +157,7 @@ class Evaluation:
             "rotation_from": self.rotation_from,
             "ate_m": self.ate_m.rmse,
             "ate_deg": self.ate_deg.rmse,
+            "scale_free": _as_plain_dict(self.scale_free),
             "ate_statistics_m": _as_plain_dict(self.ate_m),
             "ate_statistics_deg": _as_plain_dict(self.ate_deg),
             "rpe": _as_plain_dict(self.rpe),
@@ -230,6 +242,7 @@ def evaluate(
         errors_deg=errors_deg,
         aligned=aligned,
         reference=_take(reference, reference_rows),
+        scale_free=_scale_free(T_est, T_ref),
         notes=(
             *_notes(path_length_m(T_aligned[:, :3, 3]), path_length_m(T_ref[:, :3, 3]), rows, moved, reference),
             *_attitude_notes(alignment, T_est, T_ref, T_aligned),
@@ -362,6 +375,18 @@ def _about_path(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) -> t
     variance = 0.5 * float(np.mean(np.sum(((y - y_mean - x + x_mean) @ across) ** 2, axis=1)))
     curvature = float(np.trace(across @ S))
     return axis, float(np.sqrt(variance / curvature)) if curvature > 0 else float("inf")
+
+
+def _scale_free(T_est: FloatArray, T_ref: FloatArray) -> ScaleFree | None:
+    """Return the scale of M poses (M, 4, 4) and their error without it; None with too few poses or without motion."""
+    if len(T_est) < _LEAST_POSES:
+        return None
+    try:
+        fit = align_poses(T_est, T_ref, "sim3")
+    except EvaluationError:
+        return None
+    errors = np.linalg.norm(apply_alignment(fit, T_est)[:, :3, 3] - T_ref[:, :3, 3], axis=1)
+    return ScaleFree(1 / fit.scale, error_statistics(errors).rmse)
 
 
 def apply_alignment(alignment: Alignment, T_est: FloatArray) -> FloatArray:
@@ -630,6 +655,9 @@ def _notes(
         notes.append(
             f"over the same poses the estimate travels {estimate_m:.1f} m and the reference {reference_m:.1f} m; {what}"
         )
+    span = float(rows[-1] - rows[0]) / max(len(estimate) - 1, 1)
+    if len(estimate) > 1 and span < _MATCHED_ESTIMATE:
+        notes.append(f"the reference covers {100 * span:.0f} % of the estimate: the figures are those of this part")
     shorter = min(len(estimate), len(reference))
     if len(rows) < _MATCHED_SHARE * shorter:
         notes.append(
