@@ -30,8 +30,8 @@ def _fill(kind: type[Window], motion: str) -> Window:
         nav = NavState(move @ window.nav.T_world_imu, rng.normal(size=3), np.zeros(3), np.zeros(3), np.zeros(3))
         window.nav = nav
         window.add_clone(k, k)
-        window.P[:DIM, :DIM] += np.eye(DIM) * 1e-3
-    A = rng.normal(size=(6, len(window.P))) * 0.3
+        window.prior.P[:DIM, :DIM] += np.eye(DIM) * 1e-3
+    A = rng.normal(size=(6, len(window.prior.P))) * 0.3
     window.add_landmarks(np.array([3, 8]), LANDMARKS, A, np.array([np.eye(3) * 1e-3] * 2))
     return kind.over(window) if issubclass(kind, StandardErrors) else window
 
@@ -61,7 +61,7 @@ def test_jacobian_of_the_usual_errors_equals_central_differences(motion: str) ->
         window.relinearise(error)
         return _usual_difference(window, at)
 
-    numeric = numeric_jacobian(moved, np.zeros(len(at.P)))
+    numeric = numeric_jacobian(moved, np.zeros(len(at.prior.P)))
     np.testing.assert_allclose(at.standard_D_error(), numeric, atol=1e-7)
 
 
@@ -69,33 +69,33 @@ def test_standard_errors_keep_the_usual_prior_when_the_means_move() -> None:
     window = _fill(StandardErrors, "imu")
     assert isinstance(window, StandardErrors)
     start, before = _fill(StandardErrors, "imu"), window.standard_D_error()
-    P_usual = before @ window.P @ before.T
-    window.relinearise(np.random.default_rng(1).normal(0, 0.1, len(window.P)))
+    P_usual = before @ window.prior.P @ before.T
+    window.relinearise(np.random.default_rng(1).normal(0, 0.1, len(window.prior.P)))
     after = window.standard_D_error()
-    np.testing.assert_allclose(after @ window.P @ after.T, P_usual, atol=1e-12)
-    np.testing.assert_allclose(after @ window.prior_delta, _usual_difference(window, start), atol=1e-12)
+    np.testing.assert_allclose(after @ window.prior.P @ after.T, P_usual, atol=1e-12)
+    np.testing.assert_allclose(after @ window.prior.delta, _usual_difference(window, start), atol=1e-12)
     assert np.abs(after - before).max() > 0.1  # so the window's own covariance did change
-    assert np.abs(window.P - start.P).max() > 1e-3
+    assert np.abs(window.prior.P - start.prior.P).max() > 1e-3
 
 
 def test_first_estimates_keep_their_linearisation_point_and_give_the_same_covariance() -> None:
     window = _fill(FirstEstimates, "imu")
     assert isinstance(window, FirstEstimates)
     start, M = _fill(FirstEstimates, "imu"), window.standard_D_error()
-    window.relinearise(np.random.default_rng(1).normal(0, 0.1, len(window.P)))
-    np.testing.assert_array_equal(window.P, start.P)
+    window.relinearise(np.random.default_rng(1).normal(0, 0.1, len(window.prior.P)))
+    np.testing.assert_array_equal(window.prior.P, start.prior.P)
     np.testing.assert_array_equal(window.standard_D_error(), M)
-    np.testing.assert_allclose(M @ window.prior_delta, _usual_difference(window, start), atol=1e-12)
+    np.testing.assert_allclose(M @ window.prior.delta, _usual_difference(window, start), atol=1e-12)
     # The output is in right-invariant errors at the present means: the same usual errors by another Jacobian.
     present = StandardErrors(window.motion, window.nav, np.eye(DIM)).standard_D_error()
-    output = present @ window.right_invariant(window.P[:DIM, :DIM]) @ present.T
-    np.testing.assert_allclose(output, (M @ window.P @ M.T)[:DIM, :DIM], atol=1e-12)
+    output = present @ window.right_invariant(window.prior.P[:DIM, :DIM]) @ present.T
+    np.testing.assert_allclose(output, (M @ window.prior.P @ M.T)[:DIM, :DIM], atol=1e-12)
 
 
 def test_first_estimates_follow_clones_and_landmarks() -> None:
     window = _fill(FirstEstimates, "imu")
     assert isinstance(window, FirstEstimates)
-    window.relinearise(np.full(len(window.P), 0.05))
+    window.relinearise(np.full(len(window.prior.P), 0.05))
     _, positions, _ = window.linearisation_point()
     window.drop_oldest_clone()
     window.keep_landmarks(np.array([False, True]))

@@ -136,7 +136,7 @@ def fly(
                 shift = se3_from_parts(so3_exp([0, 0, yaw]), np.zeros(3))
             run.T_world_estimated = shift
         run.estimates.append(estimate)
-        run.navigation.append(run.filter._output[:15, :15].copy())
+        run.navigation.append(run.filter._propagation.posterior.own[:15, :15].copy())
         if each is not None:
             each(run)
     return run

@@ -155,10 +155,10 @@ def test_errors_depend_on_the_focal_length_as_a_filter_with_another_one_shows(se
     right, longer = (
         _window_of(replace(CAMERA, fu=k * CAMERA.fu, fv=k * CAMERA.fv), settings) for k in (1.0, float(np.exp(by)))
     )
-    assert longer.focal is not None
+    assert longer.prior.focal is not None
     plain = copy.deepcopy(longer)
-    for window, moved in ((right, 0.0), (plain, 0.0), (longer, -by * longer.focal.error_D_bias)):
-        window.relinearise(moved - window.prior_delta)  # to the prior's mean
+    for window, moved in ((right, 0.0), (plain, 0.0), (longer, -by * longer.prior.focal.error_D_bias)):
+        window.relinearise(moved - window.prior.delta)  # to the prior's mean
     assert (len(right.landmarks) > 0) == (settings.calibrate_stereo != "on")
     for without, given in zip(_difference(right, plain), _difference(right, longer), strict=True):
         assert np.linalg.norm(given) <= 0.1 * np.linalg.norm(without)
@@ -177,7 +177,7 @@ def test_a_focal_length_is_followed_until_the_turns_agree_beyond_doubt(sigma: fl
     filt.take_turns(TurnComparison(0.005, sigma, gyro_agrees=True))
     fly_with(filt, flight, _samples(flight, OFF, 0.0, noise), noise, 0.5)
     assert filt._window is not None
-    assert (filt._window.focal is not None) == followed
+    assert (filt._window.prior.focal is not None) == followed
 
 
 def test_a_baseline_is_judged_once_the_turns_are_compared() -> None:

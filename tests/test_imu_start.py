@@ -78,7 +78,7 @@ def _tilt_and_velocity(start: Start, filt: Msckf) -> tuple[float, float, float]:
     window = filt._window
     assert window is not None
     R = window.nav.T_world_imu[:3, :3]
-    P = filt._output
+    P = filt._propagation.posterior.own
     up_true, up = R_true[2], R[2]  # R' e_z
     error = R @ np.cross(up, up_true)  # world side; up_true = R' exp(phi)' e_z
     angle = float(np.degrees(np.arccos(np.clip(up @ up_true, -1, 1))))

@@ -122,7 +122,7 @@ def test_first_tilt_follows_the_terms() -> None:
     filt = Msckf(CAMERA, T_CAM0_IMU, FULL, motion="imu")
     filt.propagate(ImuSample(0, np.zeros(3), force))
     filt.update(Flight().observe(0, 0.5, np.random.default_rng(0), 40))
-    P = filt._started().P
+    P = filt._started().prior.P
     np.testing.assert_allclose(P[3:6, DIM : DIM + 15], analytic @ P[DIM : DIM + 15, DIM : DIM + 15], atol=1e-12)
     assert np.abs(P[3:6, DIM : DIM + 15]).max() > 1e-5
 
@@ -238,9 +238,9 @@ def test_predicted_motions_are_as_uncertain_as_the_terms() -> None:
     assert len(squared) == 11
     assert 0.5 < np.mean(squared) < 4.5
 
-    step = filt._step_to(20 * STEP_NS)
+    step = filt._propagation.step_to(filt._started(), 20 * STEP_NS)
     assert step.Phi_imu is not None
-    grown = filt._grown(step.nav, NO_STEP.then(step))
+    grown = filt._propagation.grown(filt._started(), step.nav, NO_STEP.then(step))
     np.testing.assert_array_equal(grown[:DIM], np.concatenate([step.Phi, step.Phi_imu], axis=1))
     np.testing.assert_array_equal(grown[DIM:], np.eye(15, DIM + 15, DIM))
 

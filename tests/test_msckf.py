@@ -23,10 +23,11 @@ from vio.filters.multiview import (
     track_information,
 )
 from vio.filters.navigation import DIM, ImuMotion, NavState, TwistMotion
+from vio.filters.prior import posterior
 from vio.filters.restart import restarted
 from vio.filters.settings import MsckfSettings
 from vio.filters.tracks import TrackTable, rows_of
-from vio.filters.window import Window, posterior
+from vio.filters.window import Window
 from vio.geometry.lie import (
     FloatArray,
     se3_exp,
@@ -326,42 +327,42 @@ def _window(seed: int = 0) -> Window:
 def test_clone_is_a_copy_with_all_its_correlations() -> None:
     window = _window()
     window.add_clone(9, 9)
-    rows = window.clone_rows(4)
-    np.testing.assert_array_equal(window.P[rows], window.P[:6])
-    np.testing.assert_allclose(window.P, window.P.T, atol=1e-15)
+    rows = window.state.clone(4)
+    np.testing.assert_array_equal(window.prior.P[rows], window.prior.P[:6])
+    np.testing.assert_allclose(window.prior.P, window.prior.P.T, atol=1e-15)
 
 
 def test_new_anchor_of_the_landmarks_changes_no_prediction() -> None:
     """Errors of a landmark in the newest clone's camera: the same distribution before and after the anchor moves."""
     window = _window()
     p = np.array([[4.0, 1.0, 0.5], [6.0, -2.0, 1.0]])
-    A = np.random.default_rng(1).normal(size=(6, len(window.P))) * 0.3
+    A = np.random.default_rng(1).normal(size=(6, len(window.prior.P))) * 0.3
     window.add_landmarks(np.array([3, 8]), p, A, np.array([np.eye(3) * 1e-3] * 2))
-    first, newest = window.first_landmark, window.clone_rows(3)
+    first, newest = window.state.landmarks.start, window.state.clone(3)
     # Position of landmark minus position of the clone, as the anchor clone sees it: xi_f - xi_rho.
-    J = np.zeros((3, len(window.P)))
+    J = np.zeros((3, len(window.prior.P)))
     J[:, first : first + 3], J[:, newest.start : newest.start + 3] = np.eye(3), -np.eye(3)
-    before = J @ window.P @ J.T
+    before = J @ window.prior.P @ J.T
     window.add_clone(9, 9)
-    first = window.first_landmark
-    J = np.zeros((3, len(window.P)))
+    first = window.state.landmarks.start
+    J = np.zeros((3, len(window.prior.P)))
     lever = point_D_pose(p)[0][:, 3:]
-    new = window.clone_rows(4)
+    new = window.state.clone(4)
     J[:, first : first + 3], J[:, newest.start : newest.start + 3] = np.eye(3), -np.eye(3)
     J[:, newest.start + 3 : newest.stop] += lever
     J[:, new.start + 3 : new.stop] -= lever
-    np.testing.assert_allclose(J @ window.P @ J.T, before, atol=1e-12)
+    np.testing.assert_allclose(J @ window.prior.P @ J.T, before, atol=1e-12)
 
 
 def test_relinearising_moves_the_means_and_not_the_prior() -> None:
     window = _window()
-    P = window.P.copy()
+    P = window.prior.P.copy()
     error = np.random.default_rng(2).normal(size=len(P)) * 0.01
     window.relinearise(error)
-    np.testing.assert_array_equal(window.P, P)
-    np.testing.assert_allclose(window.prior_delta, error)
-    window.relinearise(-window.prior_delta)
-    np.testing.assert_allclose(window.prior_delta, 0, atol=1e-15)
+    np.testing.assert_array_equal(window.prior.P, P)
+    np.testing.assert_allclose(window.prior.delta, error)
+    window.relinearise(-window.prior.delta)
+    np.testing.assert_allclose(window.prior.delta, 0, atol=1e-15)
     np.testing.assert_allclose(window.clones[2].T_world_imu, _window().clones[2].T_world_imu, atol=1e-4)
 
 
@@ -370,11 +371,11 @@ def test_commit_in_two_parts_equals_commit_at_once() -> None:
     H, r = rng.normal(size=(40, DIM + 24)), rng.normal(size=40)
     once, twice = _window(), _window()
     once.absorb(H.T @ H, H.T @ r)
-    once.relinearise(-once.prior_delta)
+    once.relinearise(-once.prior.delta)
     for part in (slice(0, 15), slice(15, 40)):
         twice.absorb(H[part].T @ H[part], H[part].T @ r[part])
-    twice.relinearise(-twice.prior_delta)
-    np.testing.assert_allclose(twice.P, once.P, atol=1e-12)
+    twice.relinearise(-twice.prior.delta)
+    np.testing.assert_allclose(twice.prior.P, once.prior.P, atol=1e-12)
     np.testing.assert_allclose(twice.nav.T_world_imu, once.nav.T_world_imu, atol=1e-10)
 
 
@@ -514,7 +515,7 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion:
     _, _, filt = flight.run(settings, motion)
     window, noise = filt._window, np.random.default_rng(1)
     assert window is not None
-    P = filt._output.copy()
+    P = filt._propagation.posterior.own.copy()
     samples = flight.imu(noise, settings, np.zeros(6)) if motion == "imu" else []
     other = ImuMotion(settings) if motion == "imu" else TwistMotion(settings)
     for sample in samples:
@@ -523,7 +524,7 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion:
             filt.propagate(sample)
     nothing = flight.observe(0, 0.0, noise, 0)
     for k in (6, 7):
-        step = other.advance(window.nav, (k - 1) * STEP_NS, k * STEP_NS, filt._noise.factors)
+        step = other.advance(window.nav, (k - 1) * STEP_NS, k * STEP_NS, filt._propagation.noise.factors)
         P = step.Phi @ P @ step.Phi.T + step.Q
         filt.update(replace(nothing, frame_index=k, time_ns=k * STEP_NS))
     estimate = filt.estimate()
@@ -547,7 +548,7 @@ def test_tracks_have_their_say_when_the_oldest_clone_leaves_and_not_before() -> 
     ids = set.intersection(*(set(flight.observe(k, 0.0, exact).ids.tolist()) for k in range(5)))
     odd, even = {i for i in ids if i % 2}, {i for i in ids if i % 2 == 0}
     assert min(len(odd), len(even)) > 10
-    table = filt._tracks.table
+    table = filt._frame.tracks.table
     left = dict(zip(table.ids(table.rows()).tolist(), table.rows().tolist(), strict=True))
     assert odd <= left.keys()
     assert not even & left.keys()
@@ -567,11 +568,11 @@ def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch
         covariance: FloatArray,
         point_D_focal: FloatArray | None,
     ) -> None:
-        table = filt._tracks.table
+        table = filt._frame.tracks.table
         rows = table.rows()
         views = table.views(rows[np.isin(table.ids(rows), ids[:1])], len(window.clones))
         T = np.array([c.T_world_imu for c in window.clones])
-        made.append((T, p_world[:1], A[:3, window.first_clone : window.first_landmark], views))
+        made.append((T, p_world[:1], A[:3, window.state.clones.start : window.state.landmarks.start], views))
         add(window, ids, p_world, A, covariance, point_D_focal)
 
     monkeypatch.setattr(Window, "add_landmarks", spy)
@@ -688,17 +689,17 @@ def test_window_and_map_stay_bounded() -> None:
     assert window is not None
     assert len(window.clones) <= 6
     assert len(window.landmark_ids) <= 8
-    assert window.P.shape[0] <= DIM + window.calibration.dim + 36 + 24
+    assert window.prior.P.shape[0] <= window.state.own.stop + 36 + 24
 
 
 def test_the_map_is_the_same_however_often_it_is_merged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Standing still, all features are told again every few frames; the map holds each of them once, or twice."""
     settings, maps, held = MsckfSettings(clones=4), [], []
     for least in (0, 10**9):
-        monkeypatch.setattr("vio.filters.msckf._LEAST_MERGE", least)
+        monkeypatch.setattr("vio.filters.point_map._LEAST_MERGE", least)
         _, _, filt = Flight(frames=60, still=True).run(settings, "imu", sigma=0.2)
         maps.append(filt.landmarks())
-        held.append(sum(len(part.ids) for part in filt._map))
+        held.append(sum(len(part.ids) for part in filt._points.parts))
     for name in ("ids", "p_world", "covariance"):
         np.testing.assert_array_equal(getattr(maps[0], name), getattr(maps[1], name))
     assert held[0] <= 2 * len(maps[0].ids) < 0.5 * held[1]
@@ -866,7 +867,7 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
         def update(self, observations: Observations) -> UpdateReport:
             if observations.frame_index == 12 and not events:
                 assert self._window is not None
-                self._window.P[0, 0] = np.nan
+                self._window.prior.P[0, 0] = np.nan
             try:
                 return super().update(observations)
             except DivergedError as error:

@@ -189,7 +189,7 @@ def _twist(nav: NavState) -> Twist:
 
 
 def _moved(window: Window, error: FloatArray) -> Window:
-    out = copy.copy(window)
+    out = copy.deepcopy(window)
     out.relinearise(error)
     return out
 
@@ -239,35 +239,35 @@ def test_the_extrinsics_error_moves_with_the_body() -> None:
     window, delta = _window(clones=0), np.array([0.01, -0.02, 0.03, 0.01, 0.02, -0.01])
     R, p, *_ = Shaking().state(0.9)
     nav = NavState(se3_from_parts(R, p), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    rows = window.calibration.extrinsic_rows + DIM
-    P = np.zeros_like(window.P)
+    rows = np.r_[window.state["extrinsics"]]
+    P = np.zeros_like(window.prior.P)
     before = se3_adjoint(window.nav.T_world_imu) @ delta
-    P[np.ix_(rows, rows)], window.prior_delta[rows] = np.outer(before, before), before
-    window.P = P
-    walk = np.diag(np.r_[np.full(6, 1e-6), 0.0])
+    P[np.ix_(rows, rows)], window.prior.delta[rows] = np.outer(before, before), before
+    window.prior.P = P
+    walk = np.r_[np.full(6, 1e-6), 0.0]
     window.propagate(Transition(nav, np.eye(DIM), np.zeros((DIM, DIM)), np.zeros((2, DIM, DIM))), walk)
     back = se3_adjoint(se3_inverse(nav.T_world_imu))
-    np.testing.assert_allclose(back @ window.prior_delta[rows], delta, atol=1e-12)
-    own = back @ window.P[np.ix_(rows, rows)] @ back.T
+    np.testing.assert_allclose(back @ window.prior.delta[rows], delta, atol=1e-12)
+    own = back @ window.prior.P[np.ix_(rows, rows)] @ back.T
     np.testing.assert_allclose(own, np.outer(delta, delta) + 1e-6 * np.eye(6), atol=1e-12)
 
 
 def test_exposures_are_where_the_images_saw_them_when_the_clocks_are_first_compared() -> None:
     """Whatever the offset: the body's pose and velocity at the IMU's time are what it makes uncertain."""
     window = _window(clones=1)
-    row = window.first_clone - 1
-    window.P[row], window.P[:, row] = 0.0, 0.0
-    window.P[row, row] = sigma2 = BOTH.time_offset_sigma_s**2
+    row = window.state.clones.start - 1
+    window.prior.P[row], window.prior.P[:, row] = 0.0, 0.0
+    window.prior.P[row, row] = sigma2 = BOTH.time_offset_sigma_s**2
     early, late = (NavState(*parts) for parts in (_nav_parts(0.3), _nav_parts(0.35)))
     window.clocks_compared, window.nav, twist = False, late, _twist(late)
     window.clones = [replace(window.clones[0], velocity=early.velocity)]
-    own, (_, J, _) = slice(0, window.first_clone), window.camera_D_own(0.0, twist)
-    without_offset = J @ window.P[own, own] @ J.T
+    own, (_, J, _) = slice(0, window.state.clones.start), window.camera_D_own(0.0, twist)
+    without_offset = J @ window.prior.P[own, own] @ J.T
     window.compare_clocks(STEP_NS, 0.0, twist)
     window.add_clone(1, STEP_NS, window.camera_D_own(0.0, twist))
-    new = window.clone_rows(1)
-    np.testing.assert_allclose(window.P[new, row], 0.0, atol=1e-12)
-    np.testing.assert_allclose(window.P[new, new], without_offset, atol=1e-12)
+    new = window.state.clone(1)
+    np.testing.assert_allclose(window.prior.P[new, row], 0.0, atol=1e-12)
+    np.testing.assert_allclose(window.prior.P[new, new], without_offset, atol=1e-12)
 
     def moved(offset_s: float) -> FloatArray:
         """The state an offset later, from the one before it, in the filter's errors."""
@@ -277,7 +277,7 @@ def test_exposures_are_where_the_images_saw_them_when_the_clocks_are_first_compa
         return np.concatenate([xi, late.velocity - so3_exp(xi[3:]) @ (late.velocity + acceleration * offset_s)])
 
     lever = (moved(1e-6) - moved(-1e-6)) / 2e-6
-    np.testing.assert_allclose(window.P[:9, row] / sigma2, lever, atol=1e-6)
+    np.testing.assert_allclose(window.prior.P[:9, row] / sigma2, lever, atol=1e-6)
 
 
 def _nav_parts(t: float) -> tuple[FloatArray, ...]:
@@ -292,26 +292,26 @@ def test_a_twist_within_its_noise_teaches_nothing_and_adds_its_noise() -> None:
     np.testing.assert_array_equal(unknown.significant(), 0.0)
     np.testing.assert_allclose(known.significant(), known.mean, rtol=2e-3)
     window = _window(clones=1)
-    row = window.first_clone - 1
+    row = window.state.clones.start - 1
     window.nav = replace(window.nav, T_world_imu=np.eye(4))
     _, _, noise = window.camera_D_own(window.calibration.time_offset_s - 0.004, unknown)
-    np.testing.assert_allclose(noise, sigma**2 * (window.P[row, row] + 0.004**2), atol=1e-6)
+    np.testing.assert_allclose(noise, sigma**2 * (window.prior.P[row, row] + 0.004**2), atol=1e-6)
 
 
 def test_new_anchor_of_the_landmarks_changes_no_prediction() -> None:
     """Where the camera will see a landmark, by all errors together: the same before and after the anchor moves."""
     window = _window()
     points = _world_points(window.T_cam0_world(), 2)
-    A = np.random.default_rng(1).normal(size=(6, len(window.P))) * 0.3
+    A = np.random.default_rng(1).normal(size=(6, len(window.prior.P))) * 0.3
     window.add_landmarks(np.array([3, 8]), points, A, np.array([np.eye(3) * 1e-3] * 2))
 
     def spreads(window: Window, anchor: int) -> FloatArray:
         """Covariance of `dp` of the first landmark, as it stands in the world."""
         J = np.zeros((3, 6 * len(window.clones)))
         J[:, 6 * anchor + 3 : 6 * anchor + 6] = -so3_hat(points[0])
-        J = window.chain(J)
-        J[:, window.first_landmark : window.first_landmark + 3] = np.eye(3)
-        out: FloatArray = J @ window.P @ J.T
+        J = window.state.jacobian(J)
+        J[:, window.state.landmarks.start : window.state.landmarks.start + 3] = np.eye(3)
+        out: FloatArray = J @ window.prior.P @ J.T
         return out
 
     before = spreads(window, 4)

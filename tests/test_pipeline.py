@@ -241,9 +241,9 @@ def test_a_divergence_is_an_event_and_not_the_end_of_the_run() -> None:
 
     class Fragile(Msckf):
         def update(self, seen: Observations) -> UpdateReport:
-            if seen.frame_index == 8 and self._smoothed is not None:
+            if seen.frame_index == 8 and self._frame.smoothed is not None:
                 assert self._window is not None
-                self._window.P[0, 0] = np.nan
+                self._window.prior.P[0, 0] = np.nan
             return super().update(seen)
 
     drive = FakeDrive(frames=20)

@@ -58,9 +58,9 @@ def test_relinearised_images_alone_say_nothing_of_the_scale() -> None:
 
     def each(run: object) -> None:
         window = run.filter._window  # type: ignore[attr-defined]
-        if window.scale_test is None:
-            window.scale_test = ScaleTest(len(window.P))
-        sigmas.append(window.scale_test.estimate()[1])
+        if window.prior.scale_test is None:
+            window.prior.scale_test = ScaleTest(len(window.prior.P))
+        sigmas.append(window.prior.scale_test.estimate()[1])
 
     fly(Course(20, 2.5, velocity=(0.5, 0.3, 0.0), yaw_rate=0.3, pixel_sigma_px=0.3), None, each=each)
     assert sigmas[-1] > 0.99 * sigmas[0]
@@ -74,13 +74,13 @@ def test_nothing_is_said_of_the_baseline_without_right_views() -> None:
 
     window = fly(Course(20, 0.3), "imu", spoil=left_only).filter._window
     assert window is not None
-    assert window.scale_test is None
+    assert window.prior.scale_test is None
 
 
 def test_the_noise_of_a_standstill_is_no_motion() -> None:
     """Zero velocity is zero at any scale; the accelerometer's noise is worth less than one of information a frame."""
     run = fly(Course(20, 2.0, pixel_sigma_px=0.3), "imu")
-    test = run.filter._window.scale_test  # type: ignore[union-attr]
+    test = run.filter._window.prior.scale_test  # type: ignore[union-attr]
     assert test is not None
     assert test.estimate()[1] ** -2 - 0.1**-2 < run.course.frames
     assert run.estimates[-1].stereo_scale is None

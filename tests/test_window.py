@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from vio.filters.navigation import DIM, Measurement, NavState, TwistMotion
+from vio.filters.prior import factor, fit, posterior
 from vio.filters.settings import MsckfSettings
-from vio.filters.window import Window, factor, fit, posterior
+from vio.filters.window import Window
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, transform_points
 
 STEP_NS = 50_000_000
@@ -28,7 +29,7 @@ def _window(clones: int = 4) -> Window:
     for k in range(clones):
         window.add_clone(k, k * STEP_NS)
         if k == clones - 2:
-            A = rng.normal(size=(6, len(window.P))) * 0.3
+            A = rng.normal(size=(6, len(window.prior.P))) * 0.3
             window.add_landmarks(np.array([3, 8]), LANDMARKS, A, np.array([np.eye(3) * 1e-3] * 2))
         if k < clones - 1:
             window.propagate(window.motion.advance(window.nav, k * STEP_NS, (k + 1) * STEP_NS))
@@ -41,26 +42,26 @@ def _symmetric_and_positive(P: FloatArray) -> bool:
 
 def test_every_change_keeps_the_covariance_symmetric_and_positive() -> None:
     window, rng = _window(), np.random.default_rng(1)
-    assert _symmetric_and_positive(window.P)
-    H = rng.normal(size=(20, len(window.P)))
+    assert _symmetric_and_positive(window.prior.P)
+    H = rng.normal(size=(20, len(window.prior.P)))
     window.absorb(H.T @ H, H.T @ rng.normal(size=20))
-    assert _symmetric_and_positive(window.P)
+    assert _symmetric_and_positive(window.prior.P)
     window.inflate_process_noise(np.eye(DIM) * 1e-4)
-    assert _symmetric_and_positive(window.P)
+    assert _symmetric_and_positive(window.prior.P)
     window.keep_landmarks(np.array([False, True]))
     window.drop_oldest_clone()
-    assert _symmetric_and_positive(window.P)
-    assert len(window.P) == DIM + 18 + 3 == len(window.prior_delta)
+    assert _symmetric_and_positive(window.prior.P)
+    assert len(window.prior.P) == DIM + 18 + 3 == len(window.prior.delta)
 
 
 def test_a_landmark_whose_error_is_its_anchors_moves_with_it() -> None:
     """Both errors are of one kind: the newest camera sees the landmark where it did, also after a large move."""
     window = _window()
     before = transform_points(se3_inverse(window.clones[-1].T_world_imu), LANDMARKS)
-    error = np.zeros(len(window.P))
+    error = np.zeros(len(window.prior.P))
     move = np.array([0.7, -0.4, 0.2, 0.5, -0.3, 0.9])
-    error[window.clone_rows(3)] = move
-    error[window.first_landmark :] = np.tile(move[:3], 2)
+    error[window.state.clone(3)] = move
+    error[window.state.landmarks.start :] = np.tile(move[:3], 2)
     window.relinearise(error)
     np.testing.assert_allclose(window.clones[3].T_world_imu, se3_exp(move) @ _window().clones[3].T_world_imu)
     after = transform_points(se3_inverse(window.clones[-1].T_world_imu), window.landmarks)
@@ -76,15 +77,15 @@ def test_widening_the_last_step_is_the_same_as_having_known_it_less() -> None:
     late.propagate(step)
     late.add_clone(4, 4 * STEP_NS)
     late.inflate_process_noise(extra)
-    np.testing.assert_allclose(late.P, early.P, atol=1e-13)
+    np.testing.assert_allclose(late.prior.P, early.prior.P, atol=1e-13)
 
 
 def test_covariance_of_the_last_move_counts_what_both_poses_share() -> None:
     window = _window()
-    J = np.zeros((6, len(window.P)))
-    J[:, window.clone_rows(3)], J[:, window.clone_rows(2)] = np.eye(6), -np.eye(6)
-    prior = fit(factor(window.P), np.zeros_like(window.P))
-    np.testing.assert_allclose(window.move_covariance(2, prior), J @ window.P @ J.T, atol=1e-12)
+    J = np.zeros((6, len(window.prior.P)))
+    J[:, window.state.clone(3)], J[:, window.state.clone(2)] = np.eye(6), -np.eye(6)
+    prior = fit(factor(window.prior.P), np.zeros_like(window.prior.P))
+    np.testing.assert_allclose(window.move_covariance(2, prior), J @ window.prior.P @ J.T, atol=1e-12)
     for index in (2, -2):
         move = window.camera_move_since(index)
         np.testing.assert_allclose(window.clones[2].T_world_imu @ move, window.clones[3].T_world_imu, atol=1e-12)
@@ -94,15 +95,15 @@ def test_covariance_of_the_last_move_counts_what_both_poses_share() -> None:
 
 def test_new_landmarks_are_correlated_with_what_made_them() -> None:
     window = _window()
-    D = len(window.P)
+    D = len(window.prior.P)
     A, noise = np.random.default_rng(2).normal(size=(3, D)), np.diag([1e-3, 2e-3, 3e-3])
     J = np.concatenate([np.eye(D), A])
-    expected = J @ window.P @ J.T
+    expected = J @ window.prior.P @ J.T
     expected[D:, D:] += noise
-    window.prior_delta = np.linspace(-1, 1, D)
+    window.prior.delta = np.linspace(-1, 1, D)
     window.add_landmarks(np.array([9]), np.array([[1.0, 2.0, 3.0]]), A, noise[None])
-    np.testing.assert_allclose(window.P, expected, atol=1e-12)
-    np.testing.assert_allclose(window.prior_delta, J @ np.linspace(-1, 1, D), atol=1e-12)
+    np.testing.assert_allclose(window.prior.P, expected, atol=1e-12)
+    np.testing.assert_allclose(window.prior.delta, J @ np.linspace(-1, 1, D), atol=1e-12)
     assert window.landmark_ids.tolist() == [3, 8, 9]
 
 
@@ -111,7 +112,7 @@ def test_what_is_forgotten_leaves_the_rest_as_it_was() -> None:
     window.drop_oldest_clone()
     window.keep_landmarks(np.array([False, True]))
     kept = np.r_[0:DIM, DIM + 6 : DIM + 24, DIM + 27 : DIM + 30]
-    np.testing.assert_array_equal(window.P, whole.P[np.ix_(kept, kept)])
+    np.testing.assert_array_equal(window.prior.P, whole.prior.P[np.ix_(kept, kept)])
     assert [c.frame_index for c in window.clones] == [1, 2, 3]
     np.testing.assert_array_equal(window.landmarks, LANDMARKS[1:])
     window.keep_landmarks(np.array([True]))
@@ -121,19 +122,19 @@ def test_what_is_forgotten_leaves_the_rest_as_it_was() -> None:
 def test_a_measurement_is_a_kalman_update_of_all_that_is_correlated() -> None:
     window, rng = _window(), np.random.default_rng(3)
     told = Measurement(rng.normal(size=(4, DIM)), rng.normal(size=4), np.diag([0.1, 0.2, 0.3, 0.4]))
-    H = np.zeros((4, len(window.P)))
+    H = np.zeros((4, len(window.prior.P)))
     H[:, :DIM] = told.H
-    K = window.P @ H.T @ np.linalg.inv(H @ window.P @ H.T + told.R)
-    expected, shift = (np.eye(len(window.P)) - K @ H) @ window.P, K @ told.residual
+    K = window.prior.P @ H.T @ np.linalg.inv(H @ window.prior.P @ H.T + told.R)
+    expected, shift = (np.eye(len(window.prior.P)) - K @ H) @ window.prior.P, K @ told.residual
     moved = copy.deepcopy(window)
     moved.measure(told)
-    np.testing.assert_allclose(moved.P, expected, atol=1e-9)
-    np.testing.assert_allclose(moved.prior_delta, 0.0, atol=1e-12)
+    np.testing.assert_allclose(moved.prior.P, expected, atol=1e-9)
+    np.testing.assert_allclose(moved.prior.delta, 0.0, atol=1e-12)
     np.testing.assert_allclose(
         moved.clones[0].T_world_imu, se3_exp(shift[DIM : DIM + 6]) @ window.clones[0].T_world_imu
     )
     window.absorb_measurement(told)
-    np.testing.assert_allclose(window.prior_delta, -shift, atol=1e-9)
+    np.testing.assert_allclose(window.prior.delta, -shift, atol=1e-9)
     np.testing.assert_array_equal(window.clones[0].T_world_imu, _window().clones[0].T_world_imu)
 
 
@@ -163,24 +164,24 @@ def test_fit_by_factors_equals_the_dense_covariance() -> None:
 def test_a_fit_of_some_errors_equals_the_one_of_all(about_all: bool) -> None:
     """Of pixels, which navigation state and calibration follow by their correlation, and of everything."""
     window, rng = _window(), np.random.default_rng(5)
-    D = len(window.P)
+    D = len(window.prior.P)
     root = rng.normal(size=(D, D))
-    window.P, window.prior_delta = root @ root.T, rng.normal(size=D)
+    window.prior.P, window.prior.delta = root @ root.T, rng.normal(size=D)
     H, r = rng.normal(size=(20, D)), rng.normal(size=20)
     if not about_all:
-        H[:, : window.first_clone] = 0.0
-    for size in (window.first_landmark, D):
+        H[:, : window.state.clones.start] = 0.0
+    for size in (window.state.landmarks.start, D):
         A, b = np.zeros((D, D)), np.zeros(D)
         A[:size, :size], b[:size] = H[:, :size].T @ H[:, :size], H[:, :size].T @ r
-        P, shift = posterior(window.P, A, b + A @ window.prior_delta)
+        P, shift = posterior(window.prior.P, A, b + A @ window.prior.delta)
         fitted, error = window.optimum(A, b, size)
-        assert fitted.prior.first == (0 if about_all else window.first_clone)
-        np.testing.assert_allclose(error, shift - window.prior_delta, atol=1e-8)
+        assert fitted.prior.first == (0 if about_all else window.state.clones.start)
+        np.testing.assert_allclose(error, shift - window.prior.delta, atol=1e-8)
         np.testing.assert_allclose(fitted.covariance(), P[:size, :size], atol=1e-8)
-    delta = window.prior_delta
+    delta = window.prior.delta
     window.absorb(A, b)
-    np.testing.assert_allclose(window.P, P, atol=1e-8)
-    np.testing.assert_allclose(window.prior_delta, delta - shift, atol=1e-8)
+    np.testing.assert_allclose(window.prior.P, P, atol=1e-8)
+    np.testing.assert_allclose(window.prior.delta, delta - shift, atol=1e-8)
 
 
 def test_changes_in_place_are_seen_by_the_next_fit() -> None:
@@ -191,6 +192,6 @@ def test_changes_in_place_are_seen_by_the_next_fit() -> None:
         window.drop_oldest_clone,
     ):
         change()
-        nothing = np.zeros_like(window.P)
+        nothing = np.zeros_like(window.prior.P)
         fitted, _ = window.optimum(nothing, np.zeros(len(nothing)), len(nothing))
-        np.testing.assert_allclose(fitted.covariance(), window.P, atol=1e-11)
+        np.testing.assert_allclose(fitted.covariance(), window.prior.P, atol=1e-11)

@@ -32,8 +32,8 @@ def _window(xi: FloatArray, n: int = 5, motion: str = "twist") -> Window:
 def _posterior(xi: FloatArray, sigma: FloatArray) -> WindowPosterior:
     """The window's posterior whose motion from first to last has standard deviations (6,) on the first body."""
     window, A = _window(xi), se3_adjoint(_START)
-    P = np.zeros((len(window.P), len(window.P)))
-    newest = window.clone_rows(4)
+    P = np.zeros((len(window.prior.P), len(window.prior.P)))
+    newest = window.state.clone(4)
     P[newest, newest] = A @ np.diag(sigma**2) @ A.T
     return WindowPosterior.of(window, P)
 
@@ -65,31 +65,31 @@ def test_displacement_is_no_longer_than_the_translation_of_the_twist() -> None:
 def test_a_single_clone_tells_no_standstill() -> None:
     window = _window(np.zeros(6), n=2)
     window.drop_oldest_clone()
-    assert not WindowPosterior.of(window, window.P).is_stationary(*_LIMITS)
+    assert not WindowPosterior.of(window, window.prior.P).is_stationary(*_LIMITS)
 
 
 def test_what_both_poses_share_does_not_blur_their_motion() -> None:
     """A position known to a metre, the same for all clones, leaves the motion known."""
     window = _window(np.zeros(6))
-    P = np.zeros((len(window.P), len(window.P)))
-    rows = slice(window.first_clone, window.first_landmark)
+    P = np.zeros((len(window.prior.P), len(window.prior.P)))
+    rows = slice(window.state.clones.start, window.state.landmarks.start)
     P[rows, rows] = np.tile(np.eye(6), (5, 5))
-    P[window.clone_rows(4), window.clone_rows(4)] += np.eye(6) * 1e-8
+    P[window.state.clone(4), window.state.clone(4)] += np.eye(6) * 1e-8
     assert WindowPosterior.of(window, P).is_stationary(*_LIMITS)
-    P[window.clone_rows(0), window.clone_rows(4)] = P[window.clone_rows(4), window.clone_rows(0)] = 0.0
+    P[window.state.clone(0), window.state.clone(4)] = P[window.state.clone(4), window.state.clone(0)] = 0.0
     assert not WindowPosterior.of(window, P).is_stationary(*_LIMITS)
 
 
 def test_each_clone_is_told_with_its_own_covariance_on_the_bodys_side() -> None:
     window = _window(np.array([0.4, 0.2, 0.0, 0.0, 0.1, 0.3]), motion="imu")
-    root = np.random.default_rng(0).normal(size=(len(window.P), len(window.P)))
+    root = np.random.default_rng(0).normal(size=(len(window.prior.P), len(window.prior.P)))
     P = root @ root.T
     posterior = WindowPosterior.of(window, P)
     for k, clone in enumerate(window.clones):
         estimate = posterior.estimate(10 + k)
         assert estimate is not None
         A = se3_adjoint(se3_inverse(clone.T_world_imu))
-        rows = window.clone_rows(k)
+        rows = window.state.clone(k)
         np.testing.assert_allclose(estimate.covariance, A @ P[rows, rows] @ A.T, rtol=1e-9)
         np.testing.assert_array_equal(estimate.T_world_imu, clone.T_world_imu)
         np.testing.assert_array_equal(estimate.velocity_world, clone.velocity)
@@ -107,7 +107,7 @@ def test_without_imu_the_velocity_is_that_of_the_poses_around() -> None:
         replace(c, T_world_imu=np.block([[c.T_world_imu[:3, :3], q[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]]))
         for c, q in zip(window.clones, p, strict=True)
     ]
-    posterior = WindowPosterior.of(window, window.P)
+    posterior = WindowPosterior.of(window, window.prior.P)
     smoothed = [posterior.estimate(c.frame_index) for c in posterior.clones]
     velocities = np.array([estimate.velocity_world for estimate in smoothed if estimate is not None])
     exact = np.column_stack([6 * t, np.full(5, -2.0), 0 * t])

@@ -33,6 +33,7 @@ import numpy as np
 from vio.errors import VioError
 from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters import imu_start, navigation, window_tracks
+from vio.filters.frame_update import FrameUpdate
 from vio.filters.msckf import Msckf
 from vio.filters.multiview import Residuals
 from vio.filters.navigation import DIM, ImuMotion, NavState, Transition
@@ -98,7 +99,7 @@ _MEASURES = {"pose": 6, "position": 3, "orientation": 3, "yaw": 1, "velocity": 3
 class StandardErrors(Window):
     """The window with the prior in the usual errors: differences of positions, velocities and points.
 
-    The error vector, and `P` and `prior_delta` over it, stay right-invariant *at the present linearisation point*,
+    The error vector, and its prior, stay right-invariant *at the present linearisation point*,
     equation (E1), so that the rest of the filter need not know. When the means move, the prior in the usual errors
     stays the same (E2).
     """
@@ -118,16 +119,16 @@ class StandardErrors(Window):
     def standard_D_error(self) -> FloatArray:
         """Jacobian (D, D) of the usual errors with respect to the window's own, equation (E1)."""
         nav, positions, landmarks = self.linearisation_point()
-        M = np.eye(len(self.P))
+        M = np.eye(len(self.prior.P))
         M[0:3, 3:6] = -so3_hat(nav.T_world_imu[:3, 3])
         if isinstance(self.motion, ImuMotion):
             M[6:9, 3:6] = -so3_hat(nav.velocity)
         for k, position in enumerate(positions):
-            rows = self.clone_rows(k)
+            rows = self.state.clone(k)
             M[rows.start : rows.start + 3, rows.start + 3 : rows.stop] = -so3_hat(position)
         if len(landmarks):
-            anchor = self.clone_rows(len(self.clones) - 1)
-            M[self.first_landmark :, anchor.start + 3 : anchor.stop] = -so3_hat(landmarks).reshape(-1, 3)
+            anchor = self.state.clone(len(self.clones) - 1)
+            M[self.state.landmarks.start :, anchor.start + 3 : anchor.stop] = -so3_hat(landmarks).reshape(-1, 3)
         return M
 
     def relinearise(self, error: FloatArray) -> None:
@@ -139,12 +140,12 @@ class StandardErrors(Window):
             T_world_imu=_moved(self.nav.T_world_imu, change[:6]),
             velocity=self.nav.velocity + change[6:9],
         )
-        moves = change[self.clone_rows(0).start : self.first_landmark].reshape(-1, 6)
+        moves = change[self.state.clone(0).start : self.state.landmarks.start].reshape(-1, 6)
         self.clones = [
             replace(c, T_world_imu=_moved(c.T_world_imu, move)) for c, move in zip(self.clones, moves, strict=True)
         ]
-        self.landmarks = self.landmarks + change[self.first_landmark :].reshape(-1, 3)
-        self.prior_delta = self.prior_delta + error
+        self.landmarks = self.landmarks + change[self.state.landmarks.start :].reshape(-1, 3)
+        self.prior.delta = self.prior.delta + error
         self._follow(before)
 
     def right_invariant(self, P: FloatArray) -> FloatArray:
@@ -158,8 +159,8 @@ class StandardErrors(Window):
         """Write the prior in right-invariant errors at the new linearisation point, equation (E2)."""
         # M = I + L with L L = 0, so the inverse is I - L.
         change = np.eye(len(before)) + before - self.standard_D_error()
-        self.P = change @ self.P @ change.T
-        self.prior_delta = change @ self.prior_delta
+        self.prior.P = change @ self.prior.P @ change.T
+        self.prior.delta = change @ self.prior.delta
 
 
 class FirstEstimates(StandardErrors):
@@ -259,6 +260,17 @@ class JudgedTracks(WindowTracks):
         return good, nis, dof
 
 
+class AblationUpdate(FrameUpdate):
+    """Reports the covariance of right-invariant errors, whatever the window's own are."""
+
+    def _marginalise(self, window: Window, *rest: Any) -> int:
+        new = super()._marginalise(window, *rest)
+        if isinstance(window, StandardErrors):
+            posterior = self._propagation.posterior
+            self._propagation.posterior = replace(posterior, own=window.right_invariant(posterior.own))
+        return new
+
+
 class Ablation(Msckf):
     """The sliding-window filter over a window of choice, uncertain of its first place and yaw."""
 
@@ -274,7 +286,8 @@ class Ablation(Msckf):
         super().__init__(CAMERA, T_CAM0_IMU, settings, motion=motion)
         self._kind, self._start, self._begun = kind, _START[start], False
         self._learn_noise = learn_noise
-        self._tracks = self._judged = JudgedTracks(CAMERA, settings)
+        self._frame = AblationUpdate(settings, self._rig, self._propagation, self._points)
+        self._frame.tracks = self._judged = JudgedTracks(CAMERA, settings)
 
     @property
     def nis(self) -> list[float]:
@@ -286,10 +299,10 @@ class Ablation(Msckf):
         window = self._started()
         if not self._begun:
             if not self._learn_noise:
-                self._noise = MotionNoise(1.0, 1.0, 1.0)
+                self._propagation.noise = MotionNoise(1.0, 1.0, 1.0)
             position_sigma, yaw_sigma = self._start
-            window.P[:3, :3] += np.eye(3) * position_sigma**2
-            window.P[5, 5] += yaw_sigma**2
+            window.prior.P[:3, :3] += np.eye(3) * position_sigma**2
+            window.prior.P[5, 5] += yaw_sigma**2
             if self._kind is not None:
                 self._window = self._kind.over(window)
             self._begun = True
@@ -303,13 +316,7 @@ class Ablation(Msckf):
     @property
     def nav_covariance(self) -> FloatArray:
         """Covariance (15, 15) of the navigation state's right-invariant error."""
-        return self._output
-
-    def _marginalise(self, window: Window, *rest: Any) -> int:
-        new = super()._marginalise(window, *rest)
-        if isinstance(window, StandardErrors):
-            self._output = window.right_invariant(self._output)
-        return new
+        return self._propagation.posterior.own
 
 
 # The flights

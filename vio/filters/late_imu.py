@@ -34,7 +34,7 @@ class LateImuMsckf(Msckf):
 
     def update(self, observations: Observations) -> UpdateReport:
         """Propagate to the time of the frame and update with its observations, see `Msckf`."""
-        if self._window is None and not self._motion.ready:
+        if self._window is None and not self._propagation.motion.ready:
             if self._early is None:
                 camera, T_cam0_imu, settings = self._without
                 self._early = Msckf(camera, T_cam0_imu, settings, motion=None)

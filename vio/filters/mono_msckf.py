@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from vio.errors import EstimationError
 from vio.filters.mono_start import START_FACTORS, MonoStart, MonoStarter, is_still
-from vio.filters.msckf import IMU_FACTORS, Msckf
-from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState
+from vio.filters.msckf import Msckf
+from vio.filters.navigation import DIM, ImuMotion, NavState
 from vio.filters.noise import MotionNoise
+from vio.filters.propagation import IMU_FACTORS
 from vio.filters.restart import GoodState, restarted
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Window
@@ -72,8 +72,9 @@ class MonoMsckf(Msckf):
 
     def _start_state(self, seen: Observations) -> tuple[NavState, FloatArray] | None:
         """The state at a frame with its covariance (15, 15); None while it is not observable."""
-        assert isinstance(self._motion, ImuMotion)
-        begun = self._starter.try_frame(seen, self._motion)
+        motion = self._propagation.motion
+        assert isinstance(motion, ImuMotion)
+        begun = self._starter.try_frame(seen, motion)
         if begun is None:
             return None
         self._begun = begun
@@ -84,7 +85,7 @@ class MonoMsckf(Msckf):
 
     def _placed(self, begun: MonoStart, good: GoodState, time_ns: int) -> tuple[NavState, FloatArray]:
         """A start after a divergence in the world of before, where position and yaw are those held since."""
-        held, P_held = restarted(good, time_ns, self._motion, self._settings)
+        held, P_held = restarted(good, time_ns, self._propagation.motion, self._settings)
         R, R_new = held.T_world_imu[:3, :3], begun.nav.T_world_imu[:3, :3]
         turn = R @ R_new.T
         yaw = so3_exp([0.0, 0.0, np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])])
@@ -97,15 +98,11 @@ class MonoMsckf(Msckf):
 
     def restart(self, observations: Observations) -> UpdateReport:
         """Begin anew after a divergence, see `Msckf`; there is no estimate until the start is observable again."""
-        if self._good is None:
-            raise EstimationError("msckf has no good state to start again from; check calibration and first frames")
-        self._resumed, self._calibration = self._good, self._good.calibration
+        self._resumed = good = self._last_good()
         self._window, self._begun, self._good = None, None, None
-        self._smoothed, self._gyro, self._blind = None, None, False
-        self._since_frame, self._predicted_step = NO_STEP, None
-        self._reset_tracks()
-        self._starter = MonoStarter(self._camera, self._calibration.T_cam0_imu, self._settings)
-        self._map = [part for part in self._map if np.isfinite(part.p_world).all()]
+        self._propagation.forget()
+        self._forget_tracks(good)
+        self._starter = MonoStarter(self._rig.camera, self._calibration.T_cam0_imu, self._settings)
         return self._update(observations)
 
     def _wait(self, observations: Observations) -> UpdateReport:
@@ -113,7 +110,8 @@ class MonoMsckf(Msckf):
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last event, with the standard deviation of its scale."""
-        return replace(super().estimate(), scale_sigma=None if self._smoothed is None else scale_sigma(self._smoothed))
+        smoothed = self._frame.smoothed
+        return replace(super().estimate(), scale_sigma=None if smoothed is None else scale_sigma(smoothed))
 
     def _apply_zero_velocity(self, window: Window) -> None:
         """Absorb a zero-velocity measurement where neither the tracks nor the IMU move; see `Msckf`.
@@ -125,7 +123,7 @@ class MonoMsckf(Msckf):
             return
         if not is_still(self._recent, list(self._samples), self._settings):
             return
-        measurement = self._motion.zero_velocity(window.nav, self._gyro)
+        measurement = self._propagation.motion.zero_velocity(window.nav, self._propagation.gyro)
         if measurement is not None:
             window.absorb_measurement(measurement)
             self._stationary_ns = now

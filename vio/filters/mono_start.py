@@ -199,12 +199,12 @@ class MonoStarter:
                     return None
                 self._follow_noise(tracks, lin)
                 A, b = eliminate_points(lin.information, np.ones(len(lin.rows), dtype=np.bool_))
-                A, b = window.lift_information(A / tracks.variance, b / tracks.variance)
+                A, b = window.state.information(A / tracks.variance, b / tracks.variance)
                 try:
                     fitted, error = window.optimum(A, b, len(A))
                 except np.linalg.LinAlgError:
                     return None
-                tracks.move_points(lin, window.exposure_errors(error), error[window.stereo_rows])
+                tracks.move_points(lin, error[window.state.clones], error[window.state.stereo])
                 window.relinearise(error)
                 if np.abs(error).max() < _CONVERGED:
                     break

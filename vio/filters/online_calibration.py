@@ -1,4 +1,8 @@
-"""Online calibration: how the camera sits on the IMU and how their clocks differ, as states of the filter.
+"""Online calibration: the constants that the filter may estimate beside the motion, one class for each block of them.
+
+`BLOCKS` is the table: a block says how large it is, when it is estimated, its prior and random walk, how an error moves
+its mean, on which side of the world it is kept, how the camera's pose depends on it, and what of it enters the
+estimate. A new one is a class here, its mean in `Calibration`, and its fields in `Estimate`.
 
 A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error `delta`, with
 `T_cam0_imu = T_hat exp(delta)`, is kept on the world's side, `eta = Ad(T_world_imu) delta`, and moves with the body.
@@ -10,20 +14,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
-from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, ImuTerms, term_sigmas
+from vio.filters.error_state import ErrorState
+from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
+from vio.filters.navigation import DIM, Growth, NavState, Transition
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import METRIC_TERMS, TERMS
+from vio.filters.stereo_calibration import TERMS
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import FIELD_TERMS, Estimate, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
+from vio.records import FIELD_TERMS, MotionSource, StereoFieldEstimate, StereoScaleEstimate
 
-# Columns of the full error [IMU terms; stereo field; baseline and focal length; eta; time offset].
-_IMU, _STEREO = np.arange(IMU_TERMS), IMU_TERMS + np.arange(TERMS)
-_ETA, _OFFSET = IMU_TERMS + TERMS + np.arange(6), np.array([IMU_TERMS + TERMS + 6])
-_FULL = IMU_TERMS + TERMS + 7
 _PARTS = slice(0, 3), slice(3, 6)  # of a twist
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
 # Random walks of a mount that gives and of clocks that drift, each per root second.
@@ -34,170 +37,6 @@ STEREO_YAW_SIGMA_DEG = 0.1  # initial standard deviation of the right camera's r
 _STEREO_FIELD_SIGMA = 2.0e-3  # the same of the other terms of the stereo field, in focal lengths
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
 _STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
-# Which coefficients are estimated, by whether those of (R3) and of (R4) are.
-_TERMS_OF = {
-    (of_field, metric): np.flatnonzero(np.repeat([of_field, metric], [FIELD_TERMS, TERMS - FIELD_TERMS]))
-    for of_field in (False, True)
-    for metric in (False, True)
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Calibration:
-    """The estimate of the rig's calibration, and which of it is estimated."""
-
-    T_cam0_imu: FloatArray  # (4, 4)
-    time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
-    extrinsics: bool = False  # whether T_cam0_imu is estimated
-    timing: bool = False  # whether the offset is estimated
-    stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))  # (10,) coefficients of (R3) and (R4)
-    stereo_field: bool = False  # whether those of (R3) are estimated
-    metric: bool = False  # whether those of (R4) are
-    imu: ImuTerms = "off"  # which of the IMU's terms are estimated; the navigation state has their means
-
-    @property
-    def dim(self) -> int:
-        """Error dimensions C, 0 to 32."""
-        return self.imu_dim + self.stereo_dim + 6 * self.extrinsics + self.timing
-
-    @property
-    def imu_dim(self) -> int:
-        """How many of the error's dimensions, the first, belong to the IMU's terms: 0, 6 or 15."""
-        return len(CHOSEN[self.imu])
-
-    @property
-    def stereo_dim(self) -> int:
-        """How many of the error's dimensions, after those of the IMU, belong to the stereo calibration: 0, 2, 8, 10."""
-        return FIELD_TERMS * self.stereo_field + (TERMS - FIELD_TERMS) * self.metric
-
-    @property
-    def stereo_terms(self) -> IntArray:
-        """Which coefficients of the stereo calibration are estimated."""
-        return _TERMS_OF[self.stereo_field, self.metric]
-
-    @property
-    def moves_camera(self) -> bool:
-        """Whether anything is estimated that stands between the body's pose and the camera's."""
-        return self.extrinsics or self.timing
-
-    @property
-    def columns(self) -> IntArray:
-        """Which entries (C,) of the full error `[IMU; stereo; eta; time offset]`, m, rad and s, are estimated."""
-        camera = _STEREO[self.stereo_terms], _ETA[: 6 * self.extrinsics], _OFFSET[: 1 * self.timing]
-        return np.concatenate([_IMU[CHOSEN[self.imu]], *camera])
-
-    @property
-    def stereo_rows(self) -> slice:
-        """Which of the error's dimensions belong to the stereo calibration."""
-        return slice(self.imu_dim, self.imu_dim + self.stereo_dim)
-
-    @property
-    def field_rows(self) -> slice:
-        """Which of the error's dimensions belong to the coefficients of (R3), where they are estimated."""
-        return slice(self.imu_dim, self.imu_dim + FIELD_TERMS)
-
-    @property
-    def extrinsic_rows(self) -> IntArray:
-        """Which of the error's dimensions belong to the extrinsics, 6 or none."""
-        return self.stereo_rows.stop + np.arange(6 * self.extrinsics)
-
-    def corrected(self, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
-        """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of the error."""
-        full = self.full(error)
-        T = self.T_cam0_imu
-        if self.extrinsics:
-            T = T @ se3_exp(se3_adjoint(se3_inverse(T_world_imu)) @ full[_ETA])
-        return replace(
-            self,
-            T_cam0_imu=T,
-            time_offset_s=self.time_offset_s + float(full[_OFFSET[0]]),
-            stereo=self.stereo + full[_STEREO],
-        )
-
-    def in_world(self, covariance: FloatArray, T_world_imu: FloatArray) -> FloatArray:
-        """Turn the covariance (C, C) of `[IMU; stereo; delta; time offset]` into that of the error, with eta."""
-        out, rows = covariance.copy(), self.extrinsic_rows
-        if self.extrinsics:
-            A = se3_adjoint(T_world_imu)
-            out[rows] = A @ out[rows]
-            out[:, rows] = out[:, rows] @ A.T
-        return out
-
-    def add_to_estimate(self, estimate: Estimate, covariance: FloatArray, T_world_imu: FloatArray) -> Estimate:
-        """Return an estimate with what is estimated of the calibration, whose errors have a covariance (C, C).
-
-        Args:
-            estimate: the rest.
-            covariance: of the calibration's errors.
-            T_world_imu: the body's pose (4, 4) of these errors.
-        """
-        if self.stereo_field:
-            own = self.field_rows
-            field = StereoFieldEstimate(self.stereo[:FIELD_TERMS], covariance[own, own])
-            estimate = replace(estimate, stereo_field=field)
-        if self.metric:
-            own = slice(self.stereo_rows.stop - METRIC_TERMS, self.stereo_rows.stop)
-            scale = StereoScaleEstimate(self.stereo[FIELD_TERMS:], covariance[own, own])
-            estimate = replace(estimate, stereo_scale=scale)
-        if self.extrinsics:
-            of_delta = self.in_world(covariance, se3_inverse(T_world_imu))[
-                np.ix_(self.extrinsic_rows, self.extrinsic_rows)
-            ]
-            estimate = replace(estimate, T_cam0_imu=self.T_cam0_imu, T_cam0_imu_covariance=of_delta)
-        if self.timing:
-            sigma = float(np.sqrt(covariance[-1, -1]))
-            estimate = replace(estimate, time_offset_s=self.time_offset_s, time_offset_sigma_s=sigma)
-        return estimate
-
-    def full(self, error: FloatArray) -> FloatArray:
-        """Fill an error (..., C) up to (..., 32) with zeros."""
-        out = np.zeros((*error.shape[:-1], _FULL))
-        out[..., self.columns] = error
-        return out
-
-
-def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: MotionSource | None) -> Calibration:
-    """Return the calibration at the start.
-
-    Of camera and IMU nothing is estimated without an IMU, and nothing metric without a metric sensor.
-    """
-    extrinsics = motion == "imu" and settings.calibrate_camera_imu in ("extrinsics", "both")
-    timing = motion == "imu" and settings.calibrate_camera_imu in ("auto", "time_offset", "both")
-    return Calibration(
-        np.asarray(T_cam0_imu, dtype=np.float64),
-        extrinsics=extrinsics,
-        timing=timing,
-        stereo_field=settings.calibrate_stereo == "on",
-        metric=motion is not None and max(settings.stereo_focal_sigma, settings.stereo_baseline_sigma) > 0,
-        imu=settings.calibrate_imu if motion == "imu" else "off",
-    )
-
-
-def calibration_covariance(calibration: Calibration, settings: MsckfSettings) -> FloatArray:
-    """Return the initial covariance (C, C) of what is estimated of `[IMU; stereo; delta; time offset]`."""
-    s = settings
-    rotation = np.radians(s.extrinsic_rotation_sigma_deg)
-    pose = np.repeat([s.extrinsic_translation_sigma_m, rotation, s.time_offset_sigma_s], [3, 3, 1])
-    sigmas = np.concatenate([term_sigmas(), _stereo_sigmas(s), pose])
-    return np.diag(sigmas[calibration.columns] ** 2)
-
-
-def calibration_walk(settings: MsckfSettings) -> FloatArray:
-    """Return the variances (32,) that a second of random walk adds to `[IMU; stereo; delta; time offset]`."""
-    s = settings
-    rotation = np.radians(_EXTRINSIC_ROTATION_WALK_DEG)
-    pose = np.repeat([_EXTRINSIC_TRANSLATION_WALK_M, rotation, _TIME_OFFSET_WALK_S], [3, 3, 1])
-    walks: FloatArray = np.concatenate([term_sigmas() * IMU_WALK, _stereo_sigmas(s) * _STEREO_WALK, pose])
-    return walks**2
-
-
-def _stereo_sigmas(settings: MsckfSettings) -> FloatArray:
-    """Initial standard deviations (10,) of the coefficients of (R3) and (R4)."""
-    s = settings
-    yaw, other = np.radians(STEREO_YAW_SIGMA_DEG), _STEREO_FIELD_SIGMA
-    metric = [s.stereo_baseline_sigma, s.stereo_focal_sigma]
-    right, both = [yaw, other, other, other], [_RADIAL * other, _RADIAL * other, other, other]
-    return np.array([*right, *both, *metric])
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +59,271 @@ class Twist:
         return out.reshape(6)
 
 
+NO_TWIST = Twist(np.zeros(6), np.zeros((6, 6)))
+
+
 def body_twist(T_world_imu: FloatArray, velocity_world: FloatArray, rate: FloatArray) -> FloatArray:
     """Twist (6,) `[v; omega]` in the body frame of a pose (4, 4), a world velocity and a body rate (3,)."""
     return np.concatenate([T_world_imu[:3, :3].T @ velocity_world, rate])
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """The estimate of the rig's calibration, and which of it is estimated."""
+
+    T_cam0_imu: FloatArray  # (4, 4)
+    time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
+    stereo: FloatArray = field(default_factory=lambda: np.zeros(TERMS))  # (10,) coefficients of (R3) and (R4)
+    estimated: dict[str, int] = field(default_factory=dict)  # names and sizes of the blocks, in the order of the table
+
+    @property
+    def moves_camera(self) -> bool:
+        """Whether anything is estimated that stands between the body's pose and the camera's."""
+        return "extrinsics" in self.estimated or "time_offset" in self.estimated
+
+    def estimating(self, name: str, settings: MsckfSettings) -> Calibration:
+        """Return the calibration with one more of its blocks estimated."""
+        chosen = {*self.estimated, name}
+        return replace(self, estimated={key: block.size(settings) for key, block in BLOCKS.items() if key in chosen})
+
+    def corrected(self, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        """Return the calibration moved by an error (C,), the body's pose (4, 4) being that of the error."""
+        out, first = self, 0
+        for name, size in self.estimated.items():
+            out = BLOCKS[name].corrected(out, error[first : first + size], T_world_imu)
+            first += size
+        return out
+
+    def variances(self, of_block: dict[str, FloatArray]) -> FloatArray:
+        """Join variances, given by block, of the blocks that are estimated (C,)."""
+        return np.concatenate([np.zeros(0), *(of_block[name] for name in self.estimated)])
+
+    def in_world(self, variances: FloatArray, T_world_imu: FloatArray) -> FloatArray:
+        """Turn variances (C,) of the constants into the covariance (C, C) of their errors, with eta."""
+        out, first = np.diag(variances), 0
+        for name, size in self.estimated.items():
+            moved = BLOCKS[name].moved_by(T_world_imu)
+            if moved is not None:
+                own = slice(first, first + size)
+                out[own, own] = moved @ out[own, own] @ moved.T
+            first += size
+        return out
+
+    def transition(self, state: ErrorState, step: Transition | Growth, T_moved: FloatArray) -> FloatArray:
+        """Transition (15 + C, 15 + C) of the errors of navigation state and calibration, equation (C4).
+
+        Args:
+            state: their rows.
+            step: of the navigation state.
+            T_moved: (4, 4) the body's motion over it, on the world's side.
+        """
+        out = np.eye(state.own.stop)
+        out[:DIM, :DIM] = step.Phi
+        if step.Phi_imu is not None:
+            out[:DIM, state["imu_terms"]] = step.Phi_imu
+        for name in self.estimated:
+            moved = BLOCKS[name].moved_by(T_moved)
+            if moved is not None:
+                out[state[name], state[name]] = moved
+        return out
+
+    def report(self, state: ErrorState, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+        """Return the fields of `Estimate` that say what is estimated, by the errors' covariance (15 + C, 15 + C)."""
+        out: dict[str, Any] = {}
+        for name in self.estimated:
+            rows = state[name]
+            out |= BLOCKS[name].report(self, nav, covariance[rows, rows])
+        return out
+
+
+class CalibrationBlock:
+    """Constants that are estimated together: one line of the table."""
+
+    name: ClassVar[str]
+    walk: ClassVar[float] = 0.0  # random walk per root second, over the initial standard deviation
+
+    def size(self, settings: MsckfSettings) -> int:
+        """How many errors (n) it has."""
+        return len(self.sigmas(settings))
+
+    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
+        """Whether it is estimated from the start, with given motion samples."""
+        raise NotImplementedError
+
+    def sigmas(self, settings: MsckfSettings) -> FloatArray:
+        """Initial standard deviations (n,)."""
+        raise NotImplementedError
+
+    def walks(self, settings: MsckfSettings) -> FloatArray:
+        """Random walks (n,), standard deviations per root second."""
+        return self.sigmas(settings) * self.walk
+
+    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        """Return a calibration moved by an error (n,) at a pose of the body (4, 4)."""
+        raise NotImplementedError
+
+    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+        """Return the fields of `Estimate` with mean and uncertainty, by the covariance (n, n) of the errors."""
+        raise NotImplementedError
+
+    def moved_by(self, T: FloatArray) -> FloatArray | None:
+        """How its errors follow a motion (4, 4) of the body on the world's side (n, n); None: not."""
+        return None
+
+    def camera_D_error(self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None) -> FloatArray | None:
+        """How its errors move the camera at an exposure (6, n), equation (C2); None: not.
+
+        Args:
+            T_world_imu: the navigation state's pose (4, 4).
+            T_exposed: the body's at the exposure (4, 4).
+            twist: of the body; None while exposures do not follow the time offset's error.
+        """
+        return None
+
+
+class _ImuTermsBlock(CalibrationBlock):
+    """Scale and misalignment of the IMU; the navigation state has their means, and its motion model their columns."""
+
+    name, walk = "imu_terms", IMU_WALK
+
+    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
+        return motion == "imu" and settings.calibrate_imu != "off"
+
+    def sigmas(self, settings: MsckfSettings) -> FloatArray:
+        return term_sigmas()[CHOSEN[settings.calibrate_imu]]
+
+    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        return calibration
+
+    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+        sigmas = np.sqrt(np.diag(all_imu_terms(covariance)))
+        return {"imu_terms": nav.imu_terms, "imu_terms_sigma": sigmas}
+
+
+class _StereoBlock(CalibrationBlock):
+    """Some coefficients of the stereo calibration; `StereoField` has their columns in the pixels."""
+
+    terms: ClassVar[slice]  # of `Calibration.stereo`
+    walk = _STEREO_WALK
+
+    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        stereo = calibration.stereo.copy()
+        stereo[self.terms] += error
+        return replace(calibration, stereo=stereo)
+
+
+class _StereoFieldBlock(_StereoBlock):
+    """The field of right columns, equation (R3)."""
+
+    name, terms = "stereo_field", slice(0, FIELD_TERMS)
+
+    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
+        return settings.calibrate_stereo == "on"
+
+    def sigmas(self, settings: MsckfSettings) -> FloatArray:
+        yaw, other = np.radians(STEREO_YAW_SIGMA_DEG), _STEREO_FIELD_SIGMA
+        return np.array([yaw, other, other, other, _RADIAL * other, _RADIAL * other, other, other])
+
+    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+        return {"stereo_field": StereoFieldEstimate(calibration.stereo[self.terms], covariance)}
+
+
+class _StereoScaleBlock(_StereoBlock):
+    """Baseline and focal length, equation (R4); they are estimated with a metric sensor only."""
+
+    name, terms = "stereo_scale", slice(FIELD_TERMS, TERMS)
+
+    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
+        return motion is not None and max(settings.stereo_focal_sigma, settings.stereo_baseline_sigma) > 0
+
+    def sigmas(self, settings: MsckfSettings) -> FloatArray:
+        return np.array([settings.stereo_baseline_sigma, settings.stereo_focal_sigma])
+
+    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+        return {"stereo_scale": StereoScaleEstimate(calibration.stereo[self.terms], covariance)}
+
+
+class _ExtrinsicsBlock(CalibrationBlock):
+    """How the camera sits on the IMU; its error is kept on the world's side."""
+
+    name = "extrinsics"
+
+    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
+        return motion == "imu" and settings.calibrate_camera_imu in ("extrinsics", "both")
+
+    def sigmas(self, settings: MsckfSettings) -> FloatArray:
+        rotation = np.radians(settings.extrinsic_rotation_sigma_deg)
+        return np.repeat([settings.extrinsic_translation_sigma_m, rotation], 3)
+
+    def walks(self, settings: MsckfSettings) -> FloatArray:
+        return np.repeat([_EXTRINSIC_TRANSLATION_WALK_M, np.radians(_EXTRINSIC_ROTATION_WALK_DEG)], 3)
+
+    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        T = calibration.T_cam0_imu @ se3_exp(se3_adjoint(se3_inverse(T_world_imu)) @ error)
+        return replace(calibration, T_cam0_imu=T)
+
+    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+        back = se3_adjoint(se3_inverse(nav.T_world_imu))
+        return {"T_cam0_imu": calibration.T_cam0_imu, "T_cam0_imu_covariance": back @ covariance @ back.T}
+
+    def moved_by(self, T: FloatArray) -> FloatArray | None:
+        return se3_adjoint(T)
+
+    def camera_D_error(self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None) -> FloatArray | None:
+        return -se3_adjoint(T_exposed @ se3_inverse(T_world_imu))
+
+
+class _TimeOffsetBlock(CalibrationBlock):
+    """How the clocks of camera and IMU differ."""
+
+    name = "time_offset"
+
+    def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
+        return motion == "imu" and settings.calibrate_camera_imu in ("auto", "time_offset", "both")
+
+    def sigmas(self, settings: MsckfSettings) -> FloatArray:
+        return np.array([settings.time_offset_sigma_s])
+
+    def walks(self, settings: MsckfSettings) -> FloatArray:
+        return np.array([_TIME_OFFSET_WALK_S])
+
+    def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        return replace(calibration, time_offset_s=calibration.time_offset_s + float(error[0]))
+
+    def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
+        sigma = float(np.sqrt(covariance[0, 0]))
+        return {"time_offset_s": calibration.time_offset_s, "time_offset_sigma_s": sigma}
+
+    def camera_D_error(self, T_world_imu: FloatArray, T_exposed: FloatArray, twist: Twist | None) -> FloatArray | None:
+        return None if twist is None else (se3_adjoint(T_exposed) @ twist.significant())[:, None]
+
+
+_ALL = _ImuTermsBlock(), _StereoFieldBlock(), _StereoScaleBlock(), _ExtrinsicsBlock(), _TimeOffsetBlock()
+BLOCKS: dict[str, CalibrationBlock] = {block.name: block for block in _ALL}  # in the order of the error vector
+
+
+def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: MotionSource | None) -> Calibration:
+    """Return the calibration at the start.
+
+    Of camera and IMU nothing is estimated without an IMU, and nothing metric without a metric sensor.
+    """
+    sizes = {name: block.size(settings) for name, block in BLOCKS.items() if block.is_estimated(settings, motion)}
+    return Calibration(np.asarray(T_cam0_imu, dtype=np.float64), estimated=sizes)
+
+
+def prior_variances(settings: MsckfSettings) -> dict[str, FloatArray]:
+    """Return the initial variances (n,) of every block."""
+    return {name: block.sigmas(settings) ** 2 for name, block in BLOCKS.items()}
+
+
+def walk_variances(settings: MsckfSettings) -> dict[str, FloatArray]:
+    """Return the variances (n,) that a second of random walk adds to every block."""
+    return {name: block.walks(settings) ** 2 for name, block in BLOCKS.items()}
+
+
+def all_imu_terms(covariance: FloatArray) -> FloatArray:
+    """Fill a covariance (I, I) of the IMU's terms that are estimated up to all (15, 15), with zeros."""
+    out = np.zeros((IMU_TERMS, IMU_TERMS))
+    chosen = next(rows for rows in CHOSEN.values() if len(rows) == len(covariance))
+    out[np.ix_(chosen, chosen)] = covariance
+    return out

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.filters.navigation import NavState
 from vio.filters.separate_bias import SeparateBias
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, se3_inverse
 
 SCALE_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
 # What is worth reporting: rigs are calibrated to 1 %, and accelerometers to 1 or 2 %. On recordings with a correct
@@ -28,6 +29,12 @@ _CLEAR = 100.0
 def is_clear(velocity: FloatArray, covariance: FloatArray) -> bool:
     """Whether a velocity (3,) of a covariance (3, 3) is far enough from its noise to tell the scale."""
     return float(velocity @ np.linalg.solve(covariance + 1e-18 * np.eye(3), velocity)) > _CLEAR
+
+
+def scaled_nav(nav: NavState, T_cam0_imu: FloatArray) -> FloatArray:
+    """How the navigation state's error (15,) moves with the logarithm of the world's scale, equation (S1)."""
+    T_world_cam0 = nav.T_world_imu @ se3_inverse(T_cam0_imu)
+    return np.concatenate([T_world_cam0[:3, 3], np.zeros(3), nav.velocity, np.zeros(6)])
 
 
 class ScaleTest(SeparateBias):

@@ -30,9 +30,9 @@ class WindowPosterior:
     @classmethod
     def of(cls, window: Window, P: FloatArray) -> WindowPosterior:
         """Take over the body's poses at the window's exposures, with the covariance P (k, k) up to theirs."""
-        rows = slice(window.first_clone, window.first_landmark)
+        rows = window.state.clones
         own = P[rows, rows]
-        if window.calibration.extrinsics:
+        if "extrinsics" in window.state:
             body_D_error = window.body_D_error()
             own = body_D_error @ P @ body_D_error.T
         has_imu = isinstance(window.motion, ImuMotion)

@@ -1,0 +1,107 @@
+"""The error vector of the sliding-window filter: its blocks, their order, and the rows of each.
+
+| block | errors |
+|---|---|
+| `nav` | navigation state (15): pose, velocity, biases |
+| those of `vio.filters.online_calibration.BLOCKS` | constants of the calibration that are estimated |
+| `clones` | camera poses (6 each), oldest first |
+| `landmarks` | points (3 each) |
+
+Covariances, Jacobians and information matrices find their rows and columns here, by the name of the block.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from vio.filters.navigation import DIM
+from vio.filters.stereo_calibration import StereoInformation
+from vio.geometry.lie import FloatArray
+
+
+class ErrorState:
+    """Where each block is in an error vector of length D; a window with other blocks has another one."""
+
+    def __init__(self, calibration: Mapping[str, int], clones: int, landmarks: int) -> None:
+        """Lay out the blocks.
+
+        Args:
+            calibration: name and size of each block of the calibration that is estimated, in their order.
+            clones: how many.
+            landmarks: how many.
+        """
+        self._rows = {"nav": slice(0, DIM)}
+        first = DIM
+        for name, size in calibration.items():
+            self._rows[name] = slice(first, first + size)
+            first += size
+        self.nav = self._rows["nav"]
+        self.own = slice(0, first)  # navigation state and calibration
+        self.calibration = slice(DIM, first)
+        # Navigation state and the IMU's terms: what the motion model predicts and corrects.
+        self.motion = slice(0, self["imu_terms"].stop if "imu_terms" in self else DIM)
+        # The coefficients of (R3) and (R4), which pixels depend on; empty where none is estimated.
+        stereo = [self[name] for name in ("stereo_field", "stereo_scale") if name in self]
+        self.stereo = slice(stereo[0].start, stereo[-1].stop) if stereo else slice(self.motion.stop, self.motion.stop)
+        self.first_of_pixels = self.stereo.start if stereo else first  # pixels depend on no error before it
+        self.clones = slice(first, first + 6 * clones)
+        self.landmarks = slice(self.clones.stop, self.clones.stop + 3 * landmarks)
+        self.size = self.landmarks.stop
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._rows
+
+    def __getitem__(self, name: str) -> slice:
+        """Rows of a block of navigation state or calibration.
+
+        Raises:
+            KeyError: it is not estimated.
+        """
+        return self._rows[name]
+
+    def clone(self, index: int) -> slice:
+        """Rows of a clone, -1 being the newest."""
+        bounds = self.clones.start if index >= 0 else self.clones.stop
+        return slice(bounds + 6 * index, bounds + 6 * index + 6)
+
+    def jacobian(self, out_D_clones: FloatArray, out_D_stereo: FloatArray | None = None) -> FloatArray:
+        """Turn Jacobians into Jacobians (..., D) by the error vector.
+
+        Args:
+            out_D_clones: by the clones (..., 6N).
+            out_D_stereo: by the stereo calibration (..., S), where it is estimated.
+        """
+        out = np.zeros((*out_D_clones.shape[:-1], self.size))
+        out[..., self.clones] = out_D_clones
+        if out_D_stereo is not None:
+            out[..., self.stereo] = out_D_stereo
+        return out
+
+    def information(
+        self, A: FloatArray, b: FloatArray, stereo: StereoInformation | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Turn information about clones into that about the error vector, matrix (D, D) and vector (D,).
+
+        Args:
+            A: information matrix (6N, 6N).
+            b: information vector (6N,).
+            stereo: the part that concerns the stereo calibration, where it is estimated, beside clones and landmarks.
+        """
+        out, vector = np.zeros((self.size, self.size)), np.zeros(self.size)
+        first = self.clones.start
+        clones = slice(first, first + len(b))
+        out[clones, clones], vector[clones] = A, b
+        if stereo is not None:
+            rows = self.stereo
+            out[rows, first:], out[first:, rows] = stereo.cross, stereo.cross.T
+            out[rows, rows], vector[rows] = stereo.A, stereo.b
+        return out, vector
+
+    def cross_information(self, stereo: StereoInformation) -> FloatArray:
+        """Cross information (D,) of the errors and the last term given, which is no state itself."""
+        out = np.zeros(self.size)
+        out[self.clones.start :] = stereo.cross[-1]
+        out[self.stereo] = stereo.A[-1, : self.stereo.stop - self.stereo.start]
+        return out

@@ -1,0 +1,58 @@
+"""The points of tracks that have ended: kept for output, and not used by the filter."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vio.filters.window import Window
+from vio.geometry.lie import FloatArray
+from vio.records import IntArray, Landmarks, no_landmarks
+
+_LEAST_MERGE = 1000  # stored points up to which the map is not merged
+
+
+class PointMap:
+    """Collects points; one that came back under its id counts once, as it was seen last."""
+
+    def __init__(self) -> None:
+        self.parts: list[Landmarks] = []
+        self._stored = 0  # points since they were merged
+
+    def store(self, ids: IntArray, p_world: FloatArray, covariance: FloatArray) -> None:
+        """Add points (K, 3) with their covariances (K, 3, 3)."""
+        if len(ids):
+            self.parts.append(Landmarks(ids, p_world, covariance))
+            self._stored += len(ids)
+            # Features that stay in view are stored again and again.
+            if self._stored > _LEAST_MERGE + len(self.parts[0].ids):
+                self.parts, self._stored = [_newest(self.parts)], 0
+
+    def take(self) -> Landmarks:
+        """Return all points, and forget them."""
+        taken = _newest(self.parts) if self.parts else no_landmarks()
+        self.parts, self._stored = [], 0
+        return taken
+
+    def with_landmarks(self, window: Window) -> Landmarks:
+        """Return all points, and the landmarks that are states."""
+        first, n, P = window.state.landmarks.start, len(window.landmarks), window.prior.P
+        blocks = [P[first + 3 * k : first + 3 * k + 3, first + 3 * k : first + 3 * k + 3] for k in range(n)]
+        states = Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))
+        return _newest([*self.parts, states])
+
+    def turn(self, R: FloatArray) -> None:
+        """Turn the world by R (3, 3)."""
+        self.parts = [Landmarks(m.ids, m.p_world @ R.T, R @ m.covariance @ R.T) for m in self.parts]
+
+    def drop_broken(self) -> None:
+        """Forget parts that are not made of numbers."""
+        self.parts = [part for part in self.parts if np.isfinite(part.p_world).all()]
+
+
+def _newest(parts: list[Landmarks]) -> Landmarks:
+    """Join parts of a map; of points that came back under their ids, the last ones."""
+    ids = np.concatenate([part.ids for part in parts])[::-1]
+    points = np.concatenate([part.p_world for part in parts])[::-1]
+    covariances = np.concatenate([part.covariance for part in parts])[::-1]
+    kept, last = np.unique(ids, return_index=True)
+    return Landmarks(kept, points[last], covariances[last])

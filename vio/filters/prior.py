@@ -1,0 +1,287 @@
+"""The prior of the window: one mean and covariance over all errors, and the algebra that changes them.
+
+The means of the states are the newest estimates, at which everything is linearised; `P` and `delta` describe what all
+absorbed measurements say: the true error of the means has mean `-delta` and covariance `P`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from vio.filters import pose_loops as loops
+from vio.filters.scale_test import ScaleTest
+from vio.filters.separate_bias import SeparateBias
+from vio.geometry.lie import FloatArray
+from vio.records import IntArray
+
+
+class Prior:
+    """Mean and covariance of D errors, and how they depend on constants that are estimated beside them."""
+
+    def __init__(self, P: FloatArray) -> None:
+        self._factors: dict[tuple[int, int], Factor] = {}  # of parts of P, since it changed
+        self.P = P
+        self.delta: FloatArray = np.zeros(len(P))
+        self.scale_test: ScaleTest | None = None
+        self.focal: SeparateBias | None = None  # the focal length's logarithm of (R4), where it is no state
+
+    @property
+    def P(self) -> FloatArray:
+        """Covariance (D, D)."""
+        return self._P
+
+    @P.setter
+    def P(self, P: FloatArray) -> None:
+        self._P, self._factors = P, {}
+
+    def to_change(self) -> FloatArray:
+        """Return the covariance, for changes in place."""
+        self._factors = {}
+        return self._P
+
+    @property
+    def biases(self) -> list[SeparateBias]:
+        """The constants that are estimated beside the errors."""
+        return [bias for bias in (self.scale_test, self.focal) if bias is not None]
+
+    def transform(self, M: FloatArray) -> None:
+        """Turn the errors into `M error`, with M (D, D)."""
+        self.P = M @ self.P @ M.T
+        self.delta = M @ self.delta
+        for bias in self.biases:
+            bias.error_D_bias = M @ bias.error_D_bias
+
+    def insert(self, first: int, covariance: FloatArray) -> None:
+        """Add errors with a covariance (S, S), from the row `first` on, that depend on no other."""
+        D, S = len(self.P), len(covariance)
+        old = np.concatenate([np.arange(first), np.arange(first + S, D + S)])
+        P, delta = np.zeros((D + S, D + S)), np.zeros(D + S)
+        P[np.ix_(old, old)], delta[old] = self.P, self.delta
+        P[first : first + S, first : first + S] = covariance
+        self.P, self.delta = P, delta
+        for bias in self.biases:
+            V, bias.error_D_bias = bias.error_D_bias, np.zeros(D + S)
+            bias.error_D_bias[old] = V
+
+    def insert_dependent(self, at: int, J: FloatArray, noise: FloatArray, of_scale: FloatArray | None) -> None:
+        """Add errors `J error + noise` at a row.
+
+        Args:
+            at: the row.
+            J: (k, m) of the first m errors.
+            noise: covariance (k, k).
+            of_scale: how they depend on the scale that is tested (k,), where it is.
+        """
+        D, (k, own) = len(self.P), (len(J), slice(0, J.shape[1]))
+        added, beside = J @ self.P[own], self.P[:, own] @ J.T  # exact copies where J is the identity
+        P = np.empty((D + k, D + k))
+        new, end = slice(at, at + k), slice(at + k, D + k)
+        P[:at, :at], P[:at, end] = self.P[:at, :at], self.P[:at, at:]
+        P[end, :at], P[end, end] = self.P[at:, :at], self.P[at:, at:]
+        P[new, :at], P[new, end] = added[:, :at], added[:, at:]
+        P[:at, new], P[end, new], P[new, new] = beside[:at], beside[at:], added[:, own] @ J.T + noise
+        delta = self.delta
+        self.delta = np.concatenate([delta[:at], J @ delta[own], delta[at:]])
+        for bias in self.biases:
+            V = bias.error_D_bias
+            of_new = of_scale if of_scale is not None and bias is self.scale_test else J @ V[own]
+            bias.error_D_bias = np.concatenate([V[:at], of_new, V[at:]])
+        self.P = P
+
+    def append(self, A: FloatArray, blocks: FloatArray, of_focal: FloatArray | None) -> None:
+        """Add errors `A error + noise` of points behind the others.
+
+        Args:
+            A: (3K, D).
+            blocks: covariances of the noise (K, 3, 3).
+            of_focal: what the focal length that is followed adds to them (3K,); None: nothing.
+        """
+        D, n = len(self.P), len(A)
+        P = np.zeros((D + n, D + n))
+        AP = A @ self.P
+        P[:D, :D], P[D:, :D], P[:D, D:] = self.P, AP, AP.T
+        P[D:, D:] = AP @ A.T
+        for k, block in enumerate(blocks):
+            P[D + 3 * k : D + 3 * k + 3, D + 3 * k : D + 3 * k + 3] += block
+        self.delta = np.concatenate([self.delta, A @ self.delta])
+        for bias in self.biases:
+            added = A @ bias.error_D_bias
+            if bias is self.focal and of_focal is not None:
+                added = added + of_focal
+            bias.error_D_bias = np.concatenate([bias.error_D_bias, added])
+        self.P = 0.5 * (P + P.T)
+
+    def keep(self, rows: IntArray) -> None:
+        """Marginalise all errors but those of given rows."""
+        P = np.empty((len(rows), len(rows)))
+        loops.take_rows(self.P, rows, P)
+        self.P = P
+        self.delta = self.delta[rows]
+        for bias in self.biases:
+            bias.error_D_bias = bias.error_D_bias[rows]
+
+    def optimum(self, information: FloatArray, vector: FloatArray, size: int, first: int = 0) -> tuple[Fit, FloatArray]:
+        """Where the prior and given information agree best.
+
+        Args:
+            information: about the first `size` errors alone; the rest of (D, D) is zero.
+            vector: (D,) likewise, at the present means.
+            size: `k`.
+            first: row before which there is usually no information.
+
+        Returns:
+            The fit, with the covariance (k, k) of the first errors there, and the error vector (D,) that moves the
+            means there.
+        """
+        prior = self._factor(information, size, first)
+        own = slice(prior.first, size)
+        A, b = information[own, own], vector[own] + information[own, own] @ self.delta[own]
+        fitted = fit(prior, A)
+        moved = fitted.move(b)
+        shift: FloatArray = self.P[:, own] @ (b - A @ moved)  # the others follow by their correlation
+        shift[own] = moved
+        return fitted, shift - self.delta
+
+    def absorb(
+        self,
+        information: FloatArray,
+        vector: FloatArray,
+        first: int = 0,
+        scaled: FloatArray | None = None,
+        focal: FloatArray | None = None,
+    ) -> None:
+        """Absorb measurements.
+
+        Args:
+            information: `H' R^-1 H` (D, D) of the residuals at the present means.
+            vector: `H' R^-1 r` (D,).
+            first: row before which there is usually no information.
+            scaled: for measurements in metres, how the errors (D,) move with the logarithm of the world's scale.
+            focal: for pixels, `H' R^-1 h` (D,) with their derivatives h by the focal length's logarithm.
+        """
+        prior = self._factor(information, len(self.P), first)
+        own = slice(prior.first, None)
+        P = fit(prior, information[own, own]).covariance()
+        self.delta = self.delta - P @ (vector + information @ self.delta)
+        self.P = P
+        if self.scale_test is not None:
+            self.scale_test.absorb(information, vector, -self.delta, P, scaled)
+        if self.focal is not None:
+            self.focal.follow(information, P, focal)
+
+    def _factor(self, information: FloatArray, size: int, first: int) -> Factor:
+        """The factor of the present covariance, up to row `size`, of the errors that information (D, D) is about.
+
+        It begins at row `first` where there is no information before it, and the part after it is not singular beyond
+        rounding. It is computed once for all fits to one covariance.
+        """
+        if information[:first].any():
+            first = 0
+        if (first, size) not in self._factors:
+            self._factors[first, size] = factor(self.P[:size, :size], first)
+        return self._factors[first, size]
+
+
+@dataclass(frozen=True, slots=True)
+class Factor:
+    """A covariance, and a factor of that of its last n errors: `P_n = L L'`."""
+
+    P: FloatArray  # (D, D)
+    L: FloatArray  # (n, n)
+    triangular: bool  # by Cholesky; False: by the eigenvectors of a P that is singular beyond rounding
+
+    @property
+    def first(self) -> int:
+        """Row of the first error that is factored."""
+        return len(self.P) - len(self.L)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """The covariance after a measurement of the last n errors in information form: `P_n_new = L (K K')^-1 L'`."""
+
+    prior: Factor
+    K_transposed: FloatArray  # (n, n) upper triangle, of `K K' = I + L' A L`, in LAPACK's order of columns
+
+    def move(self, vector: FloatArray) -> FloatArray:
+        """Return `P_n_new v` (n,), for the information vector v (n,) the shift of their mean."""
+        L = self.prior.L
+        out: FloatArray = L @ lapack.dpotrs(self.K_transposed, L.T @ vector, lower=0)[0]
+        return out
+
+    def rows(self, rows: slice) -> FloatArray:
+        """Return the rows (k, n) of L that belong to rows of P: `J L` for a choice J of the errors."""
+        first = self.prior.first
+        return self.prior.L[rows.start - first : rows.stop - first]
+
+    def whitened(self, J_L: FloatArray) -> FloatArray:
+        """Return S (..., k, n) with `S S'` the covariance of `J error`, from `J L` (..., k, n)."""
+        rows = np.ascontiguousarray(J_L).reshape(-1, J_L.shape[-1])
+        S: FloatArray = blas.dtrsm(1.0, self.K_transposed, rows.T, lower=0, trans_a=1).T
+        return S.reshape(J_L.shape)
+
+    def covariance(self) -> FloatArray:
+        """Return the covariance (D, D) of all errors: symmetric and positive by construction.
+
+        That of the last n is `W' W`. With N the others' covariance with them before, times `L'^-1 K'^-1`, the others'
+        covariance with them is `N W`, and their own is `N N'` and what it is given the last n.
+        """
+        P, L, first = self.prior.P, self.prior.L, self.prior.first
+        W = blas.dtrsm(1.0, self.K_transposed, L.T, lower=0, trans_a=1)
+        out: FloatArray = np.empty(P.shape)
+        out[first:, first:] = W.T @ W
+        if first:
+            G: FloatArray = blas.dtrsm(1.0, L.T, P[:first, first:].T, lower=0, trans_a=1).T
+            N = self.whitened(G)
+            out[:first, first:] = N @ W
+            out[first:, :first] = out[:first, first:].T
+            out[:first, :first] = P[:first, :first] - G @ G.T + N @ N.T
+            _keep_positive(out, P, first)
+        return out
+
+
+def _keep_positive(out: FloatArray, P: FloatArray, count: int) -> None:
+    """Add to the first variances of a covariance what keeps it positive to rounding, also where P knows one exactly."""
+    np.einsum("ii->i", out)[:count] += 1e-14 * P.diagonal()[:count] + 1e-24
+
+
+def factor(P: FloatArray, first: int = 0) -> Factor:
+    """Factor a covariance (D, D) from the row `first` on; the whole where that part is singular beyond rounding."""
+    A = np.array(P[first:, first:], order="C")
+    _keep_positive(A, A, len(A))
+    upper, failed = lapack.dpotrf(A.T, lower=0, overwrite_a=1)
+    if not failed:
+        return Factor(P, upper.T, True)
+    values, vectors = np.linalg.eigh(P)
+    root: FloatArray = np.array(vectors * np.sqrt(np.maximum(values, 0.0)), dtype=np.float64, order="C")
+    return Factor(P, root, False)
+
+
+def fit(prior: Factor, information: FloatArray) -> Fit:
+    """Fit a prior to a measurement in information form (D, D).
+
+    `(P^-1 + A)^-1` without an inverse of P, which is singular where states are copies or known. Of `I + L' A L = K K'`,
+    only the triangle of K' is computed, in LAPACK's order of columns, in which the transpose of an array is free.
+
+    Raises:
+        numpy.linalg.LinAlgError: the information is not positive.
+    """
+    L = prior.L
+    if prior.triangular:
+        inner, _ = lapack.dsygst(information.T, L.T, itype=2, lower=0)
+    else:
+        inner = np.asfortranarray(L.T @ information @ L)
+    np.einsum("ii->i", inner)[:] += 1.0
+    K_transposed, failed = lapack.dpotrf(inner, lower=0, overwrite_a=1)
+    if failed:
+        raise np.linalg.LinAlgError("the information is not positive")
+    return Fit(prior, K_transposed)
+
+
+def posterior(P: FloatArray, information: FloatArray, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the covariance (D, D) and the shift of the mean (D,) after a measurement in information form."""
+    P_new = fit(factor(P), information).covariance()
+    return P_new, P_new @ vector

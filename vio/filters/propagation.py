@@ -1,0 +1,233 @@
+"""Between two frames: the motion model propagates the navigation state and predicts the camera's motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.errors import EstimationError
+from vio.filters.navigation import DIM, NO_STEP, Growth, ImuMotion, NavState, Transition, TwistMotion
+from vio.filters.noise import MotionNoise
+from vio.filters.online_calibration import NO_TWIST, Twist, body_twist, walk_variances
+from vio.filters.settings import MsckfSettings
+from vio.filters.window import Window
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
+from vio.records import MotionPrior, MotionSample, MotionSource
+
+# Factors on the motion model's densities: at the start, at least, at most.
+IMU_FACTORS = (1.0, 1.0, 50.0)
+_TWIST_FACTORS = (1.0, 0.1, 10.0)
+# A start with a large uncertainty of the tilt is linearised far from the truth, which shows as process noise.
+_FACTOR_PER_TILT_SIGMA = 1 / np.radians(8.0)
+_MOST_START_FACTOR = 5.0
+_USELESS_RAD = 0.2  # standard deviation of a predicted rotation beyond which its pixels start no search
+
+
+@dataclass(frozen=True, slots=True)
+class FramePosterior:
+    """Covariances after a frame, with all that was seen."""
+
+    own: FloatArray  # (15 + C, 15 + C) of navigation state and calibration
+    with_newest: FloatArray  # (15 + C + 6, 15 + C + 6) the same, and the newest clone's after it
+    T_world_imu: FloatArray  # (4, 4) of the navigation state
+
+    @classmethod
+    def begun(cls, window: Window) -> FramePosterior:
+        """Take over the covariance of a window without clones."""
+        D = window.state.size
+        with_newest = np.zeros((D + 6, D + 6))
+        with_newest[:D, :D] = window.prior.P
+        return cls(window.prior.P.copy(), with_newest, window.nav.T_world_imu)
+
+    @classmethod
+    def of(cls, window: Window, P: FloatArray) -> FramePosterior:
+        """Take over the part of the covariance P (k, k) of a window's errors."""
+        state = window.state
+        rows = np.r_[state.own, state.clone(-1)]
+        return cls(P[state.own, state.own], P[np.ix_(rows, rows)], window.nav.T_world_imu)
+
+    def transformed(self, window: Window, M: FloatArray) -> FramePosterior:
+        """Return the covariances after `Window.turn_world`, which returned M."""
+        own, rows = window.state.own, np.r_[window.state.own, window.state.clone(-1)]
+        turn = M[np.ix_(rows, rows)]
+        return FramePosterior(
+            M[own, own] @ self.own @ M[own, own].T, turn @ self.with_newest @ turn.T, window.nav.T_world_imu
+        )
+
+
+_NOTHING = FramePosterior(np.zeros((DIM, DIM)), np.zeros((DIM + 6, DIM + 6)), np.eye(4))
+
+
+class Propagation:
+    """The motion model, its noise, and how far it has carried the navigation state."""
+
+    def __init__(self, source: MotionSource | None, settings: MsckfSettings) -> None:
+        """Prepare; no window exists yet."""
+        self.source = source
+        self.motion: ImuMotion | TwistMotion = ImuMotion(settings) if source == "imu" else TwistMotion(settings)
+        self.walk = walk_variances(settings)  # a second
+        self.noise = self.unknown_noise()
+        self.time_ns = 0
+        self.body_ns = 0  # time of the navigation state, on the IMU's clock
+        self.blind = False  # the last frame showed nothing
+        self.posterior = _NOTHING  # after the last frame that showed something
+        self.since_frame = NO_STEP  # how the error has grown since then
+        self.gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
+        self._predicted_step: tuple[int, Transition] | None = None  # integrated by `predict`, with its end
+
+    def unknown_noise(self) -> MotionNoise:
+        """The motion model's noise where nothing was learned of it."""
+        return MotionNoise(*IMU_FACTORS) if self.source == "imu" else MotionNoise(*_TWIST_FACTORS)
+
+    def begin(self, window: Window, time_ns: int, body_ns: int) -> None:
+        """Go on from a window without clones, at the times of a frame and of the navigation state."""
+        self.forget()
+        self.time_ns, self.body_ns = time_ns, body_ns
+        self.posterior = FramePosterior.begun(window)
+
+    def forget(self) -> None:
+        """Forget the last frame and the steps since."""
+        self.gyro, self.blind = None, False
+        self.since_frame, self._predicted_step = NO_STEP, None
+
+    def take(self, sample: MotionSample) -> None:
+        """Take a motion sample, which may change what the next step looks like."""
+        self.motion.take(sample)
+        self._predicted_step = None
+
+    def advance(self, window: Window, time_ns: int) -> None:
+        """Carry the navigation state on to a frame or sample."""
+        body_ns = self.body_time(window, time_ns)
+        if body_ns > self.body_ns:
+            step = self.step_to(window, body_ns)
+            self.motion.forget_before(body_ns)
+            walk = window.calibration.variances(self.walk) * ((body_ns - self.body_ns) * 1e-9)
+            window.propagate(step, walk)
+            self.since_frame = self.since_frame.then(step)
+            self.gyro = step.gyro
+            self.body_ns = body_ns
+        self._predicted_step = None
+        self.time_ns = time_ns
+
+    def step_to(self, window: Window, body_ns: int) -> Transition:
+        """The motion model's step from the present state; what `predict` has integrated is not integrated again."""
+        if self._predicted_step is None or self._predicted_step[0] != body_ns:
+            step = self.motion.advance(window.nav, self.body_ns, body_ns, self.noise.factors)
+            self._predicted_step = body_ns, step
+        return self._predicted_step[1]
+
+    def body_time(self, window: Window, time_ns: int) -> int:
+        """The time on the IMU's clock to which the navigation state is carried for a frame."""
+        if "time_offset" not in window.state or not isinstance(self.motion, ImuMotion):
+            return time_ns
+        return self.motion.covered(time_ns + round(1e9 * window.calibration.time_offset_s))
+
+    def measure(self, window: Window) -> None:
+        """Absorb the velocity that was just taken, if any."""
+        measurement = self.motion.measurement(window.nav)
+        if measurement is None:
+            return
+        if self.blind:
+            window.measure(measurement)
+        else:  # the frame's fit will move the means, and better
+            window.absorb_measurement(measurement)
+
+    def predict(self, window: Window, time_ns: int) -> tuple[FloatArray, MotionPrior] | None:
+        """Predict the camera's pose (4, 4) `T_cam0_world` at a coming frame and its motion; None: not well enough."""
+        nav, growth = window.nav, self.since_frame
+        body_ns = self.body_time(window, time_ns)
+        if body_ns > self.body_ns:
+            try:
+                step = self.step_to(window, body_ns)
+            except EstimationError:  # the update will say it
+                return None
+            nav, growth = step.nav, growth.then(step)
+        T_cam0_imu, late_s = window.calibration.T_cam0_imu, (body_ns - time_ns) * 1e-9
+        T_world_imu, *camera_D_own = window.camera_D_own(late_s, self.twist(window, nav, growth), nav)
+        T_cam0_world = T_cam0_imu @ se3_inverse(T_world_imu)
+        T_curr_prev = T_cam0_world @ window.exposures()[-1] @ se3_inverse(T_cam0_imu)
+        # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
+        A = se3_adjoint(T_cam0_world)
+        expected = self.expected_error(window, nav, growth, *camera_D_own)
+        motion = MotionPrior(T_curr_prev, A @ expected @ A.T)
+        of_rotation = motion.covariance[3:, 3:]  # no eigenvalue is larger than its trace
+        if of_rotation.trace() > _USELESS_RAD**2 and np.linalg.eigvalsh(of_rotation)[-1] > _USELESS_RAD**2:
+            return None
+        return T_cam0_world, motion
+
+    def expected_error(
+        self, window: Window, nav: NavState, growth: Growth, camera_D_own: FloatArray, noise: FloatArray
+    ) -> FloatArray:
+        """Covariance (6, 6) of `xi_curr - xi_prev`, of the camera, where the errors have grown since the last frame.
+
+        Args:
+            window: the window.
+            nav: the navigation state at the present frame.
+            growth: since the last frame.
+            camera_D_own: how the camera's pose at the present frame follows them, equation (C2).
+            noise: and what that leaves open.
+        """
+        if not window.calibration.moves_camera and "imu_terms" not in window.state:
+            M = growth.Phi[:6] - np.eye(6, DIM)
+            out: FloatArray = M @ self.posterior.own[:DIM, :DIM] @ M.T + growth.Q[:6, :6]
+            return out
+        J = camera_D_own
+        M = np.concatenate([J @ self.grown(window, nav, growth), -np.eye(6)], axis=1)
+        out = M @ self.posterior.with_newest @ M.T + J[:, :DIM] @ growth.Q @ J[:, :DIM].T + noise
+        return np.asarray(out, dtype=np.float64)
+
+    def grown(self, window: Window, nav: NavState, growth: Growth) -> FloatArray:
+        """Transition (15 + C, 15 + C) of the errors of navigation state and calibration since the last frame."""
+        T_moved = nav.T_world_imu @ se3_inverse(self.posterior.T_world_imu)
+        return window.calibration.transition(window.state, growth, T_moved)
+
+    def twist(self, window: Window, nav: NavState, growth: Growth) -> Twist:
+        """The body's twist, and how well it is known; equation (C3)."""
+        if not isinstance(self.motion, ImuMotion) or "time_offset" not in window.state:
+            return NO_TWIST
+        R = nav.T_world_imu[:3, :3]
+        own, rate_D_error = window.state.motion, self.motion.rate_D_error(nav)
+        Phi = growth.Phi if own.stop == DIM else self.grown(window, nav, growth)[own, own]
+        P = Phi @ self.posterior.own[own, own] @ Phi.T
+        P[:DIM, :DIM] += growth.Q
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = R.T @ P[6:9, 6:9] @ R  # v = exp(phi) v_hat + xi_v, seen from the body turned by phi
+        by_gyro = np.eye(3) * self.motion.rate_variance(self.noise.factors)
+        covariance[3:, 3:] = rate_D_error @ P @ rate_D_error.T + by_gyro
+        return Twist(body_twist(nav.T_world_imu, nav.velocity, nav.rate), covariance)
+
+    @property
+    def late_s(self) -> float:
+        """The navigation state's time on the IMU's clock minus the last frame's stamp."""
+        return (self.body_ns - self.time_ns) * 1e-9
+
+    def own_covariance(self, window: Window) -> FloatArray:
+        """Covariance (15 + C, 15 + C) of navigation state and calibration at the time of the last event."""
+        if not self.blind:
+            return self.posterior.own
+        grow = self.grown(window, window.nav, self.since_frame)
+        out: FloatArray = grow @ self.posterior.own @ grow.T
+        out[:DIM, :DIM] += self.since_frame.Q
+        return out
+
+    def exposed(self, window: Window, own: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Pose (4, 4) of the body at the newest exposure and its covariance (6, 6), by `own_covariance`."""
+        if "time_offset" not in window.state:
+            return window.nav.T_world_imu, own[:6, :6]
+        if not self.blind:
+            with_newest = self.posterior.with_newest
+            J = np.eye(6, len(with_newest), len(own))  # of the camera, and back to the body
+            J[:, : len(own)] += window.body_D_error()[-6:, : len(own)]
+            return window.clones[-1].T_world_imu, J @ with_newest @ J.T
+        T, J, noise = window.camera_D_own(self.late_s, self.twist(window, window.nav, self.since_frame))
+        if "extrinsics" in window.state:
+            J[:, window.state["extrinsics"]] = 0.0  # of the body
+        return T, J @ own @ J.T + noise
+
+
+def first_imu_noise(P: FloatArray) -> MotionNoise:
+    """The IMU's noise at a start whose navigation state has the covariance P (15, 15)."""
+    tilt_sigma = float(np.sqrt(P[3:5, 3:5].diagonal().max()))
+    start = min(IMU_FACTORS[0] + _FACTOR_PER_TILT_SIGMA * tilt_sigma, _MOST_START_FACTOR)
+    return MotionNoise(start, *IMU_FACTORS[1:])
