@@ -377,6 +377,11 @@ def imu_matrices(terms: FloatArray) -> tuple[FloatArray, FloatArray]:
     return M[0], M[1]
 
 
+def _kept(*shape: int) -> dict[str, tuple[int, ...]]:
+    """Metadata of a field that may be missing, and that a run keeps as an array of a shape, () for a number."""
+    return {"shape": shape}
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """The filter's belief at one time."""
@@ -384,23 +389,28 @@ class Estimate:
     time_ns: int
     T_world_imu: FloatArray  # (4, 4)
     covariance: FloatArray  # (6, 6) of xi in T_imu_world = exp(xi) T_imu_world_hat, [rho; phi], m and rad
-    velocity_world: FloatArray | None = None  # (3,) m/s
-    velocity_covariance: FloatArray | None = None  # (3, 3) of velocity_world, (m/s)^2
-    gyro_bias: FloatArray | None = None  # (3,) rad/s
-    gyro_bias_sigma: FloatArray | None = None  # (3,) standard deviations, rad/s
-    accel_bias: FloatArray | None = None  # (3,) m/s^2
-    accel_bias_sigma: FloatArray | None = None  # (3,) standard deviations, m/s^2; zero where it is not estimated
-    gravity_world: FloatArray | None = None  # (3,) m/s^2, where the world is not upright (an IMU that began late)
+    velocity_world: FloatArray | None = field(default=None, metadata=_kept(3))  # m/s
+    velocity_covariance: FloatArray | None = field(default=None, metadata=_kept(3, 3))  # of velocity_world, (m/s)^2
+    gyro_bias: FloatArray | None = field(default=None, metadata=_kept(3))  # rad/s
+    gyro_bias_sigma: FloatArray | None = field(default=None, metadata=_kept(3))  # standard deviations, rad/s
+    accel_bias: FloatArray | None = field(default=None, metadata=_kept(3))  # m/s^2
+    # Standard deviations, m/s^2; zero where it is not estimated.
+    accel_bias_sigma: FloatArray | None = field(default=None, metadata=_kept(3))
+    # m/s^2, where the world is not upright (an IMU that began late).
+    gravity_world: FloatArray | None = field(default=None, metadata=_kept(3))
     # The calibration, where the filter estimates it; a frame stamped t was exposed at t + offset of the IMU's clock.
-    T_cam0_imu: FloatArray | None = None  # (4, 4)
-    T_cam0_imu_covariance: FloatArray | None = None  # (6, 6) of xi in T_cam0_imu = T_hat exp(xi), [rho; phi], m and rad
-    time_offset_s: float | None = None
-    time_offset_sigma_s: float | None = None
+    T_cam0_imu: FloatArray | None = field(default=None, metadata=_kept(4, 4))
+    # Of xi in T_cam0_imu = T_hat exp(xi), [rho; phi], m and rad.
+    T_cam0_imu_covariance: FloatArray | None = field(default=None, metadata=_kept(6, 6))
+    time_offset_s: float | None = field(default=None, metadata=_kept())
+    time_offset_sigma_s: float | None = field(default=None, metadata=_kept())
     stereo_field: StereoFieldEstimate | None = None
     stereo_scale: StereoScaleEstimate | None = None
-    imu_terms: FloatArray | None = None  # (15,) scale and misalignment of accelerometer and gyro, as IMU_ENTRIES
-    imu_terms_sigma: FloatArray | None = None  # (15,) standard deviations; zero where a term is not estimated
-    scale_sigma: float | None = None  # one camera: standard deviation of the scale of the last frames' motion, over it
+    # Scale and misalignment of accelerometer and gyro, as IMU_ENTRIES; standard deviations, zero where not estimated.
+    imu_terms: FloatArray | None = field(default=None, metadata=_kept(15))
+    imu_terms_sigma: FloatArray | None = field(default=None, metadata=_kept(15))
+    # One camera: standard deviation of the scale of the last frames' motion, over it.
+    scale_sigma: float | None = field(default=None, metadata=_kept())
     # The pose in a map; None without one, or without a place in it yet.
     T_map_body: FloatArray | None = None  # (4, 4)
     T_map_body_covariance: FloatArray | None = None  # (6, 6) of xi in T_map_body = T_hat exp(xi), given the map

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from vio.filters.navigation import DIM
+from vio.filters.online_calibration import BLOCKS
 from vio.filters.stereo_calibration import StereoInformation
 from vio.geometry.lie import FloatArray
 
@@ -40,12 +41,13 @@ class ErrorState:
         self.nav = self._rows["nav"]
         self.own = slice(0, first)  # navigation state and calibration
         self.calibration = slice(DIM, first)
-        # Navigation state and the IMU's terms: what the motion model predicts and corrects.
-        self.motion = slice(0, self["imu_terms"].stop if "imu_terms" in self else DIM)
-        # The coefficients of (R3) and (R4), which pixels depend on; empty where none is estimated.
-        stereo = [self[name] for name in ("stereo_field", "stereo_scale") if name in self]
-        self.stereo = slice(stereo[0].start, stereo[-1].stop) if stereo else slice(self.motion.stop, self.motion.stop)
-        self.first_of_pixels = self.stereo.start if stereo else first  # pixels depend on no error before it
+        of_motion, of_pixels = (
+            sum(size for name, size in calibration.items() if BLOCKS[name].enters == where)
+            for where in ("motion", "pixels")
+        )
+        self.motion = slice(0, DIM + of_motion)  # what the motion model predicts and corrects
+        self.stereo = slice(self.motion.stop, self.motion.stop + of_pixels)  # coefficients that pixels depend on
+        self.first_of_pixels = self.stereo.start if of_pixels else first  # pixels depend on no error before it
         self.clones = slice(first, first + 6 * clones)
         self.landmarks = slice(self.clones.stop, self.clones.stop + 3 * landmarks)
         self.size = self.landmarks.stop

@@ -1,8 +1,8 @@
 """Online calibration: the constants that the filter may estimate beside the motion, one class for each block of them.
 
-`BLOCKS` is the table: a block says how large it is, when it is estimated, its prior and random walk, how an error moves
-its mean, on which side of the world it is kept, how the camera's pose depends on it, and what of it enters the
-estimate. A new one is a class here, its mean in `Calibration`, and its fields in `Estimate`.
+`BLOCKS` is the table: a block says when it is estimated, its prior and random walk, how an error moves its mean, where
+its errors enter, and what of it is reported. A new one is a class here, its mean in `Calibration`, its fields in
+`Estimate`, and its setting; its columns are in `camera_D_error`, in `StereoField`, or in the motion model's step.
 
 A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error `delta`, with
 `T_cam0_imu = T_hat exp(delta)`, is kept on the world's side, `eta = Ad(T_world_imu) delta`, and moves with the body.
@@ -14,18 +14,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
-from vio.filters.error_state import ErrorState
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.navigation import DIM, Growth, NavState, Transition
 from vio.filters.settings import MsckfSettings
 from vio.filters.stereo_calibration import TERMS
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import FIELD_TERMS, MotionSource, StereoFieldEstimate, StereoScaleEstimate
+from vio.records import FIELD_TERMS, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
+
+if TYPE_CHECKING:
+    from vio.filters.error_state import ErrorState
 
 _PARTS = slice(0, 3), slice(3, 6)  # of a twist
 _NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in its standard deviations at standstill
@@ -79,7 +81,14 @@ class Calibration:
     @property
     def moves_camera(self) -> bool:
         """Whether anything is estimated that stands between the body's pose and the camera's."""
-        return "extrinsics" in self.estimated or "time_offset" in self.estimated
+        return any(BLOCKS[name].enters == "camera" for name in self.estimated)
+
+    @property
+    def stereo_terms(self) -> IntArray:
+        """Which of the coefficients `stereo` are estimated."""
+        blocks = [BLOCKS[name] for name in self.estimated]
+        terms = [np.arange(TERMS)[block.terms] for block in blocks if isinstance(block, StereoBlock)]
+        return np.concatenate([np.arange(0), *terms])
 
     def estimating(self, name: str, settings: MsckfSettings) -> Calibration:
         """Return the calibration with one more of its blocks estimated."""
@@ -140,6 +149,8 @@ class CalibrationBlock:
     """Constants that are estimated together: one line of the table."""
 
     name: ClassVar[str]
+    # Where its errors enter: in the motion model's step, in pixels, or in the camera's pose at an exposure.
+    enters: ClassVar[Literal["motion", "pixels", "camera"]]
     walk: ClassVar[float] = 0.0  # random walk per root second, over the initial standard deviation
 
     def size(self, settings: MsckfSettings) -> int:
@@ -184,7 +195,7 @@ class CalibrationBlock:
 class _ImuTermsBlock(CalibrationBlock):
     """Scale and misalignment of the IMU; the navigation state has their means, and its motion model their columns."""
 
-    name, walk = "imu_terms", IMU_WALK
+    name, enters, walk = "imu_terms", "motion", IMU_WALK
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return motion == "imu" and settings.calibrate_imu != "off"
@@ -200,19 +211,20 @@ class _ImuTermsBlock(CalibrationBlock):
         return {"imu_terms": nav.imu_terms, "imu_terms_sigma": sigmas}
 
 
-class _StereoBlock(CalibrationBlock):
+class StereoBlock(CalibrationBlock):
     """Some coefficients of the stereo calibration; `StereoField` has their columns in the pixels."""
 
     terms: ClassVar[slice]  # of `Calibration.stereo`
-    walk = _STEREO_WALK
+    enters, walk = "pixels", _STEREO_WALK
 
     def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
+        """Return a calibration moved by an error (n,) of its coefficients."""
         stereo = calibration.stereo.copy()
         stereo[self.terms] += error
         return replace(calibration, stereo=stereo)
 
 
-class _StereoFieldBlock(_StereoBlock):
+class _StereoFieldBlock(StereoBlock):
     """The field of right columns, equation (R3)."""
 
     name, terms = "stereo_field", slice(0, FIELD_TERMS)
@@ -228,7 +240,7 @@ class _StereoFieldBlock(_StereoBlock):
         return {"stereo_field": StereoFieldEstimate(calibration.stereo[self.terms], covariance)}
 
 
-class _StereoScaleBlock(_StereoBlock):
+class _StereoScaleBlock(StereoBlock):
     """Baseline and focal length, equation (R4); they are estimated with a metric sensor only."""
 
     name, terms = "stereo_scale", slice(FIELD_TERMS, TERMS)
@@ -246,7 +258,7 @@ class _StereoScaleBlock(_StereoBlock):
 class _ExtrinsicsBlock(CalibrationBlock):
     """How the camera sits on the IMU; its error is kept on the world's side."""
 
-    name = "extrinsics"
+    name, enters = "extrinsics", "camera"
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return motion == "imu" and settings.calibrate_camera_imu in ("extrinsics", "both")
@@ -276,7 +288,7 @@ class _ExtrinsicsBlock(CalibrationBlock):
 class _TimeOffsetBlock(CalibrationBlock):
     """How the clocks of camera and IMU differ."""
 
-    name = "time_offset"
+    name, enters = "time_offset", "camera"
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return motion == "imu" and settings.calibrate_camera_imu in ("auto", "time_offset", "both")
@@ -299,7 +311,8 @@ class _TimeOffsetBlock(CalibrationBlock):
 
 
 _ALL = _ImuTermsBlock(), _StereoFieldBlock(), _StereoScaleBlock(), _ExtrinsicsBlock(), _TimeOffsetBlock()
-BLOCKS: dict[str, CalibrationBlock] = {block.name: block for block in _ALL}  # in the order of the error vector
+# In the order of the error vector: what enters in the motion, in pixels, in the camera's pose.
+BLOCKS: dict[str, CalibrationBlock] = {block.name: block for block in _ALL}
 
 
 def first_calibration(T_cam0_imu: FloatArray, settings: MsckfSettings, motion: MotionSource | None) -> Calibration:

@@ -10,12 +10,11 @@ from vio.filters.online_calibration import Calibration, prior_variances
 from vio.filters.scale_test import SCALE_SIGMA, ScaleTest
 from vio.filters.separate_bias import SeparateBias
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import LEAST_FIELD_PX, METRIC_TERMS, TERMS, RowField, StereoField
+from vio.filters.stereo_calibration import LEAST_FIELD_PX, METRIC_TERMS, RowField, StereoField
 from vio.filters.window import Window
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import (
-    FIELD_TERMS,
     ROW_TERMS,
     TURNS_NOT_SHOWN,
     Estimate,
@@ -131,22 +130,17 @@ class RigCalibration:
 
     def field(self, window: Window) -> StereoField | None:
         """The stereo calibration's faults at the window's present means; None where they are not estimated."""
-        stereo, has_field, has_scale = (
-            window.calibration.stereo,
-            "stereo_field" in window.state,
-            "stereo_scale" in window.state,
-        )
-        if not has_field and not has_scale:
+        estimated, stereo = window.calibration.stereo_terms, window.calibration.stereo
+        if not len(estimated):
             return None
         rows, rows_D_common = np.zeros(ROW_TERMS), None
-        if has_field:
+        if "stereo_field" in window.state:
             rows = self._rows.coefficients
         # Lenses that bend both images alike pass for a focal length: 2 ± 0.4 % for k1 = -0.03. Where that counts as
         # known, drives come out no better without their part of the rows: KITTI 03 by 20 %, 06 and 0039 not.
-        if has_field and has_scale:
+        if "stereo_field" in window.state and "stereo_scale" in window.state:
             rows, rows_D_common = self._rows.without_common(stereo), self._rows.rows_D_common
-        terms = np.arange(0 if has_field else FIELD_TERMS, TERMS if has_scale else FIELD_TERMS)
-        return StereoField(self.camera, rows, stereo, terms, rows_D_common)
+        return StereoField(self.camera, rows, stereo, estimated, rows_D_common)
 
     def report(self, window: Window, estimate: Estimate) -> Estimate:
         """Return an estimate with the scale that was taken over, and with the rows that were learned."""

@@ -26,26 +26,15 @@ from vio.records import (
 )
 from vio.files.tables import Rows
 
+# Optional fields of an estimate, with their shapes.
+_KEPT = {field.name: field.metadata["shape"] for field in dataclasses.fields(Estimate) if "shape" in field.metadata}
 ESTIMATE = np.dtype(
     [
         ("index", "<i8"),  # number of the frame
         ("time_ns", "<i8"),
         ("T_world_imu", "<f8", (4, 4)),
         ("covariance", "<f8", (6, 6)),
-        ("velocity_world", "<f8", (3,)),
-        ("velocity_covariance", "<f8", (3, 3)),
-        ("gyro_bias", "<f8", (3,)),
-        ("gyro_bias_sigma", "<f8", (3,)),
-        ("accel_bias", "<f8", (3,)),
-        ("accel_bias_sigma", "<f8", (3,)),
-        ("gravity_world", "<f8", (3,)),
-        ("T_cam0_imu", "<f8", (4, 4)),
-        ("T_cam0_imu_covariance", "<f8", (6, 6)),
-        ("imu_terms", "<f8", (15,)),
-        ("imu_terms_sigma", "<f8", (15,)),
-        ("time_offset_s", "<f8"),
-        ("time_offset_sigma_s", "<f8"),
-        ("scale_sigma", "<f8"),
+        *((name, "<f8", shape) for name, shape in _KEPT.items()),
         ("stereo_field", "<f8", (8,)),
         ("stereo_field_covariance", "<f8", (8, 8)),
         ("stereo_rows_rms_px", "<f8"),
@@ -55,13 +44,6 @@ ESTIMATE = np.dtype(
         ("stereo_scale_covariance", "<f8", (2, 2)),
     ]
 )
-_OPTIONAL_ARRAYS = (
-    *("velocity_world", "velocity_covariance"),
-    *("gyro_bias", "gyro_bias_sigma", "accel_bias", "accel_bias_sigma", "gravity_world"),
-    *("T_cam0_imu", "T_cam0_imu_covariance", "imu_terms", "imu_terms_sigma"),
-)
-_OPTIONAL_NUMBERS = ("time_offset_s", "time_offset_sigma_s", "scale_sigma")
-
 _STAGES = 16  # of the front end, at most
 _COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")
 _TIMES = ("read_ms", "frontend_ms", "watch_ms", "select_ms", "filter_ms")
@@ -97,7 +79,7 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
     row = np.zeros(1, dtype=ESTIMATE)
     row["index"], row["time_ns"] = index, estimate.time_ns
     row["T_world_imu"], row["covariance"] = estimate.T_world_imu, estimate.covariance
-    for name in (*_OPTIONAL_ARRAYS, *_OPTIONAL_NUMBERS):
+    for name in _KEPT:
         value = getattr(estimate, name)
         row[name] = np.nan if value is None else value
     field = estimate.stereo_field
@@ -115,8 +97,9 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
 
 def estimate_of(row: np.void) -> Estimate:
     """Return the estimate of a row."""
-    optional: dict[str, Any] = {name: _array(row[name]) for name in _OPTIONAL_ARRAYS}
-    optional |= {name: _number(row[name]) for name in _OPTIONAL_NUMBERS}
+    optional: dict[str, Any] = {
+        name: (_array if shape else _number)(row[name]) for name, shape in _KEPT.items()
+    }
     scale, S = _array(row["stereo_scale"]), _array(row["stereo_scale_covariance"])
     return Estimate(
         int(row["time_ns"]),
