@@ -195,7 +195,9 @@ class CalibrationBlock:
 class _ImuTermsBlock(CalibrationBlock):
     """Scale and misalignment of the IMU; the navigation state has their means, and its motion model their columns."""
 
-    name, enters, walk = "imu_terms", "motion", IMU_WALK
+    name = "imu_terms"
+    enters = "motion"
+    walk = IMU_WALK
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return motion == "imu" and settings.calibrate_imu != "off"
@@ -215,7 +217,8 @@ class StereoBlock(CalibrationBlock):
     """Some coefficients of the stereo calibration; `StereoField` has their columns in the pixels."""
 
     terms: ClassVar[slice]  # of `Calibration.stereo`
-    enters, walk = "pixels", _STEREO_WALK
+    enters = "pixels"
+    walk = _STEREO_WALK
 
     def corrected(self, calibration: Calibration, error: FloatArray, T_world_imu: FloatArray) -> Calibration:
         """Return a calibration moved by an error (n,) of its coefficients."""
@@ -258,7 +261,8 @@ class _StereoScaleBlock(StereoBlock):
 class _ExtrinsicsBlock(CalibrationBlock):
     """How the camera sits on the IMU; its error is kept on the world's side."""
 
-    name, enters = "extrinsics", "camera"
+    name = "extrinsics"
+    enters = "camera"
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return motion == "imu" and settings.calibrate_camera_imu in ("extrinsics", "both")
@@ -288,7 +292,8 @@ class _ExtrinsicsBlock(CalibrationBlock):
 class _TimeOffsetBlock(CalibrationBlock):
     """How the clocks of camera and IMU differ."""
 
-    name, enters = "time_offset", "camera"
+    name = "time_offset"
+    enters = "camera"
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
         return motion == "imu" and settings.calibrate_camera_imu in ("auto", "time_offset", "both")

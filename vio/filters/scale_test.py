@@ -8,9 +8,11 @@ Reference: Friedland, Treatment of bias in recursive filtering, IEEE TAC (1969).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from vio.filters.navigation import NavState
+from vio.filters.navigation import DIM, NavState
 from vio.filters.separate_bias import SeparateBias
 from vio.geometry.lie import FloatArray, se3_inverse
 
@@ -67,6 +69,15 @@ class ScaleTest(SeparateBias):
         self._information += float(V @ W - W @ P @ W)
         self._vector += float(V @ (b - A @ mean))
         self.error_D_bias = self.error_D_bias - P @ W
+
+    def of_clone(
+        self, nav: NavState, T_exposed: FloatArray, camera_D_own: FloatArray, T_cam0_imu: FloatArray
+    ) -> FloatArray:
+        """How the error (6,) of a clone of the navigation state depends on the scale, its own pose being scaled too."""
+        V = self.error_D_bias[: camera_D_own.shape[1]].copy()
+        V[:DIM] += scaled_nav(nav, T_cam0_imu)
+        out: FloatArray = camera_D_own @ V - scaled_nav(replace(nav, T_world_imu=T_exposed), T_cam0_imu)[:6]
+        return out
 
     def estimate(self) -> tuple[float, float]:
         """Logarithm of the true scale over the filter's, and its standard deviation."""

@@ -209,21 +209,13 @@ class Window:
             exposure: what `camera_D_own` has returned for it; None: the navigation state is that of the exposure.
         """
         T, camera_D_own, noise = self.camera_D_own(0.0, NO_TWIST) if exposure is None else exposure
-        self.prior.insert_dependent(self.state.clones.stop, camera_D_own, noise, self._scale_of_clone(T, camera_D_own))
+        test, T_cam0_imu = self.prior.scale_test, self.calibration.T_cam0_imu
+        of_scale = None if test is None else test.of_clone(self.nav, T, camera_D_own, T_cam0_imu)
+        self.prior.insert_dependent(self.state.clones.stop, camera_D_own, noise, of_scale)
         self.clones.append(Clone(frame_index, time_ns, T, self.nav.velocity))
         self._lay_out()
         if len(self.landmarks):
             self._anchor_to_newest(self.state.clone(-2).start + 3)
-
-    def _scale_of_clone(self, T_exposed: FloatArray, camera_D_own: FloatArray) -> FloatArray | None:
-        """How the error (6,) of a clone of the navigation state depends on the scale, its own pose being scaled too."""
-        if self.prior.scale_test is None:
-            return None
-        nav, V = self.nav, self.prior.scale_test.error_D_bias[self.state.own].copy()
-        V[:DIM] += scaled_nav(nav, self.calibration.T_cam0_imu)
-        moved = scaled_nav(replace(nav, T_world_imu=T_exposed), self.calibration.T_cam0_imu)
-        out: FloatArray = camera_D_own @ V - moved[:6]
-        return out
 
     def camera_D_own(
         self, late_s: float, twist: Twist, nav: NavState | None = None

@@ -98,7 +98,7 @@ def estimate_row(index: int, estimate: Estimate) -> Rows:
 def estimate_of(row: np.void) -> Estimate:
     """Return the estimate of a row."""
     optional: dict[str, Any] = {
-        name: (_array if shape else _number)(row[name]) for name, shape in _KEPT.items()
+        name: _array(row[name]) if shape else _number(row[name]) for name, shape in _KEPT.items()
     }
     scale, S = _array(row["stereo_scale"]), _array(row["stereo_scale_covariance"])
     return Estimate(
