@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from vio import evaluate, load_config, open_dataset, run
+from vio import Parts, evaluate, load_config, open_dataset, run
 from vio.records import FrontendOutput, observations
 from vio.testing import check_frontend
 
@@ -52,7 +52,8 @@ if __name__ == "__main__":
             from vio.sim.demo import write_demo_recording
         source = sys.argv[1] if len(sys.argv) > 1 else str(write_demo_recording(Path(folder) / "street"))
         dataset = open_dataset(source)
-        result = run(dataset, load_config(overrides=["motion=none"]), frontend=CornersAndFlow(dataset.recording.camera))
+        parts = Parts(frontend=CornersAndFlow(dataset.recording.camera))
+        result = run(dataset, load_config(overrides=["motion=none"]), parts=parts)
         if dataset.recording.reference is not None:
             score = evaluate(result.trajectory, dataset.recording.reference, T_cam0_imu=result.T_cam0_body)
             print(f"ATE {score.ate_m.rmse:.3f} m over {score.path_length_m:.1f} m")

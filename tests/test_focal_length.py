@@ -95,7 +95,7 @@ class _Told(Msckf):
     told_in = 40
 
     def update(self, observations: Observations) -> UpdateReport:
-        self.take_turns(self.before if observations.frame_index < self.told_in else self.found)
+        self.take_rotation_comparison(self.before if observations.frame_index < self.told_in else self.found)
         return super().update(observations)
 
 
@@ -174,7 +174,7 @@ def test_what_is_not_beyond_doubt_changes_nothing() -> None:
 def test_a_focal_length_is_followed_until_the_turns_agree_beyond_doubt(sigma: float, followed: bool) -> None:
     noise, flight = np.random.default_rng(0), Shaking(5)
     filt = Msckf(CAMERA, T_CAM0_IMU, OFF, motion="imu")
-    filt.take_turns(TurnComparison(0.005, sigma, gyro_agrees=True))
+    filt.take_rotation_comparison(TurnComparison(0.005, sigma, gyro_agrees=True))
     fly_with(filt, flight, _samples(flight, OFF, 0.0, noise), noise, 0.5)
     assert filt._window is not None
     assert (filt._window.prior.focal is not None) == followed

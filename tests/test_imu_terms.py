@@ -25,7 +25,7 @@ from vio.filters.navigation import DIM, NO_STEP, ImuMotion, NavState, rotation_t
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, so3_log
 from vio.geometry.stereo import CameraKind
-from vio.live.chain import build_backend
+from vio.live.build import build_backend
 from vio.live.prediction import PosePredictor
 from vio.records import Estimate, ImuSample, MotionSource, imu_matrices
 from vio.runs.checkpoint import load_checkpoint, save_checkpoint

@@ -21,6 +21,7 @@ from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
+from vio.live.build import MapUse
 from vio.mapping.builder import MapBuilder, MapUpdate
 from vio.mapping.map_store import MapStore
 from vio.mapping.session import HANDOVER_FRAMES, MapSession
@@ -28,7 +29,7 @@ from vio.records import Estimate, FrameResult, LoopEvent, LoopMatches, Observati
 from vio.runs.finished import read_finished_run
 from vio.runs.loop_files import read_loops, write_loops
 from vio.runs.mapped import corrected
-from vio.runs.pipeline import run
+from vio.runs.pipeline import RunControl, run
 from vio.runs.recorder import GrowingFolder
 
 
@@ -102,9 +103,9 @@ def test_loops_are_read_as_they_were_written(tmp_path: Path) -> None:
 
 def test_a_run_goes_on_to_the_same_map(flight: Path, mapped: Path, tmp_path: Path) -> None:
     folder, path = GrowingFolder(tmp_path / "run", {}), tmp_path / "yard.map"
-    first = run(open_dataset(flight), Config(), folder=folder, should_stop=Stop(300), map_file=path)
+    first = run(open_dataset(flight), Config(), map=MapUse(path), control=RunControl(folder, should_stop=Stop(300)))
     assert 5 < len(first.frames) < 20
-    second = run(open_dataset(flight), Config(), folder=folder, resume=True)
+    second = run(open_dataset(flight), Config(), control=RunControl(folder, resume=True))
     assert second.mapped is not None
     final = read_trajectory(mapped / "map_trajectory.tum")
     np.testing.assert_allclose(second.mapped.T_map_body, final.T_world_body, atol=1e-8)

@@ -20,6 +20,7 @@ from vio.cameras.rig import Rig
 from vio.config import Config
 from vio.errors import CalibrationError, ConfigError, DataError, VioError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_log
+from vio.live.build import Parts
 from vio.live.odometry import Odometry
 from vio.numerics.threads import BlasLimit, one_blas_thread
 from vio.records import Estimate, FrameResult, FrontendOutput, ImuSample, StereoFrame
@@ -264,7 +265,7 @@ class Picky:
 
 
 def test_frames_that_the_front_end_refuses_are_skipped_and_said() -> None:
-    odometry = Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, frontend=Picky())
+    odometry = Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, parts=Parts(frontend=Picky()))
     images = np.random.default_rng(0).integers(0, 255, (12, 480, 752), dtype=np.uint8)
     given = [odometry.add_stereo(k * STEP_NS, images[k], images[k]) is not None for k in range(12)]
     assert given == [not 3 <= k < 8 for k in range(12)]
@@ -317,7 +318,7 @@ def test_one_blas_thread_inside_and_the_callers_number_outside(fails: bool, monk
             raise DataError("enough")
 
     with threadpool_limits(limits=2, user_api="blas"):
-        odometry = Odometry(CAMERA, IMAGES_ALONE, selector=Spy(), on_frame=on_frame)
+        odometry = Odometry(CAMERA, IMAGES_ALONE, parts=Parts(selector=Spy()), on_frame=on_frame)
         with pytest.raises(DataError):
             odometry.add_observations(0, [1], [[1, 2, 0, 2]])
         assert set(threads()) == {2}

@@ -32,7 +32,7 @@ from vio.frontend.one_camera import disparities
 from vio.geometry.distortion import CameraModel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import left_alone, left_rays, one_camera
-from vio.live.chain import build_backend
+from vio.live.build import build_backend
 from vio.records import ImuSample, Observations, StereoFrame
 
 LEFT = left_alone(CAMERA)
@@ -124,7 +124,7 @@ def test_start_in_motion_waits_and_is_as_good_as_it_says() -> None:
     for flown in _curves():
         assert flown.begun is not None
         assert 10 <= flown.begun <= 35
-        start = flown.filter.begun
+        start = flown.filter._begun
         assert start is not None
         assert start.scale_sigma is not None
         assert 0.005 < start.scale_sigma <= 0.1
@@ -143,7 +143,7 @@ def test_flight_after_the_start_is_consistent() -> None:
 def test_steady_flight_never_begins_as_nothing_shows_its_scale() -> None:
     flown = Flown(Path3(35, "steady"), 0)
     assert flown.begun is None
-    assert flown.filter.waits_for
+    assert flown.filter.initialisation.waits_for
 
 
 def test_steady_flight_tells_nothing_more_of_the_scale() -> None:
@@ -159,7 +159,7 @@ def test_start_at_standstill_knows_the_velocity_and_finds_the_scale_in_flight() 
     flown = Flown(Path3(70, "take-off"), 1)
     assert flown.begun is not None
     assert flown.begun <= 12
-    start = flown.filter.begun
+    start = flown.filter._begun
     assert start is not None
     assert start.scale_sigma is None
     assert np.sqrt(start.P.diagonal()[6:9].max()) < 0.05

@@ -20,6 +20,7 @@ from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
 from vio.geometry.lie import se3_exp, se3_from_parts, se3_inverse, transform_points
 from vio.geometry.stereo import StereoCamera, project
+from vio.live.build import Parts, resolve_motion
 from vio.records import (
     Event,
     FrameResult,
@@ -35,7 +36,7 @@ from vio.records import (
     observations,
 )
 from vio.runs.folder import read_run, write_run_folder
-from vio.runs.pipeline import resolve_motion, run
+from vio.runs.pipeline import run
 from vio.runs.tables import ESTIMATE, FRAME
 
 CAMERA = StereoCamera(700.0, 700.0, 600.0, 180.0, 0.54, 1242, 375)
@@ -157,7 +158,7 @@ def test_only_selected_rows_reach_the_filter(backend: Literal["msckf", "vislam"]
             return FrontendOutput(replace(seen, has_right=seen.ids % 3 != 0), 0, 0, 0)
 
     drive = FakeDrive()
-    result = run(drive, Config(backend=backend), selector=Half(), frontend=LeftOnlyForThrees(drive))
+    result = run(drive, Config(backend=backend), parts=Parts(LeftOnlyForThrees(drive), Half()))
     assert len(result.landmarks.ids) > 0
     assert not np.any(result.landmarks.ids % 2)
     assert np.any(result.landmarks.ids % 3 == 0) == (backend == "msckf")
@@ -231,7 +232,7 @@ def test_run_uses_one_blas_thread_and_restores_the_callers_number(fails: bool) -
     with threadpool_limits(limits=2, user_api="blas"):
         assert _blas_threads() == {2}
         with pytest.raises(DataError, match="enough") if fails else nullcontext():
-            run(drive, Config(), backend=backend)
+            run(drive, Config(), parts=Parts(backend=backend))
         assert _blas_threads() == {2}
     assert inside == [{1}] * (1 if fails else 3)
 
@@ -248,7 +249,7 @@ def test_a_divergence_is_an_event_and_not_the_end_of_the_run() -> None:
 
     drive = FakeDrive(frames=20)
     backend = Fragile(CAMERA, T_CAM0_IMU, Config().msckf, motion="velocity")
-    result = run(drive, Config(), backend=backend)
+    result = run(drive, Config(), parts=Parts(backend=backend))
     (line,) = [line for line in result.warnings if "started again" in line]
     assert line.startswith("frame 8: msckf diverged at frame 8")
     np.testing.assert_allclose(result.trajectory.positions, drive.poses[:, :3, 3], atol=0.3)

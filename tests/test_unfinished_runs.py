@@ -31,7 +31,7 @@ from vio.filters.msckf import Msckf
 from vio.protocols import Dataset
 from vio.records import Estimate, Recording, StereoFieldEstimate, StereoScaleEstimate
 from vio.runs.checkpoint import load_checkpoint, save_checkpoint
-from vio.runs.pipeline import RunResult, run
+from vio.runs.pipeline import RunControl, RunResult, run
 from vio.runs.recorder import GrowingFolder
 from vio.runs.tables import estimate_of, estimate_row
 from vio.sim.effects import CLEAN
@@ -155,10 +155,10 @@ def test_a_run_goes_on_to_the_same_bits(
 ) -> None:
     whole = run(make(flight_log), config, keep_observations=True)
     folder = GrowingFolder(tmp_path / "run", {})
-    first = run(make(flight_log), config, keep_observations=True, folder=folder, should_stop=Stop(events))
+    first = run(make(flight_log), config, keep_observations=True, control=RunControl(folder, should_stop=Stop(events)))
     assert first.stopped == "interrupted"
     assert 5 < len(first.frames) < len(whole.frames)
-    second = run(make(flight_log), config, keep_observations=True, folder=folder, resume=True)
+    second = run(make(flight_log), config, keep_observations=True, control=RunControl(folder, resume=True))
     assert second.stopped is None
     _assert_same(whole, second)
     assert whole.observations is not None
@@ -176,7 +176,7 @@ def test_points_put_away_while_running_stay_in_the_map(
 ) -> None:
     monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.05)
     whole = run(open_dataset(flight_log), Config())
-    grown = run(open_dataset(flight_log), Config(), folder=GrowingFolder(tmp_path / "run", {}))
+    grown = run(open_dataset(flight_log), Config(), control=RunControl(GrowingFolder(tmp_path / "run", {})))
     assert len(grown.landmarks.ids) > 50
     _assert_same(whole, grown)
 
@@ -189,14 +189,14 @@ def test_a_checkpoint_does_not_wait_for_an_imu_that_begins_late(
     monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.05)
     log = _flight_log(tmp_path / "late.npz", imu_from_ns=imu_from_s * 10**9)
     whole = run(open_dataset(log), Config())
-    grown = run(open_dataset(log), Config(), folder=GrowingFolder(tmp_path / "run", {}))
+    grown = run(open_dataset(log), Config(), control=RunControl(GrowingFolder(tmp_path / "run", {})))
     assert grown.stopped is None
     assert len(grown.landmarks.ids) > 50
     _assert_same(whole, grown)
 
 
 def test_a_run_in_memory_that_is_stopped_keeps_its_map(flight_log: Path) -> None:
-    stopped = run(open_dataset(flight_log), Config(), should_stop=Stop(400))
+    stopped = run(open_dataset(flight_log), Config(), control=RunControl(should_stop=Stop(400)))
     same = run(open_dataset(flight_log), Config(), stop=len(stopped.frames))
     np.testing.assert_array_equal(stopped.landmarks.ids, same.landmarks.ids)
 

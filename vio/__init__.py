@@ -18,13 +18,17 @@ if TYPE_CHECKING:
     from vio.datasets.rigs import load_rig
     from vio.datasets.rigs.one_camera import load_camera
     from vio.evaluation.trajectories import evaluate
+    from vio.live.build import MapUse, Parts
     from vio.live.odometry import Odometry
-    from vio.runs.pipeline import run
+    from vio.runs.pipeline import RunControl, run
 
 __all__ = [
     "CameraRig",
+    "MapUse",
     "Odometry",
+    "Parts",
     "Rig",
+    "RunControl",
     "__version__",
     "evaluate",
     "load_camera",
@@ -36,8 +40,11 @@ __all__ = [
 
 _MODULES = {  # loaded when the name is first used
     "CameraRig": "vio.cameras.camera_rig",
+    "MapUse": "vio.live.build",
     "Odometry": "vio.live.odometry",
+    "Parts": "vio.live.build",
     "Rig": "vio.cameras.rig",
+    "RunControl": "vio.runs.pipeline",
     "evaluate": "vio.evaluation.trajectories",
     "load_camera": "vio.datasets.rigs.one_camera",
     "load_config": "vio.config",

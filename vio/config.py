@@ -14,7 +14,7 @@ import typing
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import yaml
 
@@ -22,12 +22,16 @@ from vio.datasets.settings import DatasetSettings
 from vio.errors import ConfigError
 from vio.files.inputs import read_input
 from vio.files.yaml_text import MOST_BYTES, read_yaml
+from vio.filters import BACKENDS
 from vio.filters.settings import MsckfSettings, VislamSettings
 from vio.frontend.settings import FrontendSettings
 from vio.selection.selectors import SelectorSettings
 from vio.setting import Range, Section, setting
 
-BackendName = Literal["vislam", "msckf"]
+if TYPE_CHECKING:
+    BackendName = str
+else:
+    BackendName = Literal[tuple(BACKENDS)]
 MotionName = Literal["auto", "imu", "velocity", "none"]
 # The settings that a user may want to change first; `vio config --show` hides the others.
 BASIC = (

@@ -2,25 +2,34 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias, runtime_checkable
 
+from vio.errors import EstimationError
+from vio.geometry.lie import FloatArray
+from vio.geometry.relative_pose import RelativePose
+from vio.geometry.stereo import StereoCamera
 from vio.records import (
     Estimate,
     Event,
     FrameResult,
     FrontendOutput,
     ImuDensities,
+    Initialisation,
     Landmarks,
     MotionPrior,
     MotionSample,
+    MotionSource,
     Observations,
     Prediction,
     Recording,
     Selection,
     StereoFrame,
     TrackPrior,
+    TurnComparison,
     UpdateReport,
+    no_landmarks,
 )
 
 if TYPE_CHECKING:
@@ -94,32 +103,91 @@ class Selector(Protocol):
 
 
 class Backend(Protocol):
-    """An estimator fed with motion samples and observations in time order."""
+    """An estimator fed with motion samples and observations in time order.
 
-    @property
-    def stereo_only(self) -> bool:
-        """Whether observations without a right match are of no use to it."""
+    Back ends inherit from it: what has a body here is optional. A new one is a file and a line in
+    `vio.filters.BACKENDS`.
+    """
 
+    motion_sources: ClassVar[tuple[MotionSource, ...]] = ()  # what it has a motion model for, the best first
+    stereo_only: ClassVar[bool] = False  # whether observations without a right match are of no use to it
+
+    @classmethod
+    def build(
+        cls, camera: StereoCamera, T_cam0_body: FloatArray, settings: Any, motion: MotionSource | None
+    ) -> Backend:
+        """Build the back end of a run; without an implementation, by the constructor with these arguments.
+
+        Args:
+            camera: the rectified camera or pair.
+            T_cam0_body: (4, 4) extrinsics of the body that is estimated.
+            settings: the configuration's section of the back end's name; None: it has none.
+            motion: which motion samples will come; None: images alone.
+
+        Raises:
+            ConfigError: it cannot estimate from this camera or motion with these settings.
+        """
+        constructor: Callable[..., Backend] = cls
+        return constructor(camera, T_cam0_body, settings, motion)
+
+    @abstractmethod
     def propagate(self, sample: MotionSample) -> None:
         """Take one motion sample; samples come in time order."""
 
-    def predict(self, time_ns: int) -> Prediction | None:
-        """Predict a frame at a coming time, without changing anything; None where no prediction is possible."""
-
+    @abstractmethod
     def update(self, observations: Observations) -> UpdateReport:
-        """Move to the time of the observations and take them in."""
+        """Move to the time of the observations and take them in.
 
+        Raises:
+            DivergedError: the state is lost, and `restart` may be called with the same observations.
+            EstimationError: the state is lost for good.
+        """
+
+    @abstractmethod
     def estimate(self) -> Estimate:
         """Return the current estimate."""
 
-    def smoothed(self, frame_index: int) -> Estimate | None:
-        """Return the estimate at a past frame with all frames since taken into account; None where it is not kept."""
-
+    @abstractmethod
     def landmarks(self) -> Landmarks:
         """Return the current map, less what `take_landmarks` has returned."""
 
+    def predict(self, time_ns: int) -> Prediction | None:
+        """Predict a frame at a coming time, without changing anything; None where no prediction is possible."""
+        return None
+
     def take_landmarks(self) -> Landmarks:
         """Return the points that will not change any more, and forget them."""
+        return no_landmarks()
+
+    def restart(self, observations: Observations) -> UpdateReport:
+        """Go on from the last plausible state after a divergence, with the frame that `update` failed at.
+
+        Raises:
+            EstimationError: there is no such state.
+        """
+        raise EstimationError(f"{type(self).__name__} cannot restart after a divergence")
+
+    @property
+    def initialisation(self) -> Initialisation:
+        """How the state was initialised; asked after an update."""
+        return Initialisation()
+
+    def take_rotation_comparison(self, comparison: TurnComparison | None) -> None:
+        """Take how the camera's rotation compares with the gyro's so far; None: not compared yet."""
+        return
+
+    @property
+    def window_frames(self) -> int:
+        """How many past frames `smoothed` and `relative` know at most; a map and `lag_frames` need some."""
+        return 0
+
+    def smoothed(self, frame_index: int) -> Estimate | None:
+        """Return the estimate at a past frame with all frames since taken into account; None where it is not kept."""
+        return None
+
+    def relative(self, older: int, newer: int) -> RelativePose | None:
+        """Return the body's motion between two past frames, by index; None where one is not kept."""
+        return None
 
 
 class Viewer(Protocol):

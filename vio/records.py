@@ -421,6 +421,14 @@ def _no_ids() -> IntArray:
 
 
 @dataclass(frozen=True, slots=True)
+class Initialisation:
+    """How a back end's state was initialised, or what it waits for."""
+
+    waits_for: str | None = None  # what is not observable yet; None: the state is initialised
+    scale_sigma: float | None = None  # standard deviation of the scale over it; None: at standstill, or it is known
+
+
+@dataclass(frozen=True, slots=True)
 class UpdateReport:
     """What one filter update did."""
 

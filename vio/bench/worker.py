@@ -151,12 +151,13 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
     import cv2
 
     from vio.runs.folder import growing_folder
-    from vio.runs.pipeline import run  # loads the compiled functions: not for a recording that cannot be opened
+    from vio.runs.pipeline import RunControl, run  # loads compiled functions: not for what cannot be opened
 
     cv2.setNumThreads(1)  # tasks run side by side; the figures do not depend on it
     with tempfile.TemporaryDirectory(prefix="vio-bench-", dir=job["scratch"]) as folder:
         growing = growing_folder(Path(folder) / "run", truth.dataset, config, {"source": "", "start": truth.first})
-        result = run(truth.dataset, config, start=truth.first, stop=truth.end, viewer=timer, folder=growing)
+        control = RunControl(growing)
+        result = run(truth.dataset, config, start=truth.first, stop=truth.end, viewer=timer, control=control)
         trajectory = result.trajectory
         figures: dict[str, Any] = {
             "frames": len(result.frames),

@@ -307,3 +307,14 @@ def _check_rigid(T: FloatArray, name: str) -> None:
     R = T[:3, :3]
     if np.abs(R.T @ R - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         raise CalibrationError(f"{name}: its 3x3 part is no rotation; check the order of the numbers")
+
+
+def rig_of_rectified(camera: StereoCamera, T_cam0_imu: FloatArray | None) -> Rig | None:
+    """Return a rectified pair with the pose (4, 4) of its IMU as a rig of two pinholes.
+
+    None: one camera, no known image size, or a cylinder, which no lens model holds.
+    """
+    if camera.width is None or camera.height is None or camera.kind != "stereo" or camera.is_cylinder:
+        return None
+    c = camera
+    return Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height, T_cam0_imu)

@@ -20,6 +20,7 @@ from vio.errors import CalibrationError, ConfigError, DataError, StoppedError, V
 from vio.evaluation.trajectories import lengths_text, rotation_drift_text
 from vio.files.atomic import atomic_write_text, check_new_file, check_replaceable, check_writable, locked_folder
 from vio.files.trajectories import read_trajectory
+from vio.live.build import MapUse, resolve_motion
 from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Trajectory
 from vio.runs.folder import (
@@ -31,7 +32,7 @@ from vio.runs.folder import (
     growing_folder,
     read_request,
 )
-from vio.runs.pipeline import RunResult, given_rig, resolve_motion, run
+from vio.runs.pipeline import RunControl, RunResult, given_rig, run
 from vio.runs.recorder import CHECKPOINT, UNFINISHED
 
 if TYPE_CHECKING:
@@ -174,11 +175,8 @@ def _process(
                 stop=stop,
                 keep_observations=save_observations,
                 viewer=Viewers(viewers),
-                folder=growing_folder(folder, dataset, config, request),
-                resume=resume,
-                should_stop=asked.reason,
-                map_file=Path(request["map"]) if request.get("map") else None,
-                localise=request.get("localise", False),
+                map=MapUse(Path(request["map"]), request.get("localise", False)) if request.get("map") else None,
+                control=RunControl(growing_folder(folder, dataset, config, request), resume, asked.reason),
             )
             file = request.get("save_calibration")  # unfinished runs of earlier versions have none
             calibration = None if file is None else _calibration_or_fault(result)

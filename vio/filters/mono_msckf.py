@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from vio.errors import ConfigError
 from vio.filters.mono_start import START_FACTORS, MonoStart, MonoStarter, is_still
 from vio.filters.msckf import Msckf
 from vio.filters.navigation import DIM, ImuMotion, NavState
@@ -19,7 +20,15 @@ from vio.filters.window_posterior import scale_sigma
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_from_parts, so3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.imu.standstill import STANDSTILL_S
-from vio.records import Estimate, ImuSample, MotionSample, Observations, UpdateReport
+from vio.records import (
+    Estimate,
+    ImuSample,
+    Initialisation,
+    MotionSample,
+    MotionSource,
+    Observations,
+    UpdateReport,
+)
 
 # A landmark that is marginalised at a scale that is still off holds on to it: of V1_02's 76 m, ATE is 0.020 m with 30
 # landmarks where the scale is known to 1 %, and 0.004 m without any (rendered images, simulated IMU).
@@ -46,15 +55,33 @@ class MonoMsckf(Msckf):
         self._recent: deque[Observations] = deque()  # of the last half second
         self._samples: deque[ImuSample] = deque()  # likewise
 
-    @property
-    def begun(self) -> MonoStart | None:
-        """How the filter has begun; None while it waits."""
-        return self._begun
+    @classmethod
+    def build(
+        cls, camera: StereoCamera, T_cam0_body: FloatArray, settings: MsckfSettings, motion: MotionSource | None
+    ) -> MonoMsckf:
+        """Build the filter of a run, see `Backend`.
+
+        Raises:
+            ConfigError: there is no IMU, or its scale is to be estimated.
+        """
+        if motion != "imu":
+            raise ConfigError(
+                "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu; --motion none leaves it out), "
+                "depth images or a second camera"
+            )
+        if settings.calibrate_imu != "off":
+            raise ConfigError(
+                f"msckf.calibrate_imu: {settings.calibrate_imu} needs a stereo pair, as the scale of one camera is the "
+                "accelerometer's; set it to off"
+            )
+        return cls(camera, T_cam0_body, settings)
 
     @property
-    def waits_for(self) -> str:
-        """Why the filter has not begun."""
-        return self._starter.why
+    def initialisation(self) -> Initialisation:
+        """The standard deviation of the scale at the initialisation, or why that is not possible yet."""
+        if self._begun is None:
+            return Initialisation(waits_for=self._starter.why)
+        return Initialisation(scale_sigma=self._begun.scale_sigma)
 
     def propagate(self, sample: MotionSample) -> None:
         """Take a motion sample, see `Msckf`."""

@@ -33,6 +33,7 @@ from vio.filters.window import Clone, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_exp, so3_log, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, depth_of, project
+from vio.protocols import Backend
 from vio.records import (
     Estimate,
     ImuSample,
@@ -52,11 +53,10 @@ from vio.records import (
 _MOST_SPEED_MPS = 100.0  # with an IMU, whose scale is metric: beyond it the filter has diverged
 
 
-class Msckf:
+class Msckf(Backend):
     """The sliding-window filter as a back end."""
 
-    motion_sources: ClassVar[tuple[MotionSource, ...]] = ("imu", "velocity")  # what it has a model for, the best first
-    stereo_only = False
+    motion_sources: ClassVar[tuple[MotionSource, ...]] = ("imu", "velocity")
 
     def __init__(
         self,
@@ -104,6 +104,24 @@ class Msckf:
         self._tilted: FloatArray = np.eye(3)  # (3, 3) how the first attitude has been corrected, on the world's side
         self._good: GoodState | None = None  # after the last plausible update
 
+    @classmethod
+    def build(
+        cls, camera: StereoCamera, T_cam0_body: FloatArray, settings: MsckfSettings, motion: MotionSource | None
+    ) -> Msckf:
+        """Build the filter of a run, see `Backend`: that of one camera, or one whose IMU may begin late, included.
+
+        Raises:
+            ConfigError: one camera without an IMU, or settings that need another motion or camera.
+        """
+        from vio.filters.late_imu import LateImuMsckf
+        from vio.filters.mono_msckf import MonoMsckf
+
+        if camera.kind == "mono":
+            return MonoMsckf.build(camera, T_cam0_body, settings, motion)
+        if motion == "imu":
+            return LateImuMsckf(camera, T_cam0_body, settings)
+        return cls(camera, T_cam0_body, settings, motion=motion)
+
     def propagate(self, sample: MotionSample) -> None:
         """Take a motion sample.
 
@@ -120,13 +138,13 @@ class Msckf:
             self._propagation.advance(self._window, sample.time_ns)
             self._measure()
 
-    def take_turns(self, turns: TurnComparison | None) -> None:
+    def take_rotation_comparison(self, comparison: TurnComparison | None) -> None:
         """Take how the camera's turns compare with the gyro's; None: they were not compared yet.
 
         Until they are, nothing is concluded of the baseline, for which a wrong focal length passes. Where they differ
         for another reason than the gyro, the focal length becomes a state in the next frame.
         """
-        self._rig.turns = turns
+        self._rig.turns = comparison
 
     def predict(self, time_ns: int) -> Prediction | None:
         """Predict a coming frame: the pixels of all tracks with a point, and the camera's motion."""
@@ -300,6 +318,11 @@ class Msckf:
             return np.zeros((IMU_TERMS, IMU_TERMS))
         own = self._window.state["imu_terms"]
         return all_imu_terms(self._propagation.own_covariance(self._window)[own, own])
+
+    @property
+    def window_frames(self) -> int:
+        """Number of past frames in the window."""
+        return self._settings.clones
 
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where it has left the window."""

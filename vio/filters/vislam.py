@@ -17,6 +17,7 @@ from vio.filters.vislam_motion import DriftingTwist, HeldInput
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, p_cam_D_z, project, triangulate, z_D_p_cam
 from vio.numerics.statistics import chi_square_quantile
+from vio.protocols import Backend
 from vio.records import (
     BoolArray,
     Estimate,
@@ -25,10 +26,8 @@ from vio.records import (
     MotionSample,
     MotionSource,
     Observations,
-    Prediction,
     UpdateReport,
     VelocitySample,
-    no_landmarks,
 )
 
 _MIN_DEPTH_M = 0.3
@@ -115,10 +114,10 @@ class _Map:
         self.slot_of.update(zip(ids.tolist(), range(first, last), strict=True))
 
 
-class Vislam:
+class Vislam(Backend):
     """The paper's filter as a back end: `propagate` takes velocities, `update` takes stereo observations."""
 
-    motion_sources: ClassVar[tuple[MotionSource, ...]] = ("velocity",)  # what it has a model for, the best first
+    motion_sources: ClassVar[tuple[MotionSource, ...]] = ("velocity",)
     stereo_only = True
 
     def __init__(
@@ -162,6 +161,19 @@ class Vislam:
         probability = settings.gate_probability
         self._gate = np.inf if probability is None else float(chi_square_quantile(probability, 4))
 
+    @classmethod
+    def build(
+        cls, camera: StereoCamera, T_cam0_body: FloatArray, settings: VislamSettings, motion: MotionSource | None
+    ) -> Vislam:
+        """Build the filter of a run, see `Backend`.
+
+        Raises:
+            ConfigError: one camera has no depths, or the settings need a motion sensor and there is none.
+        """
+        if camera.kind == "mono":
+            raise ConfigError("backend vislam needs a stereo pair, and this is one camera; take msckf")
+        return cls(camera, T_cam0_body, settings, motion_sensor=motion is not None)
+
     def propagate(self, sample: MotionSample) -> None:
         """Take a velocity sample.
 
@@ -181,10 +193,6 @@ class Vislam:
         if self._time_ns is not None:
             self._state = self._motion.predict(self._state, self._time_ns, time_ns)
         self._time_ns = time_ns
-
-    def predict(self, time_ns: int) -> Prediction | None:
-        """Return nothing: the paper's filter makes no prediction for the front end."""
-        return None
 
     def update(self, observations: Observations) -> UpdateReport:
         """Predict to the time of the frame, then update pose and landmarks with its observations.
@@ -227,20 +235,12 @@ class Vislam:
         remedy = "" if self._settings.motion_model == "input" else "; give it velocities, or stop before that frame"
         return f"vislam diverged at frame {frame_index}: too few features for too long, or too many wrong ones{remedy}"
 
-    def smoothed(self, frame_index: int) -> Estimate | None:
-        """Return nothing: the paper's filter keeps no past pose."""
-        return None
-
     def estimate(self) -> Estimate:
         """Return the pose at the time of the last frame."""
         U, twist = self._state.U, self._state.twist
         T_world_imu = se3_inverse(U)
         velocity = None if twist is None else T_world_imu[:3, :3] @ twist[:3]
         return Estimate(self._time_ns or 0, T_world_imu, self._state.Sigma[:6, :6].copy(), velocity)
-
-    def take_landmarks(self) -> Landmarks:
-        """Return nothing: all points stay in the state."""
-        return no_landmarks()
 
     def landmarks(self) -> Landmarks:
         """Return every landmark ever initialised."""

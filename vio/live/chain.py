@@ -4,12 +4,7 @@ from __future__ import annotations
 
 import time
 
-from vio.config import BackendName, Config
-from vio.errors import ConfigError, DataError, DivergedError
-from vio.filters.late_imu import LateImuMsckf
-from vio.filters.mono_msckf import MonoMsckf
-from vio.filters.msckf import Msckf
-from vio.filters.vislam import Vislam
+from vio.errors import DataError, DivergedError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.run import RunWatch
@@ -26,8 +21,6 @@ from vio.records import (
     UpdateReport,
     no_features,
 )
-
-BACKENDS: dict[BackendName, type[Vislam] | type[Msckf]] = {"vislam": Vislam, "msckf": Msckf}
 
 
 class Chain:
@@ -95,11 +88,14 @@ class Chain:
             seen = seen.take(seen.has_right)
         selection = self.selector.select(seen, expected.motion if expected else None)
         timer.end("select")
-        if self._motion == "imu" and isinstance(self.backend, Msckf):
-            self.backend.take_turns(self.watch.turns)
+        if self._motion == "imu":
+            self.backend.take_rotation_comparison(self.watch.turns)
         report = self._update(seen.take(selection.chosen))
-        if not self._has_started(frame, report):
+        initialisation = self.backend.initialisation
+        if not report.started:
+            self.watch.waiting(frame, initialisation.waits_for or "the state is not observable yet")
             return None
+        self.watch.begun(frame, initialisation.scale_sigma)
         estimate = self.backend.estimate()
         timer.end("update")
         self.watch.update(frame.index, report, estimate)
@@ -110,60 +106,16 @@ class Chain:
         )
 
     def _update(self, seen: Observations) -> UpdateReport:
-        """Update with a frame; a back end that can start again does so where it diverges."""
+        """Update with a frame; a back end that diverges is restarted."""
         try:
             return self.backend.update(seen)
         except DivergedError as error:
-            if not isinstance(self.backend, Msckf):
-                raise
             report = self.backend.restart(seen)
             if report.started:
                 self.watch.restarted(seen.frame_index, str(error), self.backend.estimate())
             else:
                 self.watch.lost(seen.frame_index, str(error))
             return report
-
-    def _has_started(self, frame: StereoFrame, report: UpdateReport) -> bool:
-        """Whether the back end has an estimate; the watch says why not, and when it begins."""
-        backend = self.backend
-        if isinstance(backend, MonoMsckf):
-            start = backend.begun
-            if start is None:
-                self.watch.waiting(frame, backend.waits_for)
-            else:
-                self.watch.begun(frame, start.scale_sigma)
-        return report.started
-
-
-def build_backend(
-    camera: StereoCamera, T_cam0_body: FloatArray, config: Config, motion: MotionSource | None
-) -> Backend:
-    """Build the configured back end; `T_cam0_body` is (4, 4)."""
-    if camera.kind == "mono":
-        return _mono_backend(camera, T_cam0_body, config, motion)
-    if config.backend == "msckf" and motion == "imu":
-        return LateImuMsckf(camera, T_cam0_body, config.msckf)
-    if config.backend == "msckf":
-        return Msckf(camera, T_cam0_body, config.msckf, motion=motion)
-    return Vislam(camera, T_cam0_body, config.vislam, motion_sensor=motion is not None)
-
-
-def _mono_backend(
-    camera: StereoCamera, T_cam0_body: FloatArray, config: Config, motion: MotionSource | None
-) -> Backend:
-    if config.backend != "msckf":
-        raise ConfigError(f"backend {config.backend} needs a stereo pair, and this is one camera; take msckf")
-    if motion != "imu":
-        raise ConfigError(
-            "one camera alone knows no scale: add an IMU (imu.csv and T_cam0_imu; --motion none leaves it out), depth "
-            "images or a second camera"
-        )
-    if config.msckf.calibrate_imu != "off":
-        raise ConfigError(
-            f"msckf.calibrate_imu: {config.msckf.calibrate_imu} needs a stereo pair, as the scale of one camera is the "
-            "accelerometer's; set it to off"
-        )
-    return MonoMsckf(camera, T_cam0_body, config.msckf)
 
 
 class _StageTimer:

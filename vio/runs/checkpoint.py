@@ -25,7 +25,7 @@ _PACKAGES = (
     *("vio.filters.", "vio.frontend.", "vio.geometry.", "vio.imu.", "vio.live.", "vio.mapping.", "vio.monitor."),
     "vio.selection.",
 )
-_MODULES = ("vio.config", "vio.datasets.frame_rate", "vio.datasets.settings", "vio.records", "vio.runs.pipeline")
+_MODULES = ("vio.config", "vio.datasets.frame_rate", "vio.datasets.settings", "vio.records", "vio.runs.pipeline", "vio.runs.dead_reckoning")
 _OTHERS = {
     ("collections", "deque"),
     ("builtins", "set"),

@@ -1,0 +1,218 @@
+"""What a run consists of: motion source, front end, selector, back end and map, for recordings and for live use."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vio.config import Config
+from vio.errors import ConfigError
+from vio.filters import backend_class
+from vio.frontend import build_frontend
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.live.chain import Chain
+from vio.live.processor import EventProcessor
+from vio.protocols import Backend, Dataset, Frontend, Selector
+from vio.records import MotionSource, Observations, Recording, RunMotion, need_stereo
+from vio.selection.selectors import build_selector
+
+if TYPE_CHECKING:
+    from vio.mapping.session import MapSession
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """Parts of the caller's own, each used in place of the configured one; None: as configured."""
+
+    frontend: Frontend | None = None
+    selector: Selector | None = None
+    backend: Backend | None = None
+
+
+CONFIGURED = Parts()
+
+
+@dataclass(frozen=True, slots=True)
+class MapUse:
+    """The map that a run begins or continues."""
+
+    path: Path
+    localise: bool = False  # find poses in the map, and leave it as it is
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where the events of a run come from, as far as its parts depend on it."""
+
+    camera: StereoCamera  # rectified
+    T_cam0_body: FloatArray  # (4, 4)
+    motion: MotionSource | None  # what propagates the pose between frames; None: images alone
+    recording: Recording | None = None  # None: live
+    features: Dataset | None = None  # the recording, or the features used in place of its images; None: live
+
+
+def recorded_source(dataset: Dataset, config: Config) -> Source:
+    """Return a recording as the source of a run.
+
+    Raises:
+        ConfigError: the recording lacks the motion or the features that the configuration names.
+    """
+    recording = dataset.recording
+    motion = resolve_motion(recording, config)
+    return Source(recording.camera, recording.T_cam0_body, motion, recording, _features(dataset, config))
+
+
+def live_source(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config) -> Source:
+    """Return a live rig as the source of a run; `T_cam0_imu` is (4, 4), None without an IMU.
+
+    Raises:
+        ConfigError: `motion` is imu without extrinsics, or the back end has no model for it.
+    """
+    sensors: set[MotionSource] = set() if T_cam0_imu is None else {"imu"}
+    if config.motion == "velocity":  # any rig may have the sensor
+        sensors.add("velocity")
+    motion = _motion(config, sensors, missing="motion imu needs the extrinsics T_cam0_imu; give the rig them")
+    return Source(camera, np.eye(4) if T_cam0_imu is None else T_cam0_imu, motion)
+
+
+def resolve_motion(recording: Recording, config: Config) -> MotionSource | None:
+    """Decide what propagates the pose between the frames of a recording; None: images alone.
+
+    Raises:
+        ConfigError: the recording lacks what was asked for, or the back end has no model for it.
+    """
+    path, logged = recording.path, recording.run_motion
+    held = ", ".join(sorted(recording.motion)) or "no motion sensor"
+    missing = f"{path}: --motion {config.motion} asked for, but the recording holds {held}"
+    motion = _motion(config, recording.motion, logged=logged, missing=missing)
+    if config.motion != "auto" or logged == "none":
+        return motion
+    if motion is None and recording.motion:
+        log.warning("%s: backend %s has no model for its %s; images alone", path, config.backend, held)
+    elif motion is not None and recording.kind == "log" and logged is None:
+        log.warning(
+            "%s: the log does not say which motion its run used; motion auto takes its %s, --motion none images alone",
+            path,
+            motion,
+        )
+    return motion
+
+
+def _motion(
+    config: Config, sensors: Collection[MotionSource], *, missing: str, logged: RunMotion | None = None
+) -> MotionSource | None:
+    """Return the motion that is configured; auto: that of a logged run, else the best that sensors and back end share.
+
+    Raises:
+        ConfigError: there is no such sensor, said by `missing`, or the back end has no model for it.
+    """
+    known = backend_class(config.backend).motion_sources
+    if config.motion == "none":
+        return None
+    if config.motion == "auto":
+        if logged == "none":
+            return None
+        if logged in known and logged in sensors:
+            return logged
+        return next((sensor for sensor in known if sensor in sensors), None)
+    if config.motion not in known:
+        able = ", ".join((*known, "none"))
+        raise ConfigError(f"backend {config.backend} has no model for --motion {config.motion}; it takes {able}")
+    if config.motion not in sensors:
+        raise ConfigError(missing)
+    return config.motion
+
+
+def _features(dataset: Dataset, config: Config) -> Dataset:
+    """Return the recording itself, or the file of features that takes the place of its images."""
+    if config.frontend.features is None:
+        return dataset
+    if config.frontend.name not in ("auto", "precomputed"):
+        raise ConfigError(f"frontend.features is given, but frontend.name is {config.frontend.name}; use precomputed")
+    from vio.datasets import open_dataset
+
+    features = open_dataset(config.frontend.features, config.dataset)
+    ours, theirs = dataset.recording, features.recording
+    if not np.isin(theirs.frame_times_ns, ours.frame_times_ns).all():
+        raise ConfigError(
+            f"{config.frontend.features}: its frames are not those of {ours.path} (other times); give the features of "
+            "this very recording"
+        )
+    return features
+
+
+def build_processor(source: Source, config: Config, parts: Parts, map: MapUse | None = None) -> EventProcessor:
+    """Connect the parts of a run, those of the caller's own and the configured ones.
+
+    Raises:
+        ConfigError: the settings contradict one another, the camera or the back end.
+        DataError: the map cannot be used.
+    """
+    camera, features = source.camera, source.features
+    backend = parts.backend or build_backend(camera, source.T_cam0_body, config, source.motion)
+    if config.lag_frames and config.lag_frames >= backend.window_frames:
+        raise ConfigError(f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones")
+    seen = camera if features is None else features.recording.camera
+    name = config.frontend.name if config.frontend.features is None else "precomputed"
+    chain = Chain(
+        camera,
+        source.T_cam0_body,
+        source.motion,
+        frontend=parts.frontend or build_frontend(name, seen, config.frontend, features),
+        selector=parts.selector or build_selector(config.selector, whole_record=_record(features), camera=seen),
+        backend=backend,
+        use_prior=config.frontend.prior,
+    )
+    session = None if map is None else _open_map(map, source, config, backend)
+    return EventProcessor(chain, wait_for_imu=source.motion == "imu", map=session)
+
+
+def build_backend(
+    camera: StereoCamera, T_cam0_body: FloatArray, config: Config, motion: MotionSource | None
+) -> Backend:
+    """Build the configured back end; `T_cam0_body` is (4, 4)."""
+    settings = getattr(config, config.backend, None)
+    return backend_class(config.backend).build(camera, T_cam0_body, settings, motion)
+
+
+def _record(features: Dataset | None) -> Callable[[], list[Observations]] | None:
+    """Return a function that reads all observations of a recording; None: it has images, or it is live."""
+    if features is None or features.observations(0) is None:
+        return None
+    indices = range(len(features.recording.frame_times_ns))
+    return lambda: [seen for seen in map(features.observations, indices) if seen is not None]
+
+
+def _open_map(use: MapUse, source: Source, config: Config, backend: Backend) -> MapSession:
+    """Open the map of a run.
+
+    Raises:
+        ConfigError: the recording has no images, or the back end keeps no window of poses.
+        DataError: the map cannot be used.
+    """
+    from vio.mapping.session import MapSession
+
+    recording = source.recording
+    if recording is not None:
+        need_stereo(recording, "a map")
+        if not recording.has_images:
+            raise ConfigError(f"{recording.path}: a map is made of images, and this recording has features only")
+    if not backend.window_frames:
+        raise ConfigError(f"a map needs the back end msckf, not {config.backend}; leave --backend out")
+    return MapSession(
+        use.path,
+        source.camera,
+        source.T_cam0_body,
+        source="live" if recording is None else str(recording.path.absolute()),
+        imu=source.motion == "imu",
+        localise=use.localise,
+        alone=source.motion is None,
+    )

@@ -1,0 +1,90 @@
+"""Checks of what a live program gives: times, samples and images as arrays of the types that the filter takes."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray
+from vio.records import Image, IntArray
+
+
+def checked_time(t_ns: Any) -> int:
+    """Return a time as an integer.
+
+    Raises:
+        DataError: it is none.
+    """
+    try:
+        return operator.index(t_ns)
+    except TypeError as error:
+        raise DataError(f"a time must be an integer number of nanoseconds, got {t_ns!r}") from error
+
+
+def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[int], list[FloatArray]]:
+    """Return times (N,) and arrays (N, 3) of one sample or several.
+
+    Raises:
+        DataError: a wrong shape or type, a value that is not finite, or times that do not increase.
+    """
+    times: IntArray = np.asarray(t_ns)
+    if not np.issubdtype(times.dtype, np.integer) or times.ndim > 1:
+        raise DataError(f"times must be integer nanoseconds, () or (N,), got {times.dtype} {times.shape}")
+    rows = []
+    for name, value in values.items():
+        try:
+            array = np.asarray(value, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise DataError(f"{name} is not numeric: {error}") from error
+        if array.shape != (*times.shape, 3):
+            raise DataError(f"{name} has shape {array.shape}, expected {(*times.shape, 3)}")
+        if not np.isfinite(array).all():
+            raise DataError(f"{name} at {np.atleast_1d(times)[0]} ns is not finite: {array}")
+        rows.append(array.reshape(-1, 3).copy())
+    times = np.atleast_1d(times)
+    if (np.diff(times) <= 0).any():
+        raise DataError("times of samples must increase; sort them and give each once")
+    return times.tolist(), rows
+
+
+def gray(image: npt.ArrayLike, name: str) -> Image:
+    """Return an image as (H, W) uint8.
+
+    Raises:
+        DataError: it is neither 8-bit gray nor BGR.
+    """
+    array = np.asarray(image)
+    if array.dtype != np.uint8 or not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] == 3)) or not array.size:
+        raise DataError(
+            f"the {name} image has shape {array.shape} and type {array.dtype}; give uint8, (H, W) gray or (H, W, 3) BGR"
+        )
+    if array.ndim == 3:
+        import cv2
+
+        array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY)
+    return np.array(array, dtype=np.uint8, order="C")  # a copy: the caller may fill its buffer again
+
+
+def checked_depths(depth_m: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Return depths as (H, W) float64.
+
+    Raises:
+        DataError: they are not of the image's shape.
+    """
+    array = np.array(depth_m, dtype=np.float64)
+    if array.shape != shape:
+        raise DataError(f"the depths have shape {array.shape}, but the image {shape}; register them to the image")
+    return array
+
+
+def check_size(image: Image, expected: tuple[int, int], name: str) -> None:
+    """Raise DataError unless an image has the height and width that the calibration states."""
+    if image.shape != expected:
+        raise DataError(
+            f"the {name} image is {image.shape[1]}x{image.shape[0]}, but the calibration is for "
+            f"{expected[1]}x{expected[0]}; check that calibration and camera belong together"
+        )

@@ -1,0 +1,113 @@
+"""Events in any order of arrival in, results of frames out: the loop that live use and recordings share."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from vio.live.chain import Chain
+from vio.live.event_order import EventOrder
+from vio.records import Estimate, Event, FrameResult, Landmarks, StereoFrame
+
+if TYPE_CHECKING:
+    from vio.mapping.session import MapSession
+
+_LEAST_WAIT_S = 1e-3  # a velocity carries the pose that far as well as the IMU does
+_CLEAR = 3.0  # standard deviations of a time offset that is waited for
+
+
+def _wait_ns(estimate: Estimate) -> int:
+    """How long after its stamp a frame is processed, ns, so that the IMU's samples reach its exposure."""
+    offset_s, sigma_s = estimate.time_offset_s, estimate.time_offset_sigma_s
+    if offset_s is None or sigma_s is None or offset_s < max(_LEAST_WAIT_S, _CLEAR * sigma_s):
+        return 0
+    return round(1e9 * offset_s)
+
+
+class EventProcessor:
+    """Takes events through the chain and, where there is one, into the map."""
+
+    def __init__(self, chain: Chain, *, wait_for_imu: bool, map: MapSession | None) -> None:
+        """Begin a trajectory.
+
+        Args:
+            chain: processes one event at a time.
+            wait_for_imu: whether a frame waits for the first sample at or after it.
+            map: the trajectory's part of a map; None: no map.
+        """
+        self._chain, self._order, self.map = chain, EventOrder(wait_for_imu=wait_for_imu), map
+        self.estimate: Estimate | None = None  # newest; None before the first
+
+    def add(self, event: Event) -> list[FrameResult]:
+        """Take an event, whose image is rectified, and return the results of the frames that it completed."""
+        self._order.put(event)
+        results: list[FrameResult] = []
+        while events := self._order.due():
+            results += self._process(events)
+        return results
+
+    def finish(self) -> list[FrameResult]:
+        """Process the frames that still wait, and let the checks report what they have not yet reported."""
+        results = self._process(self._order.flush())
+        self._chain.watch.close()
+        if self.map is not None:
+            self.map.finish()
+        return results
+
+    def close(self) -> None:
+        """Write the map and release its file; without a map, nothing is held."""
+        if self.map is not None:
+            self.map.close()
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the checks have found so far, one line each."""
+        return tuple(self._chain.watch.lines)
+
+    @property
+    def frames_refused(self) -> int:
+        """Number of frames that the front end refused."""
+        return self._chain.watch.frames_refused
+
+    @property
+    def frames_waiting(self) -> int:
+        """Number of frames without a pose, as the back end could not be initialised yet."""
+        return self._chain.watch.frames_waiting
+
+    def landmarks(self) -> Landmarks:
+        """Return the points of the map so far, after the first frame with a pose."""
+        return self._chain.backend.landmarks()
+
+    def take_landmarks(self) -> Landmarks:
+        """Return the points that will not change any more, and forget them; `landmarks` has the others."""
+        return self._chain.backend.take_landmarks()
+
+    def smoothed(self, frame_index: int) -> Estimate | None:
+        """Return the estimate at a past frame with all frames since; None where the window does not hold it."""
+        return self._chain.backend.smoothed(frame_index)
+
+    def _process(self, events: list[Event]) -> list[FrameResult]:
+        """Give events that are due to the chain."""
+        results: list[FrameResult] = []
+        for event in events:
+            if not isinstance(event, StereoFrame):
+                self._chain.sample(event)
+                continue
+            result = self._chain.frame(event)
+            if result is not None:
+                results.append(self._in_map(event, result))
+                self.estimate = results[-1].estimate
+                self._order.exposed_after_ns = _wait_ns(self.estimate)
+        return results
+
+    def _in_map(self, frame: StereoFrame, result: FrameResult) -> FrameResult:
+        """Add what the map says of a frame."""
+        if self.map is None:
+            return result
+        loops = self.map.frame(frame, result.output.observations, result.estimate, self._chain.backend.relative)
+        T = self.map.T_map_odom
+        if T is not None:
+            T_map_body, covariance = T @ result.estimate.T_world_imu, self.map.covariance
+            estimate = replace(result.estimate, T_map_body=T_map_body, T_map_body_covariance=covariance)
+            result = replace(result, estimate=estimate)
+        return replace(result, loops=loops, is_keyframe=self.map.newest_keyframe == frame.index)
