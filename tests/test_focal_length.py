@@ -17,7 +17,7 @@ from vio.filters.window import Window
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import InertialFinding
-from vio.records import TURNS_NOT_SHOWN, ImuSample, Observations, TurnComparison, UpdateReport
+from vio.records import ROTATION_NOT_COMPARABLE, ImuSample, Observations, RotationComparison, UpdateReport
 from vio.sim.motion import evaluate, hand_held, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU
 
@@ -28,9 +28,9 @@ def _longer(camera: StereoCamera) -> StereoCamera:
 
 def _compared(
     it: Watched, camera: StereoCamera, samples: list[ImuSample] | None = None
-) -> tuple[TurnComparison | None, list[InertialFinding]]:
+) -> tuple[RotationComparison | None, list[InertialFinding]]:
     check, found = _checked(replace(it, camera=camera), samples=samples)
-    return check.turns, found
+    return check.rotation_comparison, found
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -84,14 +84,14 @@ def test_without_turns_nothing_is_said() -> None:
     assert _compared(still, _longer(it.camera)) == (None, [])
 
 
-_CLEAR = TurnComparison(-0.05, 0.004, gyro_agrees=True)
+_CLEAR = RotationComparison(-0.05, 0.004, gyro_agrees=True)
 
 
 class _Told(Msckf):
     """A filter that is told of the focal length from a frame on."""
 
-    found: TurnComparison = TURNS_NOT_SHOWN
-    before: TurnComparison | None = None
+    found: RotationComparison = ROTATION_NOT_COMPARABLE
+    before: RotationComparison | None = None
     told_in = 40
 
     def update(self, observations: Observations) -> UpdateReport:
@@ -100,7 +100,7 @@ class _Told(Msckf):
 
 
 def _fly(
-    camera: StereoCamera, found: TurnComparison, told_in: int = 40, before: TurnComparison | None = None
+    camera: StereoCamera, found: RotationComparison, told_in: int = 40, before: RotationComparison | None = None
 ) -> tuple[_Told, list[tuple[float, float] | None], FloatArray]:
     """Fly with a camera as calibrated; return the filter, what it says in each frame, and its errors (frames, 3), m."""
     noise, flight = np.random.default_rng(0), Shaking(120)
@@ -120,7 +120,8 @@ def test_a_filter_that_is_told_takes_the_focal_length_over_and_improves_it() -> 
     assert abs(percent - 100 * (1 / 1.05 - 1)) < 3 * sigma
     assert sigma < 0.3
     told, untold = (
-        np.linalg.norm(e[80:] - e[80], axis=1).max() for e in (errors, _fly(_longer(CAMERA), TURNS_NOT_SHOWN)[2])
+        np.linalg.norm(e[80:] - e[80], axis=1).max()
+        for e in (errors, _fly(_longer(CAMERA), ROTATION_NOT_COMPARABLE)[2])
     )
     assert told < 0.5 * untold
     # What the wrong one did until then is taken back: 0.6 m of error before, and nothing is less known than it was.
@@ -165,8 +166,8 @@ def test_errors_depend_on_the_focal_length_as_a_filter_with_another_one_shows(se
 
 
 def test_what_is_not_beyond_doubt_changes_nothing() -> None:
-    given = _fly(CAMERA, TurnComparison(-0.05, 0.012, gyro_agrees=True))
-    plain = _fly(CAMERA, TURNS_NOT_SHOWN)
+    given = _fly(CAMERA, RotationComparison(-0.05, 0.012, gyro_agrees=True))
+    plain = _fly(CAMERA, ROTATION_NOT_COMPARABLE)
     np.testing.assert_array_equal(given[2], plain[2])
 
 
@@ -174,7 +175,7 @@ def test_what_is_not_beyond_doubt_changes_nothing() -> None:
 def test_a_focal_length_is_followed_until_the_turns_agree_beyond_doubt(sigma: float, followed: bool) -> None:
     noise, flight = np.random.default_rng(0), Shaking(5)
     filt = Msckf(CAMERA, T_CAM0_IMU, OFF, motion="imu")
-    filt.take_rotation_comparison(TurnComparison(0.005, sigma, gyro_agrees=True))
+    filt.take_rotation_comparison(RotationComparison(0.005, sigma, gyro_agrees=True))
     fly_with(filt, flight, _samples(flight, OFF, 0.0, noise), noise, 0.5)
     assert filt._window is not None
     assert (filt._window.prior.focal is not None) == followed
@@ -182,9 +183,9 @@ def test_a_focal_length_is_followed_until_the_turns_agree_beyond_doubt(sigma: fl
 
 def test_a_baseline_is_judged_once_the_turns_are_compared() -> None:
     short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.1)
-    told = _fly(short, TURNS_NOT_SHOWN, 0)[1]
+    told = _fly(short, ROTATION_NOT_COMPARABLE, 0)[1]
     found_in = told.index(next(x for x in told if x is not None))
-    _, said, _ = _fly(short, TURNS_NOT_SHOWN, found_in + 10)
+    _, said, _ = _fly(short, ROTATION_NOT_COMPARABLE, found_in + 10)
     assert said[: found_in + 10] == [None] * (found_in + 10)
     assert said[-1] is not None
     assert abs(said[-1][0] - 10.0) < 3 * said[-1][1]
@@ -193,7 +194,7 @@ def test_a_baseline_is_judged_once_the_turns_are_compared() -> None:
 def test_a_baseline_that_was_taken_over_stays_reported_once_the_focal_length_is_a_state() -> None:
     """It is 20 % off, and estimated on beside the focal length: the one may have passed for the other."""
     short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.2)
-    filt, said, _ = _fly(short, _CLEAR, 100, before=TURNS_NOT_SHOWN)
+    filt, said, _ = _fly(short, _CLEAR, 100, before=ROTATION_NOT_COMPARABLE)
     assert said[99] is not None
     scale = filt.estimate().stereo_scale
     assert scale is not None

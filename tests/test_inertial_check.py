@@ -282,7 +282,7 @@ def test_the_filter_judges_no_baseline_by_an_imu_that_looks_faulty(name: str, at
             watch.sample(event)
         else:
             watch.observations(event)
-            agree.append(watch.turns is not None and watch.turns.agree)
+            agree.append(watch.rotation_comparison is not None and watch.rotation_comparison.agree)
     assert any(agree[at + 20 :]) == (name == "")
 
 

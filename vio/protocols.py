@@ -24,10 +24,10 @@ from vio.records import (
     Observations,
     Prediction,
     Recording,
+    RotationComparison,
     Selection,
     StereoFrame,
     TrackPrior,
-    TurnComparison,
     UpdateReport,
     no_landmarks,
 )
@@ -172,7 +172,7 @@ class Backend(Protocol):
         """How the state was initialised; asked after an update."""
         return Initialisation()
 
-    def take_rotation_comparison(self, comparison: TurnComparison | None) -> None:
+    def take_rotation_comparison(self, comparison: RotationComparison | None) -> None:
         """Take how the camera's rotation compares with the gyro's so far; None: not compared yet."""
         return
 

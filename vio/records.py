@@ -27,7 +27,7 @@ MotionSource: TypeAlias = Literal["imu", "velocity"]
 RunMotion: TypeAlias = Literal["imu", "velocity", "none"]  # none: images alone
 
 # Rigs are calibrated to 1 % of a focal length, and gyros to 1 or 2 % of their scale.
-_TURNS_OFF, _TURNS_SIGMAS, _TURNS_SIGMA = 0.03, 5.0, 0.01
+_RATES_DIFFER, _RATES_SIGMAS, _RATES_SIGMA = 0.03, 5.0, 0.01
 _KNOWN = 1e-8  # a standard deviation below it is rounding
 _INT64, _FLOAT64, _BOOL = np.dtype(np.int64), np.dtype(np.float64), np.dtype(np.bool_)
 
@@ -321,30 +321,30 @@ class StereoFieldEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class TurnComparison:
-    """How the camera's turns about the axes of its image compare with the gyro's; (I5) of docs/inertial.md."""
+class RotationComparison:
+    """How the camera's rotation about the axes of its image compares with the gyro's; (I5) of docs/inertial.md."""
 
-    excess: float  # by what share the camera turns more than the gyro says
-    sigma: float  # its standard deviation; inf: there are no turns
+    excess: float  # by what share the camera rotates more than the gyro measures
+    sigma: float  # its standard deviation; inf: there is no rotation
     gyro_agrees: bool  # about the optical axis, where no focal length matters: the gyro's scale is not the cause
 
     @property
     def differ(self) -> bool:
         """Whether they differ beyond doubt, and beyond what calibrations leave."""
-        return self.sigma < _TURNS_SIGMA and abs(self.excess) > max(_TURNS_OFF, _TURNS_SIGMAS * self.sigma)
+        return self.sigma < _RATES_SIGMA and abs(self.excess) > max(_RATES_DIFFER, _RATES_SIGMAS * self.sigma)
 
     @property
     def agree(self) -> bool:
         """Whether no focal length that is off shows in them, be it that there are none."""
-        return self.sigma == np.inf or (self.sigma < 2 * _TURNS_SIGMA and abs(self.excess) < _TURNS_OFF)
+        return self.sigma == np.inf or (self.sigma < 2 * _RATES_SIGMA and abs(self.excess) < _RATES_DIFFER)
 
     @property
     def settled(self) -> bool:
         """Whether they agree beyond doubt, so that they will not be found to differ."""
-        return abs(self.excess) + _TURNS_SIGMAS * self.sigma < _TURNS_OFF
+        return abs(self.excess) + _RATES_SIGMAS * self.sigma < _RATES_DIFFER
 
 
-TURNS_NOT_SHOWN = TurnComparison(0.0, np.inf, False)
+ROTATION_NOT_COMPARABLE = RotationComparison(0.0, np.inf, False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,6 @@ from vio.records import (
     Observations,
     Prediction,
     TrackPrior,
-    TurnComparison,
     UpdateReport,
     VelocitySample,
     no_landmarks,
@@ -138,13 +137,13 @@ class Msckf(Backend):
             self._propagation.advance(self._window, sample.time_ns)
             self._measure()
 
-    def take_rotation_comparison(self, comparison: TurnComparison | None) -> None:
-        """Take how the camera's turns compare with the gyro's; None: they were not compared yet.
+    def take_rotation_comparison(self, comparison: RotationComparison | None) -> None:
+        """Take how the camera's rotation compares with the gyro's; None: they were not compared yet.
 
         Until they are, nothing is concluded of the baseline, for which a wrong focal length passes. Where they differ
         for another reason than the gyro, the focal length becomes a state in the next frame.
         """
-        self._rig.turns = comparison
+        self._rig.rotation = comparison
 
     def predict(self, time_ns: int) -> Prediction | None:
         """Predict a coming frame: the pixels of all tracks with a point, and the camera's motion."""

@@ -15,16 +15,16 @@ from vio.filters.window import Window
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.records import (
+    ROTATION_NOT_COMPARABLE,
     ROW_TERMS,
-    TURNS_NOT_SHOWN,
     Estimate,
     MotionSource,
     Observations,
+    RotationComparison,
     StereoScaleEstimate,
-    TurnComparison,
 )
 
-_FREED_FOCAL_SIGMA = 0.05  # over it, once the turns of camera and gyro differ
+_FREED_FOCAL_SIGMA = 0.05  # over it, once the rotation of camera and gyro differ
 
 
 class RigCalibration:
@@ -34,7 +34,7 @@ class RigCalibration:
         """Prepare for a camera; nothing is estimated yet but what the settings want from the start."""
         self.camera = camera  # with the scale that was taken over
         self.settings = settings  # with the priors of what was freed
-        self.turns: TurnComparison | None = TURNS_NOT_SHOWN  # as others compared them; None: they will
+        self.rotation: RotationComparison | None = ROTATION_NOT_COMPARABLE  # as others compared them; None: they will
         self.scale_log: float | None = None  # of the baseline over the calibrated one; None: nothing contradicts it
         self._rows = RowField(camera)
 
@@ -62,10 +62,10 @@ class RigCalibration:
 
     def focal_length_is_off(self, window: Window) -> bool:
         """Whether camera and gyro turn differently, the gyro is not the cause, and the focal length is no state."""
-        turns = self.turns
-        if turns is not None and turns.settled:
+        rotation = self.rotation
+        if rotation is not None and rotation.settled:
             window.prior.focal = None  # what is not needed need not be followed
-        return turns is not None and window.prior.focal is not None and turns.differ and turns.gyro_agrees
+        return rotation is not None and window.prior.focal is not None and rotation.differ and rotation.gyro_agrees
 
     def free_focal_length(self, window: Window) -> None:
         """Make states of baseline and focal length; errors depend on them as was followed beside them, (S5)."""
@@ -100,7 +100,7 @@ class RigCalibration:
             test.frames += 1
         if test is None or (self.scale_log is None and not test.contradicted):
             return None
-        if self.scale_log is None and (self.turns is None or not self.turns.agree):
+        if self.scale_log is None and (self.rotation is None or not self.rotation.agree):
             return None  # a wrong focal length passes for it
         log, _ = test.estimate()
         move = float(np.expm1(log)) * window.scaled()

@@ -89,7 +89,7 @@ class Chain:
         selection = self.selector.select(seen, expected.motion if expected else None)
         timer.end("select")
         if self._motion == "imu":
-            self.backend.take_rotation_comparison(self.watch.turns)
+            self.backend.take_rotation_comparison(self.watch.rotation_comparison)
         report = self._update(seen.take(selection.chosen))
         initialisation = self.backend.initialisation
         if not report.started:

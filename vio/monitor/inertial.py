@@ -23,10 +23,10 @@ from vio.monitor.force_fit import fit_force
 from vio.monitor.gyro import judge_gyro
 from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
+from vio.monitor.rotation_comparison import compare_rotations, judge_rotations
 from vio.monitor.samples import Samples, Size, judge_size
 from vio.monitor.stamps import judge_stamps
-from vio.monitor.turns import compare_turns, judge_turns
-from vio.records import TURNS_NOT_SHOWN, ImuSample, Observations, TurnComparison
+from vio.records import ROTATION_NOT_COMPARABLE, ImuSample, Observations, RotationComparison
 
 _LEAST_AT_END = 20  # intervals needed to judge at the end of a run
 _LATER_EVALUATIONS = 150  # intervals between evaluations after `_ENOUGH`; until then `FIRST_EVALUATION`
@@ -66,7 +66,7 @@ class InertialCheck:
         self._since_evaluation = self._seen = 0
         self._suspected: set[InertialFault] = set()
         self._done = False
-        self.turns: TurnComparison | None = None  # the newest comparison; None: too few frames yet
+        self.rotation_comparison: RotationComparison | None = None  # the newest comparison; None: too few frames yet
         self.imu_at_fault = False  # by the newest judgement of units, axes, signs and clocks, reported yet or not
 
     def imu(self, sample: ImuSample) -> None:
@@ -108,8 +108,8 @@ class InertialCheck:
         self._since_evaluation += len(motion)
         self._seen += len(motion)
         if self._since_evaluation < (FIRST_EVALUATION if self._seen < _ENOUGH else _LATER_EVALUATIONS):
-            if self.turns is None:
-                self._compare_first_turns()
+            if self.rotation_comparison is None:
+                self._compare_first_rotations()
             return found
         self._since_evaluation = 0
         judged = self._judge(last=False)
@@ -131,7 +131,7 @@ class InertialCheck:
         gyro_fit = fit_gyro(record, _LEAST_AT_END)
         if gyro_fit is None:
             if self._seen >= _ENOUGH:
-                self.turns = self.turns or TURNS_NOT_SHOWN
+                self.rotation_comparison = self.rotation_comparison or ROTATION_NOT_COMPARABLE
             return self._judge_stationary(size, record, last=last)
         force = None if size.unit is None else fit_force(record, gyro_fit, self._T[:3, 3])
         evidence = Evidence(
@@ -162,7 +162,7 @@ class InertialCheck:
         found = [f for f in (size.finding, offset, judge_stamps(record)) if f is not None]
         rotation = judge_gyro(evidence, size.unit or 1.0)
         found += rotation
-        found += self._compare_turns(record, gyro_fit) if not rotation else []
+        found += self._compare_rotations(record, gyro_fit) if not rotation else []
         agrees, measured = gyro_fit.unexplained < AGREES, False
         if size.unit is not None and agrees and all(f.fault == "gyro units" for f in rotation):
             forces, measured = judge_force(evidence, size.unit)
@@ -177,8 +177,8 @@ class InertialCheck:
         self._done = enough and all(f.fault in self._suspected for f in found)
         return found
 
-    def _compare_first_turns(self) -> None:
-        """Find before the first evaluation that the turns agree, for which the filter waits; to differ takes more."""
+    def _compare_first_rotations(self) -> None:
+        """Find before the first evaluation that rotations agree, for which the filter waits; to differ takes more."""
         times_ns, values = self._samples.table()
         motion = self._motion.joined()
         if len(times_ns) < 2 or motion is None:
@@ -186,17 +186,17 @@ class InertialCheck:
         self.imu_at_fault = judge_size(times_ns, values[:, 3:]).finding is not None
         record = record_of(motion, times_ns, values)
         gyro_fit = fit_gyro(record, _LEAST_AT_END)
-        turns = None if gyro_fit is None else compare_turns(record, gyro_fit, self._T[:3, :3])
+        turns = None if gyro_fit is None else compare_rotations(record, gyro_fit, self._T[:3, :3])
         if turns is not None and np.isfinite(turns.sigma) and turns.agree:
-            self.turns = turns
+            self.rotation_comparison = turns
 
-    def _compare_turns(self, record: Record, gyro_fit: GyroFit) -> list[InertialFinding]:
-        """Compare the camera's turns with the gyro's until the filter has been told that the focal length is off."""
-        known = self.turns
+    def _compare_rotations(self, record: Record, gyro_fit: GyroFit) -> list[InertialFinding]:
+        """Compare the camera's rotation with the gyro's until the filter knows that the focal length is off."""
+        known = self.rotation_comparison
         if known is not None and known.differ and known.gyro_agrees:
             return []
-        self.turns = compare_turns(record, gyro_fit, self._T[:3, :3])
-        return judge_turns(self.turns, self._stereo)
+        self.rotation_comparison = compare_rotations(record, gyro_fit, self._T[:3, :3])
+        return judge_rotations(self.rotation_comparison, self._stereo)
 
     def _unreported(self, found: Sequence[InertialFinding]) -> tuple[InertialFinding, ...]:
         """Return the findings of groups that were not reported before."""

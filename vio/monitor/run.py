@@ -21,8 +21,8 @@ from vio.records import (
     MotionSample,
     Observations,
     Prediction,
+    RotationComparison,
     StereoFrame,
-    TurnComparison,
     UpdateReport,
 )
 
@@ -138,16 +138,16 @@ class RunWatch:
             self._report_findings(self._inertial.frame(seen))
 
     @property
-    def turns(self) -> TurnComparison | None:
-        """How the camera's turns compare with the gyro's so far; None: not compared yet, or no IMU.
+    def rotation_comparison(self) -> RotationComparison | None:
+        """How the camera's rotation compares with the gyro's so far; None: not compared yet, or no IMU.
 
-        While the IMU looks faulty, turns that agree count as not compared: the filter, which waits for them to judge
-        the baseline by the IMU, then takes no wrong unit or axis for a wrong baseline.
+        While the IMU looks faulty, rotations that agree count as not compared: the filter, which waits for them to
+        judge the baseline by the IMU, then takes no wrong unit or axis for a wrong baseline.
         """
         check = self._inertial
-        if check is None or check.turns is None:
+        if check is None or check.rotation_comparison is None:
             return None
-        return None if check.imu_at_fault and check.turns.agree else check.turns
+        return None if check.imu_at_fault and check.rotation_comparison.agree else check.rotation_comparison
 
     def refused(self, index: int, reason: str) -> None:
         """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""

@@ -1,4 +1,4 @@
-"""The camera's turns about the axes of its image against the gyro's: they differ where the focal length is off."""
+"""The camera's rotation about the axes of its image against the gyro's: they differ where the focal length is off."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import InertialFinding
 from vio.monitor.gyro_fit import AGREES, GyroFit
 from vio.monitor.motion import Record
-from vio.records import TURNS_NOT_SHOWN, TurnComparison
+from vio.records import ROTATION_NOT_COMPARABLE, RotationComparison
 
 _BLOCKS = 10  # of the record, for the jackknife
 _IMAGE, _OPTICAL = [0, 1], [2]  # the camera's axes
 
 
-def compare_turns(record: Record, fit: GyroFit, R_cam0_imu: FloatArray) -> TurnComparison:
+def compare_rotations(record: Record, fit: GyroFit, R_cam0_imu: FloatArray) -> RotationComparison:
     """Compare the rates of camera and gyro about the axes of the image, and about the optical axis; equation (I5).
 
     Args:
@@ -25,14 +25,14 @@ def compare_turns(record: Record, fit: GyroFit, R_cam0_imu: FloatArray) -> TurnC
     """
     used = fit.covered
     if fit.unexplained > AGREES or not fit.fits(R_cam0_imu) or not used.any():
-        return TURNS_NOT_SHOWN
+        return ROTATION_NOT_COMPARABLE
     camera, gyro = record.twists[used, 3:], fit.gyro[used] @ R_cam0_imu.T
     (image, sigma), (optical, optical_sigma) = (
         _factor(camera[:, axes], gyro[:, axes], fit.weight[used]) for axes in (_IMAGE, _OPTICAL)
     )
     excess = image - 1
     agrees = abs(optical - 1) < abs(excess) / 2 and optical_sigma < abs(excess) / 4
-    return TurnComparison(excess, sigma, agrees)
+    return RotationComparison(excess, sigma, agrees)
 
 
 def _factor(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[float, float]:
@@ -50,8 +50,8 @@ def _factor(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[f
     return float(factors[0]), float(np.sqrt((_BLOCKS - 1) / _BLOCKS * spread))
 
 
-def judge_turns(compared: TurnComparison, camera: StereoCamera) -> list[InertialFinding]:
-    """Report turns that differ where the gyro's scale may be the cause, or the filter cannot find the focal length."""
+def judge_rotations(compared: RotationComparison, camera: StereoCamera) -> list[InertialFinding]:
+    """Report rotations that differ by the gyro's scale, or by a focal length that the filter cannot find."""
     if not compared.differ or (compared.gyro_agrees and not camera.is_cylinder):
         return []
     estimate = "" if camera.is_cylinder else ", or have the focal length estimated (msckf.stereo_focal_sigma: 0.05)"
