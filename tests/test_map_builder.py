@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import pickle
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from vio.geometry.stereo import project, triangulate
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures, extract
 from vio.mapping.map_store import MapStore
+from vio.protocols import Dataset
 from vio.records import LoopEvent
+from vio.runs.checkpoint import load_checkpoint, save_checkpoint
 from vio.sim.motion import look_rotation, spline_from_waypoints
 from vio.sim.rigs import small_rig
 from vio.sim.sequence import SimulatedRecording, simulate
@@ -273,12 +276,13 @@ def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBui
     path = tmp_path / "b.map"
     builder = _map(room_walk, path, rows=slice(0, 30))
     builder.commit()
-    saved = pickle.dumps(builder)
+    dataset = cast("Dataset", SimpleNamespace(observations=None))
+    save_checkpoint(tmp_path / "state", builder, dataset)
     for keyframe, features in keyframes[30:33]:  # what the first process still did before it died
         builder.add(keyframe, features)
     builder.commit()
     builder.close()
-    resumed: MapBuilder = pickle.loads(saved)
+    resumed: MapBuilder = load_checkpoint(tmp_path / "state", dataset)
     resumed.reopen(MapStore(path))
     for keyframe, features in keyframes[30:]:
         resumed.add(keyframe, features)

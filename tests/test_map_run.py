@@ -105,7 +105,7 @@ def test_a_run_goes_on_to_the_same_map(flight: Path, mapped: Path, tmp_path: Pat
     folder, path = GrowingFolder(tmp_path / "run", {}), tmp_path / "yard.map"
     first = run(open_dataset(flight), Config(), map=MapUse(path), control=RunControl(folder, should_stop=Stop(300)))
     assert 5 < len(first.frames) < 20
-    second = run(open_dataset(flight), Config(), control=RunControl(folder, resume=True))
+    second = run(open_dataset(flight), Config(), map=MapUse(path), control=RunControl(folder, resume=True))
     assert second.mapped is not None
     final = read_trajectory(mapped / "map_trajectory.tum")
     np.testing.assert_allclose(second.mapped.T_map_body, final.T_world_body, atol=1e-8)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import errno
 import json
 import os
-import pickle
 import signal
 import subprocess
 import sys
+import threading
 import time
+import zlib
+from collections import deque
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
@@ -30,7 +32,7 @@ from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
 from vio.protocols import Dataset
 from vio.records import Estimate, Recording, StereoFieldEstimate, StereoScaleEstimate
-from vio.runs.checkpoint import load_checkpoint, save_checkpoint
+from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.runs.pipeline import RunControl, RunResult, run
 from vio.runs.recorder import GrowingFolder
 from vio.runs.tables import estimate_of, estimate_row
@@ -357,32 +359,120 @@ def state(flight_log: Path, tmp_path: Path) -> tuple[Path, Dataset]:
     return tmp_path / "c", dataset
 
 
-def test_a_checkpoint_cannot_call_what_is_not_the_estimators(state: tuple[Path, Dataset]) -> None:
+def _forge(path: Path, tree: Any) -> None:
+    """Put another state into a checkpoint, with the checksum that belongs to it."""
+    head = json.loads(path.read_bytes()[8:].split(b"\n")[0])
+    text = json.dumps(tree).encode()
+    body = json.dumps({**head, "tree_bytes": len(text)}).encode() + b"\n" + text
+    path.write_bytes(b"%08x" % zlib.crc32(body) + body)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "subprocess:Popen",
+        "vio.frontend.align:np.f2py.subprocess.Popen",
+        "vio.frontend.klt:Path",  # another module's
+        "vio.live.odometry:Config",  # the same under a second name
+        "vio.files.atomic:atomic_write_bytes",
+        "vio.errors:DataError",  # of a base that is not ours
+        "vio.__main__:main",
+        "vio:load_rig",
+    ],
+)
+def test_a_checkpoint_holds_objects_of_our_own_classes_only(name: str, state: tuple[Path, Dataset]) -> None:
     path, dataset = state
-
-    class Attack:
-        def __init__(self, function: Any, *arguments: Any) -> None:
-            self.call = function, arguments
-
-        def __reduce__(self) -> Any:
-            return self.call
-
-    from vio.files.atomic import atomic_write_bytes
-
-    head = path.read_bytes().split(b"\n")[0]
-    target = path.with_name("owned")
-    for attack in (
-        Attack(os.system, f"touch {target}"),
-        Attack(atomic_write_bytes, str(target), b""),
-        Attack(eval, f"open({str(target)!r}, 'w')"),
-    ):
-        path.write_bytes(head + b"\n" + pickle.dumps(attack))
-        with pytest.raises(DataError, match="does not belong into a checkpoint"):
-            load_checkpoint(path, dataset)
-    assert not target.exists()
+    _forge(path, ["dict", "run", ["object", name, {"args": ["list", "touch", "owned"]}]])
+    with pytest.raises(DataError, match=r"is damaged \(.*repeat the run from its start"):
+        load_checkpoint(path, dataset)
 
 
-@pytest.mark.parametrize("spoil", [lambda b: b[:-5], lambda b: b"", lambda b: b"{}\n" + b.split(b"\n", 1)[1]])
+@pytest.mark.parametrize(
+    "tree",
+    [
+        ["array", "|O", [1], "C", 0, True],
+        ["array", "<f8", [2**62], "C", 0, True],
+        ["array", "<f8", [0], "C", -8, True],
+        ["array", "<f8", [-1], "C", 0, True],
+        ["generator", "MT19937", {}],
+        ["ref", 9],
+        ["ref", -1],
+        ["tuple", ["ref", 1]],
+        ["__class__", "x"],
+        ["dict", "a"],
+        ["object", "vio.records:ImuSample", {"other": 1}],
+        {"a": 1},
+        [],
+        None,
+    ],
+    ids=str,
+)
+def test_a_forged_tree_is_one_line(tree: Any, state: tuple[Path, Dataset]) -> None:
+    path, dataset = state
+    _forge(path, ["list", tree] if tree is not None else json.loads("[" * 900 + "]" * 900))
+    with pytest.raises(DataError, match=r"c: is damaged \(.*\); repeat the run from its start") as error:
+        load_checkpoint(path, dataset)
+    assert "\n" not in str(error.value)
+
+
+def test_what_a_checkpoint_holds_comes_back_with_its_types_layouts_and_references(state: tuple[Path, Dataset]) -> None:
+    path, dataset = state
+    fixed = np.arange(6.0).reshape(2, 3)
+    fixed.flags.writeable = False
+    shared: list[Any] = [1, 2.5, None, "text", float("nan"), -0.0, 2**70]
+    shared.append(shared)
+    rows = np.zeros(2, dtype=[("a", "<i8"), ("T", "<f4", (2, 2))])
+    generator = np.random.default_rng(3)
+    generator.random(5)
+    given = {
+        "arrays": (
+            np.asfortranarray(fixed),
+            fixed.T[1:],
+            np.zeros((0, 3)),
+            rows,
+            np.array([True, False]),
+            np.float32(2),
+        ),
+        "shared": (shared, shared, deque([shared], maxlen=3)),
+        (1, "key"): {3, 4},
+        5: (frozenset((1,)), slice(None, 4, 2), 1 + 2j, b"bytes", True),
+        "fixed": fixed,
+        "scalar": rows[0],
+        "record": Estimate(7, np.eye(4), np.eye(6)),
+        "generator": generator,
+        "data": (dataset, dataset.observations),
+    }
+    save_checkpoint(path, given, dataset)
+    back = load_checkpoint(path, dataset)
+    assert list(back) == list(given)
+    for a, b in zip(given["arrays"], back["arrays"], strict=True):
+        assert (a.dtype, a.shape, type(a)) == (b.dtype, b.shape, type(b))
+        np.testing.assert_array_equal(a, b)
+    assert back["arrays"][0].flags.f_contiguous
+    assert [a.flags.writeable for a in (back["fixed"], back["arrays"][0])] == [False, True]
+    again, twice, (inside,) = back["shared"]
+    assert again is twice
+    assert again is inside
+    assert again is again[-1]
+    assert repr(again[:-1]) == repr(shared[:-1])
+    assert back["shared"][2].maxlen == 3
+    assert (back[1, "key"], back[5]) == (given[1, "key"], given[5])
+    assert back["scalar"] == rows[0]
+    np.testing.assert_array_equal(back["record"].covariance, np.eye(6))
+    assert back["generator"].random() == generator.random()
+    assert back["data"] == (dataset, dataset.observations)
+
+
+@pytest.mark.parametrize("value", [Path("x"), print, lambda: 0, np.array([{}]), int, threading.Lock()], ids=str)
+def test_what_a_checkpoint_cannot_hold_is_named_when_it_is_saved(value: Any, state: tuple[Path, Dataset]) -> None:
+    with pytest.raises(NotSavableError, match="does not belong into a checkpoint"):
+        save_checkpoint(state[0], [value], state[1])
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda b: b[:-5], lambda b: b"", lambda b: b"{}\n" + b.split(b"\n", 1)[1], lambda b: b[:-9] + b"\x07" + b[-8:]],
+)
 def test_a_damaged_or_foreign_checkpoint_is_refused(
     state: tuple[Path, Dataset], spoil: Callable[[bytes], bytes]
 ) -> None:

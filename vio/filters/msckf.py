@@ -43,6 +43,7 @@ from vio.records import (
     MotionSource,
     Observations,
     Prediction,
+    RotationComparison,
     TrackPrior,
     UpdateReport,
     VelocitySample,

@@ -74,7 +74,7 @@ class MapSession:
             DataError: the map cannot be used.
         """
         check_camera(path, camera)
-        self._path, self._localise, self._imu, self._alone = str(path), localise, imu, alone
+        self._localise, self._imu, self._alone = localise, imu, alone
         self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
         store = MapStore(path, create=not localise, read_only=localise)
         self._builder = MapBuilder(store, source, camera, upright=imu, localise=localise)
@@ -314,7 +314,7 @@ class MapSession:
         return {**state, "_results": results}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore a checkpoint, with the map as it was then."""
+        """Restore a checkpoint; `reopen` then gives it the map's file."""
         results = state.pop("_results")
         self.__dict__.update(state)
         self._executor = ThreadPoolExecutor(1, "map")
@@ -323,7 +323,14 @@ class MapSession:
             done: Future[MapUpdate] = Future()
             done.set_result(update)
             self._waiting.append((due, frame, done))
-        self._builder.reopen(MapStore(Path(self._path), read_only=self._localise))
+
+    def reopen(self, path: Path) -> None:
+        """Go on from a checkpoint with the map in a file, as it was then.
+
+        Raises:
+            DataError: the map cannot be used.
+        """
+        self._builder.reopen(MapStore(path, read_only=self._localise))
 
 
 def _predicted(before: Estimate, after: Estimate) -> RelativePose:

@@ -1,87 +1,90 @@
 """The state of an unfinished run in a file, from which it goes on to the same bits.
 
-The file is a line of JSON, which says what program wrote it, and a pickle. Loading accepts the classes of the estimator
-and of NumPy only, so a file from elsewhere cannot call anything else.
+The file is a checksum, a line of JSON (the program that wrote it and the inputs of the run), the state as a tree in
+JSON, and the bytes of its arrays. A node of the tree is a plain value or a list that begins with the name of its kind;
+lists are numbered in the order in which they begin, and `["ref", n]` is one that came before. Loading makes objects of
+this package's classes without calling their constructors, and sets their attributes; it calls nothing that the file
+names.
 """
 
 from __future__ import annotations
 
-import io
+import importlib
 import json
-import pickle
 import platform
+import types
+import zlib
+from collections import deque
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Literal, Protocol
 
 import numpy as np
 
 from vio._version import __version__
-from vio.files.atomic import atomic_write_bytes
 from vio.errors import DataError
+from vio.files.atomic import atomic_write_bytes
+from vio.files.inputs import read_input
 from vio.protocols import Dataset
 
-_FORMAT = "stereo-vio checkpoint"
-_PACKAGES = (
-    *("vio.filters.", "vio.frontend.", "vio.geometry.", "vio.imu.", "vio.live.", "vio.mapping.", "vio.monitor."),
-    "vio.selection.",
-)
-_MODULES = ("vio.config", "vio.datasets.frame_rate", "vio.datasets.settings", "vio.records", "vio.runs.pipeline", "vio.runs.dead_reckoning")
-_OTHERS = {
-    ("collections", "deque"),
-    ("builtins", "set"),
-    ("builtins", "frozenset"),
-    ("builtins", "slice"),
-    ("builtins", "complex"),
-    ("numpy", "dtype"),
-    ("numpy", "ndarray"),
-    ("numpy._core.multiarray", "_reconstruct"),
-    ("numpy._core.multiarray", "scalar"),
-    ("numpy._core.numeric", "_frombuffer"),
-    ("numpy.random._pickle", "__bit_generator_ctor"),
-    ("numpy.random._pickle", "__generator_ctor"),
-    ("numpy.random._pcg64", "PCG64"),
-    ("numpy.random.bit_generator", "__pyx_unpickle_SeedSequence"),
-    ("numpy.random.bit_generator", "SeedSequence"),
-}
+_FORMAT = "stereo-vio checkpoint 2"
+_PACKAGE = __name__.split(".", maxsplit=1)[0]
+_MOST_BYTES = 4 << 30
+_BIT_GENERATORS = {own.__name__: own for own in (np.random.PCG64, np.random.PCG64DXSM, np.random.SFC64)}
+_PLAIN = frozenset((type(None), bool, int, float, str))
+_SEQUENCES = frozenset((list, tuple, set, frozenset))
+_BASES = (object, Generic, Protocol)  # of the classes whose objects are saved, beside this package's own
+_MOST_CHANGES = 3  # of the inputs, named in an error
 
 
 class NotSavableError(Exception):
     """A part of the run holds what cannot be saved."""
 
 
-def save_checkpoint(path: Path, state: Any, dataset: Dataset) -> None:
+def save_checkpoint(path: Path, state: Any, dataset: Dataset, inputs: Mapping[str, Any] | None = None) -> None:
     """Write a state atomically; the recording itself, where the state refers to it, is left out.
+
+    Args:
+        path: the file.
+        state: plain values, arrays, containers and objects of this package's classes.
+        dataset: the recording.
+        inputs: what the results depend on, as JSON values by name; they must be the same when the run goes on.
 
     Raises:
         NotSavableError: a part of the state cannot be saved.
         DataError: the file cannot be written.
     """
-    stream = io.BytesIO()
-    stream.write(json.dumps(_program()).encode() + b"\n")
+    writer = _Writer(dataset)
     try:
-        _Pickler(stream, dataset).dump(state)
-    except (TypeError, AttributeError, pickle.PicklingError) as error:
-        raise NotSavableError(str(error)) from error
-    atomic_write_bytes(path, stream.getvalue())
+        tree = json.dumps(writer.node(state), separators=(",", ":"), check_circular=False).encode()
+    except RecursionError as error:
+        raise NotSavableError("its parts are nested too deeply") from error
+    head = json.dumps({"program": _program(), "inputs": dict(inputs or {}), "tree_bytes": len(tree)}).encode()
+    body = b"".join((head, b"\n", tree, *writer.blobs))
+    atomic_write_bytes(path, b"".join((b"%08x" % zlib.crc32(body), body)))
 
 
-def load_checkpoint(path: Path, dataset: Dataset) -> Any:
+def load_checkpoint(path: Path, dataset: Dataset, inputs: Mapping[str, Any] | None = None) -> Any:
     """Read a state; what referred to the recording refers to `dataset` then.
 
     Raises:
-        DataError: the file is damaged, or another program wrote it.
+        DataError: the file is damaged, another program wrote it, or the run had other inputs.
     """
     try:
-        data = path.read_bytes()
-        head, _, body = data.partition(b"\n")
-        written, now = json.loads(head), _program()
-        if written != now:
-            differ = ", ".join(
-                f"{key} {written.get(key)}, now {now[key]}" for key in now if written.get(key) != now[key]
-            )
-            raise DataError(f"{path}: was written by another program ({differ}); repeat the run from its start")
-        return _Unpickler(io.BytesIO(body), dataset).load()
-    except (OSError, ValueError, AttributeError, TypeError, KeyError, EOFError, pickle.UnpicklingError) as error:
+        data = read_input(path, _MOST_BYTES)
+        if data[:8] != b"%08x" % zlib.crc32(memoryview(data)[8:]):
+            raise ValueError("its checksum does not agree with its content; or an earlier version wrote it")
+        end = data.index(b"\n")
+        head = json.loads(data[8:end])
+        if program := _changes(head["program"], _program()):
+            raise DataError(f"{path}: was written by another program ({program}); repeat the run from its start")
+        if changed := _changes(head["inputs"], json.loads(json.dumps(dict(inputs or {})))):
+            raise DataError(f"{path}: what the run depends on has changed ({changed}); undo that, or repeat the run")
+        body = memoryview(data)[end + 1 :]
+        tree = json.loads(bytes(body[: head["tree_bytes"]]))
+        return _Reader(dataset, body[head["tree_bytes"] :]).node(tree)
+    except (OSError, ValueError, AttributeError, TypeError, LookupError, ImportError, RecursionError) as error:
         raise DataError(f"{path}: is damaged ({error}); repeat the run from its start") from error
 
 
@@ -100,32 +103,201 @@ def _program() -> dict[str, str]:
     }
 
 
-class _Pickler(pickle.Pickler):
-    def __init__(self, stream: io.BytesIO, dataset: Dataset) -> None:
-        super().__init__(stream, protocol=5)
+def _changes(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    """Name the values that are not what they were; empty: all are."""
+    names = [name for name in {**before, **now} if before.get(name) != now.get(name)]
+    texts = [f"{name} was {before.get(name)}, now {now.get(name)}" for name in names[:_MOST_CHANGES]]
+    return "; ".join(texts + [f"and {len(names) - _MOST_CHANGES} more"] * (len(names) > _MOST_CHANGES))
+
+
+@cache
+def _slots(cls: type) -> dict[str, types.MemberDescriptorType]:
+    """Return the slots of one of this package's classes by name.
+
+    Raises:
+        TypeError: it is another's, or a base of it is.
+    """
+    for base in cls.__mro__:
+        if base not in _BASES and base.__module__.split(".")[0] != _PACKAGE:
+            raise TypeError(f"{base.__module__}.{base.__qualname__} does not belong into a checkpoint")
+    members = {name: own for base in cls.__mro__ for name, own in vars(base).items()}
+    return {name: own for name, own in members.items() if isinstance(own, types.MemberDescriptorType)}
+
+
+def _own_hook(cls: type, name: str) -> Any:
+    """Return `__getstate__` or `__setstate__` where this package's code defines it; None: it does not."""
+    hook = getattr(cls, name, None)
+    return hook if str(getattr(hook, "__module__", None)).split(".")[0] == _PACKAGE else None
+
+
+class _Writer:
+    """Makes a tree of a state, and collects the bytes of its arrays."""
+
+    def __init__(self, dataset: Dataset) -> None:
+        self.blobs: list[bytes] = []
         self._dataset = dataset
+        self._bytes = 0
+        self._numbers: dict[int, int] = {}  # of the objects, by id; -1: a tuple or set that has not ended
+        self._kept: list[Any] = []  # so that no id is used twice
 
-    def persistent_id(self, obj: Any) -> str | None:
-        if obj is self._dataset:
-            return "dataset"
-        if getattr(obj, "__self__", None) is self._dataset and getattr(obj, "__name__", "") == "observations":
-            return "observations"
-        return None
+    def node(self, value: Any) -> Any:
+        """Return the node of a value.
+
+        Raises:
+            NotSavableError: it cannot be saved.
+        """
+        if type(value) in _PLAIN:
+            return value
+        number = self._numbers.get(id(value))
+        if number is None:
+            number = len(self._kept)
+            self._kept.append(value)
+            self._numbers[id(value)] = -1 if isinstance(value, (tuple, frozenset)) else number
+            made = self._list(value)
+            self._numbers[id(value)] = number
+            return made
+        if number < 0:
+            raise NotSavableError(f"a {type(value).__name__} that contains itself")
+        return ["ref", number]
+
+    def _list(self, value: Any) -> list[Any]:
+        kind, node = type(value), self.node
+        if kind in _SEQUENCES:
+            return [kind.__name__, *map(node, value)]
+        if kind is dict:
+            return ["dict", *(node(part) for pair in value.items() for part in pair)]
+        if kind is np.ndarray:
+            return self._array("array", value)
+        if isinstance(value, np.generic):
+            return self._array("scalar", np.array(value))
+        if kind is deque:
+            return ["deque", value.maxlen, *map(node, value)]
+        if kind is slice:
+            return ["slice", *map(node, (value.start, value.stop, value.step))]
+        if kind is complex:
+            return ["complex", value.real, value.imag]
+        if kind is bytes:
+            return self._array("bytes", np.frombuffer(value, dtype=np.uint8))
+        if kind is np.random.Generator:
+            bits = value.bit_generator
+            return ["generator", type(bits).__name__, node(bits.state)]
+        if value is self._dataset:
+            return ["dataset"]
+        if kind is types.MethodType and value.__self__ is self._dataset and value.__name__ == "observations":
+            return ["observations"]
+        return self._object(value, kind)
+
+    def _array(self, kind: str, value: np.ndarray[Any, Any]) -> list[Any]:
+        if value.dtype.hasobject:
+            raise NotSavableError("an array of objects does not belong into a checkpoint")
+        order: Literal["C", "F"] = "F" if value.flags.fnc else "C"
+        self.blobs.append(value.tobytes(order))
+        start, self._bytes = self._bytes, self._bytes + value.nbytes
+        dtype = np.lib.format.dtype_to_descr(value.dtype) if value.dtype.names else value.dtype.str
+        return [kind, dtype, value.shape, order, start, value.flags.writeable]
+
+    def _object(self, value: Any, kind: type) -> list[Any]:
+        name = f"{kind.__module__}:{kind.__qualname__}"
+        try:
+            slots = _slots(_own_class(name))
+        except (TypeError, ValueError, LookupError, ImportError) as error:
+            raise NotSavableError(str(error)) from error
+        hook = _own_hook(kind, "__getstate__")
+        if hook is not None:
+            state = hook(value)
+        else:
+            state = {key: getattr(value, key) for key in slots if hasattr(value, key)} | getattr(value, "__dict__", {})
+        return ["object", name, {key: self.node(own) for key, own in state.items()}]
 
 
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, stream: io.BytesIO, dataset: Dataset) -> None:
-        super().__init__(stream)
-        self._dataset = dataset
+class _Reader:
+    """Makes a state of its tree and the bytes of its arrays; what does not fit raises a built-in exception."""
 
-    def find_class(self, module: str, name: str) -> Any:
-        ours = module in _MODULES or module.startswith(_PACKAGES)
-        if not ours and (module, name) not in _OTHERS:
-            raise pickle.UnpicklingError(f"{module}.{name} does not belong into a checkpoint")
-        found = super().find_class(module, name)
-        if ours and not isinstance(found, type):
-            raise pickle.UnpicklingError(f"{module}.{name} is no class")
-        return found
+    def __init__(self, dataset: Dataset, blobs: memoryview) -> None:
+        self._dataset, self._blobs = dataset, blobs
+        self._made: list[Any] = []  # by number; None: not yet
 
-    def persistent_load(self, pid: Any) -> Any:
-        return {"dataset": self._dataset, "observations": self._dataset.observations}[pid]
+    def node(self, node: Any) -> Any:
+        """Return the value of a node."""
+        if type(node) in _PLAIN:
+            return node
+        kind, *parts = node
+        if kind == "ref":
+            if parts[0] < 0 or (made := self._made[parts[0]]) is None:
+                raise ValueError("a part refers to one that is not complete")
+            return made
+        self._made.append(None)
+        number = len(self._made) - 1
+        if kind in ("list", "dict", "set", "deque"):
+            return self._container(number, kind, parts)
+        if kind == "object":
+            return self._object(number, *parts)
+        self._made[number] = made = self._value(kind, parts)
+        return made
+
+    def _container(self, number: int, kind: str, parts: list[Any]) -> Any:
+        """Make a container, which its parts may refer to."""
+        made: Any = deque(maxlen=parts.pop(0)) if kind == "deque" else {"list": list, "dict": dict, "set": set}[kind]()
+        self._made[number] = made
+        values = map(self.node, parts)
+        if kind == "dict":
+            made.update(zip(values, values, strict=True))  # one iterator: keys and values in turns
+        elif kind == "set":
+            made.update(values)
+        else:
+            made.extend(values)
+        return made
+
+    def _object(self, number: int, name: str, state: dict[str, Any]) -> Any:
+        cls = _own_class(name)
+        slots, restore = _slots(cls), _own_hook(cls, "__setstate__")
+        made = self._made[number] = object.__new__(cls)
+        values = {key: self.node(node) for key, node in state.items()}
+        if restore is not None:
+            restore(made, values)
+            return made
+        for key, value in values.items():
+            if key in slots:
+                slots[key].__set__(made, value)
+            else:
+                vars(made)[key] = value
+        return made
+
+    def _value(self, kind: str, parts: list[Any]) -> Any:
+        if kind in ("array", "scalar", "bytes"):
+            array = self._array(*parts)
+            return array if kind == "array" else array[()] if kind == "scalar" else array.tobytes()
+        if kind in ("dataset", "observations"):
+            return self._dataset if kind == "dataset" else self._dataset.observations
+        if kind == "generator":
+            generator = np.random.Generator(_BIT_GENERATORS[parts[0]]())
+            generator.bit_generator.state = self.node(parts[1])
+            return generator
+        kinds: dict[str, Any] = {"tuple": tuple, "frozenset": frozenset}
+        values = [self.node(part) for part in parts]
+        return kinds[kind](values) if kind in kinds else {"slice": slice, "complex": complex}[kind](*values)
+
+    def _array(
+        self, dtype: Any, shape: list[int], order: Literal["C", "F"], start: int, writeable: bool
+    ) -> np.ndarray[Any, Any]:
+        if min(start, *shape, 0) < 0:
+            raise ValueError("the place of an array is negative")
+        fields = [(name, of, *map(tuple, rest)) for name, of, *rest in dtype] if type(dtype) is list else dtype
+        made: np.ndarray[Any, Any] = np.ndarray(shape, np.dtype(fields), self._blobs, start, order=order).copy(order="K")
+        made.flags.writeable = writeable
+        return made
+
+
+@cache
+def _own_class(name: str) -> type:
+    """Return a class of this package by `module:qualified name`, without a call of anything but its module's import."""
+    module, _, path = name.partition(":")
+    parents = module.split(".")
+    if parents[0] != _PACKAGE or parents[-1] == "__main__":
+        raise ValueError(f"{name} does not belong into a checkpoint")
+    found: Any = importlib.import_module(module)
+    for part in path.split("."):
+        found = vars(found)[part]
+    if not isinstance(found, type) or (found.__module__, found.__qualname__) != (module, path):
+        raise ValueError(f"{name} is no class of its module")
+    return found

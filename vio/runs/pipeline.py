@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
@@ -42,6 +42,9 @@ from vio.records import (
 from vio.runs.dead_reckoning import DeadReckoning
 from vio.runs.mapped import MappedRun, mapped_run
 from vio.runs.recorder import GrowingFolder, RunRecorder
+
+if TYPE_CHECKING:
+    from vio.mapping.session import MapSession
 
 __all__ = ["STAGES", "FrameLog", "NullViewer", "RunControl", "RunResult", "run"]
 
@@ -138,7 +141,7 @@ def run(
         keep_observations: keep what the front end gave, for writing an observation log.
         viewer: watches each frame.
         parts: front end, selector or back end in place of the configured ones.
-        map: a map to begin, to continue or to be localised in.
+        map: a map to begin, to continue or to be localised in; on resuming, the same.
         control: where the run is written while it goes on, and what may end it.
 
     Raises:
@@ -154,6 +157,7 @@ def run(
     features = source.features or dataset
     if control.resume:
         state = recorder.restore(features)
+        _reopen_map(state.processor.map, map)
         viewer = _skipped(viewer, len(recorder))
     else:
         reckoned = source.motion == "velocity"
@@ -214,6 +218,19 @@ def given_rig(dataset: Dataset) -> Rig | None:
     if T_cam0_imu is not None:
         T_cam0_imu = se3_inverse(rig.T_imu_cam0)
     return Rig(rig.cam0, rig.cam1, se3_inverse(rig.T_cam0_cam1), T_cam0_imu, dataset.imu_noise, made.time_offset_s)
+
+
+def _reopen_map(session: MapSession | None, use: MapUse | None) -> None:
+    """Give a restored session its map's file; the checkpoint itself names no file.
+
+    Raises:
+        ConfigError: the run had a map and none is given, or the other way round.
+        DataError: the map cannot be used.
+    """
+    if (session is None) != (use is None):
+        raise ConfigError(f"the run began {'without' if session is None else 'with'} a map; go on in the same way")
+    if session is not None and use is not None:
+        session.reopen(use.path)
 
 
 def _nothing_done(recording: Recording, processor: EventProcessor, stopped: str | None) -> NoReturn:
