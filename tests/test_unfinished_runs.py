@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -30,9 +32,11 @@ from vio.errors import DataError, EstimationError
 from vio.files.tables import Table
 from vio.files.trajectories import read_trajectory
 from vio.filters.msckf import Msckf
+from vio.geometry.stereo import StereoCamera
 from vio.protocols import Dataset
 from vio.records import Estimate, Recording, StereoFieldEstimate, StereoScaleEstimate
 from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
+from vio.runs.folder import growing_folder
 from vio.runs.pipeline import RunControl, RunResult, run
 from vio.runs.recorder import GrowingFolder
 from vio.runs.tables import estimate_of, estimate_row
@@ -106,11 +110,11 @@ class Stop:
         return "interrupted" if self.left <= 0 else None
 
 
-def _flight_log(path: Path, frames: int = FRAMES, imu_from_ns: int = 0) -> Path:
+def _flight_log(path: Path, frames: int = FRAMES, imu_from_ns: int = 0, camera: StereoCamera = CAMERA) -> Path:
     """An observation log of a flight with an IMU, which may begin late."""
     flight, noise = Flight(frames=frames), np.random.default_rng(0)
     times = np.arange(frames, dtype=np.int64) * STEP_NS
-    recording = Recording("flight", Path("flight"), CAMERA, T_CAM0_IMU, times, False, frozenset({"imu"}), None)
+    recording = Recording("flight", Path("flight"), camera, T_CAM0_IMU, times, False, frozenset({"imu"}), None)
     samples = [s for s in flight.imu(noise, Config().msckf, np.zeros(6)) if s.time_ns >= imu_from_ns]
     seen = [flight.observe(k, 0.3, noise) for k in range(frames)]
     write_observation_log(path, recording, seen, samples, run_motion="imu")  # type: ignore[arg-type]
@@ -347,6 +351,110 @@ def test_a_disk_that_fills_keeps_what_is_written(
     assert main(["run", str(flight_log), "--out", str(out)]) == 1
     assert "No space left" in capsys.readouterr().err
     assert len(read_trajectory(out / "trajectory.tum")) > 30
+
+
+# What lies in the folder when a run goes on
+
+
+@pytest.fixture
+def stopped(flight_log: Path, tmp_path: Path) -> Path:
+    """The folder of a run that was interrupted, with a recording of its own."""
+    shutil.copy(flight_log, tmp_path / "flight.npz")
+    dataset, config, out = open_dataset(tmp_path / "flight.npz"), Config(), tmp_path / "run"
+    request = {"source": f"log:{tmp_path / 'flight.npz'}", "start": 0, "stop": None, "reference": None, "map": None}
+    request |= {"save_observations": True, "lengths_m": None}
+    folder = growing_folder(out, dataset, config, request)
+    run(dataset, config, keep_observations=True, folder=folder, should_stop=Stop(300))
+    return out
+
+
+def _refused(folder: Path, capsys: pytest.CaptureFixture[str], pattern: str) -> None:
+    """Go on with a run, which must be refused in one line and leave its tables as they are."""
+    held = {path: path.read_bytes() for path in folder.rglob("*.npy")}
+    assert main(["run", "--resume", str(folder), "--quiet"]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert re.search(pattern, error), error
+    assert {path: path.read_bytes() for path in folder.rglob("*.npy")} == held
+
+
+def _flip(path: Path, place: int = -200) -> None:
+    data = bytearray(path.read_bytes())
+    data[place] ^= 1
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("name", ["estimates", "frames", "observations", "seen", "samples"])
+@pytest.mark.parametrize(
+    "spoil", [lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]), _flip, Path.unlink], ids=str
+)
+def test_a_damaged_table_is_not_gone_on_with(
+    name: str, spoil: Callable[[Path], Any], stopped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil(stopped / "unfinished" / f"{name}.npy")
+    _refused(stopped, capsys, rf"{name}\.npy: .*(is damaged|No such file).*repeat the run from its start")
+
+
+@pytest.mark.parametrize(
+    ("name", "before", "after", "pattern"),
+    [
+        ("config.yaml", "clones: 11", "clones: 12", r"msckf\.clones was 11, now 12"),
+        ("unfinished/run.json", '"stop": null', '"stop": 50', "stop was None, now 50"),
+    ],
+)
+def test_a_run_whose_settings_were_edited_names_them(
+    name: str, before: str, after: str, pattern: str, stopped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (stopped / name).read_text()
+    assert before in text
+    (stopped / name).write_text(text.replace(before, after))
+    _refused(stopped, capsys, f"what the run depends on has changed.*{pattern}")
+
+
+def test_a_run_whose_recording_was_edited_names_what(stopped: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _flight_log(stopped.parent / "flight.npz", frames=FRAMES - 1)
+    _refused(stopped, capsys, f"number of frames was {FRAMES}, now {FRAMES - 1}")
+    _flight_log(stopped.parent / "flight.npz", camera=replace(CAMERA, fu=CAMERA.fu + 1))
+    _refused(stopped, capsys, rf"camera\.fu was {CAMERA.fu}, now {CAMERA.fu + 1}")
+
+
+def test_a_run_that_dies_after_its_checkpoint_goes_on_with_estimates_that_were_smoothed_since(
+    flight_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config, folder = replace(Config(), lag_frames=4), GrowingFolder(tmp_path / "run", {})
+    whole = run(open_dataset(flight_log), config)
+    stop = Stop(350)
+
+    def died() -> str | None:
+        if stop.left == 50:
+            monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 0.0)
+        if stop.left == 49:
+            monkeypatch.setattr("vio.runs.recorder._CHECKPOINT_S", 1e9)
+        if stop() is not None:
+            raise RuntimeError("died")
+        return None
+
+    with pytest.raises(RuntimeError, match="died"):
+        run(open_dataset(flight_log), config, folder=folder, should_stop=died)
+    _assert_same(whole, run(open_dataset(flight_log), config, folder=folder, resume=True))
+
+
+@pytest.mark.parametrize("kind", ["symbolic", "hard"])
+@pytest.mark.parametrize("name", ["trajectory.tum", "frames.csv", "unfinished/estimates.npy", "unfinished"])
+def test_links_in_a_run_folder_are_not_followed(
+    name: str, kind: str, stopped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, foreign = stopped / name, stopped.parent / "foreign"
+    path.rename(foreign)
+    if kind == "symbolic" or foreign.is_dir():
+        path.symlink_to(foreign)
+    else:
+        path.hardlink_to(foreign)
+    names = sorted(foreign.rglob("*")) if foreign.is_dir() else [foreign]
+    before = [(part, part.read_bytes()) for part in names]
+    assert main(["run", "--resume", str(stopped), "--quiet"]) == 1
+    assert re.search(f"{path.name}: is a link", capsys.readouterr().err)
+    assert [(part, part.read_bytes()) for part in names] == before
 
 
 # Checkpoints

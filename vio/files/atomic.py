@@ -12,9 +12,11 @@ import logging
 import os
 import re
 import shutil
+import stat
 import uuid
 from collections.abc import Collection, Iterator
 from pathlib import Path
+from typing import BinaryIO, Literal
 
 from vio.errors import DataError, VioError
 
@@ -26,6 +28,8 @@ except ImportError:  # Windows: leftovers stay
     fcntl = None  # type: ignore[assignment]
 
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+# Of `os.open`: neither follows a link nor waits for the reader of a pipe; text is written as it is.
+_NO_LINK = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
 _PROBE_BYTES = 2**22  # what a run of a thousand frames writes, about
 
 
@@ -87,6 +91,34 @@ def _new_partial_folder(target: Path) -> tuple[Path, int | None]:
 
 def _unwritable(path: Path, error: OSError) -> DataError:
     return DataError(f"cannot write {path}: {error.strerror or error}; choose a writable path with enough free space")
+
+
+def open_own(path: Path, mode: Literal["wb", "ab", "r+b"]) -> BinaryIO:
+    """Open a file of this program's for writing, whose content `wb` removes; a link is not followed.
+
+    Raises:
+        DataError: it is a link, which could lead to another's file, or no file.
+        OSError: it cannot be opened.
+    """
+    check_own(path)  # in words; what replaces it meanwhile is not opened
+    flags = os.O_RDWR | (0 if mode == "r+b" else os.O_CREAT) | (os.O_APPEND if mode == "ab" else 0)
+    descriptor = os.open(path, flags | _NO_LINK, 0o666)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise DataError(f"{path}: is no file; remove it, and repeat the command")
+    if mode == "wb":
+        os.ftruncate(descriptor, 0)
+    return os.fdopen(descriptor, mode)
+
+
+def check_own(path: Path) -> None:
+    """Raise DataError where a file or folder of this program's is a link, which could lead to another's."""
+    try:
+        found = path.lstat()
+    except OSError:  # opening it says why
+        return
+    if path.is_symlink() or (stat.S_ISREG(found.st_mode) and found.st_nlink > 1):
+        raise DataError(f"{path}: is a link, and another file would be overwritten; remove it, and repeat the command")
 
 
 def atomic_write_bytes(path: str | os.PathLike[str], data: bytes) -> None:

@@ -7,6 +7,7 @@ that dies leaves a file with all rows of its last flush.
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO, Generic, TypeVar, overload
@@ -15,7 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import DataError
+from vio.files.atomic import open_own
 
+_CHUNK = 10_000  # rows of which a checksum is computed at a time
 Rows = np.ndarray  # structured (N,)
 _Record = TypeVar("_Record")
 
@@ -23,43 +26,36 @@ _Record = TypeVar("_Record")
 class Table:
     """Structured rows, appended one or several at a time."""
 
-    def __init__(self, dtype: np.dtype, path: Path | None = None, *, keep: int = 0) -> None:
+    def __init__(
+        self, dtype: np.dtype, path: Path | None = None, *, keep: int = 0, summed: tuple[int, int] = (0, 0)
+    ) -> None:
         """Begin a table, or continue one.
 
         Args:
             dtype: structured type of a row.
             path: its file; None: in memory.
             keep: rows of an existing file to keep; what follows them is cut off.
+            summed: of how many of these rows a checksum is known, and the checksum, see `check_table`.
 
         Raises:
-            DataError: the file cannot be written, or has fewer rows or another type.
+            DataError: the file cannot be written, is a link, or has fewer rows or another type.
         """
         self.dtype, self._path = dtype, path
         self._memory: Rows = np.zeros(0, dtype=dtype)
-        self._count = keep
+        self._count, self._summed = keep, summed
         self._file: BinaryIO | None = None
+        self._is_synced = False
         if path is not None:
+            if keep:
+                check_table(path, dtype, keep)
             try:
-                self._file = path.open("r+b" if keep else "w+b")
-                self._start = self._begin(keep)
+                self._file = open_own(path, "r+b" if keep else "wb")
+                self._write_header()
+                self._start = self._file.tell()
+                self._file.truncate(self._start + keep * dtype.itemsize)
+                self._file.seek(0, os.SEEK_END)
             except OSError as error:
                 raise DataError(f"cannot write {path}: {error.strerror or error}") from error
-
-    def _begin(self, keep: int) -> int:
-        """Write a new file's header, or cut an existing file after `keep` rows; return where rows begin."""
-        assert self._file is not None
-        if keep:
-            np.lib.format.read_magic(self._file)
-            (rows,), _, dtype = np.lib.format.read_array_header_1_0(self._file)
-            if dtype != self.dtype or rows < keep:
-                self._file.close()
-                raise DataError(f"{self._path}: has {rows} rows of another kind or fewer than {keep}; it cannot go on")
-            start = self._file.tell()
-            self._file.truncate(start + keep * self.dtype.itemsize)
-        self._write_header()
-        start = self._file.tell()
-        self._file.seek(0, os.SEEK_END)
-        return start
 
     def _write_header(self) -> None:
         assert self._file is not None
@@ -77,6 +73,7 @@ class Table:
         Raises:
             OSError: the disk is full.
         """
+        self._is_synced = False
         if self._file is not None:
             self._file.write(rows.tobytes())
         else:
@@ -89,6 +86,7 @@ class Table:
 
     def replace(self, index: int, row: Rows) -> None:
         """Put a row (1,) in the place of another."""
+        self._is_synced = False
         if self._file is None:
             self._memory[index] = row[0]
             return
@@ -105,6 +103,19 @@ class Table:
         self._file.flush()
         self._file.seek(0, os.SEEK_END)
 
+    def sync(self) -> None:
+        """Flush, and wait until the disk has all rows."""
+        self.flush()
+        if self._file is not None and not self._is_synced:
+            os.fsync(self._file.fileno())
+            self._is_synced = True
+
+    def checksum(self, count: int) -> int:
+        """Return the CRC-32 of the first `count` rows, which may not change afterwards."""
+        done, crc = self._summed
+        self._summed = count, _checksum(self.rows(done, count), crc)
+        return self._summed[1]
+
     def rows(self, start: int = 0, stop: int | None = None) -> Rows:
         """Return rows, those of a file mapped into memory and not to be changed."""
         if self._file is None or self._count == 0:
@@ -120,6 +131,35 @@ class Table:
         if self._file is not None:
             self.flush()
             self._file.close()
+
+
+def check_table(path: Path, dtype: np.dtype, keep: int, summed: tuple[int, int] = (0, 0)) -> None:
+    """Check, without a change of it, that a table's file can be continued after `keep` rows.
+
+    Args:
+        path: its file.
+        dtype: structured type of a row.
+        keep: a number of rows.
+        summed: a number of rows, and the checksum that they must have.
+
+    Raises:
+        DataError: it is missing, has fewer rows or another type, or its rows are not those of the checksum.
+    """
+    try:
+        held = np.load(path, mmap_mode="r" if keep else None, allow_pickle=False)
+        if held.dtype != dtype or len(held) < keep:
+            raise ValueError(f"it has {len(held)} rows, of another kind or fewer than {keep}")
+        if _checksum(held[: summed[0]], 0) != summed[1]:
+            raise ValueError("its checksum does not agree with its content")
+    except (OSError, ValueError, EOFError) as error:
+        raise DataError(f"{path}: is damaged ({error}); repeat the run from its start") from error
+
+
+def _checksum(rows: Rows, crc: int) -> int:
+    """Return the CRC-32 of rows that follow others with the CRC-32 `crc`."""
+    for start in range(0, len(rows), _CHUNK):
+        crc = zlib.crc32(rows[start : start + _CHUNK].tobytes(), crc)
+    return crc
 
 
 class Records(Sequence[_Record], Generic[_Record]):

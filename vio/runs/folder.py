@@ -7,8 +7,9 @@ import logging
 import math
 import platform
 import shutil
+import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from vio._version import __version__
-from vio.files.atomic import atomic_folder
+from vio.files.atomic import atomic_folder, check_own
 from vio.calibration.stereo_field import PARAMETERS
-from vio.config import Config, to_yaml
+from vio.config import Config, describe, to_yaml
 from vio.datasets.common import checked_transform
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, DataError, EvaluationError
@@ -27,7 +28,7 @@ from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.files.inputs import read_input
 from vio.runs.loop_files import write_keyframes, write_loops
 from vio.runs.mapped import MappedRun
-from vio.runs.pipeline import STAGES, FrameLog, RunResult
+from vio.runs.pipeline import STAGES, FrameLog, RunResult, given_rig
 from vio.files.printable import json_text, printable
 from vio.protocols import Dataset
 from vio.records import IMU_ENTRIES, Landmarks, Trajectory
@@ -41,6 +42,7 @@ log = logging.getLogger(__name__)
 MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
 CALIBRATION = "camchain-imucam.yaml"  # the corrected calibration, where no other file is named for it
 REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
+_OF_THE_OUTPUT = ("source", "reference", "lengths_m", "save_calibration")  # of a request: it may move, or be compared anew
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 FILES = (
     MARKER,
@@ -108,13 +110,17 @@ def finish_run_folder(
     """
     unfinished = folder / UNFINISHED
     final = unfinished / "final"
+    check_own(unfinished)
+    check_own(final)
     try:
-        final.mkdir(exist_ok=True)
+        if final.exists():  # of a process that died
+            shutil.rmtree(final)
+        final.mkdir()
         metrics = _write_files(final, folder, result, reference, lengths_m, save_observations=save_observations)
         if result.stopped is None:
             (unfinished / "estimates.npy").replace(folder / "estimates.npy")
         else:
-            shutil.copyfile(unfinished / "estimates.npy", folder / "estimates.npy")
+            shutil.copyfile(unfinished / "estimates.npy", final / "estimates.npy")
         for name in sorted(path.name for path in final.iterdir() if path.name != MARKER):
             (final / name).replace(folder / name)
         (final / MARKER).replace(folder / MARKER)
@@ -148,7 +154,26 @@ def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapp
         MARKER: json_text(metrics, indent=2) + "\n",
         f"{UNFINISHED}/{REQUEST}": json.dumps(request, indent=2) + "\n",  # names of files as they are
     }
-    return GrowingFolder(folder, texts, replaces=FILES)
+    return GrowingFolder(folder, texts, replaces=FILES, inputs=_inputs(dataset, config, request))
+
+
+def _inputs(dataset: Dataset, config: Config, request: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the results depend on beside the images and samples themselves: settings, calibration, frames."""
+    recording = dataset.recording
+    times_ns = recording.frame_times_ns
+    values = {row.key: row.default for row in describe(config)}
+    values |= {name: value for name, value in request.items() if name not in _OF_THE_OUTPUT}
+    values |= {"number of frames": len(times_ns), "checksum of their times": zlib.crc32(times_ns.tobytes())}
+    values |= _flat("camera", recording.camera) | _flat("T_cam0_imu", recording.T_cam0_imu)
+    return values | _flat("calibration", given_rig(dataset))
+
+
+def _flat(name: str, value: Any) -> dict[str, Any]:
+    """Return the fields of a record by their full names, as values of JSON."""
+    if is_dataclass(value):
+        parts = [_flat(f"{name}.{part.name}", getattr(value, part.name)) for part in fields(value)]
+        return {key: own for part in parts for key, own in part.items()}
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value}
 
 
 def read_request(folder: Path) -> dict[str, Any]:

@@ -12,13 +12,13 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 
-from vio.files.atomic import atomic_write_text
+from vio.files.atomic import atomic_write_text, check_own, open_own
 from vio.runs.checkpoint import NotSavableError, load_checkpoint, save_checkpoint
 from vio.errors import DataError
 from vio.records import FrameLog, FrameResult
@@ -42,13 +42,14 @@ from vio.runs.tables import (
     sample_of,
     sample_row,
 )
-from vio.files.tables import Records, Rows, Table
+from vio.files.tables import Records, Rows, Table, check_table
 from vio.files.trajectories import tum_text
 
 log = logging.getLogger(__name__)
 
 UNFINISHED = "unfinished"  # folder inside a run's folder, while the run goes on or can go on
 CHECKPOINT = "checkpoint"
+_TEXTS = ("trajectory.tum", "frames.csv")  # that grow
 _FLUSH_S = 1.0
 _CHECKPOINT_S = 5.0
 _CHUNK = 100_000  # points at a time
@@ -73,6 +74,7 @@ class GrowingFolder:
     path: Path
     texts: Mapping[str, str]  # files written at the beginning, by name: what is known of the run before its first frame
     replaces: Sequence[str] = ()  # names of an earlier run's files, removed when the first frame has been processed
+    inputs: Mapping[str, Any] = field(default_factory=dict)  # JSON values by name: must be the same when it goes on
 
 
 class RunRecorder:
@@ -254,12 +256,23 @@ class RunRecorder:
             dataset: the recording, which is left out of it.
             finished: points of the map that will not change any more, and that the state no longer has.
         """
+        assert self._folder is not None
         with self._writing():
             self._put_away(finished)
         self.flush()
-        own = {"counts": {name: len(table) for name, table in self._tables.items()}, "stages": self._rows.stages}
+        settled = max(len(self) - self._lag, 0)  # estimates after these will be replaced
+        tables = {}
+        with self._writing():
+            for name, table in self._tables.items():
+                table.sync()
+                summed = settled if name == "estimates" else len(table)
+                tables[name] = len(table), (summed, table.checksum(summed))
+        late = np.array(self._tables["estimates"].rows(settled))
+        own = {"tables": tables, "late": late, "stages": self._rows.stages}
         try:
-            save_checkpoint(self._unfinished / CHECKPOINT, {"recorder": own, "run": state}, dataset)
+            save_checkpoint(
+                self._unfinished / CHECKPOINT, {"recorder": own, "run": state}, dataset, self._folder.inputs
+            )
         except NotSavableError as error:
             self._savable = False
             log.warning("this run cannot go on with --resume if it is interrupted: %s", error)
@@ -269,16 +282,23 @@ class RunRecorder:
         """Go on from the folder's checkpoint; return the state that `save` was given.
 
         Raises:
-            DataError: there is none, or it is damaged.
+            DataError: there is none, it or a table is damaged, or the run depends on what has changed since.
         """
         assert self._folder is not None
-        state = load_checkpoint(self._unfinished / CHECKPOINT, dataset)
+        for name in (UNFINISHED, *_TEXTS):
+            check_own(self._folder.path / name)
+        state = load_checkpoint(self._unfinished / CHECKPOINT, dataset, self._folder.inputs)
         own = state["recorder"]
         self._rows.stages = list(own["stages"])
-        self._tables = {
-            name: Table(dtype, self._unfinished / f"{name}.npy", keep=own["counts"][name])
-            for name, dtype in _TABLES.items()
-        }
+        paths = {name: self._unfinished / f"{name}.npy" for name in _TABLES}
+        for name, dtype in _TABLES.items():
+            check_table(paths[name], dtype, *own["tables"][name])
+        for name, dtype in _TABLES.items():
+            keep, summed = own["tables"][name]
+            self._tables[name] = Table(dtype, paths[name], keep=keep, summed=summed)
+        estimates = self._tables["estimates"]
+        for k, row in enumerate(own["late"], start=len(estimates) - len(own["late"])):
+            estimates.replace(k, row[None])
         return state["run"]
 
     def close(self) -> None:
@@ -330,12 +350,9 @@ class RunRecorder:
             self._csv_stages = sorted(self._rows.stages)
         first = start == 0
         tum = tum_text(rows["time_ns"], rows["T_world_imu"], body=self._body if first else None)
-        for name, text in (
-            ("trajectory.tum", tum),
-            ("frames.csv", frames_csv(frames, self._csv_stages, header=first)),
-        ):
-            with (folder / name).open("w" if first else "a", encoding="utf-8", newline="\n") as stream:
-                stream.write(text)
+        for name, text in zip(_TEXTS, (tum, frames_csv(frames, self._csv_stages, header=first)), strict=True):
+            with open_own(folder / name, "wb" if first else "ab") as stream:
+                stream.write(text.encode())
                 stream.flush()
                 os.fsync(stream.fileno())
 
