@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import signal
 import sqlite3
 import subprocess
@@ -147,16 +149,22 @@ def test_a_map_of_another_version_is_refused(tmp_path: Path) -> None:
         MapStore(path)
 
 
+def _make_older(path: Path, version: int) -> None:
+    """Make a map as earlier versions wrote it."""
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        for table in ("sessions", "keyframes", "features", "odometry", "loops"):
+            database.execute(f"ALTER TABLE {table} DROP COLUMN crc32")
+        for column in ("projection", "kind") if version == 1 else ():
+            database.execute(f"ALTER TABLE sessions DROP COLUMN {column}")
+        database.execute(f"PRAGMA user_version = {version}")
+        database.commit()
+
+
 def test_a_map_of_version_1_is_read_and_continued(tmp_path: Path) -> None:
     """It did not say of what cameras its images were."""
     path = tmp_path / "a.map"
     fill(path).close()
-    database = sqlite3.connect(path)
-    for column in ("projection", "kind"):
-        database.execute(f"ALTER TABLE sessions DROP COLUMN {column}")
-    database.execute("PRAGMA user_version = 1")
-    database.commit()
-    database.close()
+    _make_older(path, 1)
     for read_only in (True, False, True):
         store = MapStore(path, read_only=read_only)
         assert store.sessions() == [SessionRow("a place", CAMERA, True, 0)]
@@ -219,3 +227,128 @@ def test_a_map_that_cannot_be_made_says_why(tmp_path: Path) -> None:
         MapStore(tmp_path, create=True)
     with pytest.raises(DataError, match=r"its folder .*nowhere does not exist"):
         MapStore(tmp_path / "nowhere" / "a.map", create=True)
+
+
+# Damage
+
+
+def _content(path: Path) -> list[Any]:
+    """Everything that a map gives."""
+    store = MapStore(path, read_only=True)
+    with contextlib.closing(store):
+        rows = [store.sessions(), store.keyframes(), store.odometry(), store.loops()]
+        return [repr(rows), *(repr(store.features(k)) for k in range(4))]
+
+
+ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x FROM n"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        f"DROP TABLE loops; CREATE VIEW loops AS {ENDLESS}",
+        f"CREATE VIEW more AS {ENDLESS}",
+        "CREATE TRIGGER t AFTER UPDATE ON keyframes BEGIN DELETE FROM sessions; END",
+        "CREATE TABLE mine (x)",
+        "CREATE INDEX mine ON loops (first)",
+        "DROP TABLE loops",
+        "ALTER TABLE loops ADD COLUMN x INTEGER",
+        "ALTER TABLE loops ADD COLUMN x AS (first + 1)",
+        "DROP TABLE loops; CREATE VIRTUAL TABLE loops USING rtree(id, first, second)",
+    ],
+    ids=lambda change: change[:30],
+)
+def test_a_file_with_another_schema_is_refused(change: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.map"
+    fill(path).close()
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.executescript(change)
+    for read_only in (True, False):
+        with pytest.raises(
+            DataError, match=r"is not as this program makes it.*; restore a copy or build it again"
+        ) as error:
+            MapStore(path, read_only=read_only)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("UPDATE keyframes SET T_map_cam = x'00' WHERE id = 1", "row 1 of keyframes"),
+        ("UPDATE keyframes SET T_map_cam = zeroblob(128) WHERE id = 1", "row 1 of keyframes: a pose is none"),
+        ("UPDATE keyframes SET drift = 'text' WHERE id = 1", "row 1 of keyframes"),
+        ("UPDATE keyframes SET session = 77 WHERE id = 2", "belongs to no session"),
+        ("UPDATE keyframes SET time_ns = 'soon' WHERE id = 2", "soon is no integer"),
+        ("UPDATE keyframes SET path_m = 9e999 WHERE id = 2", "inf is no finite number"),
+        ("DELETE FROM keyframes WHERE id = 2", "row 2 is missing"),
+        ("UPDATE keyframes SET up_cam = x'000000000000f87f' WHERE id = 1", "row 1 of keyframes"),
+        ("UPDATE loops SET second = 9999", "keyframes that are not there"),
+        ("UPDATE odometry SET first = 3 WHERE second = 2", "keyframes that are not there"),
+        ("UPDATE odometry SET covariance = x'' WHERE second = 2", "row 2 of odometry"),
+        ("DELETE FROM features WHERE keyframe = 3", "has no features"),
+        ("UPDATE features SET z = substr(z, 1, 20) WHERE keyframe = 1", "row 1 of features"),
+        ("UPDATE features SET has_right = x'' WHERE keyframe = 1", "row 1 of features: its arrays are of different"),
+        (
+            "UPDATE features SET sigma_px = substr(sigma_px, 5) WHERE keyframe = 1",
+            "its arrays are of different lengths",
+        ),
+        ("UPDATE sessions SET fu = 0", "its camera is none"),
+        ("UPDATE sessions SET kind = x'00'", "a name is no text"),
+    ],
+)
+@pytest.mark.parametrize("version", [2, VERSION])
+def test_values_that_do_not_fit_together_are_one_line(version: int, change: str, message: str, tmp_path: Path) -> None:
+    """Version 2 has no checksums, which find any change."""
+    path = tmp_path / "a.map"
+    fill(path).close()
+    if version == 2:
+        _make_older(path, version)
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute(change)
+        database.commit()
+    with pytest.raises(DataError, match=r"a\.map: is damaged or no map \(.*\); restore a copy") as error:
+        _content(path)
+    assert "\n" not in str(error.value)
+    assert re.search(message if version == 2 or "DELETE" in change else "checksum does not agree", str(error.value))
+
+
+def _is_same_or_refused(path: Path, expected: list[Any]) -> bool:
+    """Read a map: whether it gives what is expected; False: it is refused in one line."""
+    try:
+        found = _content(path)
+    except DataError as error:
+        if "\n" in str(error):
+            raise
+        return False
+    assert found == expected
+    return True
+
+
+def test_a_map_whose_bytes_have_flipped_is_refused_or_the_same(tmp_path: Path) -> None:
+    path, flipped = tmp_path / "a.map", tmp_path / "b.map"
+    fill(path).close()
+    expected, whole, refused = _content(path), path.read_bytes(), 0
+    for place in np.random.default_rng(0).integers(len(whole), size=200).tolist():
+        data = bytearray(whole)
+        data[place] ^= 0x41
+        flipped.write_bytes(data)
+        refused += not _is_same_or_refused(flipped, expected)
+    assert refused > 20
+
+
+def test_a_long_step_ends_with_a_signal_and_with_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(number: int, frame: Any) -> None:
+        raise KeyboardInterrupt
+
+    store = fill(tmp_path / "a.map")
+    before = signal.signal(signal.SIGALRM, stop)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        with pytest.raises(KeyboardInterrupt), store._errors():
+            store._db.execute(f"SELECT count(*) FROM ({ENDLESS})").fetchone()
+        monkeypatch.setattr("vio.mapping.map_store._MOST_S", 0.2)
+        with pytest.raises(DataError, match="a step took more than"), store._errors():
+            store._db.execute(f"SELECT count(*) FROM ({ENDLESS})").fetchone()
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    store.close()

@@ -1,16 +1,22 @@
-"""The map's file: SQLite, version 2, described in docs/maps.md; version 1 is read, and becomes 2 when written to.
+"""The map's file: SQLite, version 3, described in docs/maps.md; older ones are read, and become 3 when written to.
 
-What belongs together is written in one transaction, so that a process that dies leaves the state before it.
+What belongs together is written in one transaction, so that a process that dies leaves the state before it. A file is
+checked when it is opened: it has our tables and nothing else, SQLite finds its pages whole, each row agrees with its
+checksum (from version 3 on), and its values fit together.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
 import sqlite3
-from collections.abc import Iterator
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,23 +26,35 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
 
-VERSION = 2
-_OLDEST = 1  # whose sessions name neither projection nor kind of their cameras: all were pinhole stereo pairs
+VERSION = 3
+_OLDEST = 1
+_SINCE = {
+    "projection": 2,
+    "kind": 2,
+    "crc32": 3,
+}  # version that brought a column; before 2 all were pinhole stereo pairs
+_KEYS = {"sessions": "id", "keyframes": "id", "features": "keyframe", "odometry": "second", "loops": "id"}
+_ROTATION_TOLERANCE = 1e-3  # of R R^T
+_MOST_S = 300.0  # of one step with the file
+_STEP = 10_000  # instructions of SQLite between two looks at the clock, and at signals
 APPLICATION_ID = 0x53564D50  # "SVMP" in the file's header
 _SCHEMA = """
 CREATE TABLE sessions (id INTEGER PRIMARY KEY, source TEXT NOT NULL, part INTEGER NOT NULL, upright INTEGER NOT NULL,
     fu REAL NOT NULL, fv REAL NOT NULL, cu REAL NOT NULL, cv REAL NOT NULL, baseline_m REAL NOT NULL,
-    width INTEGER, height INTEGER, projection TEXT NOT NULL, kind TEXT NOT NULL);
+    width INTEGER, height INTEGER, projection TEXT NOT NULL, kind TEXT NOT NULL, crc32 INTEGER NOT NULL);
 CREATE TABLE keyframes (id INTEGER PRIMARY KEY, session INTEGER NOT NULL, frame INTEGER NOT NULL,
     time_ns INTEGER NOT NULL, T_map_cam BLOB NOT NULL, T_odom_cam BLOB NOT NULL, drift BLOB NOT NULL,
-    path_m REAL NOT NULL, up_cam BLOB, up_sigma_rad REAL);
+    path_m REAL NOT NULL, up_cam BLOB, up_sigma_rad REAL, crc32 INTEGER NOT NULL);
 CREATE TABLE features (keyframe INTEGER PRIMARY KEY, z BLOB NOT NULL, has_right BLOB NOT NULL, sigma_px BLOB NOT NULL,
-    descriptors BLOB NOT NULL);
+    descriptors BLOB NOT NULL, crc32 INTEGER NOT NULL);
 CREATE TABLE odometry (second INTEGER PRIMARY KEY, first INTEGER NOT NULL, T_i_j BLOB NOT NULL,
-    covariance BLOB NOT NULL);
+    covariance BLOB NOT NULL, crc32 INTEGER NOT NULL);
 CREATE TABLE loops (id INTEGER PRIMARY KEY, first INTEGER NOT NULL, second INTEGER NOT NULL, T_i_j BLOB NOT NULL,
-    covariance BLOB NOT NULL, inliers INTEGER NOT NULL, kept INTEGER NOT NULL);
+    covariance BLOB NOT NULL, inliers INTEGER NOT NULL, kept INTEGER NOT NULL, crc32 INTEGER NOT NULL);
 """
+
+
+_Row = TypeVar("_Row")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +105,16 @@ def _errors_of(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.OperationalError as error:
+        if "interrupted" in str(error):  # by a signal's handler, whose exception SQLite takes for a wish to stop
+            raise KeyboardInterrupt from error
         remedy = "wait for the run that uses it" if "locked" in str(error) else "check the path and the free space"
         raise DataError(f"{path}: the map cannot be used ({error}); {remedy}") from error
     except sqlite3.DatabaseError as error:
-        raise DataError(f"{path}: is damaged or no map ({error}); restore a copy or build it again") from error
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, fault: object) -> DataError:
+    return DataError(f"{path}: is damaged or no map ({fault}); restore a copy or build it again")
 
 
 class MapStore:
@@ -111,6 +135,7 @@ class MapStore:
             DataError: there is no such map, it is damaged, of another version, or in use by another process.
         """
         self.path = path if known_as is None else known_as
+        self._end_s = math.inf
         check_path(path)
         if not create and not path.is_file():
             raise DataError(f"{path}: there is no such map; vio run --map {path} makes one")
@@ -122,6 +147,8 @@ class MapStore:
                 self._db = sqlite3.connect(path, check_same_thread=False, timeout=1.0)
                 self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._db.isolation_level = None
+            self._db.create_function("row_crc32", -1, _row_crc32, deterministic=True)
+            self._db.set_progress_handler(self._is_late, _STEP)
             empty = not self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
             if empty and create:
                 self._db.executescript(
@@ -135,16 +162,40 @@ class MapStore:
                     f"{path}: is a map of version {self._pragma('user_version')}, this program reads {VERSION}; use "
                     "the program that wrote it, or build the map again"
                 )
+            self._check()
             if not read_only:
                 self._db.execute("BEGIN IMMEDIATE")
                 self._bring_up_to_date()
 
+    def _check(self) -> None:
+        """Raise DataError unless the file holds our tables, whole, with values that fit together."""
+        if (found := _schema_of(self._db)) != _expected(self.version):
+            other = sorted({name for _, name, *_ in found ^ _expected(self.version)})
+            raise _damaged(self.path, f"{', '.join(other)} is not as this program makes it")
+        ((answer,),) = self._db.execute("PRAGMA quick_check(1)")
+        if answer != "ok":
+            raise _damaged(self.path, " ".join(answer.split()))
+        sessions, keyframes = len(self.sessions()), len(self.keyframes())
+        if any(not 0 <= k.session < sessions for k in self.keyframes()):
+            raise _damaged(self.path, "a keyframe belongs to no session")
+        pairs = [(i, j) for i, j, _ in self.odometry()] + [(o.first, o.second) for o in self.loops()]
+        if any(not 0 <= i < j < keyframes for i, j in pairs):
+            raise _damaged(self.path, "a motion is between keyframes that are not there")
+        if [k for (k,) in self._db.execute("SELECT keyframe FROM features ORDER BY keyframe")] != list(
+            range(keyframes)
+        ):
+            raise _damaged(self.path, "a keyframe has no features")
+
     def _bring_up_to_date(self) -> None:
-        """Add what version 1 had not."""
-        if self._pragma("user_version") == VERSION:
-            return
-        for column, value in (("projection", "pinhole"), ("kind", "stereo")):
-            self._db.execute(f"ALTER TABLE sessions ADD COLUMN {column} TEXT NOT NULL DEFAULT '{value}'")
+        """Add what older versions had not."""
+        version = self.version
+        if version < 2:
+            for column, value in (("projection", "pinhole"), ("kind", "stereo")):
+                self._db.execute(f"ALTER TABLE sessions ADD COLUMN {column} TEXT NOT NULL DEFAULT '{value}'")
+        if version < 3:
+            for table in _KEYS:
+                self._db.execute(f"ALTER TABLE {table} ADD COLUMN crc32 INTEGER NOT NULL DEFAULT 0")
+                self._sign(table)
         self._db.execute(f"PRAGMA user_version = {VERSION}")
 
     @property
@@ -155,8 +206,19 @@ class MapStore:
     def _pragma(self, name: str) -> int:
         return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
 
-    def _errors(self) -> contextlib.AbstractContextManager[None]:
-        return _errors_of(self.path)
+    @contextlib.contextmanager
+    def _errors(self) -> Iterator[None]:
+        self._end_s = time.monotonic() + _MOST_S
+        with _errors_of(self.path):
+            try:
+                yield
+            except sqlite3.OperationalError as error:
+                if not self._is_late():
+                    raise
+                raise DataError(f"{self.path}: a step took more than {_MOST_S:.0f} s; build the map again") from error
+
+    def _is_late(self) -> bool:
+        return time.monotonic() > self._end_s
 
     # Writing
 
@@ -218,36 +280,39 @@ class MapStore:
 
     def set_poses(self, T_map_cam: FloatArray) -> None:
         """Replace the poses (K, 4, 4) of all keyframes."""
-        with self._errors():
-            self._db.executemany(
-                "UPDATE keyframes SET T_map_cam = ? WHERE id = ?", [(_blob(T), k) for k, T in enumerate(T_map_cam)]
-            )
+        self._set("keyframes", "T_map_cam", [_blob(T) for T in T_map_cam])
 
     def set_kept(self, kept: list[bool]) -> None:
         """Say of each loop whether it agrees with the others."""
-        with self._errors():
-            self._db.executemany("UPDATE loops SET kept = ? WHERE id = ?", [(k, n) for n, k in enumerate(kept)])
+        self._set("loops", "kept", kept)
 
     def set_parts(self, parts: list[int]) -> None:
         """Replace the part of each session."""
-        with self._errors():
-            self._db.executemany("UPDATE sessions SET part = ? WHERE id = ?", [(p, n) for n, p in enumerate(parts)])
+        self._set("sessions", "part", parts)
 
     def truncate(self, sessions: int, keyframes: int, loops: int) -> None:
         """Forget what was added after there were so many."""
         with self._errors():
-            for table, column, count in (
-                ("sessions", "id", sessions),
-                ("keyframes", "id", keyframes),
-                ("features", "keyframe", keyframes),
-                ("odometry", "second", keyframes),
-                ("loops", "id", loops),
-            ):
-                self._db.execute(f"DELETE FROM {table} WHERE {column} >= ?", (count,))
+            for table, key in _KEYS.items():
+                count = {"sessions": sessions, "loops": loops}.get(table, keyframes)
+                self._db.execute(f"DELETE FROM {table} WHERE {key} >= ?", (count,))
 
     def _insert(self, table: str, values: tuple[Any, ...]) -> None:
         with self._errors():
-            self._db.execute(f"INSERT INTO {table} VALUES ({','.join('?' * len(values))})", values)
+            self._db.execute(f"INSERT INTO {table} VALUES ({'?,' * len(values)}0)", values)
+            self._sign(table, f"WHERE {_KEYS[table]} = {int(values[0])}")
+
+    def _set(self, table: str, column: str, values: Sequence[Any]) -> None:
+        """Replace a value of every row, in the order of their numbers."""
+        with self._errors():
+            rows = [(value, n) for n, value in enumerate(values)]
+            self._db.executemany(f"UPDATE {table} SET {column} = ? WHERE id = ?", rows)
+            self._sign(table)
+
+    def _sign(self, table: str, which: str = "") -> None:
+        """Write the checksums of rows, of their values as they are stored."""
+        columns = [name for name, *_ in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))]
+        self._db.execute(f"UPDATE {table} SET crc32 = row_crc32({', '.join(columns[:-1])}) {which}")
 
     def _count(self, table: str) -> int:
         with self._errors():
@@ -257,63 +322,142 @@ class MapStore:
 
     def sessions(self) -> list[SessionRow]:
         """Return all sessions."""
-        return [
-            SessionRow(source, StereoCamera(*camera), bool(upright), part)
-            for _, source, part, upright, *camera in self._all("sessions")
-        ]
+
+        def made(_: int, source: str, part: int, upright: int, *camera: Any) -> SessionRow:
+            lengths: list[Any] = [_number(value) for value in camera[:5]]
+            size, names = camera[5:7], [source, *camera[7:]]
+            if not all(isinstance(value, (int, type(None))) for value in size) or min(lengths[:2]) <= 0:
+                raise ValueError("its camera is none")
+            if not all(isinstance(value, str) for value in names):
+                raise ValueError("a name is no text")
+            return SessionRow(source, StereoCamera(*lengths, *camera[5:]), bool(upright), _integer(part))
+
+        return self._read("sessions", made)
 
     def keyframes(self) -> list[KeyframeRow]:
         """Return all keyframes."""
-        return [
-            KeyframeRow(
-                session,
-                frame,
-                time_ns,
-                _matrix(T_map, 4),
-                _matrix(T_odom, 4),
-                _matrix(drift, 6),
-                path_m,
-                None if up is None else np.frombuffer(up, dtype="<f8").copy(),
-                sigma,
-            )
-            for _, session, frame, time_ns, T_map, T_odom, drift, path_m, up, sigma in self._all("keyframes")
-        ]
+
+        def made(
+            _: int, session: int, frame: int, time_ns: int, T_map: bytes, T_odom: bytes, drift: bytes, path_m: float,
+            up: bytes | None, sigma: float | None,
+        ) -> KeyframeRow:  # fmt: skip
+            numbers = _integer(session), _integer(frame), _integer(time_ns)
+            vertical = None if up is None else _array(up, 3), 0.0 if sigma is None else _number(sigma)
+            return KeyframeRow(*numbers, _pose(T_map), _pose(T_odom), _array(drift, 6, 6), _number(path_m), *vertical)
+
+        return self._read("keyframes", made)
 
     def odometry(self) -> list[tuple[int, int, RelativePose]]:
         """Return all motions between keyframes, (first, second, motion)."""
-        rows = self._all("odometry", "second")
-        return [(first, second, RelativePose(_matrix(T, 4), _matrix(C, 6))) for second, first, T, C in rows]
+
+        def made(second: int, first: int, T: bytes, covariance: bytes) -> tuple[int, int, RelativePose]:
+            return _integer(first), second, RelativePose(_pose(T), _array(covariance, 6, 6))
+
+        return self._read("odometry", made)
 
     def loops(self) -> list[LoopRow]:
         """Return all loops."""
-        return [
-            LoopRow(first, second, RelativePose(_matrix(T, 4), _matrix(C, 6)), inliers, bool(kept))
-            for _, first, second, T, C, inliers, kept in self._all("loops")
-        ]
+
+        def made(_: int, first: int, second: int, T: bytes, covariance: bytes, inliers: int, kept: int) -> LoopRow:
+            pose = RelativePose(_pose(T), _array(covariance, 6, 6))
+            return LoopRow(_integer(first), _integer(second), pose, _integer(inliers), bool(kept))
+
+        return self._read("loops", made)
 
     def features(self, keyframe: int) -> KeyframeFeatures:
         """Return the features of one keyframe."""
-        with self._errors():
-            row = self._db.execute("SELECT * FROM features WHERE keyframe = ?", (keyframe,)).fetchone()
-        if row is None:
-            raise DataError(f"{self.path}: is damaged (keyframe {keyframe} has no features); restore a copy")
-        _, z, has_right, sigma, descriptors = row
-        bits = np.frombuffer(descriptors, dtype=np.uint8).reshape(-1, DESCRIPTOR_BYTES)
-        return KeyframeFeatures(
-            np.frombuffer(z, dtype="<f4").astype(np.float64).reshape(-1, 4),
-            np.unpackbits(np.frombuffer(has_right, dtype=np.uint8), count=len(bits)).astype(np.bool_),
-            np.frombuffer(sigma, dtype="<f4").astype(np.float64),
-            bits.copy(),
-        )
 
-    def _all(self, table: str, key: str = "id") -> list[Any]:
+        def made(_: int, z: bytes, has_right: bytes, sigma: bytes, descriptors: bytes) -> KeyframeFeatures:
+            bits = np.frombuffer(descriptors, dtype=np.uint8).reshape(-1, DESCRIPTOR_BYTES)
+            pixels = np.frombuffer(z, dtype="<f4").astype(np.float64).reshape(len(bits), 4)
+            right = np.unpackbits(np.frombuffer(has_right, dtype=np.uint8)).astype(np.bool_)
+            sigma_px = np.frombuffer(sigma, dtype="<f4").astype(np.float64)
+            if len(sigma_px) != len(bits) or len(right) != 8 * ((len(bits) + 7) // 8):
+                raise ValueError("its arrays are of different lengths")
+            if not (np.isfinite(pixels[:, :2]).all() and np.isfinite(sigma_px).all()):
+                raise ValueError("a pixel is not finite")
+            return KeyframeFeatures(pixels, right[: len(bits)], sigma_px, bits.copy())
+
+        found = self._read("features", made, f"WHERE keyframe = {int(keyframe)}")
+        if not found:
+            raise _damaged(self.path, f"keyframe {keyframe} has no features")
+        return found[0]
+
+    def _read(self, table: str, made: Callable[..., _Row], which: str = "") -> list[_Row]:
+        """Return what is made of the rows of a table, in the order of their numbers.
+
+        Raises:
+            DataError: a row is missing, or not what was written.
+        """
+        key = _KEYS[table]
         with self._errors():
-            return self._db.execute(f"SELECT * FROM {table} ORDER BY {key}").fetchall()
+            rows = self._db.execute(f"SELECT * FROM {table} {which} ORDER BY {key}").fetchall()
+        out, signed = [], self.version >= _SINCE["crc32"]
+        for place, row in enumerate(rows):
+            try:
+                if signed and row[-1] != _row_crc32(*row[:-1]):
+                    raise ValueError("its checksum does not agree with its content")
+                if key == "id" and row[0] != place:
+                    raise ValueError(f"row {place} is missing")
+                out.append(made(*row[: len(row) - signed]))
+            except (ValueError, TypeError) as error:
+                raise _damaged(self.path, f"row {row[0]} of {table}: {error}") from error
+        return out
+
+
+def _schema_of(database: sqlite3.Connection) -> set[tuple[Any, ...]]:
+    """Return tables and columns, and what else a file has; a view or a trigger would run when rows are read."""
+    found = database.execute("SELECT type, name, sql LIKE 'CREATE TABLE %' FROM sqlite_master").fetchall()
+    columns = 'SELECT name, type, "notnull", pk, hidden FROM pragma_table_xinfo(?)'
+    return {
+        (kind, name, plain, *column)
+        for kind, name, plain in found
+        for column in (database.execute(columns, (name,)).fetchall() if (kind, plain) == ("table", 1) else [()])
+    }
+
+
+@cache
+def _expected(version: int) -> frozenset[tuple[Any, ...]]:
+    """Return what `_schema_of` finds in a map of a version."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as database:
+        database.executescript(_SCHEMA)
+        return frozenset(row for row in _schema_of(database) if _SINCE.get(row[3], _OLDEST) <= version)
+
+
+def _row_crc32(*values: Any) -> int:
+    """Return the CRC-32 of a row's values as SQLite gives them."""
+    crc = 0
+    for value in values:
+        crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r};".encode(), crc)
+    return crc
 
 
 def _blob(array: FloatArray) -> bytes:
     return np.ascontiguousarray(array, dtype="<f8").tobytes()
 
 
-def _matrix(blob: bytes, size: int) -> FloatArray:
-    return np.frombuffer(blob, dtype="<f8").reshape(size, size).copy()
+def _array(blob: bytes, *shape: int) -> FloatArray:
+    """Return the finite numbers of a blob as an array of a shape."""
+    array = np.frombuffer(blob, dtype="<f8").reshape(shape).copy()
+    if not np.isfinite(array).all():
+        raise ValueError("a number is not finite")
+    return array
+
+
+def _pose(blob: bytes) -> FloatArray:
+    T = _array(blob, 4, 4)
+    if np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > _ROTATION_TOLERANCE or (T[3] != (0, 0, 0, 1)).any():
+        raise ValueError("a pose is none")
+    return T
+
+
+def _number(value: Any) -> float:
+    if not isinstance(value, float) or not math.isfinite(value):
+        raise ValueError(f"{str(value)[:20]} is no finite number")
+    return value
+
+
+def _integer(value: Any) -> int:
+    if not isinstance(value, int):
+        raise ValueError(f"{str(value)[:20]} is no integer")
+    return value
