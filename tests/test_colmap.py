@@ -31,8 +31,7 @@ from vio.offline.poses import align_to_points, position_covariances
 from vio.offline.saved_run import read_saved_run, with_poses
 from vio.records import Estimate, LoopEvent, LoopMatches
 from vio.runs.folder import write_run_folder
-from vio.runs.loop_files import write_loops
-from vio.runs.mapped import corrected
+from vio.runs.mapped import corrected, write_loops
 from vio.runs.pipeline import run as process
 from vio.sim.effects import CLEAN
 from vio.sim.export import export_kitti

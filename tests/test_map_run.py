@@ -27,8 +27,7 @@ from vio.mapping.map_store import MapStore
 from vio.mapping.session import HANDOVER_FRAMES, MapSession
 from vio.records import Estimate, FrameResult, LoopEvent, LoopMatches, Observations, StereoFrame, observations
 from vio.runs.finished import read_finished_run
-from vio.runs.loop_files import read_loops, write_loops
-from vio.runs.mapped import corrected
+from vio.runs.mapped import corrected, read_loops, write_loops
 from vio.runs.pipeline import RunControl, run
 from vio.runs.recorder import GrowingFolder
 

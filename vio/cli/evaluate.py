@@ -123,9 +123,10 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
 
 def _read(path: Path) -> tuple[Trajectory, FloatArray | None]:
     """Read a trajectory file, a run's folder or a COLMAP model, with the extrinsics if it has them."""
-    from vio.runs.folder import MARKER, read_run
+    from vio.runs.files import RunFile
+    from vio.runs.folder import read_run
 
-    if path.is_dir() and not (path / MARKER).is_file():
+    if path.is_dir() and not (path / RunFile.METRICS).is_file():
         from vio.offline.colmap import quiet
         from vio.offline.colmap.trajectory import model_folder, read_colmap_trajectory
 

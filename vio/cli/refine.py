@@ -99,13 +99,14 @@ def _write(out: Path, run: SavedRun, done: Refinement, metrics: dict[str, Any]) 
     from vio.files.atomic import atomic_folder
     from vio.files.printable import json_text
     from vio.files.trajectories import write_tum
-    from vio.runs.folder import MARKER, write_landmarks_ply
+    from vio.runs.files import RunFile
+    from vio.runs.folder import write_landmarks_ply
 
-    with atomic_folder(out, replace=True, marker=MARKER) as folder:
+    with atomic_folder(out, replace=True, marker=RunFile.METRICS) as folder:
         in_body = done.trajectory.in_imu(run.T_cam0_imu) if run.metrics["body"] == "imu" else done.trajectory
-        write_tum(folder / "trajectory.tum", in_body)
-        write_landmarks_ply(folder / "landmarks.ply", done.landmarks)
-        (folder / MARKER).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
+        write_tum(folder / RunFile.TRAJECTORY, in_body)
+        write_landmarks_ply(folder / RunFile.LANDMARKS, done.landmarks)
+        (folder / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
 
 
 def _rows(m: dict[str, Any]) -> list[tuple[str, str]]:

@@ -26,6 +26,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.errors import DataError
     from vio.files.atomic import check_new_file
+    from vio.runs.files import RunFile
     from vio.runs.finished import read_finished_run, with_distinct_names
 
     try:
@@ -33,7 +34,7 @@ def execute(args: argparse.Namespace) -> int:
     except ImportError as error:  # pragma: no cover - plotly is installed with this package
         raise DataError(f"the report needs plotly ({error}); install it with: pip install plotly") from error
     runs = with_distinct_names([read_finished_run(folder, args.reference) for folder in args.runs])
-    out: Path = args.out or args.runs[0] / "report.html"
+    out: Path = args.out or args.runs[0] / RunFile.REPORT
     check_new_file(out, b'<p class="remark">stereo-vio')
     write_report(out, runs)
     print(out)

@@ -23,17 +23,14 @@ from vio.files.trajectories import read_trajectory
 from vio.live.build import MapUse, resolve_motion
 from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Trajectory
+from vio.runs.files import CHECKPOINT, FILES, RunFile
 from vio.runs.folder import (
-    CALIBRATION,
-    FILES,
-    MARKER,
     calibration_text,
     finish_run_folder,
     growing_folder,
     read_request,
 )
 from vio.runs.pipeline import RunControl, RunResult, given_rig, run
-from vio.runs.recorder import CHECKPOINT, UNFINISHED
 
 if TYPE_CHECKING:
     from vio.view.live import RerunViewer
@@ -139,9 +136,9 @@ def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
         VioError: the folder holds no unfinished run, or one that another program began.
     """
     request = read_request(folder)
-    config = load_config(folder / "config.yaml")
+    config = load_config(folder / RunFile.CONFIG)
     dataset = _opened(request["source"], config, mapped=request["map"] is not None)
-    saved = (folder / UNFINISHED / CHECKPOINT).is_file()
+    saved = (folder / RunFile.UNFINISHED / CHECKPOINT).is_file()
     if not saved:
         log.warning("%s: the run ended before its first checkpoint; it begins again", folder)
     return _process(dataset, config, folder, request, progress=progress, resume=saved)
@@ -193,7 +190,7 @@ def _process(
                 atomic_write_text(file, calibration)
                 metrics["calibration"] = file
         except KeyboardInterrupt as error:
-            if not (folder / UNFINISHED).is_dir():
+            if not (folder / RunFile.UNFINISHED).is_dir():
                 raise
             text = f"interrupted; what was flushed is in {folder}; go on with: vio run --resume {folder}"
             raise StoppedError(text, status=130) from error
@@ -238,7 +235,7 @@ def _calibration_file(dataset: Dataset, folder: Path, asked: Path | None) -> Pat
             f"{dataset.recording.path}: states no image size, which a calibration needs; leave --save-calibration out"
         )
     if asked == Path():
-        return folder / CALIBRATION
+        return folder / RunFile.CALIBRATION
     if asked.suffix.lower() not in (".yaml", ".yml"):
         raise ConfigError(f"--save-calibration {asked}: writes Kalibr's format; give a file name that ends in .yaml")
     if asked.is_dir() or not asked.absolute().parent.is_dir():
@@ -273,7 +270,7 @@ def check_out(folder: Path) -> Path:
     """
     if folder.exists() and not folder.is_dir():
         raise VioError(f"{folder}: is a file; --out takes a folder")
-    check_replaceable(folder, replace=True, marker=MARKER, own=FILES)
+    check_replaceable(folder, replace=True, marker=RunFile.METRICS, own=FILES)
     check_writable(folder)
     return folder
 
@@ -331,7 +328,7 @@ def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if metrics.get("calibration") is not None:
         rows.append(("calib.", f"{metrics['calibration']} (next: --calibration FILE)"))
     rows.append(("results", metrics["out"]))
-    plot = Path(metrics["out"]) / "trajectory.png"
+    plot = Path(metrics["out"]) / RunFile.PICTURE
     rows.append(("plot", str(plot) if plot.is_file() else "could not be drawn"))
     return rows
 

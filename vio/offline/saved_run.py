@@ -27,10 +27,9 @@ from vio.geometry.stereo import StereoCamera
 from vio.offline.comparison import GroundTruth
 from vio.offline.keyframes import TrackedPath
 from vio.records import FIELD_TERMS, ROW_TERMS, FeatureTracks, IntArray, LoopEvent, StereoFrame, need_stereo
+from vio.runs.files import RunFile
 from vio.runs.folder import read_metrics
-from vio.runs.loop_files import read_loops
-
-OBSERVATIONS = "observations.npz"
+from vio.runs.mapped import read_loops
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,17 +62,19 @@ def read_saved_run(folder: Path) -> SavedRun:
         DataError: no such folder, or the observations were not saved.
     """
     metrics, T_cam0_imu = read_metrics(folder)
-    log = folder / OBSERVATIONS
+    log = folder / RunFile.OBSERVATIONS
     if not log.is_file():
-        raise DataError(f"{folder} has no {OBSERVATIONS}; repeat its run with --save-observations")
+        raise DataError(f"{folder} has no {RunFile.OBSERVATIONS}; repeat its run with --save-observations")
     dataset = read_observation_log(log)
     need_stereo(replace(dataset.recording, path=folder), "checking, refining or exporting a run")
     loops = tuple(o for o in read_loops(folder) if o.kept and o.keyframe_frame is not None and o.matches is not None)
-    poses = "map_trajectory.tum" if loops else "trajectory.tum"
+    poses = RunFile.MAP_TRAJECTORY if loops else RunFile.TRAJECTORY
     trajectory = read_trajectory(folder / poses)
     frames = trajectory.frame_indices
     if frames is None or not np.array_equal(frames, dataset.present) or not np.isfinite(trajectory.T_world_body).all():
-        raise DataError(f"{folder}: {poses} and {OBSERVATIONS} are not of the same complete run; repeat the run")
+        raise DataError(
+            f"{folder}: {poses} and {RunFile.OBSERVATIONS} are not of the same complete run; repeat the run"
+        )
     camera, tracks = dataset.recording.camera, dataset.tracks
     coefficients, field = _field_coefficients(folder, camera, metrics), None
     if camera.is_cylinder:
@@ -155,9 +156,9 @@ def with_poses(run: SavedRun, folder: Path) -> SavedRun:
     Raises:
         DataError: that folder does not exist or contains other frames.
     """
-    if not (folder / "trajectory.tum").is_file():
+    if not (folder / RunFile.TRAJECTORY).is_file():
         raise DataError(f"{folder} contains no trajectory; create it with `vio refine {run.tracked.where}`")
-    trajectory = read_trajectory(folder / "trajectory.tum").in_cam0(run.T_cam0_imu)
+    trajectory = read_trajectory(folder / RunFile.TRAJECTORY).in_cam0(run.T_cam0_imu)
     if trajectory.frame_indices is None or not np.array_equal(trajectory.frame_indices, run.tracked.frames):
         raise DataError(f"{folder} contains other frames than {run.tracked.where}; refine again")
     return replace(run, tracked=replace(run.tracked, trajectory=trajectory))

@@ -16,11 +16,11 @@ from vio.errors import ConfigError, DataError, EvaluationError
 from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.geometry.lie import FloatArray
 from vio.files.inputs import read_input
-from vio.runs.loop_files import read_keyframes, read_loops
+from vio.runs.mapped import read_keyframes, read_loops
 from vio.records import LoopEvent, MapKeyframes
 from vio.records import Trajectory
 from vio.runs.folder import read_metrics
-from vio.runs.recorder import UNFINISHED
+from vio.runs.files import RunFile
 from vio.runs.tables import ESTIMATE
 from vio.files.tables import Rows
 from vio.files.trajectories import read_trajectory
@@ -69,18 +69,18 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         DataError: it is no run's folder, or a file in it is missing or damaged.
     """
     metrics, T_cam0_body = read_metrics(folder)
-    if not (folder / "estimates.npy").is_file() and (folder / UNFINISHED).is_dir():
+    if not (folder / RunFile.ESTIMATES).is_file() and (folder / RunFile.UNFINISHED).is_dir():
         raise DataError(f"{folder}: this run was ended before its end; `vio run --resume {folder}` goes on with it")
-    estimates = _read_estimates(folder / "estimates.npy")
-    frames = _read_frames(folder / "frames.csv", len(estimates))
-    points = _read_points(folder / "landmarks.ply")
+    estimates = _read_estimates(folder / RunFile.ESTIMATES)
+    frames = _read_frames(folder / RunFile.FRAMES, len(estimates))
+    points = _read_points(folder / RunFile.LANDMARKS)
     trajectory = Trajectory(
         np.array(estimates["T_world_imu"]),
         np.array(estimates["time_ns"]),
         "cam0" if metrics.get("body") == "cam0" else "imu",
         frame_indices=np.array(estimates["index"]),
     )
-    reckoned, in_map = folder / "dead_reckoning.tum", folder / "map_trajectory.tum"
+    reckoned, in_map = folder / RunFile.DEAD_RECKONING, folder / RunFile.MAP_TRAJECTORY
     return FinishedRun(
         folder=folder,
         name=folder.resolve().name,
@@ -92,7 +92,7 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         trajectory=trajectory,
         evaluation=_evaluation(folder, trajectory, reference, T_cam0_body),
         dead_reckoning=read_trajectory(reckoned) if reckoned.is_file() else None,
-        changed=_changed_settings(folder / "config.yaml"),
+        changed=_changed_settings(folder / RunFile.CONFIG),
         T_cam0_body=T_cam0_body,
         mapped=read_trajectory(in_map) if in_map.is_file() else None,
         loops=read_loops(folder),
@@ -160,7 +160,7 @@ def _evaluation(
     folder: Path, trajectory: Trajectory, reference: Path | None, T_cam0_body: FloatArray
 ) -> Evaluation | None:
     """Compare with a given reference, or with the one that the run left in its folder."""
-    path = folder / "reference.tum" if reference is None else reference
+    path = folder / RunFile.REFERENCE if reference is None else reference
     if reference is None and not path.is_file():
         return None
     truth = read_trajectory(path)

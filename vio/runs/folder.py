@@ -26,46 +26,21 @@ from vio.errors import CalibrationError, DataError, EvaluationError
 from vio.evaluation.trajectories import Evaluation, error_statistics, evaluate, path_length_m
 from vio.geometry.lie import FloatArray, se3_inverse, se3_log, transform_points
 from vio.files.inputs import read_input
-from vio.runs.loop_files import write_keyframes, write_loops
-from vio.runs.mapped import MappedRun
+from vio.runs.files import FILES, REQUEST, RunFile
+from vio.runs.mapped import MappedRun, write_keyframes, write_loops
 from vio.runs.pipeline import STAGES, FrameLog, RunResult, given_rig
 from vio.files.printable import json_text, printable
 from vio.protocols import Dataset
 from vio.records import IMU_ENTRIES, Landmarks, Trajectory
-from vio.runs.recorder import UNFINISHED, GrowingFolder
+from vio.runs.recorder import GrowingFolder
 from vio.runs.tables import frames_csv
 from vio.files.tables import Records
 from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
 
 log = logging.getLogger(__name__)
 
-MARKER = "metrics.json"  # a folder with this file, and with nothing but FILES, is a run's and may be replaced
-CALIBRATION = "camchain-imucam.yaml"  # the corrected calibration, where no other file is named for it
-REQUEST = "run.json"  # in the folder of an unfinished run: what it was asked to do
 _OF_THE_OUTPUT = ("source", "reference", "lengths_m", "save_calibration")  # of a request: it may move, or be compared anew
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
-FILES = (
-    MARKER,
-    UNFINISHED,
-    "config.yaml",
-    "trajectory.tum",
-    "trajectory.kitti",
-    "map_trajectory.tum",
-    "map_causal.tum",
-    "map_covariance.npy",
-    "loops.csv",
-    "loop_matches.npz",
-    "map_keyframes.csv",
-    "estimates.npy",
-    "reference.tum",
-    "dead_reckoning.tum",
-    "landmarks.ply",
-    "frames.csv",
-    "observations.npz",
-    "trajectory.png",
-    CALIBRATION,
-    "report.html",  # of vio report
-)
 
 
 def write_run_folder(
@@ -88,8 +63,8 @@ def write_run_folder(
     Raises:
         VioError: the folder cannot be written, or contains something else.
     """
-    with atomic_folder(folder, replace=True, marker=MARKER, own=FILES) as temporary:
-        np.save(temporary / "estimates.npy", result.estimates.rows)
+    with atomic_folder(folder, replace=True, marker=RunFile.METRICS, own=FILES) as temporary:
+        np.save(temporary / RunFile.ESTIMATES, result.estimates.rows)
         return _write_files(temporary, folder, result, reference, lengths_m, save_observations=save_observations)
 
 
@@ -108,7 +83,7 @@ def finish_run_folder(
     Raises:
         VioError: the folder cannot be written.
     """
-    unfinished = folder / UNFINISHED
+    unfinished = folder / RunFile.UNFINISHED
     final = unfinished / "final"
     check_own(unfinished)
     check_own(final)
@@ -118,12 +93,12 @@ def finish_run_folder(
         final.mkdir()
         metrics = _write_files(final, folder, result, reference, lengths_m, save_observations=save_observations)
         if result.stopped is None:
-            (unfinished / "estimates.npy").replace(folder / "estimates.npy")
+            (unfinished / RunFile.ESTIMATES).replace(folder / RunFile.ESTIMATES)
         else:
-            shutil.copyfile(unfinished / "estimates.npy", final / "estimates.npy")
-        for name in sorted(path.name for path in final.iterdir() if path.name != MARKER):
+            shutil.copyfile(unfinished / RunFile.ESTIMATES, final / RunFile.ESTIMATES)
+        for name in sorted(path.name for path in final.iterdir() if path.name != RunFile.METRICS):
             (final / name).replace(folder / name)
-        (final / MARKER).replace(folder / MARKER)
+        (final / RunFile.METRICS).replace(folder / RunFile.METRICS)
         shutil.rmtree(unfinished if result.stopped is None else final)
     except OSError as error:
         raise DataError(f"cannot write {folder}: {error.strerror or error}; the trajectory so far is there") from error
@@ -150,9 +125,9 @@ def growing_folder(folder: Path, dataset: Dataset, config: Config, request: Mapp
         "T_cam0_imu": recording.T_cam0_body.tolist(),
     }
     texts = {
-        "config.yaml": to_yaml(config),
-        MARKER: json_text(metrics, indent=2) + "\n",
-        f"{UNFINISHED}/{REQUEST}": json.dumps(request, indent=2) + "\n",  # names of files as they are
+        RunFile.CONFIG: to_yaml(config),
+        RunFile.METRICS: json_text(metrics, indent=2) + "\n",
+        f"{RunFile.UNFINISHED}/{REQUEST}": json.dumps(request, indent=2) + "\n",  # names of files as they are
     }
     return GrowingFolder(folder, texts, replaces=FILES, inputs=_inputs(dataset, config, request))
 
@@ -182,7 +157,7 @@ def read_request(folder: Path) -> dict[str, Any]:
     Raises:
         DataError: the folder is no run's, the run is complete, or the file is damaged.
     """
-    path = folder / UNFINISHED / REQUEST
+    path = folder / RunFile.UNFINISHED / REQUEST
     if not path.is_file():
         read_metrics(folder)
         raise DataError(f"{folder}: its run is complete; there is nothing to go on with")
@@ -206,38 +181,38 @@ def _write_files(
     """Write all results but `estimates.npy` into `target`, and return the metrics, which name `folder`."""
     evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
     metrics = metrics_of(result, evaluation, dead_reckoning, folder)
-    (target / "config.yaml").write_text(to_yaml(result.config), encoding="utf-8")
-    write_tum(target / "trajectory.tum", result.trajectory)
-    write_kitti(target / "trajectory.kitti", in_first_cam0(result.trajectory, result.T_cam0_body))
+    (target / RunFile.CONFIG).write_text(to_yaml(result.config), encoding="utf-8")
+    write_tum(target / RunFile.TRAJECTORY, result.trajectory)
+    write_kitti(target / RunFile.TRAJECTORY_KITTI, in_first_cam0(result.trajectory, result.T_cam0_body))
     if evaluation is not None:
         times_ns = result.trajectory.times_ns
         assert times_ns is not None
         # The poses that were compared, each at the time of its estimate: the folder alone then tells the errors.
-        write_tum(target / "reference.tum", replace(evaluation.reference, times_ns=times_ns[evaluation.rows]))
+        write_tum(target / RunFile.REFERENCE, replace(evaluation.reference, times_ns=times_ns[evaluation.rows]))
     if result.dead_reckoning is not None:
-        write_tum(target / "dead_reckoning.tum", result.dead_reckoning)
+        write_tum(target / RunFile.DEAD_RECKONING, result.dead_reckoning)
     if result.mapped is not None:
         metrics["map"] = _write_mapped(target, result, result.mapped, reference)
-    write_landmarks_ply(target / "landmarks.ply", result.landmarks)
-    _write_frames(target / "frames.csv", result.frames)
+    write_landmarks_ply(target / RunFile.LANDMARKS, result.landmarks)
+    _write_frames(target / RunFile.FRAMES, result.frames)
     if save_observations:
-        _write_observations(target / "observations.npz", result)
+        _write_observations(target / RunFile.OBSERVATIONS, result)
     from vio.runs.picture import plot_run
 
-    plot_run(target / "trajectory.png", result, evaluation, dead_reckoning)
-    (target / MARKER).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
+    plot_run(target / RunFile.PICTURE, result, evaluation, dead_reckoning)
+    (target / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
     return metrics
 
 
 def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference: Trajectory | None) -> dict[str, Any]:
     """Write the poses in the map and the loops, and return their metrics."""
     final = replace(result.trajectory, T_world_body=mapped.T_map_body)
-    write_tum(target / "map_trajectory.tum", final)
+    write_tum(target / RunFile.MAP_TRAJECTORY, final)
     causal = mapped.causal
     if len(causal):
         poses = Trajectory(np.array(causal["T_map_body"]), np.array(causal["time_ns"]), result.body)
-        write_tum(target / "map_causal.tum", poses)
-    np.save(target / "map_covariance.npy", causal["covariance"])
+        write_tum(target / RunFile.MAP_CAUSAL, poses)
+    np.save(target / RunFile.MAP_COVARIANCE, causal["covariance"])
     write_loops(target, mapped.loops)
     write_keyframes(target, mapped.in_map)
     evaluation, _ = score(replace(result, dead_reckoning=None), reference, T_world_body=mapped.T_map_body)
@@ -466,7 +441,7 @@ def read_run(path: Path) -> tuple[Trajectory, FloatArray | None]:
     if not path.is_dir():
         return read_trajectory(path), None
     _, T_cam0_imu = read_metrics(path)
-    return read_trajectory(path / "trajectory.tum"), T_cam0_imu
+    return read_trajectory(path / RunFile.TRAJECTORY), T_cam0_imu
 
 
 def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
@@ -475,9 +450,9 @@ def read_metrics(folder: Path) -> tuple[dict[str, Any], FloatArray]:
     Raises:
         DataError: the folder is not a run's, or its metrics are damaged.
     """
-    path = folder / MARKER
+    path = folder / RunFile.METRICS
     if not path.is_file():
-        raise DataError(f"{folder}: no run folder (it has no {MARKER}); give a folder that `vio run` wrote")
+        raise DataError(f"{folder}: no run folder (it has no {RunFile.METRICS}); give a folder that `vio run` wrote")
     try:
         metrics = json.loads(read_input(path))
         T_cam0_imu = np.array(metrics["T_cam0_imu"], dtype=np.float64)

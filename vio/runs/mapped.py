@@ -1,19 +1,38 @@
-"""The poses of a run in its map: as they were known at the time, and as they are known at the end."""
+"""A run in its map: poses as known at the time and at the end, and the files of its loops and keyframes."""
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
-from vio.records import LoopEvent, MapKeyframes
-from vio.records import Estimate, IntArray
+from vio.datasets.common import read_npz
+from vio.errors import DataError
+from vio.files.inputs import read_input
 from vio.files.tables import Records, Rows
+from vio.geometry.lie import (
+    FloatArray,
+    quat_xyzw_from_rotation,
+    rotation_from_quat_xyzw,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_log,
+)
+from vio.records import Estimate, IntArray, LoopEvent, LoopMatches, MapKeyframes, no_map_keyframes
+from vio.runs.files import RunFile
 
 if TYPE_CHECKING:
     from vio.mapping.session import MapSession
+
+_LOOP_COLUMNS = (
+    *("frame", "time_ns", "keyframe", "keyframe_time_ns", "inliers", "gap_m", "joined", "keyframe_frame", "kept"),
+)
+_KEYFRAME_COLUMNS = ("keyframe", "frame", "time_ns", "own", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,3 +77,105 @@ def corrected(
     xi = se3_log(se3_inverse(end) @ T_map[after])
     share = (index - frames[before]) / np.maximum(frames[after] - frames[before], 1)
     return out @ se3_exp(np.clip(share, 0.0, 1.0)[:, None] * xi)
+
+
+def write_loops(folder: Path, loops: Sequence[LoopEvent]) -> None:
+    """Write the loops of a run, one a line, and the features that agree with them."""
+    rows = [[getattr(o, column) for column in _LOOP_COLUMNS] for o in loops]
+    lines = [",".join("" if value is None else str(value) for value in row) for row in rows]
+    (folder / RunFile.LOOPS).write_text("\n".join([",".join(_LOOP_COLUMNS), *lines]) + "\n", encoding="utf-8")
+    known = [(n, o.matches) for n, o in enumerate(loops) if o.matches is not None]
+    np.savez_compressed(
+        folder / RunFile.LOOP_MATCHES,
+        loop=np.repeat([n for n, _ in known], [len(m) for _, m in known]).astype(np.int64),
+        z_keyframe=np.concatenate([np.zeros((0, 4)), *(m.z_keyframe for _, m in known)]),
+        z_frame=np.concatenate([np.zeros((0, 4)), *(m.z_frame for _, m in known)]),
+        has_right_keyframe=np.concatenate([np.zeros(0, dtype=np.bool_), *(m.has_right_keyframe for _, m in known)]),
+        has_right_frame=np.concatenate([np.zeros(0, dtype=np.bool_), *(m.has_right_frame for _, m in known)]),
+    )
+
+
+def write_keyframes(folder: Path, keyframes: MapKeyframes) -> None:
+    """Write the keyframes of a map, one a line."""
+    T = keyframes.T_map_body
+    poses = np.concatenate([T[:, :3, 3], quat_xyzw_from_rotation(T[:, :3, :3])], axis=1).tolist()
+    columns = (keyframes.keyframe, keyframes.frame, keyframes.time_ns, keyframes.own.astype(np.int64))
+    numbers = np.stack(columns, axis=1).tolist()
+    lines = [",".join(map(str, [*row, *pose])) for row, pose in zip(numbers, poses, strict=True)]
+    (folder / RunFile.MAP_KEYFRAMES).write_text("\n".join([",".join(_KEYFRAME_COLUMNS), *lines]) + "\n", encoding="utf-8")
+
+
+def read_loops(folder: Path) -> tuple[LoopEvent, ...]:
+    """Read what `write_loops` wrote; a run without a map has none.
+
+    Raises:
+        DataError: a file is damaged.
+    """
+    path = folder / RunFile.LOOPS
+    if not path.is_file():
+        return ()
+    matches = _read_matches(folder / RunFile.LOOP_MATCHES)
+    try:
+        rows = _read_rows(path)
+        return tuple(
+            LoopEvent(
+                frame=int(row["frame"]),
+                time_ns=int(row["time_ns"]),
+                keyframe=int(row["keyframe"]),
+                keyframe_time_ns=int(row["keyframe_time_ns"]),
+                inliers=int(row["inliers"]),
+                gap_m=float(row["gap_m"]),
+                joined=row["joined"] == "True",
+                keyframe_frame=int(row["keyframe_frame"]) if row.get("keyframe_frame") else None,
+                kept=row.get("kept", "True") == "True",
+                matches=matches.get(n),
+            )
+            for n, row in enumerate(rows)
+        )
+    except (KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
+
+
+def read_keyframes(folder: Path) -> MapKeyframes:
+    """Read what `write_keyframes` wrote; a run without a map has none.
+
+    Raises:
+        DataError: the file is damaged.
+    """
+    path = folder / RunFile.MAP_KEYFRAMES
+    if not path.is_file():
+        return no_map_keyframes()
+    try:
+        rows = _read_rows(path)
+        keyframe, frame, time_ns, own = (
+            np.array([int(row[name]) for row in rows], dtype=np.int64) for name in _KEYFRAME_COLUMNS[:4]
+        )
+        values = [[float(row[name]) for name in _KEYFRAME_COLUMNS[4:]] for row in rows]
+    except (KeyError, ValueError, TypeError) as error:
+        raise DataError(f"{path}: is damaged ({error}); repeat the run") from error
+    poses = np.array(values).reshape(-1, 7)
+    if not np.isfinite(poses).all() or (np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1) > 1e-3).any():
+        raise DataError(f"{path}: is damaged (a pose is none); repeat the run")
+    T = se3_from_parts(rotation_from_quat_xyzw(poses[:, 3:]), poses[:, :3])
+    return MapKeyframes(keyframe, frame, time_ns, own > 0, T)
+
+
+def _read_rows(path: Path) -> list[dict[str, str]]:
+    try:
+        text = read_input(path).decode("utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read ({error}); repeat the run") from error
+    return list(csv.DictReader(text.splitlines()))
+
+
+def _read_matches(path: Path) -> dict[int, LoopMatches]:
+    """Read the features of each loop; a missing file has none."""
+    if not path.is_file():
+        return {}
+    held = read_npz(path)
+    names = ("z_keyframe", "z_frame", "has_right_keyframe", "has_right_frame")
+    shapes = [held[name].shape for name in names if name in held]
+    loop = held.get("loop")
+    if loop is None or shapes != [(len(loop), 4), (len(loop), 4), (len(loop),), (len(loop),)]:
+        raise DataError(f"{path}: is damaged; repeat the run")
+    return {int(n): LoopMatches(*(held[name][loop == n] for name in names)) for n in np.unique(loop)}

@@ -25,6 +25,7 @@ from vio.records import FrameLog, FrameResult
 from vio.geometry.lie import FloatArray
 from vio.protocols import Dataset
 from vio.records import BodyFrame, Estimate, Landmarks, MotionSample, Observations
+from vio.runs.files import CHECKPOINT, RunFile
 from vio.runs.tables import (
     ESTIMATE,
     FRAME,
@@ -47,9 +48,7 @@ from vio.files.trajectories import tum_text
 
 log = logging.getLogger(__name__)
 
-UNFINISHED = "unfinished"  # folder inside a run's folder, while the run goes on or can go on
-CHECKPOINT = "checkpoint"
-_TEXTS = ("trajectory.tum", "frames.csv")  # that grow
+_TEXTS = (RunFile.TRAJECTORY, RunFile.FRAMES)  # that grow
 _FLUSH_S = 1.0
 _CHECKPOINT_S = 5.0
 _CHUNK = 100_000  # points at a time
@@ -285,7 +284,7 @@ class RunRecorder:
             DataError: there is none, it or a table is damaged, or the run depends on what has changed since.
         """
         assert self._folder is not None
-        for name in (UNFINISHED, *_TEXTS):
+        for name in (RunFile.UNFINISHED, *_TEXTS):
             check_own(self._folder.path / name)
         state = load_checkpoint(self._unfinished / CHECKPOINT, dataset, self._folder.inputs)
         own = state["recorder"]
@@ -313,7 +312,7 @@ class RunRecorder:
     @property
     def _unfinished(self) -> Path:
         assert self._folder is not None
-        return self._folder.path / UNFINISHED
+        return self._folder.path / RunFile.UNFINISHED
 
     def _begin(self) -> None:
         """Create the tables and, in a folder, remove what an earlier run left there."""
@@ -323,11 +322,11 @@ class RunRecorder:
             with self._writing():
                 self._folder.path.mkdir(parents=True, exist_ok=True)
                 texts = self._folder.texts
-                for name in [name for name in texts if not name.startswith(UNFINISHED)]:  # they say whose folder it is
+                for name in [name for name in texts if not name.startswith(RunFile.UNFINISHED)]:  # they say whose folder it is
                     atomic_write_text(self._folder.path / name, texts[name])
-                _remove(self._folder.path, [UNFINISHED, *(n for n in self._folder.replaces if n not in texts)])
+                _remove(self._folder.path, [RunFile.UNFINISHED, *(n for n in self._folder.replaces if n not in texts)])
                 self._unfinished.mkdir()
-                for name in [name for name in texts if name.startswith(UNFINISHED)]:
+                for name in [name for name in texts if name.startswith(RunFile.UNFINISHED)]:
                     atomic_write_text(self._folder.path / name, texts[name])
                 self._tables = {name: Table(dtype, self._unfinished / f"{name}.npy") for name, dtype in _TABLES.items()}
         for row in self._early:

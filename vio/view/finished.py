@@ -12,8 +12,8 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError, VioError
 from vio.geometry.stereo import Projection, StereoCamera
-from vio.offline.saved_run import OBSERVATIONS
 from vio.records import Image, Landmarks, LoopEvent, StereoFrame, UpdateReport
+from vio.runs.files import RunFile
 from vio.runs.finished import FinishedRun
 from vio.runs.tables import estimate_of
 from vio.view.live import SERIES, RerunViewer, ViewedRig, states_of
@@ -35,7 +35,7 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
     """
     rig = _rig_of(run)
     viewer = RerunViewer(stream, rig, share=1.0)
-    saved = run.folder / OBSERVATIONS
+    saved = run.folder / RunFile.OBSERVATIONS
     log_of_features = read_observation_log(saved) if saved.is_file() else None
     images = _images_of(run, rig.camera.projection)
     names = {
