@@ -364,7 +364,7 @@ def stopped(flight_log: Path, tmp_path: Path) -> Path:
     request = {"source": f"log:{tmp_path / 'flight.npz'}", "start": 0, "stop": None, "reference": None, "map": None}
     request |= {"save_observations": True, "lengths_m": None}
     folder = growing_folder(out, dataset, config, request)
-    run(dataset, config, keep_observations=True, folder=folder, should_stop=Stop(300))
+    run(dataset, config, keep_observations=True, control=RunControl(folder, should_stop=Stop(300)))
     return out
 
 
@@ -435,8 +435,8 @@ def test_a_run_that_dies_after_its_checkpoint_goes_on_with_estimates_that_were_s
         return None
 
     with pytest.raises(RuntimeError, match="died"):
-        run(open_dataset(flight_log), config, folder=folder, should_stop=died)
-    _assert_same(whole, run(open_dataset(flight_log), config, folder=folder, resume=True))
+        run(open_dataset(flight_log), config, control=RunControl(folder, should_stop=died))
+    _assert_same(whole, run(open_dataset(flight_log), config, control=RunControl(folder, resume=True)))
 
 
 @pytest.mark.parametrize("kind", ["symbolic", "hard"])
