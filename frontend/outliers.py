@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vio.frontend.lens import Lens, lens_of, moved_pixel
+from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, turn_to
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project
 from vio.numerics.compiled import compiled, move_by_twist, solve_positive
@@ -70,17 +70,17 @@ def pixel_errors(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArr
     T = np.ascontiguousarray(T_curr_prev).reshape(-1, 4, 4)
     out = np.empty((len(T), len(p_prev)))
     points, seen = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels)
-    _distances(lens_of(camera), T, points, seen, out)
+    _distances(camera_args(camera), T, points, seen, out)
     return out.reshape(*T_curr_prev.shape[:-2], len(p_prev))
 
 
 @compiled
-def _distances(lens: Lens, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
+def _distances(camera: CameraArgs, T: FloatArray, points: FloatArray, pixels: FloatArray, out: FloatArray) -> None:
     """Write the distances (H, N) of points (N, 3) moved by motions (H, 4, 4) from pixels (N, 2)."""
     for h in range(len(T)):
         motion = T[h]
         for n in range(len(points)):
-            u, v, depth = moved_pixel(lens, motion, points[n, 0], points[n, 1], points[n, 2])
+            u, v, depth = moved_pixel(camera, motion, points[n, 0], points[n, 1], points[n, 2])
             du, dv = u - pixels[n, 0], v - pixels[n, 1]
             out[h, n] = np.sqrt(du * du + dv * dv) if depth > _MIN_DEPTH_M else np.inf
 
@@ -101,13 +101,13 @@ def _gauss_newton(
     """
     T = np.array(T, order="C")  # of one layout, so that one version is compiled
     points, seen, w = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ascontiguousarray(weight)
-    _iterate(lens_of(camera), T, points, seen, w, np.inf, iterations, free.stop, 0.0)
+    _iterate(camera_args(camera), T, points, seen, w, np.inf, iterations, free.stop, 0.0)
     return T
 
 
 @compiled
 def _iterate(
-    lens: Lens,
+    camera: CameraArgs,
     T: FloatArray,
     points: FloatArray,
     pixels: FloatArray,
@@ -122,8 +122,7 @@ def _iterate(
     Weights (H, K) are multiplied by those of Geman and McClure at a scale; infinite: by none. A motion is done when no
     entry of it changes by `converged`.
     """
-    fu, fv, cu, cv, cylinder = lens
-    azimuth, s, c = 0.0, 0.0, 1.0  # of a point about the baseline: a cylinder is a pinhole turned to it
+    fu, fv, cu, cv, _, _ = camera
     A, xi, u_D_xi, v_D_xi = np.empty((free, free)), np.empty(6), np.empty(6), np.empty(6)
     before = np.empty((4, 4))
     for h in range(len(T)):
@@ -138,19 +137,13 @@ def _iterate(
                 x = T[h, 0, 0] * px + T[h, 0, 1] * py + T[h, 0, 2] * pz + T[h, 0, 3]
                 y = T[h, 1, 0] * px + T[h, 1, 1] * py + T[h, 1, 2] * pz + T[h, 1, 3]
                 z = T[h, 2, 0] * px + T[h, 2, 1] * py + T[h, 2, 2] * pz + T[h, 2, 3]
-                if cylinder:
-                    azimuth = np.arctan2(y, z)
-                    s, c = np.sin(azimuth), np.cos(azimuth)
-                    y, z = 0.0, np.sqrt(y * y + z * z)
+                azimuth, s, c, y, z = turn_to(camera, y, z)
                 w2 = weight[h, n] ** 2
                 if not z > _MIN_DEPTH_M or w2 == 0.0:
                     continue
                 a, b = x / z, y / z
-                du, dv = pixels[h, n, 0] - fu * a - cu, pixels[h, n, 1] - fv * b - cv
-                u, v = fu * x / z + cu, fv * y / z + cv
-                if cylinder:
-                    dv -= fv * azimuth
-                    v = fv * azimuth + cv
+                du, dv = pixels[h, n, 0] - fu * a - cu, pixels[h, n, 1] - fv * b - cv - fv * azimuth
+                u, v = fu * x / z + cu, fv * y / z + fv * azimuth + cv
                 error = np.sqrt((u - pixels[h, n, 0]) ** 2 + (v - pixels[h, n, 1]) ** 2)  # as `_distances`
                 if not error < 3.0 * scale_px:
                     continue
@@ -161,7 +154,7 @@ def _iterate(
                 u_D_xi[3], u_D_xi[4], u_D_xi[5] = -fu * a * b, fu * (1.0 + a * a), -fu * b
                 v_D_xi[0], v_D_xi[1], v_D_xi[2] = 0.0, fv / z, -fv * b / z
                 v_D_xi[3], v_D_xi[4], v_D_xi[5] = -fv * (1.0 + b * b), fv * a * b, fv * a
-                if cylinder:
+                if azimuth != 0.0:
                     for i in range(1, 5, 3):  # back from the turned camera
                         u_D_xi[i], u_D_xi[i + 1] = c * u_D_xi[i] + s * u_D_xi[i + 1], c * u_D_xi[i + 1] - s * u_D_xi[i]
                         v_D_xi[i], v_D_xi[i + 1] = c * v_D_xi[i] + s * v_D_xi[i + 1], c * v_D_xi[i + 1] - s * v_D_xi[i]
@@ -201,7 +194,9 @@ def _refine(
     """Refine one motion (4, 4) on all points, with Geman-McClure weights."""
     T = np.array(T[None], order="C")
     points, seen, equal = np.ascontiguousarray(p_prev), np.ascontiguousarray(pixels), np.ones((1, len(p_prev)))
-    _iterate(lens_of(camera), T, points[None], seen[None], equal, scale_px, _REFINE_ITERATIONS, free.stop, converged)
+    _iterate(
+        camera_args(camera), T, points[None], seen[None], equal, scale_px, _REFINE_ITERATIONS, free.stop, converged
+    )
     return T[0]
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.frontend.lens import Lens, lens_of, moved_pixel
+from vio.cameras.projection import CameraArgs, camera_args, moved_pixel
 from vio.frontend.patches import inside
 from vio.frontend.tracks import Tracks
 from vio.geometry.lie import FloatArray, se3_from_parts
@@ -69,15 +69,15 @@ def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tupl
 def moved_pixels(camera: StereoCamera, T_curr_prev: FloatArray, p_prev: FloatArray, left: FloatArray) -> FloatArray:
     """Left pixels (N, 2) of points (N, 3) after a camera motion; points behind the camera keep their pixels `left`."""
     out = left.copy()
-    _move(lens_of(camera), np.ascontiguousarray(T_curr_prev), np.ascontiguousarray(p_prev), out)
+    _move(camera_args(camera), np.ascontiguousarray(T_curr_prev), np.ascontiguousarray(p_prev), out)
     return out
 
 
 @compiled
-def _move(lens: Lens, T: FloatArray, points: FloatArray, pixels: FloatArray) -> None:
+def _move(camera: CameraArgs, T: FloatArray, points: FloatArray, pixels: FloatArray) -> None:
     """Replace the pixels (N, 2) of points (N, 3) that are ahead after a motion (4, 4) by those after it."""
     for n in range(len(points)):
-        u, v, depth = moved_pixel(lens, T, points[n, 0], points[n, 1], points[n, 2])
+        u, v, depth = moved_pixel(camera, T, points[n, 0], points[n, 1], points[n, 2])
         if depth > _MIN_DEPTH_M:
             pixels[n, 0], pixels[n, 1] = u, v
 

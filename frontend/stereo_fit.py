@@ -10,9 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from vio.cameras.projection import CameraArgs, camera_args, point_at
 from vio.frontend.align import align, on_peak
 from vio.frontend.columns import take
-from vio.frontend.lens import Lens, lens_of, point_at
 from vio.frontend.patches import View
 from vio.frontend.settings import DisparitySettings
 from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, RowField, match_rows, shifted_rows
@@ -169,13 +169,13 @@ class StereoFit:
         right[rows], has_right[rows], skews[rows] = pixels, True, skew
         point, has_point = tracks.point.copy(), tracks.has_point.copy()
         f_baseline = self._camera.fu * self._camera.baseline_m
-        _triangulate(lens_of(self._camera), f_baseline, tracks.left, rows, pixels, point, has_point)
+        _triangulate(camera_args(self._camera), f_baseline, tracks.left, rows, pixels, point, has_point)
         return replace(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)
 
 
 @compiled
 def _triangulate(
-    lens: Lens,
+    camera: CameraArgs,
     f_baseline: float,
     left: FloatArray,
     rows: IntArray,
@@ -188,5 +188,5 @@ def _triangulate(
         disparity = left[n, 0] - right[k, 0]
         if disparity >= _MIN_DISPARITY_PX:
             v = (left[n, 1] + right[k, 1]) / 2.0
-            point[n, 0], point[n, 1], point[n, 2] = point_at(lens, left[n, 0], v, f_baseline / disparity)
+            point[n, 0], point[n, 1], point[n, 2] = point_at(camera, left[n, 0], v, f_baseline / disparity)
             has_point[n] = True

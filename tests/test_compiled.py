@@ -17,12 +17,13 @@ from numba.core.dispatcher import Dispatcher
 
 from tests import numpy_twins
 from tests.test_frontend_patches import PLAIN, POINTS, picture
+from vio.cameras.projection import camera_args
+from vio.cameras.rectification_error import error_jacobian
 from vio.datasets import png_rows
 from vio.filters import multiview, pose_loops, stereo_calibration, track_loops
 from vio.filters.multiview import Views
 from vio.frontend import outliers, patches, right_camera
 from vio.frontend.align import align, cut_patches, rounded, shift_warps, templates, warped_patches
-from vio.frontend.lens import lens_of
 from vio.frontend.outliers import _gauss_newton, _refine, pixel_errors
 from vio.frontend.prediction import _borrow, moved_pixels
 from vio.frontend.stereo_fit import _triangulate
@@ -148,7 +149,7 @@ def test_features_are_moved_and_triangulated_as_single_points_are_in_numpy(camer
     rows, point, has_point = np.arange(0, 40, 2), np.zeros((40, 3)), np.zeros(40, dtype=np.bool_)
     rows[1], rows[2] = 3, 5
     f_baseline = camera.fu * camera.baseline_m
-    _triangulate(lens_of(camera), f_baseline, z[:, :2].copy(), rows, z[rows, 2:], point, has_point)
+    _triangulate(camera_args(camera), f_baseline, z[:, :2].copy(), rows, z[rows, 2:], point, has_point)
     expected, valid = triangulate(camera, z[rows])
     assert not valid[1:3].any()
     np.testing.assert_array_equal(has_point[rows], valid)
@@ -346,13 +347,13 @@ def test_stereo_field_is_linearised_and_eliminated_as_in_numpy() -> None:
     rng = np.random.default_rng(13)
     rows, states = rng.normal(0, 0.01, 7), rng.normal(0, 0.01, 10)
     expected = numpy_twins.corrected(CAMERA, rows, states, views.z, views.weight)
-    views = stereo_calibration.StereoField(CAMERA, rows, states, np.arange(10)).corrected(views)
+    views = stereo_calibration.StereoCorrection(CAMERA, rows, states, np.arange(10)).corrected(views)
     np.testing.assert_allclose(views.z, expected, rtol=1e-12)
     at = multiview.residuals(CAMERA, T, p, views)
     at, p = at.take(at.ahead), p[at.ahead]
     weight = rng.uniform(0.1, 1.0, at.r.shape[:2])
     info = multiview.track_information(CAMERA, T, at, p, weight)
-    H = stereo_calibration.field_jacobian(CAMERA, expected[: len(p)])
+    H = error_jacobian(CAMERA, expected[: len(p)])
     np.testing.assert_allclose(H, numpy_twins.field_jacobian(CAMERA, expected[: len(p)]), rtol=1e-12)
     ours = stereo_calibration.stereo_columns(at, H, info.q.p_D_q, weight)
     _same(ours, numpy_twins.stereo_columns(at, H, info.q.p_D_q, weight))

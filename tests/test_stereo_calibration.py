@@ -17,6 +17,7 @@ from tests import test_filter_truth
 from tests.numerics import numeric_jacobian
 from tests.test_filter_truth import SETTINGS, Course, Run, Spoil, fly
 from tests.test_multiview import T_CAM0_WORLD
+from vio.cameras.rectification_error import TERMS, error_jacobian
 from vio.filters.multiview import (
     _PRIOR,
     Residuals,
@@ -29,12 +30,10 @@ from vio.filters.multiview import (
     track_information,
 )
 from vio.filters.stereo_calibration import (
-    TERMS,
-    RowField,
     StereoColumns,
-    StereoField,
+    StereoCorrection,
+    VerticalDisparityModel,
     eliminate_points_from_columns,
-    field_jacobian,
     landmark_columns,
     stereo_columns,
 )
@@ -68,7 +67,7 @@ def _grid() -> FloatArray:
     return np.stack([u, v, u - d, v], axis=-1).reshape(-1, 4)
 
 
-def test_field_jacobian_equals_central_differences_of_distorted_projections() -> None:
+def test_error_jacobian_equals_central_differences_of_distorted_projections() -> None:
     """Both lenses distorted alike, columns of the right camera moved as (R3) says, and both scaled as by (R4)."""
     z = _grid()
 
@@ -86,7 +85,7 @@ def test_field_jacobian_equals_central_differences_of_distorted_projections() ->
         return np.concatenate([left, right], axis=1)
 
     numeric = numeric_jacobian(seen, np.zeros(TERMS), eps=1e-6).reshape(-1, 4, TERMS)
-    np.testing.assert_allclose(field_jacobian(CAMERA, z), numeric, atol=1e-4)
+    np.testing.assert_allclose(error_jacobian(CAMERA, z), numeric, atol=1e-4)
 
 
 def test_what_both_lenses_do_to_rows_is_taken_off_those_of_the_right_camera() -> None:
@@ -95,17 +94,17 @@ def test_what_both_lenses_do_to_rows_is_taken_off_those_of_the_right_camera() ->
     rows, rows_D_common = np.zeros(7), rng.normal(0, 0.1, (7, 4))
 
     def corrected(s: FloatArray) -> FloatArray:
-        field = StereoField(CAMERA, rows - rows_D_common @ s[4:8], s, np.arange(TERMS))
+        field = StereoCorrection(CAMERA, rows - rows_D_common @ s[4:8], s, np.arange(TERMS))
         return field.corrected(Views(z, np.ones(z.shape))).z
 
     numeric = numeric_jacobian(corrected, np.zeros(TERMS), eps=1e-6).reshape(-1, 4, TERMS)
-    field = StereoField(CAMERA, rows, np.zeros(TERMS), np.arange(TERMS), rows_D_common)
+    field = StereoCorrection(CAMERA, rows, np.zeros(TERMS), np.arange(TERMS), rows_D_common)
     np.testing.assert_allclose(field.jacobian(z), -numeric, atol=1e-4)
 
 
-def _right_columns(rows: RowField, states: FloatArray, z: FloatArray) -> FloatArray:
+def _right_columns(rows: VerticalDisparityModel, states: FloatArray, z: FloatArray) -> FloatArray:
     """The field (M,) of the right columns at pixels (M, 4)."""
-    field = StereoField(CAMERA, rows.coefficients, np.concatenate([states, np.zeros(2)]), np.arange(TERMS))
+    field = StereoCorrection(CAMERA, rows.coefficients, np.concatenate([states, np.zeros(2)]), np.arange(TERMS))
     return (z - field.corrected(Views(z, np.ones(z.shape))).z)[:, 2]
 
 
@@ -115,7 +114,7 @@ def test_a_wrong_baseline_and_focal_length_are_taken_out_of_the_pixels() -> None
     p = np.random.default_rng(3).uniform([-1.0, -0.8, 2.0], [1.0, 0.8, 6.0], (20, 3))
     z, expected = project(true, p), project(CAMERA, p)
     scale = np.concatenate([np.zeros(8), np.log([1.07, 1.03])])
-    field = StereoField(CAMERA, np.zeros(7), scale, np.array([8, 9]))
+    field = StereoCorrection(CAMERA, np.zeros(7), scale, np.array([8, 9]))
     weight = np.tile([1.0, 1.0, 1.0, 0.0], (20, 1))
     weight[3, 2] = 0.0
     corrected = field.corrected(Views(z, weight)).z
@@ -178,8 +177,8 @@ def test_a_right_camera_below_the_left_one_s_row_is_no_turn() -> None:
 # Rows
 
 
-def _learned(z: FloatArray, camera: StereoCamera = CAMERA, frames: int = 50) -> RowField:
-    rows = RowField(camera)
+def _learned(z: FloatArray, camera: StereoCamera = CAMERA, frames: int = 50) -> VerticalDisparityModel:
+    rows = VerticalDisparityModel(camera)
     for k in range(frames):
         rows.update(observations(k, k, np.arange(len(z)), z))
     return rows
@@ -188,7 +187,7 @@ def _learned(z: FloatArray, camera: StereoCamera = CAMERA, frames: int = 50) -> 
 def test_rows_are_learned_among_mismatches() -> None:
     """200 frames of 100 matches, 0.3 px of noise, one match in five wrong by up to 20 px: the field to 0.02 px."""
     true, rng = np.array([2e-3, -3e-3, 1e-3, 4e-3, -2e-3, 3e-3, 6e-3]), np.random.default_rng(5)
-    rows, grid = RowField(CAMERA), _grid()
+    rows, grid = VerticalDisparityModel(CAMERA), _grid()
 
     def field(z: FloatArray, values: FloatArray = true) -> FloatArray:
         x, y = _rays(CAMERA, z[:, 2:])[:, :2].T
@@ -231,7 +230,7 @@ def test_the_covariance_of_rows_covers_features_that_keep_their_error() -> None:
 def test_rows_are_not_learned_from_few_matches_or_left_views() -> None:
     z = _grid()
     z[:, 3] += 2.0
-    rows = RowField(CAMERA)
+    rows = VerticalDisparityModel(CAMERA)
     rows.update(observations(0, 0, np.arange(29), z[:29]))
     seen = observations(1, 1, np.arange(len(z)), z)
     rows.update(replace(seen, has_right=np.zeros(len(z), dtype=np.bool_)))
@@ -260,7 +259,7 @@ def _linear() -> tuple[FloatArray, Residuals, TrackInformation, StereoColumns, F
     at = residuals(CAMERA, T_CAM0_WORLD, p, views)
     weight = np.random.default_rng(8).uniform(0.3, 1.0, (len(p), CLONES))
     info = track_information(CAMERA, T_CAM0_WORLD, at, p, weight)
-    H = field_jacobian(CAMERA, views.z - at.r)
+    H = error_jacobian(CAMERA, views.z - at.r)
     return p, at, info, stereo_columns(at, H, info.q.p_D_q, weight), H, weight
 
 
@@ -307,10 +306,10 @@ def test_points_follow_the_coefficients_as_their_triangulation_does() -> None:
     z = np.array([[project(CAMERA, transform_points(T, p[0])) for T in T_CAM0_WORLD]])
     at = residuals(CAMERA, T_CAM0_WORLD, p, Views(z, weight))
     info = track_information(CAMERA, T_CAM0_WORLD, at, p, np.ones((1, CLONES)))
-    columns = stereo_columns(at, field_jacobian(CAMERA, z), info.q.p_D_q, np.ones((1, CLONES)))
+    columns = stereo_columns(at, error_jacobian(CAMERA, z), info.q.p_D_q, np.ones((1, CLONES)))
 
     def triangulated(s: FloatArray) -> FloatArray:
-        field = StereoField(CAMERA, np.zeros(7), s, np.arange(TERMS))
+        field = StereoCorrection(CAMERA, np.zeros(7), s, np.arange(TERMS))
         return refine_points(CAMERA, T_CAM0_WORLD, p, field.corrected(Views(z, weight)), 10, 1e6)[0]
 
     numeric = numeric_jacobian(triangulated, np.zeros(TERMS), eps=1e-6)
@@ -322,7 +321,7 @@ def test_landmarks_tell_of_the_coefficients_as_dense_equations_do() -> None:
     p, views = _tracks()
     newest = Views(views.z[:, -1], views.weight[:, -1])
     at = landmark_residuals(CAMERA, T_CAM0_WORLD[-1], p, newest, 0.25)
-    H = field_jacobian(CAMERA, newest.z - at.r)
+    H = error_jacobian(CAMERA, newest.z - at.r)
     out = landmark_columns(at, H, CLONES)
     size, rho = 6 * CLONES + 3 * len(p), 6 * CLONES - 6
     A, cross, b = np.zeros((TERMS, TERMS)), np.zeros((TERMS, size)), np.zeros(TERMS)
@@ -400,7 +399,7 @@ def test_no_landmark_enters_while_the_field_is_estimated() -> None:
 
 def _scaled(baseline: float, focal: float) -> Spoil:
     """What a pair sees whose baseline and focal length differ from the calibration by factors."""
-    field = StereoField(
+    field = StereoCorrection(
         test_filter_truth.CAMERA,
         np.zeros(7),
         np.concatenate([np.zeros(8), np.log([baseline, focal])]),

@@ -22,7 +22,7 @@ from tests.test_stereo_calibration import _turned_right
 from vio.calibration.found_rig import found_rig
 from vio.calibration.stereo_field import (
     PARAMETERS,
-    PixelField,
+    DisplacementField,
     _Frame,
     calibrated_rig,
     field_of,
@@ -352,6 +352,6 @@ def test_results_are_written_where_no_rig_has_the_field_that_was_found(
 
 
 def test_pixel_field_of_an_estimate_without_rows_has_none() -> None:
-    field = PixelField.of(CAMERA, StereoFieldEstimate(np.array([1e-3, *[0.0] * 7]), np.eye(8)))
+    field = DisplacementField.of(CAMERA, StereoFieldEstimate(np.array([1e-3, *[0.0] * 7]), np.eye(8)))
     moved = field.at(np.array([[300.0, 100.0, 290.0, 100.0]]))
     np.testing.assert_allclose(moved, [[0, 0, 1e-3 * CAMERA.fu, 0]], atol=1e-12)

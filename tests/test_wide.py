@@ -13,6 +13,7 @@ import pytest
 import vio
 from tests import test_msckf
 from tests.numpy_twins import residuals
+from vio.cameras.rectification_error import TERMS, error_jacobian
 from vio.cameras.rig import Rig
 from vio.cli import main
 from vio.cli.running import _opened
@@ -24,7 +25,7 @@ from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters import multiview
 from vio.filters.multiview import Views
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import TERMS, RowField, StereoField, field_jacobian
+from vio.filters.stereo_calibration import StereoCorrection, VerticalDisparityModel
 from vio.frontend.outliers import RansacProblem, bearing_consensus, epipolar_distance
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.rectify import PINHOLE_REACH
@@ -243,7 +244,7 @@ def _through_lens(rays: FloatArray, shift: FloatArray) -> FloatArray:
 def _field(a: FloatArray, v: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
     """Pixels (N, 4) without a field of states (8,) and rows (7,)."""
     z = np.column_stack([left, right[:, 0], left[:, 1]])
-    field = StereoField(CYLINDER, v, np.concatenate([a, [0.0, 0.0]]), np.arange(TERMS))
+    field = StereoCorrection(CYLINDER, v, np.concatenate([a, [0.0, 0.0]]), np.arange(TERMS))
     return field.corrected(Views(z, np.tile([1.0, 1.0, 1.0, 0.0], (len(z), 1)))).z
 
 
@@ -274,7 +275,7 @@ def test_rows_show_a_turned_right_camera() -> None:
     z = project(CYLINDER, p)
     turned = (p - [CYLINDER.baseline_m, 0, 0]) @ so3_exp([2e-3, 1e-3, -1.5e-3]).T
     z[:, 2:] = _on_cylinder(turned) * [CYLINDER.fu, CYLINDER.fv] + [CYLINDER.cu, CYLINDER.cv]
-    rows = RowField(CYLINDER)
+    rows = VerticalDisparityModel(CYLINDER)
     rng = np.random.default_rng(5)
     for k in range(20):
         rows.update(observations(k, k, np.arange(300), z + rng.normal(0, 0.1, z.shape)))
@@ -290,7 +291,7 @@ def test_the_field_takes_out_a_right_camera_below_the_left_one_s_row() -> None:
     moved = z.copy()
     shifted = p - CYLINDER.baseline_m * np.array([1.0, below, 0.0])
     moved[:, 2:] = _on_cylinder(shifted) * [CYLINDER.fu, CYLINDER.fv] + [CYLINDER.cu, CYLINDER.cv]
-    rows = RowField(CYLINDER)
+    rows = VerticalDisparityModel(CYLINDER)
     for k in range(20):
         rows.update(observations(k, k, np.arange(300), moved))
     np.testing.assert_allclose(rows.coefficients[6], -below, atol=1e-3)
@@ -303,7 +304,7 @@ def test_the_field_takes_out_a_right_camera_below_the_left_one_s_row() -> None:
 def test_derivatives_by_the_field_are_those_of_the_correction() -> None:
     pixels, p = _around(50)
     z, step = project(CYLINDER, p), 1e-4
-    H = field_jacobian(CYLINDER, z)
+    H = error_jacobian(CYLINDER, z)
     for j in range(8):
         a = step * np.eye(8)[j]
         change = z[:, :3] - _field(a, np.zeros(7), pixels, z[:, 2:])[:, :3]

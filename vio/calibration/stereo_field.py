@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from vio.cameras.rectification_error import error_basis
 from vio.cameras.rig import Rig
 from vio.geometry.distortion import CameraModel, project_point, rectified_pair
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
@@ -67,39 +68,22 @@ _TEXT = {
 }
 
 
-def field_basis(camera: StereoCamera, z: FloatArray) -> FloatArray:
-    """Derivatives (N, 4, 15) of pixels `[ul vl ur vr]` (N, 4) by the coefficients of (R3) and the rows (R2)."""
-    x, y, xr = (z[:, 0] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv, (z[:, 2] - camera.cu) / camera.fu
-    out = np.zeros((len(z), 4, TERMS))
-    both, rows = slice(RIGHT_TERMS, FIELD_TERMS), FIELD_TERMS
-    for column, u in ((0, x), (2, xr)):
-        r2 = u * u + y * y
-        out[:, column, both] = np.stack([u * r2, u * r2 * r2, 2 * u * y, r2 + 2 * u * u], axis=1)
-        out[:, column + 1, both] = np.stack([y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * u * y], axis=1)
-    r2 = xr * xr + y * y
-    out[:, 2, :RIGHT_TERMS] = np.stack([np.ones_like(x), xr, r2, r2 * r2], axis=1)
-    # What the rows tell of the right columns: their coefficients of y, x y and y^2 - x^2.
-    out[:, 2, [rows + 1, rows + 3, rows + 4, rows + 5]] = np.stack([-y, -y * y, -xr * y, xr * y], axis=1)
-    out[:, 3, rows:] = np.stack([np.ones_like(y), xr, y, xr * y, xr * xr, y * y, x - xr], axis=1)
-    return out * np.array([camera.fu, camera.fv, camera.fu, camera.fv])[:, None]
-
-
 @dataclass(frozen=True, slots=True)
-class PixelField:
+class DisplacementField:
     """How far the pixels of a rectified pair are off, as a run estimated it."""
 
     camera: StereoCamera
     coefficients: FloatArray  # (15,) of (R3) and of the rows (R2), in focal lengths
 
     @classmethod
-    def of(cls, camera: StereoCamera, estimate: StereoFieldEstimate) -> PixelField:
+    def of(cls, camera: StereoCamera, estimate: StereoFieldEstimate) -> DisplacementField:
         """Return the field of an estimate, without rows where they are not known."""
         rows = np.zeros(ROW_TERMS) if estimate.rows is None else estimate.rows
         return cls(camera, np.concatenate([estimate.coefficients, rows]))
 
     def at(self, z: FloatArray) -> FloatArray:
         """Return how far pixels `[ul vl ur vr]` (N, 4) are off, (N, 4) pixels."""
-        out: FloatArray = field_basis(self.camera, z) @ self.coefficients
+        out: FloatArray = error_basis(self.camera, z) @ self.coefficients
         return out
 
     def without(self, z: FloatArray, has_right: BoolArray) -> FloatArray:
@@ -212,13 +196,13 @@ def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
     return replace(rig, cam0=lens(rig.cam0), cam1=lens(cam1), T_cam1_cam0=T)
 
 
-def field_of(camera: StereoCamera, parameters: FloatArray) -> PixelField:
+def field_of(camera: StereoCamera, parameters: FloatArray) -> DisplacementField:
     """Return the field of a rectified pair, with image size, that is off by parameters (14,)."""
     assert camera.width is not None
     assert camera.height is not None
     c = camera
     given = Rig.rectified(c.fu, c.fv, c.cu, c.cv, c.baseline_m, camera.width, camera.height)
-    return PixelField(camera, _Frame.of(given).coefficients(parameters))
+    return DisplacementField(camera, _Frame.of(given).coefficients(parameters))
 
 
 def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
@@ -227,7 +211,7 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
     The Cauchy prior is a Gaussian one whose weights follow the parameters.
     """
     frame = _Frame.of(given)
-    measured = PixelField.of(frame.camera, field).coefficients
+    measured = DisplacementField.of(frame.camera, field).coefficients
     assert field.rows_covariance is not None
     P = _MODEL**2 * np.eye(TERMS)
     P[:FIELD_TERMS, :FIELD_TERMS] += field.covariance
@@ -247,7 +231,7 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
         x = x + np.linalg.solve(information, gradient * free)
     covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     seen = frame.as_seen(x)
-    left = seen - frame.grid - field_basis(frame.camera, frame.where_read(seen)) @ measured
+    left = seen - frame.grid - error_basis(frame.camera, frame.where_read(seen)) @ measured
     left_px = float(np.sqrt(np.mean(left**2)))
     return CalibratedRig(replace(frame.moved(x), residual_px=left_px), x, covariance, left_px)
 
@@ -324,7 +308,7 @@ class _Frame:
     def coefficients(self, x: FloatArray) -> FloatArray:
         """Return the field's coefficients (15,) that fit best what parameters (14,) do to the grid's pixels."""
         seen = self.as_seen(x)
-        D = field_basis(self.camera, self.where_read(seen)).reshape(-1, TERMS)[:, :_BELOW]
+        D = error_basis(self.camera, self.where_read(seen)).reshape(-1, TERMS)[:, :_BELOW]
         found = np.linalg.lstsq(D, (seen - self.grid).ravel(), rcond=None)[0]
         return np.append(found, -x[PARAMETERS.index("ty")])  # shown by near points alone
 

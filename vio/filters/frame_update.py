@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.cameras.rectification_error import TERMS, error_jacobian
 from vio.filters import track_loops
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
@@ -26,13 +27,7 @@ from vio.filters.prior import Fit
 from vio.filters.propagation import FramePosterior, Propagation
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import (
-    TERMS,
-    StereoInformation,
-    eliminate_points_from_columns,
-    field_jacobian,
-    landmark_columns,
-)
+from vio.filters.stereo_calibration import StereoInformation, eliminate_points_from_columns, landmark_columns
 from vio.filters.tracks import measured, rows_of
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior
@@ -265,7 +260,7 @@ class FrameUpdate:
             said = said + eliminate_points_from_columns(*self.tracks.focal_columns(tracks, rows), everything)
         if len(pixels.z):
             at = self._landmark_residuals(window, pixels)
-            H = field_jacobian(self._rig.camera, pixels.z - at.r, first, TERMS - first)
+            H = error_jacobian(self._rig.camera, pixels.z - at.r, first, TERMS - first)
             said = said + landmark_columns(at, H, len(window.clones))
         return window.state.cross_information(said.scaled(1 / self.tracks.variance))
 

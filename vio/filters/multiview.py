@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.cameras.projection import camera_args
 from vio.filters import track_loops as loops
 from vio.geometry.lie import FloatArray, so3_hat
 from vio.geometry.stereo import StereoCamera, left_rays
@@ -70,7 +71,7 @@ def residuals(camera: StereoCamera, T_cam0_world: FloatArray, p_world: FloatArra
     at = Residuals(np.empty((F, N, 4)), np.empty((F, N, 4, 3)), np.empty(F, dtype=np.bool_))
     least = MIN_DEPTH * camera.baseline_m
     loops.compare_views(
-        loops.lens_of(camera), least, T_cam0_world, p_world, views.z, views.weight, at.r, at.z_D_p, at.ahead
+        camera_args(camera), least, T_cam0_world, p_world, views.z, views.weight, at.r, at.z_D_p, at.ahead
     )
     return at
 
@@ -116,7 +117,7 @@ def inverse_depth(camera: StereoCamera, T_cam0_world: FloatArray, p_world: Float
     )
     least = MIN_DEPTH * camera.baseline_m
     columns = q.anchor, q.centre, q.disparity, q.p_D_q, q.q_D_p
-    loops.anchor_points(loops.lens_of(camera), least, T_cam0_world, p_world, np.ascontiguousarray(seen), *columns)
+    loops.anchor_points(camera_args(camera), least, T_cam0_world, p_world, np.ascontiguousarray(seen), *columns)
     return q
 
 
@@ -128,7 +129,7 @@ def first_points(camera: StereoCamera, T_cam0_world: FloatArray, views: Views) -
     """
     p, known = np.zeros((len(views.z), 3)), np.empty(len(views.z), dtype=np.bool_)
     disparities = LEAST_DISPARITY_PX, camera.fu / MIN_DEPTH
-    loops.start_by_stereo(loops.lens_of(camera), disparities, T_cam0_world, views.z, views.weight, p, known)
+    loops.start_by_stereo(camera_args(camera), disparities, T_cam0_world, views.z, views.weight, p, known)
     if known.all():
         return p, known
     earlier = views.weight.copy()
@@ -182,7 +183,7 @@ def refine_points(
 
     Steps are taken in the coordinates (M5), damped by their prior, and end ahead of all cameras that saw the point.
     """
-    lens, least, T = loops.lens_of(camera), MIN_DEPTH * camera.baseline_m, T_cam0_world
+    lens, least, T = camera_args(camera), MIN_DEPTH * camera.baseline_m, T_cam0_world
     p, seen, dq = p_world.copy(), views.weight[..., 0] > 0, np.empty((len(p_world), 3))
     for _ in range(steps):
         loops.put_ahead(lens, least, LEAST_DISPARITY_PX, T, views.z, views.weight, p)

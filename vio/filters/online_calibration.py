@@ -2,7 +2,7 @@
 
 `BLOCKS` is the table: a block says when it is estimated, its prior and random walk, how an error moves its mean, where
 its errors enter, and what of it is reported. A new one is a class here, its mean in `Calibration`, its fields in
-`Estimate`, and its setting; its columns are in `camera_D_error`, in `StereoField`, or in the motion model's step.
+`Estimate`, and its setting; its columns are in `camera_D_error`, in `StereoCorrection`, or in the motion model's step.
 
 A frame stamped t was exposed at `t + time_offset_s` of the IMU's clock. The extrinsics' error `delta`, with
 `T_cam0_imu = T_hat exp(delta)`, is kept on the world's side, `eta = Ad(T_world_imu) delta`, and moves with the body.
@@ -18,10 +18,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
+from vio.cameras.rectification_error import TERMS
 from vio.filters.imu_terms import CHOSEN, IMU_TERMS, IMU_WALK, term_sigmas
 from vio.filters.navigation import DIM, Growth, NavState, Transition
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import TERMS
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_exp, se3_inverse
 from vio.numerics.statistics import chi_square_quantile
 from vio.records import FIELD_TERMS, IntArray, MotionSource, StereoFieldEstimate, StereoScaleEstimate
@@ -214,7 +214,7 @@ class _ImuTermsBlock(CalibrationBlock):
 
 
 class StereoBlock(CalibrationBlock):
-    """Some coefficients of the stereo calibration; `StereoField` has their columns in the pixels."""
+    """Some coefficients of the stereo calibration; `StereoCorrection` has their columns in the pixels."""
 
     terms: ClassVar[slice]  # of `Calibration.stereo`
     enters = "pixels"

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from vio.cameras.rectification_error import METRIC_TERMS
 from vio.filters.online_calibration import Calibration, prior_variances
 from vio.filters.scale_test import SCALE_SIGMA, ScaleTest
 from vio.filters.separate_bias import SeparateBias
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import LEAST_FIELD_PX, METRIC_TERMS, RowField, StereoField
+from vio.filters.stereo_calibration import LEAST_FIELD_PX, StereoCorrection, VerticalDisparityModel
 from vio.filters.window import Window
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
@@ -36,7 +37,7 @@ class RigCalibration:
         self.settings = settings  # with the priors of what was freed
         self.rotation: RotationComparison | None = ROTATION_NOT_COMPARABLE  # as others compared them; None: they will
         self.scale_log: float | None = None  # of the baseline over the calibrated one; None: nothing contradicts it
-        self._rows = RowField(camera)
+        self._rows = VerticalDisparityModel(camera)
 
     def first_covariance(self, calibration: Calibration, T_world_imu: FloatArray) -> FloatArray:
         """Covariance (C, C) of the errors of a calibration of which nothing was seen yet, at a pose (4, 4)."""
@@ -128,7 +129,7 @@ class RigCalibration:
         out: FloatArray = test.estimate()[1] ** 2 * np.outer(V, V)
         return out
 
-    def field(self, window: Window) -> StereoField | None:
+    def field(self, window: Window) -> StereoCorrection | None:
         """The stereo calibration's faults at the window's present means; None where they are not estimated."""
         estimated, stereo = window.calibration.stereo_terms, window.calibration.stereo
         if not len(estimated):
@@ -140,7 +141,7 @@ class RigCalibration:
         # known, drives come out no better without their part of the rows: KITTI 03 by 20 %, 06 and 0039 not.
         if "stereo_field" in window.state and "stereo_scale" in window.state:
             rows, rows_D_common = self._rows.without_common(stereo), self._rows.rows_D_common
-        return StereoField(self.camera, rows, stereo, estimated, rows_D_common)
+        return StereoCorrection(self.camera, rows, stereo, estimated, rows_D_common)
 
     def report(self, window: Window, estimate: Estimate) -> Estimate:
         """Return an estimate with the scale that was taken over, and with the rows that were learned."""

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.cameras.rectification_error import TERMS, corrected_pixels, error_jacobian, vertical_disparity_terms
 from vio.filters import track_loops as loops
 from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
@@ -22,8 +23,6 @@ from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import median
 from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, IntArray, Observations
 
-METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
-TERMS = FIELD_TERMS + METRIC_TERMS
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
 LEAST_FIELD_PX = 0.05  # root mean square of the field over the matches; smaller ones do no harm
@@ -32,32 +31,7 @@ _ROW_SIGNIFICANCE = 25.0  # squared standard deviations of the field by noise al
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
 
 
-def field_jacobian(camera: StereoCamera, z: FloatArray, first: int = 0, terms: int = TERMS) -> FloatArray:
-    """Derivatives of pixels `[ul vl ur vr]` (..., 4) by coefficients of (R3) and (R4), (..., 4, terms), pixels.
-
-    The row of `vr` is zero: right rows are not measured.
-    """
-    out = np.empty((*z.shape[:-1], 4, terms))
-    jacobian = loops.cylinder_field_jacobian if camera.is_cylinder else loops.stereo_field_jacobian
-    jacobian(loops.lens_of(camera), np.ascontiguousarray(z).reshape(-1, 4), first, out.reshape(-1, 4, terms))
-    return out
-
-
-def _row_terms(camera: StereoCamera, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives (N, 7) of right minus left rows by the coefficients of (R2), and (N, 4) by k1, k2, q1, q2 of (R3).
-
-    In focal lengths, of pixels (N, 4).
-    """
-    if camera.is_cylinder:
-        basis, common = np.empty((len(z), ROW_TERMS)), np.empty((len(z), FIELD_TERMS - RIGHT_TERMS))
-        loops.cylinder_rows(loops.lens_of(camera), np.ascontiguousarray(z), basis, common)
-        return basis, common
-    left, x, y = (z[:, 0] - camera.cu) / camera.fu, (z[:, 2] - camera.cu) / camera.fu, (z[:, 1] - camera.cv) / camera.fv
-    basis = np.stack([np.ones_like(x), x, y, x * y, x * x, y * y, left - x], axis=1)
-    return basis, _common_rows(left, x, y)
-
-
-class RowField:
+class VerticalDisparityModel:
     """Learns how far right rows are off over the image, equation (R2), from the matches of all frames."""
 
     def __init__(self, camera: StereoCamera) -> None:
@@ -77,7 +51,7 @@ class RowField:
         if len(z) < _MIN_ROWS:
             return
         camera = self._camera
-        basis, common = _row_terms(camera, z)
+        basis, common = vertical_disparity_terms(camera, z)
         rows = z[:, 3] - z[:, 1]
         # The median is taken out, as in the first frames the field itself is not yet known.
         residual = _centred(rows - camera.fv * (basis @ self.coefficients))
@@ -128,19 +102,12 @@ class RowField:
         return self.rms_px**2 > max(LEAST_FIELD_PX**2 + _ROW_SIGNIFICANCE * uncertainty, _ROW_DOMINANCE * noise)
 
 
-def _common_rows(x: FloatArray, xr: FloatArray, y: FloatArray) -> FloatArray:
-    """Derivatives (N, 4) of right minus left rows, in focal lengths, by k1, k2, q1 and q2 of (R3)."""
-    squares = xr * xr - x * x
-    fourth = squares * (xr * xr + x * x + 2 * y * y)
-    return np.stack([y * squares, y * fourth, squares, 2 * y * (xr - x)], axis=1)
-
-
 def _centred(values: FloatArray) -> FloatArray:
     return np.asarray(values - median(values), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
-class StereoField:
+class StereoCorrection:
     """The field at the present estimate: what is taken out of the pixels."""
 
     camera: StereoCamera
@@ -152,7 +119,7 @@ class StereoField:
 
     def jacobian(self, z: FloatArray) -> FloatArray:
         """Derivatives of pixels (..., 4) by the coefficients that are estimated (..., 4, S)."""
-        out = field_jacobian(self.camera, z, int(self.terms[0]), len(self.terms))
+        out = error_jacobian(self.camera, z, int(self.terms[0]), len(self.terms))
         if self.rows_D_common is not None and self.terms[0] == 0:
             for k, rows in enumerate(self.rows_D_common.T):
                 out[..., 2, RIGHT_TERMS + k] -= self._right_columns(z, rows)
@@ -160,17 +127,13 @@ class StereoField:
 
     def _right_columns(self, z: FloatArray, rows: FloatArray) -> FloatArray:
         """What rows (7,) of (R2) tell of the right columns of pixels (..., 4), pixels (...)."""
-        alone = StereoField(self.camera, rows, np.zeros(TERMS), self.terms)
+        alone = StereoCorrection(self.camera, rows, np.zeros(TERMS), self.terms)
         out: FloatArray = z[..., 2] - alone.corrected(Views(z, np.ones_like(z))).z.reshape(z.shape)[..., 2]
         return out
 
     def corrected(self, views: Views) -> Views:
         """Return views (..., 4) without the field."""
-        z, weight = np.ascontiguousarray(views.z), np.ascontiguousarray(views.weight)
-        out = np.empty(z.shape)
-        flat = z.reshape(-1, 4), weight.reshape(-1, 4), out.reshape(-1, 4)
-        correct = loops.correct_cylinder_pixels if self.camera.is_cylinder else loops.correct_pixels
-        correct(loops.lens_of(self.camera), self.coefficients, self.rows, *flat)
+        out = corrected_pixels(self.camera, self.coefficients, self.rows, views.z, views.weight)
         return Views(out, views.weight)
 
     def seen(self, z: FloatArray) -> FloatArray:

@@ -1,32 +1,29 @@
 """The compiled loops over tracks and their views behind `multiview` and `stereo_calibration`.
 
-Shapes: F tracks, N clones, S coefficients of the stereo field. `lens` is that of `lens_of`. Each loop writes into the
-arrays that come last. `tests/numpy_twins.py` holds the same in NumPy.
+Shapes: F tracks, N clones, S coefficients of the rectification error. `camera` is that of `camera_args`. Each loop
+writes into the arrays that come last. `tests/numpy_twins.py` holds the same in NumPy.
 """
 
 from __future__ import annotations
 
-from typing import TypeAlias
-
 import numpy as np
 
+from vio.cameras.projection import CameraArgs, point_at, turn_to
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera
 from vio.numerics.compiled import compiled, solve_positive
 from vio.records import BoolArray, IntArray
 
-Lens: TypeAlias = tuple[float, float, float, float, float, bool]
 
-
-def lens_of(camera: StereoCamera) -> Lens:
-    """Return `(fu, fv, cu, cv, baseline, whether it is a cylinder)`."""
-    fu, fv, cu, cv = float(camera.fu), float(camera.fv), float(camera.cu), float(camera.cv)
-    return fu, fv, cu, cv, float(camera.baseline_m), camera.is_cylinder
+@compiled
+def _turned_rows(T: FloatArray, s: float, c: float, row1: FloatArray, row2: FloatArray) -> None:
+    """Write the y and z axes (3,) of a camera (4, 4) turned about its baseline by an angle of this sine and cosine."""
+    for j in range(3):
+        row1[j], row2[j] = c * T[1, j] - s * T[2, j], s * T[1, j] + c * T[2, j]
 
 
 @compiled
 def compare_views(
-    lens: Lens,
+    camera: CameraArgs,
     least_depth: float,
     T: FloatArray,
     p: FloatArray,
@@ -37,17 +34,15 @@ def compare_views(
     ahead: BoolArray,
 ) -> None:
     """Write residuals (F, N, 4), Jacobians (F, N, 4, 3) by the points (F, 3), and which points are ahead (F,): (M1)."""
-    fu, fv, cu, cv, baseline, cylinder = lens
-    azimuth, s, c = 0.0, 0.0, 1.0  # of the point, about the baseline: a cylinder is a pinhole turned to it
+    fu, fv, cu, cv, baseline, _ = camera
+    row1, row2 = np.empty(3), np.empty(3)
     for f in range(len(p)):
         ahead[f] = True
         for n in range(len(T)):
             x = T[n, 0, 0] * p[f, 0] + T[n, 0, 1] * p[f, 1] + T[n, 0, 2] * p[f, 2] + T[n, 0, 3]
             y = T[n, 1, 0] * p[f, 0] + T[n, 1, 1] * p[f, 1] + T[n, 1, 2] * p[f, 2] + T[n, 1, 3]
             depth = T[n, 2, 0] * p[f, 0] + T[n, 2, 1] * p[f, 1] + T[n, 2, 2] * p[f, 2] + T[n, 2, 3]
-            if cylinder:
-                azimuth, depth = np.arctan2(y, depth), np.sqrt(y * y + depth * depth)
-                s, c = np.sin(azimuth), np.cos(azimuth)
+            azimuth, s, c, y, depth = turn_to(camera, y, depth)
             seen = weight[f, n, 0] > 0.0
             usable = depth > least_depth
             if seen and not usable:
@@ -58,25 +53,16 @@ def compare_views(
                     for j in range(3):
                         J[f, n, a, j] = 0.0
                 continue
-            u, v, d = fu * x / depth, fv * y / depth, fu * baseline / depth
+            _turned_rows(T[n], s, c, row1, row2)
+            u, v, d, row = fu * x / depth, fv * y / depth, fu * baseline / depth, fv * azimuth
             for a in range(4):
-                w = weight[f, n, a]
-                axis, focal, pixel, centre = 0, fu, u, cu
-                if a == 1 or a == 3:
-                    axis, focal, pixel, centre = 1, fv, v, cv
-                elif a == 2:
-                    pixel = u - d
-                if cylinder and axis == 1:
-                    pixel = fv * azimuth
-                r[f, n, a] = (z[f, n, a] - pixel - centre) * w if w > 0.0 else 0.0
-                if cylinder:
-                    for j in range(3):
-                        along = pixel * (s * T[n, 1, j] + c * T[n, 2, j]) if axis == 0 else 0.0
-                        across = T[n, 0, j] if axis == 0 else c * T[n, 1, j] - s * T[n, 2, j]
-                        J[f, n, a, j] = w * (focal * across - along) / depth
-                    continue
+                w, of_row = weight[f, n, a], a == 1 or a == 3
+                pixel = v if of_row else u - d if a == 2 else u
+                seen_at = pixel + row if of_row else pixel
+                r[f, n, a] = (z[f, n, a] - seen_at - (cv if of_row else cu)) * w if w > 0.0 else 0.0
                 for j in range(3):
-                    J[f, n, a, j] = w * (focal * T[n, axis, j] - pixel * T[n, 2, j]) / depth
+                    along = fv * row1[j] if of_row else fu * T[n, 0, j]
+                    J[f, n, a, j] = w * (along - pixel * row2[j]) / depth
 
 
 @compiled
@@ -104,7 +90,7 @@ def mark_measured(J: FloatArray, out: BoolArray) -> None:
 
 @compiled
 def anchor_points(
-    lens: Lens,
+    camera: CameraArgs,
     least_depth: float,
     T: FloatArray,
     p: FloatArray,
@@ -116,8 +102,8 @@ def anchor_points(
     q_D_p: FloatArray,
 ) -> None:
     """Write the coordinates (M5) of points (F, 3): the columns of `InverseDepth`."""
-    fu, baseline, cylinder = lens[0], lens[4], lens[5]
-    row1, row2 = np.empty(3), np.empty(3)  # y and z axes of the camera, for a cylinder turned to the point
+    fu, baseline = camera[0], camera[4]
+    row1, row2 = np.empty(3), np.empty(3)
     for f in range(len(p)):
         k = 0
         for n in range(len(T) - 1, -1, -1):
@@ -129,14 +115,8 @@ def anchor_points(
         x = T[k, 0, 0] * p[f, 0] + T[k, 0, 1] * p[f, 1] + T[k, 0, 2] * p[f, 2] + T[k, 0, 3]
         y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
         z = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
-        for i in range(3):
-            row1[i], row2[i] = T[k, 1, i], T[k, 2, i]
-        if cylinder:
-            azimuth = np.arctan2(y, z)
-            s, c = np.sin(azimuth), np.cos(azimuth)
-            y, z = 0.0, np.sqrt(y * y + z * z)
-            for i in range(3):
-                row1[i], row2[i] = c * T[k, 1, i] - s * T[k, 2, i], s * T[k, 1, i] + c * T[k, 2, i]
+        _, s, c, y, z = turn_to(camera, y, z)
+        _turned_rows(T[k], s, c, row1, row2)
         z = max(z, least_depth)
         disparity[f] = fu * baseline / z
         for i in range(3):
@@ -184,22 +164,17 @@ def _first_view(weight: FloatArray, f: int) -> int:
 
 
 @compiled
-def _put_on_ray(lens: Lens, T: FloatArray, u: float, v: float, disparity: float, p: FloatArray) -> None:
+def _put_on_ray(camera: CameraArgs, T: FloatArray, u: float, v: float, disparity: float, p: FloatArray) -> None:
     """Write the point (3,) in the world that a camera (4, 4) sees at a left pixel, at a disparity."""
-    fu, fv, cu, cv, baseline, cylinder = lens
-    scale = fu * baseline / disparity
-    angle = (v - cv) / fv
-    y, z = angle, 1.0
-    if cylinder:
-        y, z = np.sin(angle), np.cos(angle)
-    x, y, z = (u - cu) / fu * scale - T[0, 3], y * scale - T[1, 3], z * scale - T[2, 3]
+    x, y, z = point_at(camera, u, v, camera[0] * camera[4] / disparity)
+    x, y, z = x - T[0, 3], y - T[1, 3], z - T[2, 3]
     for i in range(3):
         p[i] = T[0, i] * x + T[1, i] * y + T[2, i] * z
 
 
 @compiled
 def start_by_stereo(
-    lens: Lens,
+    camera: CameraArgs,
     disparities: tuple[float, float],
     T: FloatArray,
     z: FloatArray,
@@ -223,12 +198,12 @@ def start_by_stereo(
         known[f] = best >= 0
         if best >= 0:
             disparity = min(max(largest, disparities[0]), disparities[1])
-            _put_on_ray(lens, T[best], z[f, best, 0], z[f, best, 1], disparity, p[f])
+            _put_on_ray(camera, T[best], z[f, best, 0], z[f, best, 1], disparity, p[f])
 
 
 @compiled
 def put_ahead(
-    lens: Lens,
+    camera: CameraArgs,
     least_depth: float,
     least_disparity: float,
     T: FloatArray,
@@ -239,13 +214,11 @@ def put_ahead(
     """Put points (F, 3) that are behind the first camera that saw them far away on its ray, in place."""
     for f in range(len(p)):
         k = _first_view(weight, f)
-        depth = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
-        if lens[5]:
-            y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
-            depth = np.sqrt(y * y + depth * depth)
-        if depth > least_depth:
+        y = T[k, 1, 0] * p[f, 0] + T[k, 1, 1] * p[f, 1] + T[k, 1, 2] * p[f, 2] + T[k, 1, 3]
+        z_cam = T[k, 2, 0] * p[f, 0] + T[k, 2, 1] * p[f, 1] + T[k, 2, 2] * p[f, 2] + T[k, 2, 3]
+        if turn_to(camera, y, z_cam)[4] > least_depth:
             continue
-        _put_on_ray(lens, T[k], z[f, k, 0], z[f, k, 1], least_disparity, p[f])
+        _put_on_ray(camera, T[k], z[f, k, 0], z[f, k, 1], least_disparity, p[f])
 
 
 @compiled
@@ -281,7 +254,7 @@ def step_points(
 
 @compiled
 def _most_disparity(
-    lens: Lens,
+    camera: CameraArgs,
     least: float,
     T: FloatArray,
     weight: FloatArray,
@@ -291,8 +264,8 @@ def _most_disparity(
     p: FloatArray,
 ) -> float:
     """Disparity beyond which a point (3,) would come nearer to one of its cameras than the least depth."""
-    if lens[5]:  # of a cylinder, a point that comes too near to another camera than its anchor is dropped afterwards
-        return lens[0] * lens[4] / least
+    if camera[5]:  # of a cylinder, a point that comes too near to another camera than its anchor is dropped afterwards
+        return camera[0] * camera[4] / least
     most = np.inf
     for n in range(len(T)):
         if weight[f, n, 0] > 0.0:
@@ -317,7 +290,7 @@ def _move(
 
 @compiled
 def move_points(
-    lens: Lens,
+    camera: CameraArgs,
     least_depth: float,
     least_disparity: float,
     T: FloatArray,
@@ -330,7 +303,7 @@ def move_points(
 ) -> None:
     """Move points (F, 3) by steps (F, 3) in the coordinates (M5), to what is ahead of all cameras that saw them."""
     for f in range(len(p)):
-        most = _most_disparity(lens, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f])
+        most = _most_disparity(camera, 1.01 * least_depth, T, weight, f, centre[f], disparity[f], p[f])
         _move(centre[f], p_D_q[f], disparity[f], dq[f], least_disparity, most, p[f])
 
 
@@ -536,159 +509,6 @@ def eliminate_tracks(
             first = k - k % 6
             for j in range(6):
                 A[k, first + j] += G[f, k, 0] * B[f, 0, j] + G[f, k, 1] * B[f, 1, j] + G[f, k, 2] * B[f, 2, j]
-
-
-@compiled
-def stereo_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray) -> None:
-    """Write the derivatives (M, 4, S) of pixels (M, 4) by S coefficients of (R3) and (R4), from the `first` one on."""
-    fu, fv, cu, cv, _, _ = lens
-    H = np.zeros((4, 10))
-    for m in range(len(z)):
-        x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
-        r2, rr2 = x * x + y * y, xr * xr + y * y
-        H[0, 4], H[0, 5], H[0, 6], H[0, 7] = fu * x * r2, fu * x * r2 * r2, fu * 2.0 * x * y, fu * (r2 + 2.0 * x * x)
-        H[1, 4], H[1, 5], H[1, 6], H[1, 7] = fv * y * r2, fv * y * r2 * r2, fv * (r2 + 2.0 * y * y), fv * 2.0 * x * y
-        H[2, 0], H[2, 1], H[2, 2], H[2, 3] = fu, fu * xr, fu * rr2, fu * rr2 * rr2
-        H[2, 4], H[2, 5] = fu * xr * rr2, fu * xr * rr2 * rr2
-        H[2, 6], H[2, 7] = fu * 2.0 * xr * y, fu * (rr2 + 2.0 * xr * xr)
-        H[2, 8], H[0, 9], H[1, 9], H[2, 9] = z[m, 2] - z[m, 0], fu * x, fv * y, fu * xr
-        for a in range(4):
-            for s in range(out.shape[2]):
-                out[m, a, s] = H[a, first + s]
-
-
-@compiled
-def correct_pixels(
-    lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
-) -> None:
-    """Write pixels (M, 4) without the field of (R3) and (R4), (10,), and what follows from the rows (7,) of (R2)."""
-    fu, fv, cu, cv, _, _ = lens
-    a0, a1, a2, a3, k1, k2, q1, q2, baseline, focal = coefficients
-    by_focal, by_both = np.exp(-focal), np.exp(-focal - baseline)
-    metric = baseline != 0.0 or focal != 0.0
-    for m in range(len(z)):
-        x, y, xr = (z[m, 0] - cu) / fu, (z[m, 1] - cv) / fv, (z[m, 2] - cu) / fu
-        r2, rr2 = x * x + y * y, xr * xr + y * y
-        radial, right_radial = r2 * (k1 + r2 * k2), rr2 * (k1 + rr2 * k2)
-        left = x * radial + 2.0 * x * y * q1 + (r2 + 2.0 * x * x) * q2
-        row = y * radial + (r2 + 2.0 * y * y) * q1 + 2.0 * x * y * q2
-        right = a0 + a1 * xr + rr2 * (a2 + rr2 * a3)
-        right += xr * right_radial + 2.0 * xr * y * q1 + (rr2 + 2.0 * xr * xr) * q2
-        right += -rows[1] * y + (rows[5] - rows[4]) * xr * y - rows[3] * y * y
-        out[m, 0] = z[m, 0] - fu * left if weight[m, 0] > 0.0 else z[m, 0]
-        out[m, 1] = z[m, 1] - fv * row if weight[m, 1] > 0.0 else z[m, 1]
-        out[m, 2] = z[m, 2] - fu * right if weight[m, 2] > 0.0 else z[m, 2]
-        out[m, 3] = z[m, 3]
-        if metric and weight[m, 0] > 0.0:
-            disparity = (out[m, 0] - out[m, 2]) * by_both
-            out[m, 0] = cu + (out[m, 0] - cu) * by_focal
-            out[m, 1] = cv + (out[m, 1] - cv) * by_focal
-            out[m, 2] = out[m, 0] - disparity if weight[m, 2] > 0.0 else z[m, 2]
-
-
-@compiled
-def _lens_plane(x: float, azimuth: float) -> tuple[float, float, float, float, float, float]:
-    """Angles off the axis (along u, along v) of a cylinder's coordinates, and how the coordinates move with them (2x2).
-
-    Errors of a wide lens are low polynomials in these angles, as those of a narrow one are on the plane z = 1.
-    """
-    rho = 1.0 / np.sqrt(1.0 + x * x)
-    a, y, z = x * rho, np.sin(azimuth) * rho, np.cos(azimuth) * rho
-    sine = np.sqrt(a * a + y * y)
-    if sine < 1e-6:
-        return a, y, 1.0, 0.0, 0.0, 1.0
-    ratio = np.arctan2(sine, z) / sine
-    ca, sa = a / sine, y / sine
-    xx, xy = (z * ca * ca + sa * sa / ratio) / rho**3, ca * sa * (z - 1.0 / ratio) / rho**3
-    yx, yy = ca * sa * (1.0 - z / ratio) / rho**2, (sa * sa + ca * ca * z / ratio) / rho**2
-    return ratio * a, ratio * y, xx, xy, yx, yy
-
-
-@compiled
-def cylinder_terms(x: float, azimuth: float, out: FloatArray) -> None:
-    """Write by how much (2, 14) a right camera's coordinates on a cylinder move, for one unit of each coefficient.
-
-    Columns: a0 to a3, k1, k2, q1, q2 of the states, then the first six of the rows, equation (R6).
-    """
-    u, v, xx, xy, yx, yy = _lens_plane(x, azimuth)
-    s, c, r2 = np.sin(azimuth), np.cos(azimuth), u * u + v * v
-    # What moves in the lens, in angles off the axis; then on the cylinder.
-    r4 = r2 * r2
-    lens_u = 4.0, u, r2, r4, r2 * u, r4 * u, 2.0 * u * v, r2 + 2.0 * u * u, 0.0, 0.0, 0.0, 0.0, 0.0, r2 * u
-    lens_v = 0.0, 0.0, 0.0, 0.0, r2 * v, r4 * v, r2 + 2.0 * v * v, 2.0 * u * v, 0.0, 0.0, v, 0.0, 3.0, r2 * v
-    for j in range(14):
-        out[0, j] = xx * lens_u[j] + xy * lens_v[j]
-        out[1, j] = yx * lens_u[j] + yy * lens_v[j]
-    # The turns about y, z and x.
-    out[0, 0] -= 3.0 * (1.0 + x * x) * c
-    out[1, 0] -= 3.0 * x * s
-    out[0, 11] += (1.0 + x * x) * c
-    out[1, 11] += x * s
-    out[0, 9] -= (1.0 + x * x) * s
-    out[1, 9] += x * c
-    out[1, 8] += 1.0
-    out[1, 12] -= 3.0
-
-
-@compiled
-def cylinder_field_jacobian(lens: Lens, z: FloatArray, first: int, out: FloatArray) -> None:
-    """Write the same for a cylinder's pixels; by the coefficients of (R4), zero."""
-    fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 14)), np.empty((2, 14))
-    for m in range(len(z)):
-        y = (z[m, 1] - cv) / fv
-        cylinder_terms((z[m, 0] - cu) / fu, y, left)
-        cylinder_terms((z[m, 2] - cu) / fu, y, right)
-        for s in range(out.shape[2]):
-            k = first + s
-            out[m, 0, s] = fu * left[0, k] if 4 <= k < 8 else 0.0
-            out[m, 1, s] = fv * left[1, k] if 4 <= k < 8 else 0.0
-            out[m, 2, s] = fu * right[0, k] if k < 8 else 0.0
-            out[m, 3, s] = 0.0
-
-
-@compiled
-def correct_cylinder_pixels(
-    lens: Lens, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
-) -> None:
-    """Write a cylinder's pixels (M, 4) without the field of (R3), (10,), and what the rows (7,) of (R2) tell."""
-    fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 14)), np.empty((2, 14))
-    for m in range(len(z)):
-        y = (z[m, 1] - cv) / fv
-        for a in range(4):
-            out[m, a] = z[m, a]
-        if weight[m, 0] > 0.0:
-            cylinder_terms((z[m, 0] - cu) / fu, y, left)
-            for j in range(4, 8):
-                out[m, 0] -= fu * left[0, j] * coefficients[j]
-                out[m, 1] -= fv * left[1, j] * coefficients[j]
-        if weight[m, 2] > 0.0:
-            cylinder_terms((z[m, 2] - cu) / fu, y, right)
-            for j in range(8):
-                out[m, 2] -= fu * right[0, j] * coefficients[j]
-            for j in range(6):
-                out[m, 2] -= fu * right[0, 8 + j] * rows[j]
-            out[m, 2] += rows[6] * (z[m, 2] - cu) * (z[m, 0] - z[m, 2]) / fu * np.sin(y)
-
-
-@compiled
-def cylinder_rows(lens: Lens, z: FloatArray, rows: FloatArray, common: FloatArray) -> None:
-    """Write the derivatives of right minus left rows, in focal lengths, of a cylinder's pixels (M, 4).
-
-    By the coefficients of (R2), (M, 7), and by k1, k2, q1 and q2 of (R3), (M, 4).
-    """
-    fu, fv, cu, cv, _, _ = lens
-    left, right = np.empty((2, 14)), np.empty((2, 14))
-    for m in range(len(z)):
-        y = (z[m, 1] - cv) / fv
-        cylinder_terms((z[m, 0] - cu) / fu, y, left)
-        cylinder_terms((z[m, 2] - cu) / fu, y, right)
-        for j in range(6):
-            rows[m, j] = right[1, 8 + j]
-        rows[m, 6] = (z[m, 0] - z[m, 2]) / fu * np.cos(y)
-        for j in range(4):
-            common[m, j] = right[1, 4 + j] - left[1, 4 + j]
 
 
 @compiled

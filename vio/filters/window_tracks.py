@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from vio.cameras.rectification_error import TERMS
 from vio.filters.multiview import (
     CAUCHY,
     Residuals,
@@ -24,7 +25,7 @@ from vio.filters.multiview import (
     usable_points,
 )
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import TERMS, StereoColumns, StereoField, stereo_columns
+from vio.filters.stereo_calibration import StereoColumns, StereoCorrection, stereo_columns
 from vio.filters.tracks import TrackTable
 from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import StereoCamera
@@ -56,7 +57,7 @@ class LinearTracks:
     weight: FloatArray  # (F, N) robust weight of each view
     information: TrackInformation
     stereo: StereoColumns | None  # where the stereo field is estimated
-    field: StereoField | None  # what was taken out of the pixels
+    field: StereoCorrection | None  # what was taken out of the pixels
 
     def newest_innovation(self) -> float | None:
         """Median absolute residual in the newest clone, pixels; None where nothing is seen in it."""
@@ -92,7 +93,7 @@ class WindowTracks:
         return rows
 
     def linearise(
-        self, T_cam0_world: FloatArray, rows: IntArray, steps: int, field: StereoField | None = None
+        self, T_cam0_world: FloatArray, rows: IntArray, steps: int, field: StereoCorrection | None = None
     ) -> LinearTracks:
         """Triangulate tracks, from where their points were last, and linearise them.
 
@@ -161,7 +162,7 @@ class WindowTracks:
         rows: IntArray,
         p_world: FloatArray,
         at: Residuals,
-        field: StereoField | None,
+        field: StereoCorrection | None,
         z: FloatArray,
     ) -> LinearTracks:
         weight = robust_weights(at, self.variance)
@@ -180,7 +181,7 @@ class WindowTracks:
             Their columns, and their part of what all tracks say.
         """
         terms = np.arange(TERMS)
-        field = StereoField(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), terms[-1:])
+        field = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), terms[-1:])
         if tracks.field is not None:
             field = replace(tracks.field, terms=terms)
         z = self._views(tracks.rows[chosen], len(tracks.T_cam0_world), tracks.field).z
@@ -189,7 +190,7 @@ class WindowTracks:
         predicted = z - at.r
         return stereo_columns(at, field.jacobian(predicted), information.q.p_D_q, tracks.weight[chosen]), information
 
-    def _views(self, rows: IntArray, clones: int, field: StereoField | None) -> Views:
+    def _views(self, rows: IntArray, clones: int, field: StereoCorrection | None) -> Views:
         """What rows showed, without the stereo field."""
         views = self.table.views(rows, clones)
         return views if field is None else field.corrected(views)

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from vio.calibration.stereo_field import PixelField
+from vio.calibration.stereo_field import DisplacementField
+from vio.cameras.rectification_error import METRIC_TERMS, TERMS
 from vio.cameras.rig import Rectifier
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.common import read_npz
@@ -18,7 +19,7 @@ from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
 from vio.files.trajectories import read_trajectory
 from vio.filters.multiview import Views
-from vio.filters.stereo_calibration import METRIC_TERMS, TERMS, StereoField
+from vio.filters.stereo_calibration import StereoCorrection
 from vio.filters.tracks import measured
 from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
@@ -41,7 +42,7 @@ class SavedRun:
     dataset: FeatureDataset  # observations of every frame, as a recording
     T_cam0_imu: FloatArray  # (4, 4)
     metrics: dict[str, Any]
-    field: PixelField | None = None  # what the run found its stereo calibration to be off by; None: nothing
+    field: DisplacementField | None = None  # what the run found its stereo calibration to be off by; None: nothing
 
     @property
     def truth(self) -> GroundTruth | None:
@@ -80,14 +81,14 @@ def read_saved_run(folder: Path) -> SavedRun:
     if camera.is_cylinder:
         camera, tracks = _in_pinhole(camera, tracks, coefficients)
     elif coefficients is not None:
-        field = PixelField(camera, coefficients)
+        field = DisplacementField(camera, coefficients)
         tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
         loops = tuple(_without(field, o) for o in loops)
     tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks, loops)
     return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics, field)
 
 
-def _without(field: PixelField, loop: LoopEvent) -> LoopEvent:
+def _without(field: DisplacementField, loop: LoopEvent) -> LoopEvent:
     """Return a loop with the pixels of a rectified pair without the field."""
     m = loop.matches
     if m is None:
@@ -106,7 +107,7 @@ def _in_pinhole(
     z = tracks.z
     if coefficients is not None:
         states = np.concatenate([coefficients[:FIELD_TERMS], np.zeros(METRIC_TERMS)])
-        stereo = StereoField(camera, coefficients[FIELD_TERMS:], states, np.arange(TERMS))
+        stereo = StereoCorrection(camera, coefficients[FIELD_TERMS:], states, np.arange(TERMS))
         z = stereo.corrected(Views(z, measured(tracks.has_right))).z
         z[:, 3] = z[:, 1]
     pinhole = pinhole_within(camera)
