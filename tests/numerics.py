@@ -28,7 +28,10 @@ TESTED_JACOBIANS = {
     "vio.geometry.distortion.uv_D_p_cam",
     "vio.geometry.sphere_models.double_sphere_D_p",
     "vio.geometry.sphere_models.unified_D_p",
+    "vio.geometry.stereo.depth_D_yz",
     "vio.geometry.stereo.p_cam_D_z",
+    "vio.geometry.stereo.ray_D_row",
+    "vio.geometry.stereo.row_D_yz",
     "vio.geometry.stereo.z_D_p_cam",
     "vio.mapping.pose_graph.r_D_poses",
 }

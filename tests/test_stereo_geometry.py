@@ -13,6 +13,8 @@ from tests.numerics import numeric_jacobian
 from vio.errors import CalibrationError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import (
+    PROJECTIONS,
+    Projection,
     StereoCamera,
     depth_of,
     facing,
@@ -80,6 +82,23 @@ def test_z_D_p_cam_equals_central_differences(seen: tuple[StereoCamera, FloatArr
     numeric = numeric_jacobian(lambda x: project(camera, x), p, eps=1e-5 * float(depth_of(camera, p)))
     analytic = z_D_p_cam(camera, p)
     np.testing.assert_allclose(analytic, numeric, rtol=1e-6, atol=1e-6 * np.abs(analytic).max())
+
+
+@pytest.mark.parametrize("name", ["pinhole", "cylinder"])
+def test_derivatives_of_rows_and_depths_equal_central_differences(name: Projection) -> None:
+    rows, yz = PROJECTIONS[name], np.array([-1.3, 2.1])
+    y, z = yz
+    depth = rows.depth(y, z)
+
+    def row(at: FloatArray) -> FloatArray:
+        return rows.row(at[0], at[1], rows.depth(at[0], at[1]), 300.0)
+
+    np.testing.assert_allclose(
+        [rows.depth_D_yz(y, z, depth)], numeric_jacobian(lambda at: rows.depth(*at), yz), atol=1e-8
+    )
+    np.testing.assert_allclose([rows.row_D_yz(y, z, depth, 300.0)], numeric_jacobian(row, yz), atol=1e-5)
+    numeric = numeric_jacobian(lambda at: np.stack(rows.ray(at[0])), np.array([0.7]))
+    np.testing.assert_allclose(np.array([rows.ray_D_row(np.float64(0.7))]).T, numeric, atol=1e-8)
 
 
 @properties

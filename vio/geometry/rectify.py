@@ -16,7 +16,7 @@ import numpy.typing as npt
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
-from vio.geometry.stereo import Projection, StereoCamera, left_rays, one_camera, project
+from vio.geometry.stereo import PROJECTIONS, Projection, StereoCamera, left_rays, one_camera, project
 
 MapArray = npt.NDArray[np.float32]
 Interpolation: TypeAlias = Literal["linear", "cubic", "lanczos4"]
@@ -25,7 +25,8 @@ ProjectionMode: TypeAlias = Literal["auto", "pinhole", "cylinder"]
 _BORDER_SAMPLES = 60  # points along each image border that determine the common field of view
 _MAX_TANGENT = 1.4  # beyond about 54 degrees off axis a planar image only stretches pixels
 PINHOLE_REACH = float(np.arctan(_MAX_TANGENT))  # radians
-_MAX_AZIMUTH = np.pi / 2  # of a cylinder's rows: further round, the rays of a lens of 195 degrees are its dark rim
+# Of a cylinder's rows, azimuths: further round, the rays of a lens of 195 degrees are its dark rim.
+_MAX_ROW = {"pinhole": _MAX_TANGENT, "cylinder": np.pi / 2}
 _MIN_TANGENT_WIDTH = 0.1
 _ROWS = 16  # of a map, computed at a time: the arrays between stay in the processor's cache
 _MAX_ROTATION_DEG = 30.0  # a camera that needs a larger rotation is not one half of a stereo pair
@@ -220,11 +221,11 @@ def _on_plane(ray: FloatArray, projection: Projection, least_depth: float) -> tu
 
     Tangents for a pinhole; tangent and azimuth (radians) for a cylinder.
     """
-    depth = np.hypot(ray[..., 1], ray[..., 2]) if projection == "cylinder" else ray[..., 2]
+    rows, y, z = PROJECTIONS[projection], ray[..., 1], ray[..., 2]
+    depth = rows.depth(y, z)
     ahead = np.asarray(depth > least_depth)
-    plane = ray[..., :2] / np.where(ahead, depth, 1.0)[..., None]
-    if projection == "cylinder":
-        plane = np.stack([plane[..., 0], np.arctan2(ray[..., 1], ray[..., 2])], axis=-1)
+    depth = np.where(ahead, depth, 1.0)
+    plane = np.stack([ray[..., 0] / depth, rows.row(y, z, depth, 1.0)], axis=-1)
     return plane, ahead
 
 
@@ -258,7 +259,7 @@ def _inner_rectangle(
         direction = {"left": [-1, 0], "right": [1, 0], "top": [0, -1], "bottom": [0, 1]}[name]
         far = np.array(direction, dtype=np.float64) * 1e9
         plane[name] = np.where(ahead[:, None], on_plane, far)
-    most = np.array([_MAX_TANGENT, _MAX_AZIMUTH if projection == "cylinder" else _MAX_TANGENT])
+    most = np.array([_MAX_TANGENT, _MAX_ROW[projection]])
     top, bottom = max(plane["top"][:, 1].max(), -most[1]), min(plane["bottom"][:, 1].min(), most[1])
     if projection == "cylinder":  # the corners of a wide lens look backwards, beyond the rows that are kept
         for name, bound in (("left", -np.inf), ("right", np.inf)):

@@ -13,6 +13,7 @@ first order in the middle row, disparity is `fu baseline / rho`, and rows reach 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral, Real
 from typing import Literal, TypeAlias
@@ -29,6 +30,63 @@ CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
 # depth, and a track enters the estimate once its inverse depth is known as well as by a stereo pair of this baseline.
 MONO_UNIT_M = 0.1
 _SHORT_M, _LONG_M = 0.005, 5.0  # baselines outside are those of another unit
+_Pair: TypeAlias = tuple[FloatArray | float, FloatArray | float]
+
+
+class PinholeRows:
+    """Where a pinhole differs from a cylinder: depths and rows of points with coordinates y and z (...), metres.
+
+    Columns follow from the depth. Rows are counted from the principal point, in the unit of the focal length.
+    """
+
+    def depth(self, y: FloatArray, z: FloatArray) -> FloatArray:
+        """Depth as disparity measures it."""
+        return z
+
+    def depth_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray) -> _Pair:
+        """Derivatives of the depth by y and z."""
+        return 0.0, 1.0
+
+    def row(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> FloatArray:
+        """Row of points of known depth."""
+        return focal * y / depth
+
+    def row_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> _Pair:
+        """Derivatives of the row by y and z."""
+        return focal / depth, -focal * y / depth**2
+
+    def ray(self, row: FloatArray) -> _Pair:
+        """Coordinates y and z of unit depth in a row of focal length 1."""
+        return row, 1.0
+
+    def ray_D_row(self, row: FloatArray) -> _Pair:
+        """Derivatives of `ray` by the row."""
+        return 1.0, 0.0
+
+
+class _CylinderRows(PinholeRows):
+    """The same of a cylinder about the baseline."""
+
+    def depth(self, y: FloatArray, z: FloatArray) -> FloatArray:
+        return np.hypot(y, z)
+
+    def depth_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray) -> _Pair:
+        return y / depth, z / depth
+
+    def row(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> FloatArray:
+        return focal * np.arctan2(y, z)
+
+    def row_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> _Pair:
+        return focal * (z / depth) / depth, -focal * (y / depth) / depth
+
+    def ray(self, row: FloatArray) -> _Pair:
+        return np.sin(row), np.cos(row)
+
+    def ray_D_row(self, row: FloatArray) -> _Pair:
+        return np.cos(row), -np.sin(row)
+
+
+PROJECTIONS: Mapping[Projection, PinholeRows] = {"pinhole": PinholeRows(), "cylinder": _CylinderRows()}
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +176,7 @@ def depth_of(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
     Along the optical axis of a pinhole; from the line of the baseline, and never negative, for a cylinder.
     """
     p = np.asarray(p_cam, dtype=np.float64)
-    return np.hypot(p[..., 1], p[..., 2]) if camera.is_cylinder else p[..., 2]
+    return PROJECTIONS[camera.projection].depth(p[..., 1], p[..., 2])
 
 
 def facing(camera: StereoCamera, pixels: npt.ArrayLike, p_cam: npt.ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -148,49 +206,37 @@ def facing(camera: StereoCamera, pixels: npt.ArrayLike, p_cam: npt.ArrayLike) ->
 def project(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
     """Stereo pixels (..., 4) of points (..., 3) in the cam0 frame, metres; their depth must not be zero."""
     p = np.asarray(p_cam, dtype=np.float64)
-    x, y, depth = p[..., 0], p[..., 1], depth_of(camera, p)
-    if camera.is_cylinder:
-        v = camera.fv * np.arctan2(y, p[..., 2]) + camera.cv
-    else:
-        v = camera.fv * y / depth + camera.cv
+    depth = depth_of(camera, p)
     out = np.empty((*p.shape[:-1], 4))
-    out[..., 0] = camera.fu * x / depth + camera.cu
+    out[..., 0] = camera.fu * p[..., 0] / depth + camera.cu
     out[..., 2] = out[..., 0] - camera.fu * camera.baseline_m / depth
-    out[..., 1] = out[..., 3] = v
+    row = PROJECTIONS[camera.projection].row(p[..., 1], p[..., 2], depth, camera.fv)
+    out[..., 1] = out[..., 3] = row + camera.cv
     return out
 
 
 def left_rays(camera: StereoCamera, pixels: npt.ArrayLike) -> FloatArray:
     """Rays (..., 3) of unit depth (`depth_of`) in the cam0 frame through left pixels (..., 2)."""
     uv = np.asarray(pixels, dtype=np.float64)
-    out = np.ones((*uv.shape[:-1], 3))
-    out[..., 0], y = (uv[..., 0] - camera.cu) / camera.fu, (uv[..., 1] - camera.cv) / camera.fv
-    if camera.is_cylinder:
-        out[..., 1], out[..., 2] = np.sin(y), np.cos(y)
-    else:
-        out[..., 1] = y
+    out = np.empty((*uv.shape[:-1], 3))
+    out[..., 0], row = (uv[..., 0] - camera.cu) / camera.fu, (uv[..., 1] - camera.cv) / camera.fv
+    out[..., 1], out[..., 2] = PROJECTIONS[camera.projection].ray(row)
     return out
 
 
 def z_D_p_cam(camera: StereoCamera, p_cam: npt.ArrayLike) -> FloatArray:
     """Jacobian (..., 4, 3) of `project` with respect to the point in the cam0 frame (pixels per metre)."""
     p = np.asarray(p_cam, dtype=np.float64)
-    x, y, depth = p[..., 0], p[..., 1], depth_of(camera, p)
+    x, depth, projection = p[..., 0], depth_of(camera, p), PROJECTIONS[camera.projection]
+    yz = p[..., 1], p[..., 2], depth
     out = np.zeros((*p.shape[:-1], 4, 3))
-    if camera.is_cylinder:
-        s, c = y / depth, p[..., 2] / depth
-        out[..., 0, 0] = out[..., 2, 0] = camera.fu / depth
-        for row, across in ((0, x), (2, x - camera.baseline_m)):
-            u_D_depth = -camera.fu * across / depth**2
-            out[..., row, 1], out[..., row, 2] = u_D_depth * s, u_D_depth * c
-        out[..., 1, 1] = out[..., 3, 1] = camera.fv * c / depth
-        out[..., 1, 2] = out[..., 3, 2] = -camera.fv * s / depth
-        return out
     out[..., 0, 0] = out[..., 2, 0] = camera.fu / depth
-    out[..., 1, 1] = out[..., 3, 1] = camera.fv / depth
-    out[..., 0, 2] = -camera.fu * x / depth**2
-    out[..., 2, 2] = -camera.fu * (x - camera.baseline_m) / depth**2
-    out[..., 1, 2] = out[..., 3, 2] = -camera.fv * y / depth**2
+    depth_D_y, depth_D_z = projection.depth_D_yz(*yz)
+    for column, across in ((0, x), (2, x - camera.baseline_m)):
+        u_D_depth = -camera.fu * across / depth**2
+        out[..., column, 1], out[..., column, 2] = u_D_depth * depth_D_y, u_D_depth * depth_D_z
+    out[..., 1, 1], out[..., 1, 2] = projection.row_D_yz(*yz, camera.fv)
+    out[..., 3, :] = out[..., 1, :]
     return out
 
 
@@ -207,12 +253,8 @@ def triangulate(
     valid = np.isfinite(z).all(axis=-1) & (disparity >= min_disparity_px)
     safe = np.where(valid[..., None], z, 0.0)
     depth = camera.fu * camera.baseline_m / np.where(valid, disparity, 1.0)
-    if camera.is_cylinder:
-        middle = np.stack([safe[..., 0], (safe[..., 1] + safe[..., 3]) / 2], axis=-1)
-        return left_rays(camera, middle) * depth[..., None], valid
-    x = (safe[..., 0] - camera.cu) / camera.fu * depth
-    y = ((safe[..., 1] + safe[..., 3]) / 2 - camera.cv) / camera.fv * depth
-    return np.stack([x, y, depth], axis=-1), valid
+    middle = np.stack([safe[..., 0], (safe[..., 1] + safe[..., 3]) / 2], axis=-1)
+    return left_rays(camera, middle) * depth[..., None], valid
 
 
 def p_cam_D_z(camera: StereoCamera, z: npt.ArrayLike) -> FloatArray:
@@ -222,17 +264,11 @@ def p_cam_D_z(camera: StereoCamera, z: npt.ArrayLike) -> FloatArray:
     depth = camera.fu * camera.baseline_m / disparity
     depth_D_ul = -depth / disparity
     ray_x = (z[..., 0] - camera.cu) / camera.fu
-    ray_y = ((z[..., 1] + z[..., 3]) / 2 - camera.cv) / camera.fv
+    row, projection = ((z[..., 1] + z[..., 3]) / 2 - camera.cv) / camera.fv, PROJECTIONS[camera.projection]
     out = np.zeros((*z.shape[:-1], 3, 4))
     out[..., 0, 0] = depth / camera.fu + ray_x * depth_D_ul
     out[..., 0, 2] = -ray_x * depth_D_ul
-    if camera.is_cylinder:
-        s, c = np.sin(ray_y), np.cos(ray_y)
-        for row, along, turned in ((1, s, c), (2, c, -s)):
-            out[..., row, 0], out[..., row, 2] = along * depth_D_ul, -along * depth_D_ul
-            out[..., row, 1] = out[..., row, 3] = turned * depth / (2 * camera.fv)
-        return out
-    out[..., 1, 0], out[..., 1, 2] = ray_y * depth_D_ul, -ray_y * depth_D_ul
-    out[..., 1, 1] = out[..., 1, 3] = depth / (2 * camera.fv)
-    out[..., 2, 0], out[..., 2, 2] = depth_D_ul, -depth_D_ul
+    for axis, ray, ray_D_row in zip((1, 2), projection.ray(row), projection.ray_D_row(row), strict=True):
+        out[..., axis, 0], out[..., axis, 2] = ray * depth_D_ul, -ray * depth_D_ul
+        out[..., axis, 1] = out[..., axis, 3] = ray_D_row * depth / (2 * camera.fv)
     return out
