@@ -31,8 +31,8 @@ Scores = npt.NDArray[np.float32]  # correlations, and what they are computed fro
 class RowField:
     """Row differences of matches over the image, estimated from the matches: the residual error of the rectification.
 
-    A small error of the relative rotation or principal point moves rows by a low polynomial in the pixel. On KITTI it
-    reaches 0.9 px in the corners, and at a slanted edge it causes an error of the disparity.
+    A small error of the relative rotation or principal point moves rows by a low polynomial in the pixel: 1, x, y, x y
+    and y^2 of equation (R2) of docs/math.md. At a slanted edge it causes an error of the disparity.
     """
 
     def __init__(self, width: int, height: int) -> None:

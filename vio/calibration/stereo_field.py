@@ -42,7 +42,7 @@ _FOURTH = RIGHT_TERMS - 1  # the one of them that no rig has
 _BELOW = TERMS - 1  # the one of the baseline's direction
 # What a calibration of a real rig is usually off by: mounts turn by tenths of a degree; principal point and focal
 # lengths by 2e-3 focal lengths; lens models as the sliding window takes them (online_calibration). A Cauchy
-# distribution of this width: a rig that is off by much more (KITTI's by 14 px and 1 degree) is believed.
+# distribution of this width: a rig that is off by much more is believed.
 _PRIOR = np.array([*[np.radians(0.5)] * 3, *[2e-3] * 4, *[2e-3] * 2, 1e-2, 1e-2, *[2e-3] * 2, np.radians(0.5)])
 _MODEL = 1e-4  # focal lengths, 0.05 px: what terms beyond those of the field leave in a coefficient
 _NO_PARAMETER = 1.0  # focal lengths: a coefficient that says nothing of the rig

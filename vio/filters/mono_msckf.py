@@ -30,12 +30,9 @@ from vio.records import (
     UpdateReport,
 )
 
-# A landmark that is marginalised at a scale that is still off holds on to it: of V1_02's 76 m, ATE is 0.020 m with 30
-# landmarks where the scale is known to 1 %, and 0.004 m without any (rendered images, simulated IMU).
-_LANDMARKS = 0
-# Parallax comes from motion alone, so a second of poses instead of half: EuRoC MH_01 ends at an ATE of 3.4 mm in place
-# of 4.9, its scale off by less than 0.1 % in place of 3 %.
-_LEAST_CLONES = 20
+# Measured in docs/notes/design_decisions.md, "of one camera".
+_LANDMARKS = 0  # one that is marginalised at a scale that is still off holds on to it
+_LEAST_CLONES = 20  # parallax comes from motion alone, so a second of poses instead of half
 _WORLD = [0, 1, 2, 5]  # errors of position and yaw, which the start takes for the world's
 
 
@@ -158,6 +155,6 @@ class MonoMsckf(Msckf):
 
 def _for_one_camera(settings: MsckfSettings) -> MsckfSettings:
     clones = max(settings.clones, _LEAST_CLONES)
-    # The time offset trades against the scale, which rests on the IMU alone: estimated, it made 0.9 to 1.2 of the ATE.
+    # The time offset trades against the scale, which rests on the IMU alone.
     calibrate = "none" if settings.calibrate_camera_imu == "auto" else settings.calibrate_camera_imu
     return replace(settings, max_landmarks=_LANDMARKS, clones=clones, calibrate_camera_imu=calibrate)

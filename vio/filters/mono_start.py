@@ -50,8 +50,8 @@ _STILL_PX = 0.5  # median motion of the tracks over half a second at standstill
 _TILT_SIGMA_RAD = np.radians(15.0)  # of gravity by the linear solution
 MOST_SCALE_SIGMA = 0.1  # of a start; the filter is linear in the scale to half the square of it, 0.5 %
 _LEAST_PX = 0.15  # pixel noise that fewer residuals than a filter's cannot prove
-# On the densities of accelerometer and gyro, until the filter has learned its own: on EuRoC's flights, stereo learns 1
-# to 4 and 3 to 10. Too small ones cost the scale (V1_02 with factors of 1: 12 % off, 2 % stated), too large ones time.
+# On the densities of accelerometer and gyro, until the filter has learned its own: too small ones cost the scale, too
+# large ones time (docs/notes/design_decisions.md, IMU noise at the start).
 START_FACTORS = np.array([2.0, 8.0])
 
 

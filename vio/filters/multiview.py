@@ -25,9 +25,8 @@ LEAST_DISPARITY_PX = 1e-3  # of a point at infinity: ten baselines of motion mov
 _PRIOR = 1e-6  # per px^2, information on the disparity: its standard deviation is 1000 px, half of what MIN_DEPTH shows
 _STEREO_VARIANCE = 2.0  # px^2, of the disparity of one stereo view, for one pixel of noise
 # One camera, whose unit of length is arbitrary: standard deviation of an inverse depth over itself, for one pixel of
-# noise, at most. A pair of 0.1 m has 5 to 15 % at usual distances. With a limit in the unit, slow flights have no track
-# (EuRoC MH_01: ATE 20 mm in place of 3); with one for the learned noise, standstills have too many (MH_03: 0.35 m in
-# place of 0.06).
+# noise, at most. With a limit in the unit, slow flights have no track; with one for the learned noise, standstills have
+# too many (docs/notes/design_decisions.md, depth of one camera's tracks).
 _MONO_DEPTH_SIGMA = 0.15
 _TINY = 1e-12  # keeps what nothing was seen of invertible
 _PARALLAX_STEPS = 3  # Gauss-Newton steps on a new point without a stereo view, before any pose has moved

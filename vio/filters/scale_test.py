@@ -17,8 +17,7 @@ from vio.filters.separate_bias import SeparateBias
 from vio.geometry.lie import FloatArray, se3_inverse
 
 SCALE_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
-# What is worth reporting: rigs are calibrated to 1 %, and accelerometers to 1 or 2 %. On recordings with a correct
-# baseline the estimate comes to 2.0 % (the real IMU of MH_03, 0.3 % claimed) and to 3.5 standard deviations.
+# More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
 _LEAST, _SIGMAS = 0.04, 5.0
 # The accelerometer's noise is in the motion that is held against the images, and there passes for motion at twice the
 # scale. It has three degrees of freedom in a frame, of which images determine a part: 0.1 of information on a recording

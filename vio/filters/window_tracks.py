@@ -35,9 +35,8 @@ from vio.records import ROW_TERMS, BoolArray, IntArray
 
 MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
 LEAST_PIXEL_SIGMA_PX = 0.03  # lower bound of the estimated noise of one pixel coordinate
-# Pixels of a track share errors that its residuals do not show, and no right image bounds what they make of the scale:
-# over 15 s of MH_03's path with clean rendered images, position NEES is 24 of 3 at the 0.03 px that the residuals
-# suggest, 0.6 at 0.1, and ATE 6.6 mm in place of 32.
+# Pixels of a track share errors that its residuals do not show, and no right image bounds what they make of the scale
+# (docs/notes/design_decisions.md, pixel noise of one camera).
 _LEAST_MONO_PX = 0.1
 _NOISE_GAIN = 0.05  # how fast the pixel noise follows the residuals
 _VIEW_PROBABILITY = 0.9999  # chi-square limit of a single view

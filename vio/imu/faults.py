@@ -2,10 +2,8 @@
 
 A spike is one sample that lies far from both of its neighbours, while these agree. A rig cannot turn or accelerate so
 within one period and back within the next: a sensor's bandwidth is a fraction of its rate, and vibration at that
-bandwidth fills the whole record, so the spike is judged by the changes of the two seconds before it. Over the flights
-V1_01, V1_02, MH_01 and MH_03 of EuRoC and room1 of TUM-VI, start of the motors, take-off and landing included, no
-sample lies further from both neighbours than 23 robust standard deviations of the changes before it, nor by more than
-2.4 mrad and 0.054 m/s over its period.
+bandwidth fills the whole record, so the spike is judged by the changes of the two seconds before it. Healthy flights
+come to 23 robust standard deviations of these changes (docs/notes/design_decisions.md, spikes of an IMU).
 
 Noise changes the last bits of every reading, so six equal numbers after six equal numbers are one reading given twice.
 How often that is due to coarse quantisation is learned from the record.

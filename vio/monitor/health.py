@@ -15,8 +15,7 @@ _GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many ti
 _LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
 _REJECTING_FRAMES = 20
 _ROWS_OFF_PX = 0.2
-# No rig comes to this by itself: a camera that is turned by one degree in its mount shows 8 px at a focal length of
-# 430 px. EuRoC's two cameras show 26 px where they are exchanged, and where their images are turned by 180 degrees.
+# No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md, exchanged cameras).
 _OTHER_PAIR_PX = 10.0
 _SCALE_OFF_PERCENT, _SCALE_SIGMAS = 1.0, 3.0  # of baseline or focal length, both to be exceeded
 _RESTART_EVENT_S = 1.0  # restarts that follow each other within this time are one event
