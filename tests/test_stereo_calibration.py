@@ -17,7 +17,13 @@ from tests import test_filter_truth
 from tests.numerics import numeric_jacobian
 from tests.test_filter_truth import SETTINGS, Course, Run, Spoil, fly
 from tests.test_multiview import T_CAM0_WORLD
-from vio.cameras.rectification_error import TERMS, error_jacobian
+from vio.cameras.rectification_error import (
+    TERMS,
+    corrected_pixels,
+    error_basis,
+    error_jacobian,
+    vertical_disparity_terms,
+)
 from vio.filters.multiview import (
     _PRIOR,
     Residuals,
@@ -100,6 +106,18 @@ def test_what_both_lenses_do_to_rows_is_taken_off_those_of_the_right_camera() ->
     numeric = numeric_jacobian(corrected, np.zeros(TERMS), eps=1e-6).reshape(-1, 4, TERMS)
     field = StereoCorrection(CAMERA, rows, np.zeros(TERMS), np.arange(TERMS), rows_D_common)
     np.testing.assert_allclose(field.jacobian(z), -numeric, atol=1e-4)
+
+
+def test_jacobian_rows_and_correction_are_of_the_same_terms() -> None:
+    rng = np.random.default_rng(8)
+    z = rng.uniform([100, 50, 50, 50], [700, 430, 650, 430], (20, 4))
+    coefficients, rows = rng.normal(0, 1e-3, 8), np.append(rng.normal(0, 1e-3, 6), 0.0)
+    basis, (own, common) = error_basis(CAMERA, z), vertical_disparity_terms(CAMERA, z)
+    np.testing.assert_allclose(basis[:, :3, :8], error_jacobian(CAMERA, z)[:, :3, :8], rtol=1e-12)
+    np.testing.assert_allclose(basis[:, 3, 8:], CAMERA.fv * own, rtol=1e-12)
+    np.testing.assert_allclose(basis[:, 3, 4:8] - basis[:, 1, 4:8], CAMERA.fv * common, rtol=1e-9, atol=1e-9)
+    found = corrected_pixels(CAMERA, np.append(coefficients, [0.0, 0.0]), rows, z, np.ones_like(z))
+    np.testing.assert_allclose((z - found)[:, :3], basis[:, :3] @ np.append(coefficients, rows), atol=1e-9)
 
 
 def _right_columns(rows: VerticalDisparityModel, states: FloatArray, z: FloatArray) -> FloatArray:

@@ -330,7 +330,7 @@ def test_a_field_that_no_rig_has_is_refused(bend: float) -> None:
     """Half or all of a radian over the image: the fit leaves the possible rigs, or misses the field by 1e5 px."""
     field = np.array([0.0] * 4 + [bend] + [0.0] * 10)
     with pytest.raises(CalibrationError, match=r"^made: no rig .* \(rows by 0\.30 px rms\); .* calibrate the cameras"):
-        found_rig(RECTIFIED, _estimate(field), is_cylinder=False, where="made")
+        found_rig(RECTIFIED, _estimate(field), CAMERA, "made")
 
 
 def test_results_are_written_where_no_rig_has_the_field_that_was_found(

@@ -7,12 +7,13 @@ from dataclasses import replace
 from vio.calibration.stereo_field import CalibratedRig, calibrated_rig
 from vio.cameras.rig import Rig
 from vio.errors import CalibrationError
+from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate
 
 _MOST_LEFT_PX = 5.0  # a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
 
 
-def found_rig(given: Rig, estimate: Estimate, *, is_cylinder: bool, where: str) -> CalibratedRig:
+def found_rig(given: Rig, estimate: Estimate, camera: StereoCamera, where: str) -> CalibratedRig:
     """Return a given rig with all that a run estimated of it.
 
     On a cylinder left and right stay as given: its stereo field is not expressed as a rig.
@@ -20,13 +21,13 @@ def found_rig(given: Rig, estimate: Estimate, *, is_cylinder: bool, where: str) 
     Args:
         given: the calibration that the run used.
         estimate: the run's last one.
-        is_cylinder: whether the images were rectified to a cylinder.
+        camera: the rectified pair.
         where: the recording, for messages.
 
     Raises:
         CalibrationError: no rig of the given lens models is off as the run found it.
     """
-    field = None if is_cylinder else estimate.stereo_field
+    field = None if camera.is_cylinder else estimate.stereo_field
     if field is None:
         return calibrated_rig(given, replace(estimate, stereo_field=None))
     cause: CalibrationError | None = None

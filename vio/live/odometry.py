@@ -305,7 +305,7 @@ class Odometry:
             if self.camera.is_cylinder:
                 raise DataError("no lens model holds a cylinder; give Odometry the rig of the raw cameras")
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
-        return found_rig(rig, estimate, is_cylinder=self.camera.is_cylinder, where="live images")
+        return found_rig(rig, estimate, self.camera, "live images")
 
     @property
     def motion(self) -> MotionSource | None:

@@ -83,9 +83,7 @@ class RunResult:
         if self.rig is None:
             return None
         recording = self.recording
-        return found_rig(
-            self.rig, self.estimates[-1], is_cylinder=recording.camera.is_cylinder, where=str(recording.path)
-        )
+        return found_rig(self.rig, self.estimates[-1], recording.camera, str(recording.path))
 
     @property
     def trajectory(self) -> Trajectory:
