@@ -10,7 +10,7 @@ from vio.frontend.align import align, on_peak, rounded, scale_change, shift_warp
 from vio.frontend.columns import take
 from vio.frontend.detect import min_distance_px
 from vio.frontend.outliers import Consensus, pixel_errors
-from vio.frontend.patches import View, inside
+from vio.frontend.patches import ImageLevels, inside
 from vio.frontend.prediction import moved_pixels
 from vio.frontend.settings import GridSettings
 from vio.frontend.tracks import ANCHOR_RADIUS_PX, INLIER_PX, AnchorBank, Tracks
@@ -43,7 +43,13 @@ class AnchorFit:
         self._camera, self._grid, self._bank = camera, grid, bank
 
     def track(
-        self, old: Tracks, before: View, left: View, found: FloatArray, seen: BoolArray, motion: Consensus | None
+        self,
+        old: Tracks,
+        before: ImageLevels,
+        left: ImageLevels,
+        found: FloatArray,
+        seen: BoolArray,
+        motion: Consensus | None,
     ) -> Tracks:
         """Align the features with their anchors; return those kept, with their new pixels.
 
@@ -93,7 +99,9 @@ class AnchorFit:
         height, width = left.full.shape
         return take(now, _spaced(now.left, 0.5 * min_distance_px(width, height, self._grid)))
 
-    def _start(self, old: Tracks, left: View, found: FloatArray, seen: BoolArray, motion: Consensus | None) -> _Start:
+    def _start(
+        self, old: Tracks, left: ImageLevels, found: FloatArray, seen: BoolArray, motion: Consensus | None
+    ) -> _Start:
         """Start the alignment at the pixel found by Lucas-Kanade, else at the pixel predicted by the motion."""
         if motion is None:
             return _Start(found, np.ones(len(old)), old.point, seen)
@@ -110,7 +118,7 @@ class AnchorFit:
         )
 
     def _realign(
-        self, old: Tracks, before: View, left: View, rows: IntArray, start: _Start
+        self, old: Tracks, before: ImageLevels, left: ImageLevels, rows: IntArray, start: _Start
     ) -> tuple[FloatArray, BoolArray]:
         """Align features with a new anchor from the previous frame; return warps (N, 2, 3) and a mask (N,)."""
         centres = rounded(old.left[rows])

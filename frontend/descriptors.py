@@ -129,7 +129,7 @@ def sift_extractor(settings: MatchSettings) -> OpenCvExtractor:
 
 
 @dataclass(frozen=True, slots=True)
-class _Pair:
+class _MatchedKeypoints:
     """The key points of the left image and their right pixels."""
 
     keypoints: Keypoints  # (N,)
@@ -215,7 +215,7 @@ class DescriptorFrontend:
             & (disparity <= self._disparity.max_disparity * width)
         )
 
-    def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[Image, Image]) -> _Pair:
+    def _stereo(self, left: Keypoints, right: Keypoints, views: tuple[Image, Image]) -> _MatchedKeypoints:
         """Match the key points of the left image into the right one."""
         right_pixels, has_right = np.zeros((len(left), 2)), np.zeros(len(left), dtype=np.bool_)
         pairs = self._match(left, right, self._allowed(left, right, views[0].shape[1]))
@@ -224,7 +224,7 @@ class DescriptorFrontend:
         right_pixels[rows], alike = self._refine(views[0], left.pixels[rows], views[1], target, target[:, 1])
         disparity = left.pixels[rows, 0] - right_pixels[rows, 0]
         has_right[rows] = alike & (disparity >= MIN_MATCH_DISPARITY_PX)
-        return _Pair(left, right_pixels, has_right)
+        return _MatchedKeypoints(left, right_pixels, has_right)
 
     def _refine(
         self,
@@ -248,7 +248,7 @@ class DescriptorFrontend:
     # --- tracking in time ---------------------------------------------------------------------------------------------
 
     def _track(
-        self, frame: StereoFrame, pair: _Pair, view: Image, prior: TrackPrior | None
+        self, frame: StereoFrame, pair: _MatchedKeypoints, view: Image, prior: TrackPrior | None
     ) -> tuple[_Tracks, FloatArray, BoolArray]:
         """Match the previous tracks to key points; return tracks, motion per second, and the mask of used points."""
         previous, used = self._previous, np.zeros(len(pair.keypoints), dtype=np.bool_)
@@ -311,7 +311,7 @@ class DescriptorFrontend:
             near |= np.abs(centre[:, None] - points).max(axis=2) <= reach
         return near
 
-    def _add_new_features(self, tracks: _Tracks, pair: _Pair, used: BoolArray, image: Image) -> _Tracks:
+    def _add_new_features(self, tracks: _Tracks, pair: _MatchedKeypoints, used: BoolArray, image: Image) -> _Tracks:
         """Add new features from key points with a right match, spread evenly over the image."""
         height, width = image.shape
         left = pair.keypoints.pixels

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from vio.frontend.patches import View, inside, mean_and_contrast
+from vio.frontend.patches import ImageLevels, inside, mean_and_contrast
 from vio.frontend.tracks import ANCHOR_RADIUS_PX
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image
@@ -26,7 +26,7 @@ _MAX_GAIN = 4.0
 
 
 def track_with_retries(
-    last: Image, view: View, points: FloatArray, guess: FloatArray, trusted: bool, levels: int
+    last: Image, view: ImageLevels, points: FloatArray, guess: FloatArray, trusted: bool, levels: int
 ) -> tuple[FloatArray, BoolArray]:
     """Track points from the last image into the current one; repeat with a wider search where many are lost.
 
@@ -71,7 +71,7 @@ def match_brightness(image: Image, other: Image) -> Image:
 
 def _track_forward_backward(
     last: Image,
-    view: View,
+    view: ImageLevels,
     points: FloatArray,
     guess: FloatArray,
     levels: int,

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from vio.frontend.patches import View
+from vio.frontend.patches import ImageLevels
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import PreviousFrame, Tracks
 from vio.records import Image, StereoFrame
@@ -18,23 +18,23 @@ class FrameImages:
 
     frame: StereoFrame
     raw: tuple[Image, ...]  # (H, W) left and right, or that of one camera
-    view: Callable[[Image], View]  # equalises and halves an image
+    view: Callable[[Image], ImageLevels]  # equalises and halves an image
     previous: PreviousFrame | None  # the last frame that was not skipped
     stereo: StereoFit
     right_trusted: bool  # the right image of the last frame was used
 
     @cached_property
-    def views(self) -> tuple[View, ...]:
+    def views(self) -> tuple[ImageLevels, ...]:
         """Left and right, or that of one camera."""
         return tuple(self.view(image) for image in self.raw)
 
     @property
-    def left(self) -> View:
+    def left(self) -> ImageLevels:
         """Image that features are tracked in."""
         return self.views[0]
 
     @property
-    def right(self) -> View | None:
+    def right(self) -> ImageLevels | None:
         """Image that they are matched in; None: one camera."""
         return self.views[1] if len(self.views) > 1 else None
 

@@ -19,7 +19,7 @@ from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_e
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
-from vio.frontend.patches import View, half_image
+from vio.frontend.patches import ImageLevels, half_image
 from vio.frontend.prediction import guessed_pixels, prior_rows, usable_prior
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import RightDelay
@@ -126,11 +126,11 @@ class KltFrontend:
         """Return what the frame says of the images, one line an event."""
         return tuple(line for check in self._checks for line in check.take_lines())
 
-    def _view(self, image: Image) -> View:
+    def _view(self, image: Image) -> ImageLevels:
         """Equalise and convert an image; the result may share memory with it."""
         if self._clahe is not None:
             image = np.asarray(self._clahe.apply(image), dtype=np.uint8)
-        return View(image, half_image(image))
+        return ImageLevels(image, half_image(image))
 
     def _set_up(self, shape: tuple[int, ...]) -> tuple[StereoFit, BoolArray | None]:
         """Return the stereo matcher and the mask (H/2, W/2) of allowed corners, set up with the first frame's shape."""
@@ -150,7 +150,7 @@ class KltFrontend:
         twist = np.zeros(6) if before is None else before.twist_per_s
         if before is not None and motion is not None:
             twist = se3_log(motion.T_curr_prev) / ((frame.time_ns - before.time_ns) * 1e-9)
-        left = View(left.full.copy(), left.half)  # a reader may reuse its buffer
+        left = ImageLevels(left.full.copy(), left.half)  # a reader may reuse its buffer
         right_half = None if right is None else right.half
         self._previous = PreviousFrame(frame.time_ns, left, right_half, tracks, twist, motion is not None)
 

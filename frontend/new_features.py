@@ -9,7 +9,7 @@ import numpy as np
 from vio.frontend.align import rounded
 from vio.frontend.columns import joined, take
 from vio.frontend.outliers import Consensus
-from vio.frontend.patches import View, inside
+from vio.frontend.patches import ImageLevels, inside
 from vio.frontend.settings import GridSettings
 from vio.frontend.stereo_fit import StereoFit
 from vio.frontend.tracks import AnchorBank, Tracks, new_tracks
@@ -33,8 +33,8 @@ class NewFeatures:
 
     def add(
         self,
-        left: View,
-        right: View | None,
+        left: ImageLevels,
+        right: ImageLevels | None,
         tracks: Tracks,
         corners: FloatArray,
         motion: Consensus | None,
@@ -69,8 +69,8 @@ class NewFeatures:
 
     def _search_right(
         self,
-        left: View,
-        right: View | None,
+        left: ImageLevels,
+        right: ImageLevels | None,
         tracks: Tracks,
         corners: FloatArray,
         motion: Consensus | None,

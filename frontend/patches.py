@@ -16,7 +16,7 @@ Patches: TypeAlias = npt.NDArray[np.float32]  # (N, h, w) gray levels
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class ImageLevels:
     """One image in the forms that tracking needs."""
 
     full: Image  # (H, W)

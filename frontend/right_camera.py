@@ -42,7 +42,7 @@ _SAID: dict[Cause, str] = {
 
 
 @dataclass(frozen=True, slots=True)
-class _Pair:
+class _SparseImages:
     """Both images of a frame, sparsely sampled."""
 
     index: int
@@ -55,7 +55,7 @@ class RightCamera(ImageCheck):
 
     def __init__(self) -> None:
         super().__init__()
-        self._last: _Pair | None = None  # the last frame in which no image was frozen
+        self._last: _SparseImages | None = None  # the last frame in which no image was frozen
         self._ratio = 1.0  # usual change of the right image over that of the left one
         self._cause: Cause | None = None  # why the right image is not used
         self._since = 0  # frame before the first such frame
@@ -92,7 +92,7 @@ class RightCamera(ImageCheck):
 
         A frozen or dark right image is noted: `usable` is False then.
         """
-        now = _Pair(index, left[::_STRIDE, ::_STRIDE].copy(), right[::_STRIDE, ::_STRIDE].copy())
+        now = _SparseImages(index, left[::_STRIDE, ::_STRIDE].copy(), right[::_STRIDE, ::_STRIDE].copy())
         last = self._last
         if last is None:
             self._last = now

@@ -6,7 +6,7 @@ import numpy as np
 
 from vio.frontend.one_camera import with_prior_depths
 from vio.frontend.outliers import Consensus
-from vio.frontend.patches import View
+from vio.frontend.patches import ImageLevels
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.right_delay import PairingCounts, RightDelay, at_exposure, at_present
 from vio.frontend.stereo_fit import StereoFit
@@ -30,8 +30,8 @@ class RightMatcher:
         frame: StereoFrame,
         previous: PreviousFrame,
         tracks: Tracks,
-        left: View,
-        right: View,
+        left: ImageLevels,
+        right: ImageLevels,
         prior: TrackPrior | None,
         stereo: StereoFit,
         motion: Consensus | None,
@@ -69,7 +69,7 @@ class RightMatcher:
         return matched
 
     def _count_pairings(
-        self, previous: PreviousFrame, left: View, tracks: Tracks, right: View, stereo: StereoFit
+        self, previous: PreviousFrame, left: ImageLevels, tracks: Tracks, right: ImageLevels, stereo: StereoFit
     ) -> PairingCounts:
         """Count the features that match if the right image belongs to this frame, the one before, or the next one."""
         assert previous.right_half is not None
@@ -86,7 +86,7 @@ class RightMatcher:
         self,
         previous: PreviousFrame,
         tracks: Tracks,
-        right: View,
+        right: ImageLevels,
         flow: FloatArray,
         T: FloatArray,
         stereo: StereoFit,

@@ -13,9 +13,9 @@ import numpy as np
 from vio.cameras.projection import CameraArgs, camera_args, point_at
 from vio.frontend.align import align, on_peak
 from vio.frontend.columns import take
-from vio.frontend.patches import View
+from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import DisparitySettings
-from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, RowField, match_rows, shifted_rows
+from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, EpipolarRowModel, match_rows, shifted_rows
 from vio.frontend.tracks import INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, depth_of
@@ -52,10 +52,10 @@ class StereoFit:
         self.max_disparity_px = disparity.max_disparity * size[0]
         self._camera = camera
         self._bank = bank
-        self._rows = RowField(*size)
+        self._rows = EpipolarRowModel(*size)
         self._unmatched = 0  # frames in a row with hardly any match
 
-    def track_right(self, tracks: Tracks, right: View, moved: bool) -> Tracks:
+    def track_right(self, tracks: Tracks, right: ImageLevels, moved: bool) -> Tracks:
         """Match features of known depth; with a consensus motion (`moved`), check the disparity against the depth.
 
         Args:
@@ -72,14 +72,14 @@ class StereoFit:
             valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= INLIER_PX
         return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
 
-    def match_near(self, tracks: Tracks, right: View, rows: IntArray, disparity: FloatArray) -> Tracks:
+    def match_near(self, tracks: Tracks, right: ImageLevels, rows: IntArray, disparity: FloatArray) -> Tracks:
         """Match the given rows (K,) near their disparities (K,)."""
         if not len(rows):
             return tracks
         pixels, skew, valid = self._fit(take(tracks, rows), right, disparity)
         return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
 
-    def search(self, left: View, right: View, points: FloatArray) -> tuple[FloatArray, BoolArray]:
+    def search(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are unique."""
         offset = round(self._rows.offset_px / 2)
         if self._unmatched % _ROW_SEARCH_FRAMES == 1:
@@ -87,7 +87,7 @@ class StereoFit:
         correlation = _MIN_CORRELATION - _COARSE_SLACK
         return self._search(left.half, shifted_rows(right.half, offset), points, correlation)
 
-    def _best_offset(self, left: View, right: View, points: FloatArray, offset: int) -> int:
+    def _best_offset(self, left: ImageLevels, right: ImageLevels, points: FloatArray, offset: int) -> int:
         """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
@@ -102,7 +102,7 @@ class StereoFit:
         self._rows.restart(2.0 * tried[best])
         return tried[best]
 
-    def count_mirrored(self, left: View, right: View, points: FloatArray) -> int:
+    def count_mirrored(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that have a match with a negative disparity."""
         a, b = (np.ascontiguousarray(view.half[:, ::-1]) for view in (left, right))
         flipped = points * [-1.0, 1.0] + [2.0 * (a.shape[1] - 1), 0.0]
@@ -138,7 +138,9 @@ class StereoFit:
     ) -> tuple[FloatArray, BoolArray]:
         return match_rows(left_half, right_half, points, self.max_disparity_px, min_correlation, _MIN_PEAK_MARGIN)
 
-    def _fit(self, tracks: Tracks, right: View, disparity: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _fit(
+        self, tracks: Tracks, right: ImageLevels, disparity: FloatArray
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Align anchors with the right image near expected disparities (N,).
 
         Returns:

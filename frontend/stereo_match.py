@@ -28,7 +28,7 @@ _FIELD_ITERATIONS = 3
 Scores = npt.NDArray[np.float32]  # correlations, and what they are computed from
 
 
-class RowField:
+class EpipolarRowModel:
     """Row differences of matches over the image, estimated from the matches: the residual error of the rectification.
 
     A small error of the relative rotation or principal point moves rows by a low polynomial in the pixel: 1, x, y, x y

@@ -8,7 +8,7 @@ import numpy as np
 
 from vio.frontend.align import cut_patches, empty_templates, replace_templates, shift_warps
 from vio.frontend.columns import joined
-from vio.frontend.patches import View
+from vio.frontend.patches import ImageLevels
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
@@ -42,7 +42,7 @@ class PreviousFrame:
     """State kept from the last frame that was not skipped."""
 
     time_ns: int
-    left: View
+    left: ImageLevels
     right_half: Image | None  # None: there is no right camera
     tracks: Tracks
     twist_per_s: FloatArray  # (6,) camera motion `[rho; phi]` per second, from the last consensus

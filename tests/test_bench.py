@@ -27,7 +27,7 @@ from vio.bench.identity import ROOT, InputDigests, imported_code
 from vio.bench.report import _as_html
 from vio.bench.store import Store
 from vio.bench.suite import Suite, config_of, read_suite, shipped_suites, suite_from
-from vio.bench.tables import METRICS, Outcome, cell_text, markdown, number, rows_of
+from vio.bench.tables import METRICS, Outcome, cell_text, markdown, number, summary_rows
 from vio.bench.tasks import tasks_of
 from vio.bench.worker import perform
 from vio.cli import main
@@ -280,13 +280,15 @@ def outcome(sequence: str, system: str, seed: int | None, ate_m: float | None, *
 
 
 def test_rows_hold_median_worst_and_spread_over_seeds() -> None:
-    rows = rows_of([outcome("a", "x", seed, value) for seed, value in enumerate([0.3, 0.1, 0.2, None])])
+    rows = summary_rows([outcome("a", "x", seed, value) for seed, value in enumerate([0.3, 0.1, 0.2, None])])
     (row,) = rows
     cell = row.cells["ate_m"]
     assert (cell.median, cell.worst, cell.spread, cell.count) == (0.2, 0.3, pytest.approx(0.2), 3)
     assert (row.runs, row.failed) == (4, 1)
     assert cell_text(cell, ATE) == "0.2 (0.1 to 0.3)"
-    covered = rows_of([outcome("a", "x", s, 0.1, coverage=c) for s, c in enumerate([0.5, 1.0])])[0].cells["coverage"]
+    covered = summary_rows([outcome("a", "x", s, 0.1, coverage=c) for s, c in enumerate([0.5, 1.0])])[0].cells[
+        "coverage"
+    ]
     assert covered.worst == 0.5
     assert cell_text(covered, next(m for m in METRICS if m.name == "coverage")) == "0.75 (0.5 to 1)"
 
@@ -303,7 +305,7 @@ def test_the_table_is_complete_whatever_failed(tmp_path: Path) -> None:
     published = [{"system": "Other", "source": "https://example.org/paper", "ate_m": {"a": 0.5}}]
     suite = _suite(tmp_path, sequences={"a": "a", "b": "b"}, published=published)
     runs = [outcome("a", "x", 0, 0.2), outcome("b", "x", 0, None), outcome("a", "peer|1", None, 0.1)]
-    text = markdown(suite, rows_of(runs), runs, {"version": "1", "code": "abc", "packages": {}})
+    text = markdown(suite, summary_rows(runs), runs, {"version": "1", "code": "abc", "packages": {}})
     assert "| sequence | x | peer\\|1 | Other (published) |" in text
     assert "| a | 0.2 | **0.1** | 0.5 |" in text
     assert "| b | failed |  |  |" in text

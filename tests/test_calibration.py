@@ -27,7 +27,7 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, s
 from vio.geometry.stereo import StereoCamera
 from vio.records import ImuSample, feature_tracks
 from vio.sim.imu import ImuNoise, simulate_imu
-from vio.sim.motion import MotionSpline, evaluate, hand_held
+from vio.sim.motion import MotionSpline, hand_held, motion_at
 
 T_CAM0_CAM1 = se3_from_parts(so3_exp([0.014, -0.002, 0.003]), [0.11, 0.0002, -0.0009])
 SIGMA_RAD = 3e-4
@@ -181,7 +181,7 @@ RATE_HZ = 20.0
 def _seen(spline: MotionSpline, *, noise: float = 1.0) -> CameraMotion:
     """Return the camera's exact twists with noise like that of stereo tracks."""
     times_ns = np.arange(spline.start_ns + 200_000_000, spline.end_ns - 200_000_000, int(1e9 / RATE_HZ))
-    state = evaluate(spline, times_ns)
+    state = motion_at(spline, times_ns)
     T_world_cam = state.T_world_imu @ se3_inverse(T_CAM0_IMU)
     steps = se3_inverse(T_world_cam[:-1]) @ T_world_cam[1:]
     twists = se3_log(steps) * RATE_HZ

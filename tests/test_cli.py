@@ -484,7 +484,7 @@ def test_without_pycolmap_only_its_commands_fail(recording: Path, tmp_path: Path
 def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: pytest.CaptureFixture[str]) -> None:
     """Three at most, all in one column."""
     from vio.cli.output import print_result
-    from vio.cli.running import rows_of
+    from vio.cli.running import metric_rows
 
     found = [f"right camera turned by +0.{k} deg about axis {k}" for k in range(5)]
     field = {"rows_rms_px": 0.4, "coefficients_px": [0.2], "sigma_px": [0.01], "rig": {"lines": found}}
@@ -498,7 +498,7 @@ def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: py
         "ms_per_frame": 20.0,
     }
     metrics |= {"backend": "msckf", "motion": None, "camera": {}, "stereo_field": field, "out": "runs/drive"}
-    print_result({}, rows_of(metrics | dict.fromkeys(absent)), as_json=False)
+    print_result({}, metric_rows(metrics | dict.fromkeys(absent)), as_json=False)
     lines = capsys.readouterr().out.splitlines()
     first = next(k for k, line in enumerate(lines) if line.startswith("stereo "))
     assert lines[first + 1 : first + 4] == [f"{'':<11}{text}" for text in found[:3]]

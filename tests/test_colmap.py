@@ -23,7 +23,7 @@ from vio.geometry.stereo import project
 from vio.offline.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px, write_model
 from vio.offline.colmap.reconstruction import pairs_to_match
 from vio.offline.colmap.trajectory import read_colmap_trajectory
-from vio.offline.comparison import Comparison, GroundTruth, compare_keyframes
+from vio.offline.comparison import GroundTruth, KeyframeComparison, compare_keyframes
 from vio.offline.keyframes import TrackedPath, choose_keyframes
 from vio.offline.loop_tracks import loop_rows
 from vio.offline.points import build_tracks, landmarks_of, reprojection, triangulate_tracks
@@ -490,7 +490,7 @@ def test_comparison_estimates_the_scale_and_locates_a_jump(saved: TrackedPath) -
     T[:, :3, 3] *= 1.01
     jump = len(rows) // 2
     T[jump:, :3, 3] += [0.05, 0, 0]
-    found: Comparison = compare_keyframes(saved, rows, se3_exp([1, 2, 3, 0.1, 0.2, 0.3]) @ T)
+    found: KeyframeComparison = compare_keyframes(saved, rows, se3_exp([1, 2, 3, 0.1, 0.2, 0.3]) @ T)
     assert found.scale == pytest.approx(1.01, abs=0.03)
     assert len(found.segments) == 1
     assert (found.segments[0].first_frame, found.segments[0].last_frame) == (

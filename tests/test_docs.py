@@ -203,12 +203,12 @@ def test_readme_shows_what_the_demo_prints(
 ) -> None:
     """Line by line, numbers apart; the small demo is too short for the line `drift`."""
     from vio.cli.output import print_result
-    from vio.cli.running import rows_of
+    from vio.cli.running import metric_rows
 
     monkeypatch.chdir(readme_folder)
     metrics = yaml.safe_load((readme_folder / "demo/run/metrics.json").read_text(encoding="utf-8"))
     shown_drift = {"t_err_percent": 0.05, "r_err_deg_per_100m": 0.039, "drift_lengths_m": [100]}
-    print_result({}, rows_of({**metrics, **shown_drift}), as_json=False)
+    print_result({}, metric_rows({**metrics, **shown_drift}), as_json=False)
     shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
     assert re.sub(r"[\d.]+\d", "#", capsys.readouterr().out) == re.sub(r"[\d.]+\d", "#", shown)
 

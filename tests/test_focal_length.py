@@ -18,7 +18,7 @@ from vio.geometry.lie import FloatArray, se3_inverse, se3_log
 from vio.geometry.stereo import StereoCamera
 from vio.imu.findings import InertialFinding
 from vio.records import ROTATION_NOT_COMPARABLE, ImuSample, Observations, RotationComparison, UpdateReport
-from vio.sim.motion import evaluate, hand_held, rotate_body_axes
+from vio.sim.motion import hand_held, motion_at, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU
 
 
@@ -66,7 +66,7 @@ def test_a_focal_length_that_is_off_shows_in_the_turns() -> None:
     """By more or by less: what moves the image may pass for motion, so the share itself measures nothing."""
     near, motion = _recording("room", 0), rotate_body_axes(hand_held(duration_s=20, seed=0), R_FLU_EUROC_IMU)
     times = [seen.time_ns for seen in near.frames]
-    T_world_imu = evaluate(motion, np.array(times)).T_world_imu
+    T_world_imu = motion_at(motion, np.array(times)).T_world_imu
     it = replace(near, frames=_observe(near.camera, T_world_imu, near.T_cam0_imu, times, 8.0, 0, 0.1))
     turns, found = _compared(it, _longer(it.camera))
     assert turns is not None

@@ -24,7 +24,7 @@ from vio.frontend.detect import (
 from vio.frontend.patches import half_image, inside
 from vio.frontend.prediction import moved_pixels, prior_pixels
 from vio.frontend.settings import GridSettings
-from vio.frontend.stereo_match import RowField, match_rows, row_correlation
+from vio.frontend.stereo_match import EpipolarRowModel, match_rows, row_correlation
 from vio.frontend.tracks import AnchorBank
 from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera
@@ -182,7 +182,7 @@ def test_matching_no_points_gives_no_disparities() -> None:
 def test_row_field_estimates_rectification_error() -> None:
     """Rows differ by a relative roll and a shift, with noise and 10 % wrong matches."""
     rng = np.random.default_rng(4)
-    field = RowField(640, 360)
+    field = EpipolarRowModel(640, 360)
     for _ in range(10):
         left = rng.uniform([0, 0], [640, 360], (150, 2))
         off = 0.3 + 0.001 * (left[:, 0] - 320) + 5e-6 * (left[:, 0] - 320) * (left[:, 1] - 180)
@@ -195,7 +195,7 @@ def test_row_field_estimates_rectification_error() -> None:
 
 
 def test_initial_row_field_is_zero() -> None:
-    np.testing.assert_array_equal(RowField(300, 200).rows(POINTS), POINTS[:, 1])
+    np.testing.assert_array_equal(EpipolarRowModel(300, 200).rows(POINTS), POINTS[:, 1])
 
 
 def test_corner_response_is_the_mean_squared_gradient_in_the_weakest_direction() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.test_frontend_scene import CAMERA, flight, stereo_frame
 from vio.frontend.klt import KltFrontend
-from vio.frontend.stereo_match import RowField, shifted_rows
+from vio.frontend.stereo_match import EpipolarRowModel, shifted_rows
 from vio.records import FrontendOutput, Image
 
 
@@ -38,10 +38,10 @@ def test_finds_the_rows_of_a_pitched_camera_within_a_few_frames(rows: int) -> No
 
 
 def test_rows_that_agree_are_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(field: RowField, offset_px: float) -> None:
+    def refuse(field: EpipolarRowModel, offset_px: float) -> None:
         raise AssertionError("restarted the rows of a good pair")
 
-    monkeypatch.setattr(RowField, "restart", refuse)
+    monkeypatch.setattr(EpipolarRowModel, "restart", refuse)
     assert _run(0)[-1].matched > 50
 
 

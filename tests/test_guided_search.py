@@ -12,7 +12,7 @@ from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, project
 from vio.mapping.builder import Keyframe, MapBuilder
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.guided_search import View, _pairs, _Target, place_points, search, shown
+from vio.mapping.guided_search import PlaceView, _pairs, _Target, place_points, search, shown
 from vio.mapping.loop_geometry import Terms, points_of, verify
 from vio.mapping.map_store import MapStore
 from vio.mapping.overlap import Overlaps
@@ -40,11 +40,11 @@ class Wallpaper:
         return KeyframeFeatures(z, rng.random(len(rows)) < 0.8, np.full(len(rows), 1.0), self._bits[rows] ^ wrong)
 
 
-def _place(paper: Wallpaper) -> list[View]:
+def _place(paper: Wallpaper) -> list[PlaceView]:
     """Two views of it, the second one a little to the side."""
     aside = RelativePose(se3_exp([0.2, 0.0, 0.1, 0.0, 0.05, 0.0]), 1e-8 * np.eye(6))
     origin = RelativePose(np.eye(4), np.zeros((6, 6)))
-    return [View(n, shown(CAMERA, paper.seen_from(r.T_i_j)), r) for n, r in enumerate((origin, aside))]
+    return [PlaceView(n, shown(CAMERA, paper.seen_from(r.T_i_j)), r) for n, r in enumerate((origin, aside))]
 
 
 def _start(T: FloatArray) -> RelativePose:
@@ -125,7 +125,7 @@ def test_where_another_stretch_of_the_path_stands_is_no_measurement() -> None:
     views, here = _place(paper), paper.seen_from(T_I_K)
     T = se3_exp([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
     wrong = RelativePose(T @ se3_exp([0.0, 0.04, 0.0, 0.0, 0.0, 0.0]), 0.01**2 * np.eye(6))
-    views.append(View(90, shown(CAMERA, paper.seen_from(T)), wrong, 90))
+    views.append(PlaceView(90, shown(CAMERA, paper.seen_from(T)), wrong, 90))
     seen = search(place_points(views), CAMERA, here, _start(T_I_K), None)
     assert seen is not None
     assert np.linalg.norm(se3_log(se3_inverse(seen.pose.T_i_j) @ T_I_K)[:3]) < 0.01
@@ -211,7 +211,7 @@ def test_windows_are_as_wide_as_the_covariance_of_the_pose_makes_them() -> None:
     p = np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 8], (6, 3))
     T, C = se3_exp([0.1, 0.0, 0.05, 0.02, -0.03, 0.01]), np.diag(np.array([0.02, 0.03, 0.05, 0.01, 0.006, 0.02]) ** 2)
     seen = KeyframeFeatures(project(CAMERA, p), np.ones(6, bool), np.ones(6), np.zeros((6, 32), np.uint8))
-    place = place_points([View(0, shown(CAMERA, seen), RelativePose(np.eye(4), np.zeros((6, 6))))])
+    place = place_points([PlaceView(0, shown(CAMERA, seen), RelativePose(np.eye(4), np.zeros((6, 6))))])
     pairs = _pairs(place, _Target.of(CAMERA, seen), T, C)
     step = 1e-6 * np.eye(6)
     ahead, back = (

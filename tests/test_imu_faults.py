@@ -12,7 +12,7 @@ import pytest
 from tests.test_msckf import CAMERA, T_CAM0_IMU, Flight
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray
-from vio.imu.clocks import Coverage
+from vio.imu.clocks import SampleCoverage
 from vio.imu.faults import ImuSampleCheck
 from vio.live.event_order import EventOrder
 from vio.monitor.run import RunWatch
@@ -192,7 +192,7 @@ def test_samples_that_are_missing_for_seconds_are_no_matter_of_clocks() -> None:
     """Frames without samples between others that have them; at either end the clocks may be shifted."""
 
     def at_end(covered_s: Callable[[float], bool]) -> list[str]:
-        coverage, last_ns = Coverage(), None
+        coverage, last_ns = SampleCoverage(), None
         for k in range(200):
             last_ns = k * 50_000_000 if covered_s(0.05 * k) else last_ns
             coverage.frame(k * 50_000_000, last_ns)

@@ -24,7 +24,7 @@ from vio.monitor.inertial import InertialCheck
 from vio.monitor.run import RunWatch
 from vio.records import ImuSample, Observations, observations
 from vio.sim.imu import ImuNoise, simulate_imu
-from vio.sim.motion import MotionSpline, car_loop, evaluate, fit_spline, hand_held, rotate_body_axes
+from vio.sim.motion import MotionSpline, car_loop, fit_spline, hand_held, motion_at, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_rectified_rig, small_rig
 
 _FRAME_NS = 50_000_000
@@ -93,8 +93,8 @@ def _recording(name: str, seed: int = 0, mount: str = "euroc") -> Watched:
     T_cam0_imu = se3_inverse(rig.T_imu_cam0)
     camera = rectified_camera(rig)
     reach = 15.0 if name == "car" else 3.0
-    frames = _observe(camera, evaluate(motion, times).T_world_imu, T_cam0_imu, times.tolist(), reach, seed)
-    gravity = 9.81 * evaluate(motion, imu.times_ns).T_world_imu[:, 2, :3]
+    frames = _observe(camera, motion_at(motion, times).T_world_imu, T_cam0_imu, times.tolist(), reach, seed)
+    gravity = 9.81 * motion_at(motion, imu.times_ns).T_world_imu[:, 2, :3]
     return Watched(camera, T_cam0_imu, list(imu_samples(imu)), list(gravity), frames)
 
 
@@ -112,7 +112,7 @@ def _real(folder: Path, seconds: float) -> Watched:
     times = np.arange(start, end, _FRAME_NS)
     rig = euroc_rectified_rig()
     camera, T_cam0_imu = rectified_camera(rig), se3_inverse(rig.T_imu_cam0)
-    frames = _observe(camera, evaluate(motion, times).T_world_imu, T_cam0_imu, times.tolist(), 3.0, 0, 0.2)
+    frames = _observe(camera, motion_at(motion, times).T_world_imu, T_cam0_imu, times.tolist(), 3.0, 0, 0.2)
     return Watched(camera, T_cam0_imu, samples, [], frames)
 
 
@@ -515,7 +515,7 @@ def test_tumvi_agrees_with_its_motion_capture(data_dir: Path) -> None:
         used = (truth.times_ns >= begin) & (truth.times_ns <= begin + 21 * 10**9)
         motion, _ = fit_spline(truth.times_ns[used], truth.T_world_body[used], knot_s=0.05)
         times = np.arange(motion.start_ns, motion.start_ns + 20 * 10**9, _FRAME_NS)
-        frames = _observe(camera, evaluate(motion, times).T_world_imu, T, times.tolist(), 2.5, 0, 0.2)
+        frames = _observe(camera, motion_at(motion, times).T_world_imu, T, times.tolist(), 2.5, 0, 0.2)
         it = Watched(camera, T, [s for s in record if times[0] <= s.time_ns <= times[-1]], [], frames)
         assert len(it.samples) > 4300
         assert _watch(it) == []

@@ -8,7 +8,7 @@ import pytest
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
-from vio.mapping.features import KeyframeFeatures, _most_alike, _near_rows, extract, no_features
+from vio.mapping.features import KeyframeFeatures, _most_alike, _near_rows, extract, no_keyframe_features
 from vio.mapping.loop_geometry import LEAST_INLIERS, match, verify
 from vio.mapping.place_index import PlaceIndex, words_of
 
@@ -95,7 +95,7 @@ def test_equal_descriptors_at_other_positions_do_not_verify() -> None:
 
 def test_too_few_features_do_not_verify() -> None:
     i, j = _views(1)
-    assert verify(CAMERA, i, CAMERA, no_features()) is None
+    assert verify(CAMERA, i, CAMERA, no_keyframe_features()) is None
     few = KeyframeFeatures(j.z[:15], j.has_right[:15], j.sigma_px[:15], j.descriptors[:15])
     assert verify(CAMERA, i, CAMERA, few) is None
 
@@ -196,6 +196,6 @@ def test_an_empty_index_and_an_empty_view_have_no_candidates() -> None:
     index = PlaceIndex()
     bits = _bits(10, np.random.default_rng(0))
     assert index.candidates(bits, np.zeros(0, dtype=np.bool_), 3).tolist() == []
-    index.add(no_features().descriptors)
+    index.add(no_keyframe_features().descriptors)
     assert index.candidates(bits, np.ones(1, dtype=np.bool_), 3).tolist() == []
-    assert index.candidates(no_features().descriptors, np.ones(1, dtype=np.bool_), 3).tolist() == []
+    assert index.candidates(no_keyframe_features().descriptors, np.ones(1, dtype=np.bool_), 3).tolist() == []

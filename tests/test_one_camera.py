@@ -23,7 +23,7 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, ConfigError, DataError
 from vio.evaluation.trajectories import nees_bounds
-from vio.filters.alignment import Bearings, FreeMotion, align, gyro_bias
+from vio.filters.alignment import Bearings, FreeMotion, align_visual_inertial, gyro_bias
 from vio.filters.mono_msckf import MonoMsckf
 from vio.filters.settings import MsckfSettings
 from vio.frontend import FrontendSettings, build_frontend
@@ -184,7 +184,7 @@ def test_linear_alignment_is_exact_without_noise() -> None:
     turned = so3_exp(np.einsum("kij,j->ki", -phi_D_bias, 1e-3 * true_bias)) @ R
     found = gyro_bias(bearings, FreeMotion(t, turned, moves, phi_D_bias), 0.1)
     np.testing.assert_allclose(found, 1e-3 * true_bias, atol=2e-6)
-    aligned = align(bearings, FreeMotion(t, R, moves, phi_D_bias), 9.81)
+    aligned = align_visual_inertial(bearings, FreeMotion(t, R, moves, phi_D_bias), 9.81)
     assert aligned is not None
     np.testing.assert_allclose(aligned.velocity, v, atol=1e-6)
     np.testing.assert_allclose(aligned.gravity, g, atol=1e-6)

@@ -23,7 +23,7 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.geometry.lie import FloatArray, quat_xyzw_from_rotation
 from vio.records import ImuSample, IntArray, StereoFrame, VelocitySample
 from vio.sim.errors import SimulationError
-from vio.sim.motion import evaluate, hand_held, rotate_body_axes
+from vio.sim.motion import hand_held, motion_at, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU
 from vio.sim.scenarios import EFFECTS, ParallelRecording, Scenario, conditions_of, plan
 from vio.sim.sequence import SimulatedRecording, Simulation
@@ -55,7 +55,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("flight")
     motion = rotate_body_axes(hand_held(duration_s=2.0, start_ns=START_NS), R_FLU_EUROC_IMU)
     times = START_NS + np.arange(200) * 10_000_000
-    T = evaluate(motion, times).T_world_imu
+    T = motion_at(motion, times).T_world_imu
     quaternions = quat_xyzw_from_rotation(T[:, :3, :3])
     rows = [
         f"{t // 10**9}.{t % 10**9:09d} " + " ".join(repr(float(x)) for x in (*pose[:3, 3], *q))
@@ -249,7 +249,7 @@ def test_predefined_motions_avoid_moving_boxes(scenario: Scenario, seed: int) ->
     simulation = plan(replace(scenario, seed=seed, rate_hz=1.0, conditions=conditions_of(["moving"])))
     assert simulation.world.movers
     for time_ns in simulation.taken_ns.tolist():
-        T = evaluate(simulation.motion, time_ns).T_world_imu[0]
+        T = motion_at(simulation.motion, time_ns).T_world_imu[0]
         for camera in (simulation.rig.T_imu_cam0, simulation.rig.T_imu_cam1):
             for box in simulation.world.movers:
                 local = np.linalg.inv(box.motion(time_ns)) @ (T @ camera)[:, 3]
@@ -267,7 +267,7 @@ def test_boxes_move_in_a_room_around_a_flight_too(flight: Path) -> None:
 def test_every_rig_looks_forward_at_any_width(rig: str) -> None:
     """Hand-held cameras look along the horizon, for all IMU axes; the field of view is unchanged."""
     wide, narrow = (plan(Scenario(rig=rig, width=width, duration_s=0.05)) for width in (None, 200))  # type: ignore[arg-type]
-    T = evaluate(narrow.motion, narrow.taken_ns[0]).T_world_imu[0] @ narrow.rig.T_imu_cam0
+    T = motion_at(narrow.motion, narrow.taken_ns[0]).T_world_imu[0] @ narrow.rig.T_imu_cam0
     assert abs(T[2, 2]) < 0.5  # the optical axis is about level
     assert T[2, 1] < -0.8  # the camera's y axis points down
     assert narrow.rig.cam0.width == 200

@@ -21,7 +21,7 @@ from vio.geometry.lie import se3_from_parts, so3_exp
 from vio.geometry.upright import attitude_deg, up_of, upright_axes
 from vio.records import LoopEvent, MapKeyframes
 from vio.report.page import page
-from vio.report.words import figures_of, summary
+from vio.report.words import run_figures, summary
 from vio.runs.curves import curves_of
 from vio.runs.finished import read_finished_run, with_distinct_names
 
@@ -55,7 +55,7 @@ def test_the_words_and_the_table_hold_the_figures_of_the_run(runs: tuple[Path, P
     assert "from an IMU by msckf" in text
     assert f"position error is {run.metrics['ate_m']:.3g} m" in text
     assert f"{1e3 * 0.05:.1f} ms" in text  # one frame every 50 ms
-    figures = figures_of(run)
+    figures = run_figures(run)
     assert figures["ATE (m)"] == f"{run.metrics['ate_m']:.4f}"
     assert figures["path (m)"] == f"{run.metrics['path_length_m']:.2f}"
     assert figures["ms a frame, mean"] == f"{run.metrics['ms_per_frame']:.1f}"

@@ -23,9 +23,9 @@ from vio.sim.imu import (
 from vio.sim.motion import (
     MotionSpline,
     car_loop,
-    evaluate,
     fit_spline,
     hand_held,
+    motion_at,
     recorded_motion,
     rotate_body_axes,
     spline_from_waypoints,
@@ -52,7 +52,7 @@ def test_derivatives_match_central_differences(name: str) -> None:
     spline = MOTIONS[name]
     h_ns = 50_000
     times = np.linspace(spline.start_ns + h_ns, spline.end_ns - h_ns, 97).astype(np.int64)
-    before, at, after = (evaluate(spline, times + step) for step in (-h_ns, 0, h_ns))
+    before, at, after = (motion_at(spline, times + step) for step in (-h_ns, 0, h_ns))
     span = 2 * h_ns * 1e-9
 
     def slope(values: str) -> FloatArray:
@@ -71,7 +71,7 @@ def test_spline_passes_through_waypoints(degree: int) -> None:
     T = _waypoints(9, seed=4)
     spline = spline_from_waypoints(T, 0.5, degree=degree)
     times = np.minimum((np.arange(9) * 500_000_000), spline.end_ns)
-    met = evaluate(spline, times).T_world_imu
+    met = motion_at(spline, times).T_world_imu
     np.testing.assert_allclose(met[:, :3, 3], T[:, :3, 3], atol=1e-3)
     assert np.abs(so3_log(np.swapaxes(met[:, :3, :3], 1, 2) @ T[:, :3, :3])).max() < 1e-3
 
@@ -81,7 +81,7 @@ def test_a_constant_twist_is_reproduced() -> None:
     omega = np.array([0.0, 0.0, 0.7])
     T = se3_from_parts(so3_exp(omega * t[:, None] * 1e-9), np.array([2.0, -1.0, 0.5]) * t[:, None] * 1e-9)
     spline, report = fit_spline(t, T, knot_s=0.1)
-    state = evaluate(spline, t[5:-5])
+    state = motion_at(spline, t[5:-5])
     assert report.position_max_m < 1e-8
     assert report.rotation_max_rad < 1e-9
     np.testing.assert_allclose(state.angular_velocity, np.broadcast_to(omega, (len(t) - 10, 3)), atol=1e-6)
@@ -91,7 +91,7 @@ def test_a_constant_twist_is_reproduced() -> None:
 def test_robust_fit_rejects_jumps() -> None:
     source = MOTIONS["hand"]
     t = np.arange(source.start_ns, source.end_ns, 10_000_000)
-    T = evaluate(source, t).T_world_imu
+    T = motion_at(source, t).T_world_imu
     rng = np.random.default_rng(0)
     T[:, :3, 3] += rng.normal(0, 3e-4, (len(t), 3))
     corrupted = T.copy()
@@ -99,7 +99,7 @@ def test_robust_fit_rejects_jumps() -> None:
     corrupted[300, :3, :3] = corrupted[300, :3, :3] @ so3_exp([0.4, 0, 0])
     spline, report = fit_spline(t, corrupted, knot_s=0.1, robust=True)
     assert report.rejected == 5
-    error = evaluate(spline, t).T_world_imu[:, :3, 3] - evaluate(source, t).T_world_imu[:, :3, 3]
+    error = motion_at(spline, t).T_world_imu[:, :3, 3] - motion_at(source, t).T_world_imu[:, :3, 3]
     assert np.abs(error).max() < 2e-3
 
 
@@ -107,17 +107,17 @@ def test_rotate_body_axes_changes_the_axes_only() -> None:
     spline = MOTIONS["hand"]
     other = rotate_body_axes(spline, R_FLU_EUROC_IMU)
     t = np.linspace(spline.start_ns, spline.end_ns, 7).astype(np.int64)
-    a, b = evaluate(spline, t), evaluate(other, t)
+    a, b = motion_at(spline, t), motion_at(other, t)
     np.testing.assert_allclose(b.angular_velocity, a.angular_velocity @ R_FLU_EUROC_IMU, atol=1e-9)
     np.testing.assert_allclose(b.T_world_imu[:, :3, :3], a.T_world_imu[:, :3, :3] @ R_FLU_EUROC_IMU, atol=1e-9)
 
 
 def test_hand_held_starts_stationary_and_car_moves_like_kitti() -> None:
-    still = evaluate(MOTIONS["hand"], np.arange(0, 900_000_000, 50_000_000))
+    still = motion_at(MOTIONS["hand"], np.arange(0, 900_000_000, 50_000_000))
     assert np.linalg.norm(still.velocity_world, axis=1).max() < 1e-3
     assert np.abs(still.angular_velocity).max() < 1e-3
     car = car_loop()
-    state = evaluate(car, np.arange(car.start_ns, car.end_ns, 100_000_000))
+    state = motion_at(car, np.arange(car.start_ns, car.end_ns, 100_000_000))
     speed = np.linalg.norm(state.velocity_world, axis=1)
     assert speed.max() == pytest.approx(10.0, abs=0.3)
     assert 3 < speed.min() < 6  # in the corners
@@ -131,7 +131,7 @@ def test_hand_held_starts_stationary_and_car_moves_like_kitti() -> None:
 def test_rejects_times_outside_the_motion() -> None:
     spline = MOTIONS["car"]
     with pytest.raises(SimulationError, match="the motion is defined from"):
-        evaluate(spline, spline.end_ns + 1)
+        motion_at(spline, spline.end_ns + 1)
 
 
 def test_rejects_bad_trajectories(tmp_path: Path) -> None:
@@ -153,7 +153,7 @@ def test_rejects_bad_trajectories(tmp_path: Path) -> None:
 def _integrate(spline: MotionSpline, rate_hz: float) -> tuple[float, float]:
     """Final errors (m, rad) of integrating exact IMU readings with the mid-point rule."""
     imu = simulate_imu(spline, rate_hz=rate_hz, noise=NO_IMU_NOISE)
-    state = evaluate(spline, imu.times_ns)
+    state = motion_at(spline, imu.times_ns)
     R, p = state.T_world_imu[0, :3, :3], state.T_world_imu[0, :3, 3]
     v = state.velocity_world[0]
     for i in range(len(imu.times_ns) - 1):
@@ -227,7 +227,7 @@ def test_spline_fits_a_real_flight_within_its_noise(data_dir: Path, flight: str)
     assert report.rejected < 0.02 * report.samples
     imu = read_imu_csv(folder / "imu0.csv")
     inside = (imu.times_ns >= spline.start_ns) & (imu.times_ns <= spline.end_ns)
-    state = evaluate(spline, imu.times_ns[inside])
+    state = motion_at(spline, imu.times_ns[inside])
     # The real sensors agree with the spline but for bias and vibration.
     gyro = imu.gyro[inside] - state.angular_velocity
     assert np.all((gyro - np.median(gyro, axis=0)).std(axis=0) < 0.1)

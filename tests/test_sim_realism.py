@@ -24,8 +24,7 @@ from vio.sim.exposure import _control
 from vio.sim.glare import glare
 from vio.sim.lighting import Light, Lighting, illumination, sun, window
 from vio.sim.miscalibration import CalibrationErrors, miscalibrated
-from vio.sim.motion import evaluate as motion_at
-from vio.sim.motion import hand_held
+from vio.sim.motion import hand_held, motion_at
 from vio.sim.people import _clearance, _place, _step, plan_walks, walking_people
 from vio.sim.render import Radiance, View, camera_rays, render
 from vio.sim.rigs import euroc_like_rig, fisheye_rig, kitti_like_rig, small_rig

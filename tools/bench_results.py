@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vio.bench.bench import read_bench
-from vio.bench.tables import METRICS, Outcome, Row, cell_text, number, rows_of
+from vio.bench.tables import METRICS, Outcome, Row, cell_text, number, summary_rows
 
 ROOT = Path(__file__).resolve().parent.parent
 FIGURES = "docs/bench_results.json"
@@ -57,7 +57,7 @@ class Benches:
     """Figures of all benches of the file."""
 
     def __init__(self, data: Mapping[str, Any]) -> None:
-        self._rows = {name: rows_of(_outcome(values) for values in facts["runs"]) for name, facts in data.items()}
+        self._rows = {name: summary_rows(_outcome(values) for values in facts["runs"]) for name, facts in data.items()}
 
     def rows(self, suite: str) -> list[Row]:
         """Return all rows of a suite."""

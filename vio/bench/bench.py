@@ -14,10 +14,10 @@ from vio._version import __version__
 from vio.bench.engines import run_here, run_on_dask
 from vio.bench.execute import failed
 from vio.bench.identity import Identity, InputDigests, code_digest, package_versions
-from vio.bench.report import write_report
+from vio.bench.report import write_bench_report
 from vio.bench.store import Record, Store
 from vio.bench.suite import Suite
-from vio.bench.tables import Outcome, csv_of_rows, csv_of_runs, markdown, rows_of
+from vio.bench.tables import Outcome, csv_of_rows, csv_of_runs, markdown, summary_rows
 from vio.bench.tasks import Task, tasks_of
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text, check_writable, locked_folder
@@ -135,7 +135,7 @@ def _write(
         "seeds": list(suite.seeds),
         "outcomes": [outcome.as_dict() for outcome in outcomes],
     }
-    rows = rows_of(outcomes)
+    rows = summary_rows(outcomes)
     texts = {
         "tables.md": markdown(suite, rows, outcomes, facts),
         "table.csv": csv_of_rows(rows),
@@ -144,7 +144,7 @@ def _write(
     }
     for name, text in texts.items():
         atomic_write_text(place.out / name, text)
-    write_report(place.out / "report.html", suite, rows, outcomes, facts)
+    write_bench_report(place.out / "report.html", suite, rows, outcomes, facts)
     trajectories = place.out / "trajectories"
     trajectories.mkdir(exist_ok=True)
     for task in tasks:

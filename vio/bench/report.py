@@ -29,7 +29,7 @@ _STYLE = (
 )
 
 
-def write_report(
+def write_bench_report(
     path: Path, suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], facts: Mapping[str, Any]
 ) -> None:
     """Write the report.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vio.config import Config, load_config, merge
-from vio.datasets.span import Seconds, parse_bound
+from vio.datasets.span import parse_bound
 from vio.errors import ConfigError
 from vio.files.inputs import read_input
 from vio.files.yaml_text import MOST_BYTES, read_yaml
@@ -155,11 +155,6 @@ def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> 
         suite.seeds,
         suite.published,
     )
-
-
-def bound(text: str) -> int | Seconds:
-    """Parse a frame number or a time of a sequence, which were checked when the suite was read."""
-    return parse_bound(text)
 
 
 def _sequence(name: str, value: Any, where: str) -> Sequence:

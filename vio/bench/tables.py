@@ -87,7 +87,7 @@ class Row:
     cells: Mapping[str, Cell]  # by name of the metric; absent where undefined
 
 
-def rows_of(outcomes: Iterable[Outcome]) -> list[Row]:
+def summary_rows(outcomes: Iterable[Outcome]) -> list[Row]:
     """Return one row for each sequence and system, in the order of the sequences."""
     groups: dict[str, dict[str, list[Outcome]]] = {}
     for outcome in outcomes:

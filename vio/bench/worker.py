@@ -21,11 +21,10 @@ import numpy as np
 
 from vio.bench.figures import between, coverage, error_curve, figures_of, numbered, pose_nees
 from vio.bench.identity import code_digest, package_versions
-from vio.bench.suite import bound
 from vio.config import Config, merge
 from vio.datasets import open_dataset
 from vio.datasets.frame_rate import used_frames
-from vio.datasets.span import frames_between
+from vio.datasets.span import frames_between, parse_bound
 from vio.errors import DataError, VioError
 from vio.evaluation.trajectories import Evaluation, evaluate
 from vio.files.printable import json_text
@@ -91,7 +90,7 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
         _check_place(job)
         config = merge(Config(), job["config"], where="the suite")
         dataset = open_dataset(job["source"], config.dataset)
-        first, end = frames_between(dataset.recording, bound(job["start"]), _stop(job))
+        first, end = frames_between(dataset.recording, parse_bound(job["start"]), _stop(job))
         total = len(dataset.recording.frame_times_ns)
         own = dataset.recording.reference
         reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
@@ -136,7 +135,7 @@ def _check_place(job: dict[str, Any]) -> None:
 
 
 def _stop(job: dict[str, Any]) -> Any:
-    return None if job["stop"] is None else bound(job["stop"])
+    return None if job["stop"] is None else parse_bound(job["stop"])
 
 
 def _used(truth: _Truth, config: Config) -> IntArray:

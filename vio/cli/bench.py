@@ -95,11 +95,11 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
     """Print the result; the status is 1 where a run has none."""
     import sys
 
-    from vio.bench.tables import METRICS, number, rows_of, summary_of
+    from vio.bench.tables import METRICS, number, summary_of, summary_rows
     from vio.cli.output import print_result
     from vio.files.printable import printable
 
-    summary = summary_of(rows_of(result.outcomes))
+    summary = summary_of(summary_rows(result.outcomes))
     lines = []
     for system, (done, count, cells) in summary.items():
         shown = [f"{m.title} {number(cells[m.name].median, m.digits)}" for m in METRICS if m.name in cells]

@@ -54,7 +54,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.files.printable import json_text
     from vio.numerics.threads import one_blas_thread
     from vio.offline.calibrate import measure
-    from vio.offline.calibration_files import write_calibration
+    from vio.offline.calibration_files import write_calibration_report
     from vio.offline.colmap import quiet
     from vio.offline.source import open_source
 
@@ -69,7 +69,7 @@ def execute(args: argparse.Namespace) -> int:
         report = measure(source, _frontend, pairs=args.pairs, frames=args.frames, progress=bar.update)
     facts = {"out": str(out), **_facts(report)}
     with atomic_folder(out, replace=True, marker=MARKER) as folder:
-        write_calibration(folder, report)
+        write_calibration_report(folder, report)
         (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
     return print_result(facts, [*_rows(report), ("results", str(out))], as_json=args.json, name_width=22)
 

@@ -23,7 +23,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
     from vio.cli.progress import ProgressBar
-    from vio.cli.running import check_out, process, rows_of
+    from vio.cli.running import check_out, metric_rows, process
     from vio.config import load_config
     from vio.sim.demo import write_demo_recording
 
@@ -31,4 +31,4 @@ def execute(args: argparse.Namespace) -> int:
     with ProgressBar("rendering the street") as bar:
         recording = write_demo_recording(args.out / "street", bar.update)
     metrics = process(str(recording), load_config(), out=args.out / "run")
-    return print_result(metrics, rows_of(metrics), as_json=args.json)
+    return print_result(metrics, metric_rows(metrics), as_json=args.json)

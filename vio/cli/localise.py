@@ -36,7 +36,7 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
-    from vio.cli.running import process, rows_of
+    from vio.cli.running import metric_rows, process
 
     metrics = process(
         args.source,
@@ -48,4 +48,4 @@ def execute(args: argparse.Namespace) -> int:
         map_file=args.map,
         localise=True,
     )
-    return print_result(metrics, rows_of(metrics), as_json=args.json)
+    return print_result(metrics, metric_rows(metrics), as_json=args.json)

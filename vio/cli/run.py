@@ -77,7 +77,7 @@ _OF_A_NEW_RUN = (
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
-    from vio.cli.running import process, resume, rows_of
+    from vio.cli.running import metric_rows, process, resume
     from vio.errors import ConfigError
 
     if args.resume is not None:
@@ -85,7 +85,7 @@ def execute(args: argparse.Namespace) -> int:
         if given:
             raise ConfigError(f"--resume goes on as the run began; leave out {', '.join(given)}")
         metrics = resume(args.resume, progress=not args.quiet)
-        return print_result(metrics, rows_of(metrics), as_json=args.json)
+        return print_result(metrics, metric_rows(metrics), as_json=args.json)
     metrics = process(
         args.source,
         config_from(args),
@@ -100,4 +100,4 @@ def execute(args: argparse.Namespace) -> int:
         map_file=args.map,
         view=args.view,
     )
-    return print_result(metrics, rows_of(metrics), as_json=args.json)
+    return print_result(metrics, metric_rows(metrics), as_json=args.json)

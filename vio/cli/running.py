@@ -284,7 +284,7 @@ def free_folder(source: Path, root: Path = Path("runs")) -> Path:
     return folder
 
 
-def rows_of(metrics: dict[str, Any]) -> list[tuple[str, str]]:
+def metric_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """Return a run's metrics as a few table rows."""
     stages = ", ".join(f"{name} {ms:.1f}" for name, ms in metrics["stages_ms"].items())
     frames, span = metrics["frames"], metrics["last_frame"] - metrics["first_frame"] + 1

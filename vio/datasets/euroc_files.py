@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.common import check_gravity_column, checked_transform, image_size, naming
-from vio.datasets.yaml_files import as_number, numbers, read_yaml
+from vio.datasets.yaml_files import as_number, numbers, read_yaml_file
 from vio.errors import CalibrationError, DataError
 from vio.files.text import INT64_MAX, check_increasing, exact_text, lines_of
 from vio.geometry.distortion import CameraModel, DistortionModel, StereoRig, rectified_pair, rig_from_rectified
@@ -64,7 +64,7 @@ def read_camera_yaml(path: Path) -> tuple[CameraModel, FloatArray]:
     Raises:
         CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
     """
-    entries = read_yaml(path)
+    entries = read_yaml_file(path)
     if (kind := entries.get("camera_model", "pinhole")) != "pinhole":
         raise CalibrationError(f"{path}: camera_model {kind!r} is not supported; only 'pinhole' is (with distortion)")
     name = entries.get("distortion_model", "none")
@@ -108,7 +108,7 @@ def read_imu_yaml(path: Path) -> tuple[FloatArray, ImuDensities | None]:
     Raises:
         CalibrationError: the file is missing, lacks an entry, or holds an impossible one.
     """
-    entries = read_yaml(path)
+    entries = read_yaml_file(path)
     return _T_BS(entries, path), _noise(entries, path)
 
 

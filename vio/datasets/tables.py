@@ -25,7 +25,7 @@ _LEAST_IMU_HZ = 50.0  # below, rotation between samples is no longer small; usua
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class TextTable:
     """The fields of a file as text."""
 
     path: Path
@@ -38,7 +38,7 @@ class Table:
         return f"{self.path}, line {self.lines[row]}"
 
 
-def read_table(path: Path, columns: int, form: str) -> Table:
+def read_table(path: Path, columns: int, form: str) -> TextTable:
     """Read a table separated by commas, semicolons or white space; its header is the last comment or text line above.
 
     Args:
@@ -65,7 +65,7 @@ def read_table(path: Path, columns: int, form: str) -> Table:
         lines.append(number)
     if not rows:
         raise DataError(f"{path}: holds no line of data ({form}); copy it again, or remove it")
-    return Table(path, header, tuple(rows), tuple(lines))
+    return TextTable(path, header, tuple(rows), tuple(lines))
 
 
 def _split(text: str) -> list[str]:
@@ -75,7 +75,7 @@ def _split(text: str) -> list[str]:
     return text.split()
 
 
-def stamps_ns(table: Table) -> IntArray:
+def stamps_ns(table: TextTable) -> IntArray:
     """Return the first column as nanoseconds (N,), strictly increasing; the unit as stated, else by its size.
 
     Raises:
@@ -152,7 +152,7 @@ def read_imu_table(path: Path) -> tuple[ImuRecord, tuple[str, ...]]:
     return ImuRecord(times_ns, gyro, accel), (*notes, *imu_notes(times_ns, str(path)))
 
 
-def _imu_order(table: Table) -> list[int] | None:
+def _imu_order(table: TextTable) -> list[int] | None:
     """Return the columns of gyro x y z and accel x y z by the header's names; None: no header.
 
     Raises:
@@ -203,7 +203,7 @@ def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
     return velocity_samples(times_ns, values[:, :3], values[:, 3:])
 
 
-def _finite(table: Table) -> FloatArray:
+def _finite(table: TextTable) -> FloatArray:
     """Return all columns but the first as finite numbers (N, K)."""
     values = np.array([[_number(x) for x in row[1:]] for row in table.rows])
     bad = ~np.isfinite(values).all(axis=1)

@@ -18,7 +18,7 @@ Entries: TypeAlias = Mapping[str, object]
 _MAX_BYTES = 1_000_000  # a calibration is some kilobytes; a larger file is another one
 
 
-def read_yaml(path: Path, what: str = "the sensor's calibration") -> dict[str, object]:
+def read_yaml_file(path: Path, what: str = "the sensor's calibration") -> dict[str, object]:
     """Read a YAML file of `key: value` lines.
 
     Raises:

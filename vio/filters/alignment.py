@@ -44,7 +44,7 @@ class FreeMotion:
 
 
 @dataclass(frozen=True, slots=True)
-class Alignment:
+class VisualInertialAlignment:
     """Velocity and gravity in the first body frame."""
 
     velocity: FloatArray  # (3,) m/s
@@ -95,7 +95,9 @@ def _rotation_information(u: FloatArray, v: FloatArray, phi_D_bias: FloatArray) 
     return A[:3, :3] - lost @ A[3:, :3], b[:3] - lost @ b[3:]
 
 
-def align(bearings: Bearings, motion: FreeMotion, gravity_mps2: float) -> Alignment | None:
+def align_visual_inertial(
+    bearings: Bearings, motion: FreeMotion, gravity_mps2: float
+) -> VisualInertialAlignment | None:
     """Velocity and gravity that, with the points on their rays, explain the bearings; None where nothing does.
 
     With camera positions `c_k = v t_k + g t_k^2 / 2 + s_k`, point `c_a + d m` of the first view's ray m must lie on the
@@ -135,7 +137,7 @@ def align(bearings: Bearings, motion: FreeMotion, gravity_mps2: float) -> Alignm
         weight = seen * (d > 0)[:, None] / depth**2 / (1 + (off / _BEARING_SIGMA) ** 2)
         if np.count_nonzero(d > 0) < _MIN_SHARED:
             return None
-    return Alignment(x[:3], x[3:])
+    return VisualInertialAlignment(x[:3], x[3:])
 
 
 def _with_length(S: FloatArray, r: FloatArray, length: float) -> FloatArray | None:

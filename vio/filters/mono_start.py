@@ -16,7 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from vio.filters.alignment import Alignment, Bearings, FreeMotion, align, gyro_bias
+from vio.filters.alignment import Bearings, FreeMotion, VisualInertialAlignment, align_visual_inertial, gyro_bias
 from vio.filters.imu_start import imu_start
 from vio.filters.multiview import eliminate_points
 from vio.filters.navigation import (
@@ -167,7 +167,7 @@ class MonoStarter:
         for _ in range(2):
             free = self._free_motion(motion, views, nav)
             nav = replace(nav, gyro_bias=nav.gyro_bias + gyro_bias(bearings, free, sigma))
-        found = align(bearings, self._free_motion(motion, views, nav), self._settings.gravity_mps2)
+        found = align_visual_inertial(bearings, self._free_motion(motion, views, nav), self._settings.gravity_mps2)
         return None if found is None else _upright(nav, found)
 
     def _free_motion(self, motion: ImuMotion, views: list[Observations], nav: NavState) -> FreeMotion:
@@ -243,7 +243,7 @@ class MonoStarter:
         tracks.variance = float(np.clip(tracks.variance * ratio, _LEAST_PX**2, self._settings.pixel_sigma_max_px**2))
 
 
-def _upright(nav: NavState, found: Alignment) -> NavState:
+def _upright(nav: NavState, found: VisualInertialAlignment) -> NavState:
     """The first state in an upright world, by the shortest turn that brings gravity down."""
     R = rotation_to_up(-found.gravity / np.linalg.norm(found.gravity))
     return replace(nav, T_world_imu=se3_from_parts(R, np.zeros(3)), velocity=R @ found.velocity)

@@ -189,7 +189,7 @@ def refine_points(
         at, q = residuals(camera, T, p, views), inverse_depth(camera, T, p, seen)
         loops.step_points(at.r, at.z_D_p, q.p_D_q, scale_px**2, _TINY, _PRIOR, dq)
         point = q.centre, q.p_D_q, q.disparity
-        loops.move_points(lens, least, LEAST_DISPARITY_PX, T, views.weight, *point, dq, p)
+        loops.step_inverse_depths(lens, least, LEAST_DISPARITY_PX, T, views.weight, *point, dq, p)
     return p
 
 

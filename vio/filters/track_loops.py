@@ -289,7 +289,7 @@ def _move(
 
 
 @compiled
-def move_points(
+def step_inverse_depths(
     camera: CameraArgs,
     least_depth: float,
     least_disparity: float,

@@ -30,7 +30,7 @@ CameraKind: TypeAlias = Literal["stereo", "rgbd", "mono"]
 # depth, and a track enters the estimate once its inverse depth is known as well as by a stereo pair of this baseline.
 MONO_UNIT_M = 0.1
 _SHORT_M, _LONG_M = 0.005, 5.0  # baselines outside are those of another unit
-_Pair: TypeAlias = tuple[FloatArray | float, FloatArray | float]
+_YZ: TypeAlias = tuple[FloatArray | float, FloatArray | float]
 
 
 class PinholeRows:
@@ -43,7 +43,7 @@ class PinholeRows:
         """Depth as disparity measures it."""
         return z
 
-    def depth_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray) -> _Pair:
+    def depth_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray) -> _YZ:
         """Derivatives of the depth by y and z."""
         return 0.0, 1.0
 
@@ -51,15 +51,15 @@ class PinholeRows:
         """Row of points of known depth."""
         return focal * y / depth
 
-    def row_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> _Pair:
+    def row_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> _YZ:
         """Derivatives of the row by y and z."""
         return focal / depth, -focal * y / depth**2
 
-    def ray(self, row: FloatArray) -> _Pair:
+    def ray(self, row: FloatArray) -> _YZ:
         """Coordinates y and z of unit depth in a row of focal length 1."""
         return row, 1.0
 
-    def ray_D_row(self, row: FloatArray) -> _Pair:
+    def ray_D_row(self, row: FloatArray) -> _YZ:
         """Derivatives of `ray` by the row."""
         return 1.0, 0.0
 
@@ -70,19 +70,19 @@ class _CylinderRows(PinholeRows):
     def depth(self, y: FloatArray, z: FloatArray) -> FloatArray:
         return np.hypot(y, z)
 
-    def depth_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray) -> _Pair:
+    def depth_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray) -> _YZ:
         return y / depth, z / depth
 
     def row(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> FloatArray:
         return focal * np.arctan2(y, z)
 
-    def row_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> _Pair:
+    def row_D_yz(self, y: FloatArray, z: FloatArray, depth: FloatArray, focal: float) -> _YZ:
         return focal * (z / depth) / depth, -focal * (y / depth) / depth
 
-    def ray(self, row: FloatArray) -> _Pair:
+    def ray(self, row: FloatArray) -> _YZ:
         return np.sin(row), np.cos(row)
 
-    def ray_D_row(self, row: FloatArray) -> _Pair:
+    def ray_D_row(self, row: FloatArray) -> _YZ:
         return np.cos(row), -np.sin(row)
 
 

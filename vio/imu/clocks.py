@@ -36,7 +36,7 @@ def judge_clocks(frame_times_ns: IntArray, imu_times_ns: IntArray) -> tuple[Iner
     return () if enough else (_part_overlap(frames, imu, step_ns, covered),)
 
 
-class Coverage:
+class SampleCoverage:
     """Count the frames that have IMU samples during a run; a gap between samples is no matter of clocks."""
 
     def __init__(self) -> None:

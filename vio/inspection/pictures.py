@@ -24,7 +24,7 @@ _LEAST_POSITIVE = 0.5  # share of matches with ul > ur; true pairs have nearly a
 
 
 @dataclass(frozen=True, slots=True)
-class Exposure:
+class GrayLevels:
     """Gray levels of one image."""
 
     mean: float
@@ -33,7 +33,7 @@ class Exposure:
     sharpness: float  # gradient of the image over that of the image blurred by 2 px; about 1 for a blurred one
 
 
-def exposure_of(image: Image) -> Exposure:
+def gray_levels_of(image: Image) -> GrayLevels:
     """Measure an image (H, W)."""
     import cv2
 
@@ -41,7 +41,7 @@ def exposure_of(image: Image) -> Exposure:
     blurred = cv2.GaussianBlur(values, (0, 0), 2.0)
     fine, coarse = (float(np.abs(np.diff(v, axis=1)).mean()) for v in (values, blurred))
     clipped = float(np.mean((image == 0) | (image == 255)))
-    return Exposure(float(values.mean()), float(values.std()), clipped, fine / max(coarse, 1e-6))
+    return GrayLevels(float(values.mean()), float(values.std()), clipped, fine / max(coarse, 1e-6))
 
 
 def images_part(frames: Sequence[StereoFrame]) -> Part:
@@ -51,7 +51,7 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
     shown = [images for images in shown if len(images) == cameras]
     if not shown:
         return Part("images", "none could be read", {}, ["no image could be read; see the warnings above"])
-    found = [[exposure_of(image) for image in side] for side in zip(*shown, strict=True)]
+    found = [[gray_levels_of(image) for image in side] for side in zip(*shown, strict=True)]
     means = [float(np.mean([e.mean for e in side])) for side in found]
     clipped = max(e.clipped for side in found for e in side)
     sharpness = float(np.median([e.sharpness for side in found for e in side]))

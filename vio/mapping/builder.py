@@ -20,7 +20,7 @@ from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.mapping.features import KeyframeFeatures
-from vio.mapping.guided_search import LEAST_CORNERS, Guided, Shown, View, place_points, search, shown
+from vio.mapping.guided_search import LEAST_CORNERS, Guided, PlaceView, Shown, place_points, search, shown
 from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
@@ -373,14 +373,16 @@ class MapBuilder:
             around[max(middle - 2 * _GUIDED_NEIGHBOURS, 0) : middle + 2 * _GUIDED_NEIGHBOURS + 1] = 0.0
         return out
 
-    def _views(self, i: int, origin: int, *, reach: int = _GUIDED_NEIGHBOURS) -> list[View]:
+    def _views(self, i: int, origin: int, *, reach: int = _GUIDED_NEIGHBOURS) -> list[PlaceView]:
         """Return keyframe i and its neighbours in its session, with their motion from another keyframe."""
         graph, session = self.graph, self.graph.session
         rows = range(max(i - reach, 0), min(i + reach + 1, len(self._index)))
         near = np.array(sorted((m for m in rows if session[m] == session[i]), key=lambda m: abs(m - i)), dtype=np.int64)
         covariance = graph.drift(np.full(len(near), origin), near, systematic=0.0)
         motion = se3_inverse(graph.T_map_cam[origin]) @ graph.T_map_cam[near]
-        return [View(m, self._shown(m), RelativePose(motion[n], covariance[n]), i) for n, m in enumerate(near.tolist())]
+        return [
+            PlaceView(m, self._shown(m), RelativePose(motion[n], covariance[n]), i) for n, m in enumerate(near.tolist())
+        ]
 
     def _read_shown(self, keyframe: int) -> Shown:
         graph = self.graph
@@ -512,7 +514,7 @@ class MapBuilder:
         self._waiting, self._moved, self._optimised = 0, True, True
 
 
-def _as_place(views: list[View], number: int, seen: Guided, features: KeyframeFeatures, needed: int) -> FoundPlace:
+def _as_place(views: list[PlaceView], number: int, seen: Guided, features: KeyframeFeatures, needed: int) -> FoundPlace:
     """Return a place found by search as a motion from the keyframe that shows most of what was found.
 
     Where that keyframe stands among the others enters the covariance by their points alone.

@@ -49,7 +49,7 @@ class KeyframeFeatures:
         return len(self.z)
 
 
-def no_features() -> KeyframeFeatures:
+def no_keyframe_features() -> KeyframeFeatures:
     """Return the features of a keyframe that shows none."""
     return KeyframeFeatures(
         np.zeros((0, 4)), np.zeros(0, dtype=np.bool_), np.zeros(0), np.zeros((0, DESCRIPTOR_BYTES), dtype=np.uint8)
@@ -61,11 +61,11 @@ def extract(left: Image, right: Image, *, most: int = MOST_FEATURES) -> Keyframe
     orb = cv2.ORB.create(_DETECTED * most, _SCALE, _LEVELS, fastThreshold=_CORNER_CONTRAST)
     found = orb.detect(left, None)
     if not found:
-        return no_features()
+        return no_keyframe_features()
     chosen = [found[k] for k in _spread(found, left.shape, most)]
     points, described = orb.compute(left, chosen)
     if described is None or not len(points):
-        return no_features()
+        return no_keyframe_features()
     bits = np.asarray(described, dtype=np.uint8)
     uv = np.array([p.pt for p in points], dtype=np.float64)
     scale = np.array([_SCALE**p.octave for p in points])

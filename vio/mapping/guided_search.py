@@ -65,7 +65,7 @@ class Shown(NamedTuple):
     descriptors: npt.NDArray[np.uint64]  # (N, 4)
 
 
-class View(NamedTuple):
+class PlaceView(NamedTuple):
     """A keyframe of a place."""
 
     keyframe: int
@@ -78,7 +78,7 @@ class View(NamedTuple):
 class PlacePoints:
     """The stereo points of a place, once for each keyframe that shows them."""
 
-    views: Sequence[View]
+    views: Sequence[PlaceView]
     p: FloatArray  # (N, 3) in the frame of the place's first keyframe
     eye: FloatArray  # (N, 3) position of the camera that saw it, likewise
     size_px: FloatArray  # (N,) of the feature
@@ -129,7 +129,7 @@ def shown(camera: StereoCamera, features: KeyframeFeatures) -> Shown:
     return Shown(camera, features, row, p[row], features.sigma_px[row], _as_words(features.descriptors[row]))
 
 
-def place_points(views: Sequence[View]) -> PlacePoints:
+def place_points(views: Sequence[PlaceView]) -> PlacePoints:
     """Return the points that the keyframes of a place show."""
     each = [view.shown for view in views]
     p = np.concatenate([transform_points(view.place.T_i_j, view.shown.p) for view in views])

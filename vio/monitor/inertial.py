@@ -15,7 +15,7 @@ import numpy as np
 from vio.calibration.inertial import Rates
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.imu.clocks import Coverage
+from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
 from vio.monitor.evidence import FIRST_EVALUATION, Evidence
@@ -51,7 +51,7 @@ class InertialCheck:
         self._stereo, self._T = camera, np.array(T_cam0_imu, dtype=np.float64)
         self._reported: set[str] = set()
         self._samples = Samples()
-        self._coverage = Coverage()
+        self._coverage = SampleCoverage()
         self._frames = 0
         self.reset()
 

@@ -22,7 +22,7 @@ from vio.offline.calibrate import CalibrationReport
 _USUAL_RATE_HZ = 20.0  # where there are no time stamps to derive it from
 
 
-def write_calibration(folder: Path, report: CalibrationReport) -> None:
+def write_calibration_report(folder: Path, report: CalibrationReport) -> None:
     """Write the measured calibration in both formats, with the given values where it is not observable.
 
     Nothing is written for features without an image size. The folder must exist.

@@ -39,7 +39,7 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class KeyframeComparison:
     """Comparison of a run's keyframes with other poses of the same frames."""
 
     total: int  # keyframes compared
@@ -61,7 +61,7 @@ class Comparison:
 
 def compare_keyframes(
     run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray, truth: GroundTruth | None = None
-) -> Comparison:
+) -> KeyframeComparison:
     """Compare poses of the left camera from another source with those of a run.
 
     Args:
@@ -82,7 +82,7 @@ def compare_keyframes(
     ate_m, ate_deg = (float(np.sqrt(np.mean(d[piece] ** 2))) for d in (difference_m, difference_deg))
     scale, sigma, why = _scale_ratio(T_other_cam0[piece], own[piece], ate_m)
     against = (None, None, None) if truth is None else _against(truth, run, rows, T_other_cam0)
-    return Comparison(
+    return KeyframeComparison(
         total=len(rows),
         frames=run.frames[rows],
         piece=piece,

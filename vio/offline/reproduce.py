@@ -91,7 +91,7 @@ VARIANTS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class VariantResult:
     """The results of one variant."""
 
     name: str
@@ -117,12 +117,12 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class ReproducedTable:
     """The experiment on one drive."""
 
     drive: str
     out: Path
-    rows: tuple[Row, ...]
+    rows: tuple[VariantResult, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """Return the table for JSON."""
@@ -140,7 +140,7 @@ class Table:
         return "\n".join(lines) + "\n"
 
 
-def reproduce(file: Path, reference: Path | None, out: Path) -> Table:
+def reproduce(file: Path, reference: Path | None, out: Path) -> ReproducedTable:
     """Run every variant on one ECE276A file; write `out/DRIVE/` with a table and a figure.
 
     Raises:
@@ -158,7 +158,7 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> Table:
             result = run(open_dataset(file, variant.dataset), variant.config)
             score = None if truth is None else evaluate(result.trajectory, truth, T_cam0_imu=result.T_cam0_body)
             results.append((variant, result, score))
-    table = Table(file.stem, out / file.stem, tuple(_row(*each) for each in results))
+    table = ReproducedTable(file.stem, out / file.stem, tuple(_row(*each) for each in results))
     with atomic_folder(table.out, replace=True, marker="table.json") as inside:
         (inside / "table.md").write_text(table.as_text(), encoding="utf-8")
         (inside / "table.json").write_text(json_text(table.as_dict(), indent=2) + "\n", encoding="utf-8")
@@ -166,10 +166,10 @@ def reproduce(file: Path, reference: Path | None, out: Path) -> Table:
     return table
 
 
-def _row(variant: Variant, result: RunResult, score: Evaluation | None) -> Row:
+def _row(variant: Variant, result: RunResult, score: Evaluation | None) -> VariantResult:
     frames = result.frames
     innovations = [f.innovation_median_px for f in frames if f.innovation_median_px is not None]
-    return Row(
+    return VariantResult(
         name=variant.name,
         used_per_frame=float(np.mean([f.used for f in frames])),
         landmarks=len(result.landmarks.ids),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.offline.colmap.reconstruction import Mapper, Reconstructed
-from vio.offline.comparison import Comparison, Segment, motion_differences
+from vio.offline.comparison import KeyframeComparison, Segment, motion_differences
 from vio.records import IntArray
 
 _SCALE = 0.01  # by which lengths may differ without a word: matches that are off by 0.1 px make as much at far points
@@ -20,7 +20,7 @@ class MapperResult:
 
     mapper: Mapper
     total: int  # keyframes given
-    found: tuple[Reconstructed, Comparison] | None  # None: it could not connect them
+    found: tuple[Reconstructed, KeyframeComparison] | None  # None: it could not connect them
 
     @property
     def verdict(self) -> str:
@@ -66,7 +66,7 @@ def overall_verdict(results: Sequence[MapperResult]) -> str:
     return text
 
 
-def _disagreement(found: dict[Mapper, Comparison]) -> str:
+def _disagreement(found: dict[Mapper, KeyframeComparison]) -> str:
     """Say what differs where no reconstruction agrees with the run throughout."""
     if len(found) == 1:
         ((name, only),) = found.items()
@@ -83,7 +83,7 @@ def _disagreement(found: dict[Mapper, Comparison]) -> str:
     return f"undecided at frames {where}: COLMAP's two reconstructions contradict one another there"
 
 
-def _shared(first: Comparison, second: Comparison) -> list[Segment]:
+def _shared(first: KeyframeComparison, second: KeyframeComparison) -> list[Segment]:
     """Return the first one's segments in which the second one differs from the run by the same motion."""
     _, rows, others = np.intersect1d(first.frames, second.frames, return_indices=True)
     frames: IntArray = first.frames[rows]

@@ -23,7 +23,7 @@ _AXES = ("right", "ahead", "up")
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class ReportSection:
     """A part of the page."""
 
     title: str
@@ -31,7 +31,7 @@ class Section:
     remark: str = ""  # how to read it
 
 
-def sections(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Section]:
+def sections(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[ReportSection]:
     """Return all figures that these runs have the data for."""
     found = [_paths(runs, curves), *_mapped(runs, curves), _position(runs, curves), _attitude(runs, curves)]
     found += [f(runs, curves) for f in (_velocity, _errors) if _applies(f, curves)]
@@ -45,7 +45,7 @@ def _applies(section: Any, curves: Sequence[Curves]) -> bool:
     return any(c.truth is not None for c in curves)
 
 
-def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
     """Draw the path from above and from the side, with the landmarks."""
     figure = _subplots(1, 2, titles=("from above", "from the side"), shared=False)
     for column, (first, second) in enumerate(((0, 1), (1, 2)), start=1):
@@ -64,10 +64,10 @@ def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
         figure.update_yaxes(title_text=f"{_AXES[second]} (m)", row=1, col=column)
         figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
     figure.update_layout(height=560)
-    return Section("Path", figure, "Axes are right, ahead and up at the start.")
+    return ReportSection("Path", figure, "Axes are right, ahead and up at the start.")
 
 
-def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Section]:
+def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[ReportSection]:
     """Draw the runs that had a map in it, from above, with keyframes and loops."""
     chosen = [
         (r, c.mapped, colour) for r, c, colour in zip(runs, curves, COLOURS, strict=False) if c.mapped is not None
@@ -90,17 +90,17 @@ def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[Secti
     figure.update_yaxes(title_text=f"{_AXES[1]} (m)", scaleanchor="x", row=1, col=1)
     figure.update_layout(height=560)
     text = "Poses of all frames after the last optimisation; a loop joins a frame with the keyframe that it sees again."
-    return [Section("Map", figure, text)]
+    return [ReportSection("Map", figure, text)]
 
 
-def _position(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+def _position(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
     figure = _three(runs, [(c.seconds, c.position, c.position_sigma) for c in curves], [f"{a} (m)" for a in _AXES])
     for truth in _truths(curves):
         _dotted(figure, truth.seconds, truth.position)
     return _over_time("Position and height", figure, "Bands are three standard deviations of the filter.")
 
 
-def _attitude(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+def _attitude(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
     names = ("heading (deg)", "pitch (deg)", "roll (deg)")
     figure = _three(runs, [(c.seconds, c.attitude, c.attitude_sigma) for c in curves], names)
     for truth in _truths(curves):
@@ -109,7 +109,7 @@ def _attitude(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
     return _over_time("Attitude", figure, text)
 
 
-def _velocity(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+def _velocity(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
     figure = _three(runs, [(c.seconds, c.velocity, c.velocity_sigma) for c in curves], [f"{a} (m/s)" for a in _AXES])
     for truth in _truths(curves):
         if len(truth.seconds) > 2:
@@ -140,7 +140,7 @@ def _dotted(figure: go.Figure, seconds: FloatArray, values: FloatArray) -> None:
         _xy(figure, seconds, values[:, row - 1], "ground truth", _TRUTH, row, dash="dot")
 
 
-def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
+def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
     figure = _subplots(2, 1)
     for run, curve, colour in zip(runs, curves, COLOURS, strict=False):
         if curve.truth is not None:
@@ -151,7 +151,7 @@ def _errors(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> Section:
     return _over_time("Errors", figure, "Against the reference, after one rigid alignment of the whole path.")
 
 
-def _features(runs: Sequence[FinishedRun]) -> Section:
+def _features(runs: Sequence[FinishedRun]) -> ReportSection:
     figure = _subplots(1, 1)
     for run, colour in zip(runs, COLOURS, strict=False):
         for name, dash in (("matched", "dot"), ("selected", "dash"), ("used", "solid")):
@@ -164,7 +164,7 @@ def _features(runs: Sequence[FinishedRun]) -> Section:
     )
 
 
-def _innovations(runs: Sequence[FinishedRun]) -> Section:
+def _innovations(runs: Sequence[FinishedRun]) -> ReportSection:
     figure = _subplots(2, 1)
     for run, colour in zip(runs, COLOURS, strict=False):
         _frame_curve(figure, run, "innovation_median_px", run.name, colour, 1)
@@ -175,7 +175,7 @@ def _innovations(runs: Sequence[FinishedRun]) -> Section:
     return _over_time("Innovations", figure, text + "consistent, less is cautious, more is overconfident.")
 
 
-def _biases(runs: Sequence[FinishedRun]) -> list[Section]:
+def _biases(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     """Draw the biases of runs with an IMU."""
     chosen = [(run, c) for run, c in zip(runs, COLOURS, strict=False) if run.metrics.get("motion") == "imu"]
     if not chosen:
@@ -193,7 +193,7 @@ def _biases(runs: Sequence[FinishedRun]) -> list[Section]:
     return [_over_time("IMU biases", figure, "Axes of the IMU; bands are three standard deviations.")]
 
 
-def _timing(runs: Sequence[FinishedRun]) -> Section:
+def _timing(runs: Sequence[FinishedRun]) -> ReportSection:
     figure = _subplots(len(runs), 1, titles=[run.name for run in runs] if len(runs) > 1 else ())
     for row, run in enumerate(runs, start=1):
         for stage, shade in zip(STAGES, STAGE_COLOURS, strict=True):
@@ -204,7 +204,7 @@ def _timing(runs: Sequence[FinishedRun]) -> Section:
     return _over_time("Time", figure, "Wall time by stage; long runs are shown by the medians of groups of frames.")
 
 
-def _stereo(runs: Sequence[FinishedRun]) -> list[Section]:
+def _stereo(runs: Sequence[FinishedRun]) -> list[ReportSection]:
     """Draw what the stereo calibration is off by, of runs that estimated it."""
     chosen = [
         (run, c) for run, c in zip(runs, COLOURS, strict=False) if np.isfinite(run.estimates["stereo_field"]).any()
@@ -246,12 +246,12 @@ def _subplots(rows: int, columns: int, *, titles: Sequence[str] = (), shared: bo
     return figure
 
 
-def _over_time(title: str, figure: go.Figure, remark: str) -> Section:
+def _over_time(title: str, figure: go.Figure, remark: str) -> ReportSection:
     for row, columns in enumerate(figure._grid_ref, start=1):
         for column in range(1, len(columns) + 1):
             _fit_bands(figure, row, column)
     figure.update_xaxes(title_text="time in the recording (s)", row=len(figure._grid_ref))
-    return Section(title, figure, remark)
+    return ReportSection(title, figure, remark)
 
 
 def _fit_bands(figure: go.Figure, row: int, column: int) -> None:

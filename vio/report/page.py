@@ -9,8 +9,8 @@ from pathlib import Path
 from vio._version import __version__
 from vio.files.atomic import atomic_write_text
 from vio.files.printable import printable
-from vio.report.figures import COLOURS, Section, sections
-from vio.report.words import figures_of, summary
+from vio.report.figures import COLOURS, ReportSection, sections
+from vio.report.words import run_figures, summary
 from vio.runs.curves import curves_of
 from vio.runs.finished import FinishedRun
 
@@ -66,7 +66,7 @@ def _words(runs: Sequence[FinishedRun]) -> str:
 
 
 def _table(runs: Sequence[FinishedRun]) -> str:
-    columns = [figures_of(run) for run in runs]
+    columns = [run_figures(run) for run in runs]
     head = "".join(f"<th>{_text(run.name)}</th>" for run in runs)
     cells = {name: "".join(f"<td>{_text(c[name])}</td>" for c in columns) for name in columns[0]}
     rows = "".join(f"<tr><th>{_text(name)}</th>{cell}</tr>" for name, cell in cells.items())
@@ -101,7 +101,7 @@ def _settings(runs: Sequence[FinishedRun]) -> str:
     )
 
 
-def _figure(section: Section, number: int) -> str:
+def _figure(section: ReportSection, number: int) -> str:
     drawing = section.figure.to_html(
         full_html=False, include_plotlyjs=False, div_id=f"figure-{number}", config={"displaylogo": False}
     )

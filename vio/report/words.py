@@ -77,7 +77,7 @@ def _work_ms(run: FinishedRun) -> Any:
 _TIMES = ("read_ms", "frontend_ms", "watch_ms", "select_ms", "filter_ms")
 
 
-def figures_of(run: FinishedRun) -> dict[str, str]:
+def run_figures(run: FinishedRun) -> dict[str, str]:
     """Return a run's figures for a table, in a fixed order; a dash where there is none."""
     m, evaluation = run.metrics, run.evaluation
     work = _work_ms(run)

@@ -251,7 +251,8 @@ class _Reader:
     def _object(self, number: int, name: str, state: dict[str, Any]) -> Any:
         cls = _own_class(name)
         slots, restore = _slots(cls), _own_hook(cls, "__setstate__")
-        made = self._made[number] = object.__new__(cls)
+        made: Any = object.__new__(cls)
+        self._made[number] = made
         values = {key: self.node(node) for key, node in state.items()}
         if restore is not None:
             restore(made, values)

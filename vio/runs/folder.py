@@ -294,7 +294,7 @@ def metrics_of(
         "warnings": list(result.warnings),
         "stereo_field": stereo_field(result),
         "stereo_scale": stereo_scale(result),
-        "scale_sigma": scale_sigma(result),
+        "scale_sigma": final_scale_sigma(result),
         "camera_imu": camera_imu(result),
         "imu": imu_calibration(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
@@ -344,7 +344,7 @@ def stereo_scale(result: RunResult) -> dict[str, Any] | None:
     return {name.replace(" ", "_"): {"percent": p, "sigma_percent": s} for name, (p, s) in scale.percent().items()}
 
 
-def scale_sigma(result: RunResult) -> float | None:
+def final_scale_sigma(result: RunResult) -> float | None:
     """Return the median standard deviation of the scale over the frames, over it; None: not of one camera."""
     known = [sigma for sigma in result.estimates.column("scale_sigma") if sigma is not None and sigma == sigma]
     return float(np.median(known)) if known else None

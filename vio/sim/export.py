@@ -32,7 +32,7 @@ from vio.protocols import Progress
 from vio.records import ImuDensities
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ADIS16448, sample_times
-from vio.sim.motion import evaluate
+from vio.sim.motion import motion_at
 from vio.sim.sequence import SimulatedRecording
 
 MARKER = "simulation.json"
@@ -140,7 +140,7 @@ def _write_images(recording: SimulatedRecording, files: list[tuple[Path, ...]], 
 def _truth_csv(recording: SimulatedRecording) -> str:
     simulation = recording.simulation
     times = sample_times(simulation.motion, _TRUTH_HZ)
-    state = evaluate(simulation.motion, times)
+    state = motion_at(simulation.motion, times)
     biases = np.zeros((len(times), 6))
     record = simulation.imu
     if record is not None and record.gyro_bias is not None and record.accel_bias is not None:

@@ -16,7 +16,7 @@ from vio.geometry.distortion import CameraModel, StereoRig, unproject_pixel
 from vio.geometry.lie import FloatArray
 from vio.records import IntArray
 from vio.sim.effects import Exposure, SensorEffects, camera_factor, sensitivity
-from vio.sim.motion import MotionSpline, evaluate
+from vio.sim.motion import MotionSpline, motion_at
 from vio.sim.render import cast
 from vio.sim.world import World, surfaces_at
 
@@ -58,7 +58,7 @@ def plan_exposures(
     times, frame = np.unique(taken_ns, return_inverse=True)
     loops = []
     for camera, (model, T_imu_cam) in enumerate(((rig.cam0, rig.T_imu_cam0), (rig.cam1, rig.T_imu_cam1))):
-        metered = _meter(world, model, evaluate(motion, times).T_world_imu @ T_imu_cam, times)
+        metered = _meter(world, model, motion_at(motion, times).T_world_imu @ T_imu_cam, times)
         loops.append(_control(metered, effects, camera, seed))
     shutter, gain, brightness = (np.stack(column, axis=1)[frame] for column in zip(*loops, strict=True))
     return ExposurePlan(shutter, gain, brightness)

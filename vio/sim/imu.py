@@ -17,7 +17,7 @@ from vio.datasets.samples import velocity_samples
 from vio.geometry.lie import FloatArray
 from vio.records import ImuDensities, ImuRecord, IntArray, VelocitySample
 from vio.setting import setting
-from vio.sim.motion import MotionSpline, evaluate
+from vio.sim.motion import MotionSpline, motion_at
 
 GRAVITY_MPS2 = 9.81
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_MPS2])
@@ -66,7 +66,7 @@ def simulate_imu(
     """
     noise = ImuNoise() if noise is None else noise
     times = sample_times(spline, rate_hz)
-    state = evaluate(spline, times)
+    state = motion_at(spline, times)
     n = len(times)
     gyro_rng, accel_rng = np.random.default_rng([seed, 21]), np.random.default_rng([seed, 22])
     gyro_bias = _walk(gyro_rng, n, rate_hz, noise.densities.gyro_walk, noise.gyro_bias_sigma)
@@ -107,7 +107,7 @@ def simulate_velocity(
     """
     noise = VelocityNoise() if noise is None else noise
     times = sample_times(spline, rate_hz) if times_ns is None else np.asarray(times_ns, dtype=np.int64)
-    state = evaluate(spline, times)
+    state = motion_at(spline, times)
     rng = np.random.default_rng([seed, 23])
     linear = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.velocity_world)
     linear = linear + noise.linear_sigma * rng.standard_normal(linear.shape)

@@ -114,7 +114,7 @@ def _locate(spline: MotionSpline, times_ns: npt.ArrayLike) -> tuple[IntArray, In
     return t, first, position - first
 
 
-def evaluate(spline: MotionSpline, times_ns: npt.ArrayLike) -> MotionState:
+def motion_at(spline: MotionSpline, times_ns: npt.ArrayLike) -> MotionState:
     """Pose and its first two derivatives at times (N,) in nanoseconds.
 
     Raises:

@@ -9,7 +9,7 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.records import NS_PER_S, IntArray
-from vio.sim.motion import MotionSpline, evaluate
+from vio.sim.motion import MotionSpline, motion_at
 from vio.sim.world import MovingBox, ObjectMotion, Solid, World
 
 _STEPS_PER_S = 1.8
@@ -48,7 +48,7 @@ def plan_walks(
     """
     rng = np.random.default_rng([seed, 6])
     times: IntArray = np.arange(motion.start_ns, motion.end_ns, _SPACING_NS, dtype=np.int64)
-    path = evaluate(motion, times).T_world_imu[:, :3, 3]
+    path = motion_at(motion, times).T_world_imu[:, :3, 3]
     walks: list[Walk] = []
     for _ in range(count):
         for _ in range(_ATTEMPTS):

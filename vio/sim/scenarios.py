@@ -30,9 +30,9 @@ from vio.sim.miscalibration import CalibrationErrors
 from vio.sim.motion import (
     MotionSpline,
     car_loop,
-    evaluate,
     hand_held,
     look_rotation,
+    motion_at,
     rotate_body_axes,
     spline_from_waypoints,
 )
@@ -341,7 +341,7 @@ def _scene(
     if not (walls or moving or windows):
         return around
     times = np.arange(motion.start_ns, motion.end_ns, 100_000_000)
-    keep_clear = np.concatenate([evaluate(motion, times).T_world_imu[:, :3, 3], along_walks(walks)])
+    keep_clear = np.concatenate([motion_at(motion, times).T_world_imu[:, :3, 3], along_walks(walks)])
     return inside(bounds=around.bounds, furniture=20, pictures=20, keep_clear=keep_clear)
 
 
@@ -380,10 +380,10 @@ def _traffic(motion: MotionSpline, seed: int) -> tuple[MovingBox, ...]:
     loop_ns = inner.end_ns - inner.start_ns
 
     def leading(time_ns: int) -> FloatArray:
-        return evaluate(ahead, int(np.clip(time_ns, ahead.start_ns, ahead.end_ns))).T_world_imu[0]
+        return motion_at(ahead, int(np.clip(time_ns, ahead.start_ns, ahead.end_ns))).T_world_imu[0]
 
     def oncoming(time_ns: int) -> FloatArray:
-        return evaluate(inner, inner.end_ns - (time_ns - motion.start_ns) % loop_ns).T_world_imu[0]
+        return motion_at(inner, inner.end_ns - (time_ns - motion.start_ns) % loop_ns).T_world_imu[0]
 
     size = np.array([4.2, 1.8, 1.5])
     return MovingBox(size, leading, texel_m=0.01), MovingBox(size, oncoming, texel_m=0.01)

@@ -37,7 +37,7 @@ from vio.sim.exposure import ExposurePlan, plan_exposures
 from vio.sim.glare import glare
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
 from vio.sim.miscalibration import CalibrationErrors, miscalibrated
-from vio.sim.motion import FitReport, MotionSpline, evaluate, recorded_motion
+from vio.sim.motion import FitReport, MotionSpline, motion_at, recorded_motion
 from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
 from vio.sim.world import World, check_clear, room
 
@@ -176,7 +176,7 @@ def _apply_faults(times: IntArray, faults: FrameFaults, seed: int) -> tuple[IntA
 
 def _check_cameras(world: World, rig: StereoRig, motion: MotionSpline, times: IntArray) -> None:
     dense = np.unique(np.concatenate([times, np.arange(times[0], times[-1], _CLEARANCE_STEP_NS)]))
-    T = evaluate(motion, dense).T_world_imu
+    T = motion_at(motion, dense).T_world_imu
     for name, T_imu_cam in (("the left camera", rig.T_imu_cam0), ("the right camera", rig.T_imu_cam1)):
         check_clear(world, (T @ T_imu_cam)[:, :3, 3], what=name)
 
@@ -187,7 +187,7 @@ def true_state(simulation: Simulation, time_ns: int) -> TrueState:
     Raises:
         SimulationError: the time is outside the motion.
     """
-    state = evaluate(simulation.motion, time_ns)
+    state = motion_at(simulation.motion, time_ns)
     biases: list[FloatArray | None] = [None, None]
     record = simulation.imu
     if record is not None and record.gyro_bias is not None and record.accel_bias is not None:
@@ -203,7 +203,7 @@ def true_state(simulation: Simulation, time_ns: int) -> TrueState:
 
 def views(simulation: Simulation, time_ns: int) -> tuple[View, View]:
     """Return the true views of both cameras at one time."""
-    T = evaluate(simulation.motion, time_ns).T_world_imu[0]
+    T = motion_at(simulation.motion, time_ns).T_world_imu[0]
     rig = simulation.rig
     return View(rig.cam0, T @ rig.T_imu_cam0, time_ns), View(rig.cam1, T @ rig.T_imu_cam1, time_ns)
 
@@ -262,7 +262,7 @@ class SimulatedRecording:
     def reference(self) -> Trajectory:
         """True poses of the IMU at the frames' stamps."""
         stamps = self.simulation.stamps_ns
-        poses = evaluate(self.simulation.motion, stamps).T_world_imu
+        poses = motion_at(self.simulation.motion, stamps).T_world_imu
         return Trajectory(poses, stamps, "imu", np.arange(len(stamps)))
 
     def __len__(self) -> int:
@@ -439,7 +439,7 @@ def room_around(
 ) -> World:
     """Build a room around a motion; its furniture keeps clear of the path."""
     times = np.arange(motion.start_ns, motion.end_ns, _CLEARANCE_STEP_NS)
-    p = evaluate(motion, times).T_world_imu[:, :3, 3]
+    p = motion_at(motion, times).T_world_imu[:, :3, 3]
     low, high = p.min(axis=0) - margin_m, p.max(axis=0) + margin_m
     area = float(np.prod((high - low)[:2]))
     return room(

@@ -168,7 +168,7 @@ def motion_of(
     return in_time_order(*parts), frozenset(sources), notes
 
 
-def white_level(index: BagIndex) -> tuple[int, list[str]]:
+def bag_white_level(index: BagIndex) -> tuple[int, list[str]]:
     """Return the level of white of 16-bit images, and a note where it is not that of 16 bits."""
     full = white_of(65535)
     white = white_of(max(index.left.white, index.right.white)) if index.left.white else full

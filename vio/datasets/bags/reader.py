@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vio.cameras.rig import Rectifier
-from vio.datasets.bags.companions import chosen_rig, contents, motion_of, white_level
+from vio.datasets.bags.companions import bag_white_level, chosen_rig, contents, motion_of
 from vio.datasets.bags.index import Stamps, stamp_of
 from vio.datasets.bags.pictures import gray_of
 from vio.datasets.bags.store import Bag, Topic
@@ -126,7 +126,7 @@ def read_bag(path: Path, settings: DatasetSettings) -> BagDataset:
         rectifier = rig.rectifier(settings.interpolation, settings.projection)
     motion, sources, motion_notes = motion_of(found, rig, stamps_ns[0])
     truth = index.reference(imu=rig.T_cam0_imu is not None)
-    white, white_notes = white_level(index)
+    white, white_notes = bag_white_level(index)
     recording = Recording(
         kind="bag",
         path=path,

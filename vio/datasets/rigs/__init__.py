@@ -17,7 +17,7 @@ from vio.datasets.rigs.boofcv import is_boofcv, read_boofcv
 from vio.datasets.rigs.camera_info import is_camera_info, pair_of_files, read_camera_info, rig_from_camera_infos
 from vio.datasets.rigs.kalibr import is_camchain, read_camchain
 from vio.datasets.rigs.opencv import is_opencv, read_entries, rig_from_opencv
-from vio.datasets.yaml_files import read_yaml
+from vio.datasets.yaml_files import read_yaml_file
 from vio.errors import CalibrationError
 from vio.files.text import text_lines
 from vio.geometry.lie import se3_from_parts, se3_inverse
@@ -102,7 +102,7 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
         return _kitti(path, image_size)
     if suffix == ".xml":
         return read_boofcv(path) if is_boofcv(path) else rig_from_opencv(read_entries(path), str(path), image_size)
-    entries = read_yaml(path, "the cameras' calibration")
+    entries = read_yaml_file(path, "the cameras' calibration")
     if is_camchain(entries):
         return read_camchain(path)
     if "T_BS" in entries:

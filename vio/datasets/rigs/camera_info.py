@@ -16,7 +16,7 @@ import numpy as np
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.rigs.opencv import CoefficientsError, trimmed_coefficients
-from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
+from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml_file, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, se3_from_parts
@@ -75,7 +75,7 @@ def read_camera_info(path: Path) -> CameraInfo:
     Raises:
         CalibrationError: an entry is missing or malformed.
     """
-    entries, where = read_yaml(path, "the camera's calibration"), str(path)
+    entries, where = read_yaml_file(path, "the camera's calibration"), str(path)
     size = [numbers(entries, key, where, 1)[0] for key in ("image_width", "image_height")]
     width, height = image_size(size, where)
     alone = "projection_matrix" not in entries

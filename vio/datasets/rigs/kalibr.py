@@ -16,7 +16,7 @@ import yaml
 
 from vio.cameras.rig import Rig
 from vio.datasets.common import checked_transform, image_size, naming
-from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
+from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml_file, section
 from vio.errors import CalibrationError
 from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, se3_inverse
@@ -58,7 +58,7 @@ def read_camchain(path: Path) -> Rig:
     Raises:
         CalibrationError: an entry is missing or impossible, or a model is not known; the message names it.
     """
-    entries = read_yaml(path, "Kalibr's calibration of the cameras")
+    entries = read_yaml_file(path, "Kalibr's calibration of the cameras")
     if not is_camchain(entries):
         raise CalibrationError(f"{path}: is no camchain of Kalibr; it must hold the block cam0 and, for stereo, cam1")
     names = [name for name in ("cam0", "cam1") if name in entries]
@@ -163,7 +163,7 @@ def _imu_beside(path: Path) -> tuple[ImuDensities | None, tuple[str, ...]]:
     for file in sorted([*path.parent.glob("*imu*.yaml"), *path.parent.glob("*imu*.yml")]):
         if "camchain" in file.name or file == path or not file.is_file():
             continue
-        entries = read_yaml(file, "Kalibr's IMU noise")
+        entries = read_yaml_file(file, "Kalibr's IMU noise")
         if is_imu_sheet(entries):
             found.append((file, read_noise(entries, file)))
     if not found:

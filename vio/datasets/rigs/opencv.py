@@ -15,7 +15,7 @@ import numpy as np
 
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import checked_transform, naming
-from vio.datasets.yaml_files import Entries, as_number, matrix, read_yaml
+from vio.datasets.yaml_files import Entries, as_number, matrix, read_yaml_file
 from vio.errors import CalibrationError
 from vio.geometry.distortion import DistortionModel
 from vio.geometry.lie import FloatArray
@@ -100,7 +100,7 @@ def read_entries(path: Path) -> dict[str, object]:
     Raises:
         CalibrationError: a file is missing, or neither YAML nor XML.
     """
-    read = _read_xml if path.suffix.lower() == ".xml" else read_yaml
+    read = _read_xml if path.suffix.lower() == ".xml" else read_yaml_file
     entries = read(path)
     for here, there in (("intrinsic", "extrinsic"), ("extrinsic", "intrinsic")):
         beside = path.with_name(path.name.replace(here, there))

@@ -12,7 +12,7 @@ from vio.errors import EstimationError
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import robust_sigma
-from vio.offline.colmap.model import LEFT, RIGHT, build_model, frame_id, image_id, matrix, numbered
+from vio.offline.colmap.model import LEFT, RIGHT, build_model, frame_id, image_id, numbered_images, pose_rows
 from vio.offline.colmap.solver import adjustment_config, solve, solver_options
 from vio.offline.points import PointTracks, keep_rows, reprojection
 from vio.records import BoolArray
@@ -116,7 +116,7 @@ def _solve(
 ) -> tuple[FloatArray, FloatArray]:
     """Return poses (K, 4, 4) and points (M, 3) of one bundle adjustment."""
     count = len(T_world_cam0)
-    model = build_model(camera, T_world_cam0, tracks, numbered(count))
+    model = build_model(camera, T_world_cam0, tracks, numbered_images(count))
     config = adjustment_config(model)
     config.set_constant_sensor_from_rig_pose(model.camera(RIGHT).sensor_id)
     config.set_constant_rig_from_world_pose(frame_id(0))
@@ -128,7 +128,7 @@ def _solve(
             options, pycolmap.PosePriorBundleAdjustmentOptions(), config, _pose_priors(model, priors, sigma_px), model
         )
     solve(adjuster)
-    T_cam0_world = np.array([matrix(model.frame(frame_id(k)).rig_from_world) for k in range(count)])
+    T_cam0_world = np.array([pose_rows(model.frame(frame_id(k)).rig_from_world) for k in range(count)])
     points = np.array([model.point3D(m + 1).xyz for m in range(len(tracks.ids))])
     return se3_inverse(T_cam0_world), points
 

@@ -43,7 +43,7 @@ def keyframe_images(frames: IntArray) -> ModelImages:
     return ModelImages(left, right)
 
 
-def numbered(count: int) -> ModelImages:
+def numbered_images(count: int) -> ModelImages:
     """Name the images of a model that is never written."""
     return ModelImages(tuple(f"{k}" for k in range(count)), tuple(f"{k}r" for k in range(count)))
 
@@ -76,7 +76,7 @@ def rig_model(
 
 def rig_geometry(model: pycolmap.Reconstruction) -> tuple[FloatArray, FloatArray]:
     """Return rotation `R_cam1_cam0` (3, 3) and unit direction (3,) from cam0 to cam1 in cam0, of a model."""
-    return without_scale(matrix(model.rig(RIG).sensor_from_rig(model.camera(RIGHT).sensor_id)))
+    return without_scale(pose_rows(model.rig(RIG).sensor_from_rig(model.camera(RIGHT).sensor_id)))
 
 
 def without_scale(T_cam1_cam0: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -210,7 +210,7 @@ def _rigid(T: FloatArray) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(np.ascontiguousarray(T[:3]))
 
 
-def matrix(T: pycolmap.Rigid3d | None) -> FloatArray:
+def pose_rows(T: pycolmap.Rigid3d | None) -> FloatArray:
     """Convert a transform of COLMAP to (4, 4)."""
     assert T is not None
     out = np.eye(4)

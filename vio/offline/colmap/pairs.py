@@ -15,9 +15,9 @@ from vio.offline.colmap.model import (
     add_frame,
     frame_id,
     image_id,
-    matrix,
-    numbered,
+    numbered_images,
     pinhole,
+    pose_rows,
     rig_geometry,
     rig_model,
     without_scale,
@@ -72,7 +72,7 @@ def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:
     found = pycolmap.estimate_essential_matrix(*pixels, camera, camera, options)
     if found is None:
         return None
-    return without_scale(matrix(found["cam2_from_cam1"]))
+    return without_scale(pose_rows(found["cam2_from_cam1"]))
 
 
 def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -93,7 +93,7 @@ def adjust_rig(matches: RayMatches, R_cam1_cam0: FloatArray, direction: FloatArr
     order = np.argsort(pair, kind="stable")
     for k in range(len(names)):
         rows = order[pair[order] == k]
-        add_frame(model, k, np.eye(4), numbered(len(names)), left[rows] - HALF_PX, right[rows] - HALF_PX)
+        add_frame(model, k, np.eye(4), numbered_images(len(names)), left[rows] - HALF_PX, right[rows] - HALF_PX)
         for at, row in enumerate(rows.tolist()):
             track = pycolmap.Track(
                 [pycolmap.TrackElement(image_id(k, LEFT), at), pycolmap.TrackElement(image_id(k, RIGHT), at)]

@@ -12,7 +12,7 @@ import pycolmap
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
-from vio.offline.colmap.model import ModelImages, matrix, mean_reprojection_error_px, rectified_rig
+from vio.offline.colmap.model import ModelImages, mean_reprojection_error_px, pose_rows, rectified_rig
 from vio.records import IntArray
 
 Mapper: TypeAlias = Literal["incremental", "global"]
@@ -130,7 +130,7 @@ def reconstruct(
     model = max(models.values(), key=lambda m: int(m.num_reg_images()))
     place = {name: k for k, name in enumerate(names.left)}
     found = sorted(
-        (place[image.name], matrix(image.cam_from_world()))
+        (place[image.name], pose_rows(image.cam_from_world()))
         for image in model.images.values()
         if image.has_pose and image.name in place
     )

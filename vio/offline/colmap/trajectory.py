@@ -10,7 +10,7 @@ import pycolmap
 
 from vio.errors import DataError
 from vio.geometry.lie import se3_inverse
-from vio.offline.colmap.model import matrix
+from vio.offline.colmap.model import pose_rows
 from vio.records import Trajectory
 
 _MODEL_FILES = ("images.bin", "images.txt")
@@ -42,7 +42,7 @@ def read_colmap_trajectory(folder: Path) -> Trajectory:
         raise DataError(
             f"{place}: two images of the reference camera have the same number; keep one camera in the model"
         )
-    poses = se3_inverse(np.array([matrix(images[k].cam_from_world()) for k in order.tolist()]))
+    poses = se3_inverse(np.array([pose_rows(images[k].cam_from_world()) for k in order.tolist()]))
     if all(_STAMP.fullmatch(Path(image.name).stem) for image in images):
         return Trajectory(poses, numbers, "cam0")
     return Trajectory(poses, None, "cam0", numbers)
