@@ -10,7 +10,6 @@ from vio.geometry.relative_pose import RelativePose
 from vio.mapping.pose_graph import (
     Edges,
     Uprights,
-    no_uprights,
     optimise,
     r_D_poses,
     residual,
@@ -21,6 +20,7 @@ COUNT = 60
 SIGMA = np.repeat([0.02, 0.004], 3)  # of a step of the odometry, m and rad
 LOOP_SIGMA = np.repeat([0.01, 0.002], 3)
 RNG = np.random.default_rng
+NO_UPRIGHTS = Uprights(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0))  # as without an IMU
 
 
 def _circle() -> FloatArray:
@@ -83,7 +83,7 @@ def test_jacobian_of_the_vertical_agrees_with_differences() -> None:
 
 def test_loops_take_the_drift_away() -> None:
     T, start, odometry, loops = _problem(1)
-    best = optimise(start, odometry, loops, no_uprights(), _fixed())
+    best = optimise(start, odometry, loops, NO_UPRIGHTS, _fixed())
     assert best.kept.all()
     assert _rmse_m(best.T_map_cam, T) < 0.5 * _rmse_m(start, T)
     np.testing.assert_array_equal(best.T_map_cam[0], start[0])
@@ -91,15 +91,15 @@ def test_loops_take_the_drift_away() -> None:
 
 def test_without_loops_the_odometry_is_the_optimum() -> None:
     _, start, odometry, _ = _problem(1)
-    best = optimise(start, odometry, Edges.of([]), no_uprights(), _fixed())
+    best = optimise(start, odometry, Edges.of([]), NO_UPRIGHTS, _fixed())
     np.testing.assert_allclose(best.T_map_cam, start, atol=1e-9)
 
 
 def test_false_loops_end_without_weight_and_change_nothing() -> None:
     _, start, odometry, loops = _problem(2)
     _, _, _, mixed = _problem(2, false_loops=4)
-    clean = optimise(start, odometry, loops, no_uprights(), _fixed())
-    robust = optimise(start, odometry, mixed, no_uprights(), _fixed())
+    clean = optimise(start, odometry, loops, NO_UPRIGHTS, _fixed())
+    robust = optimise(start, odometry, mixed, NO_UPRIGHTS, _fixed())
     assert robust.kept[: len(loops)].all()
     assert not robust.kept[len(loops) :].any()
     np.testing.assert_allclose(robust.T_map_cam, clean.T_map_cam, atol=1e-5)
@@ -110,7 +110,7 @@ def test_the_error_at_the_optimum_is_that_of_its_covariance() -> None:
     squared = []
     for seed in range(12):
         _, start, odometry, loops = _problem(seed)
-        best = optimise(start, odometry, loops, no_uprights(), _fixed()).T_map_cam
+        best = optimise(start, odometry, loops, NO_UPRIGHTS, _fixed()).T_map_cam
         r = np.concatenate([residual(best, odometry).ravel(), residual(best, loops).ravel()])
         sigma = np.concatenate([np.tile(SIGMA, len(odometry)), np.tile(LOOP_SIGMA, len(loops))])
         squared.append(float(np.sum((r / sigma) ** 2)))
@@ -124,7 +124,7 @@ def test_the_vertical_keeps_the_map_upright() -> None:
     ups = Uprights(np.arange(COUNT), T[:, 2, :3], np.full(COUNT, 0.002))
     tilt = [
         np.abs(best.T_map_cam[:, 2, :3] - T[:, 2, :3]).max()
-        for best in (optimise(start, odometry, loops, given, _fixed()) for given in (no_uprights(), ups))
+        for best in (optimise(start, odometry, loops, given, _fixed()) for given in (NO_UPRIGHTS, ups))
     ]
     assert tilt[1] < 0.3 * tilt[0]
     assert tilt[1] < 0.004
@@ -134,7 +134,7 @@ def test_fixed_poses_stay_and_the_others_follow() -> None:
     T, start, odometry, loops = _problem(6)
     fixed = np.arange(COUNT) < COUNT // 2
     start[fixed] = T[fixed]
-    best = optimise(start, odometry, loops, no_uprights(), fixed)
+    best = optimise(start, odometry, loops, NO_UPRIGHTS, fixed)
     np.testing.assert_array_equal(best.T_map_cam[fixed], T[fixed])
     assert np.linalg.norm(se3_log(se3_inverse(best.T_map_cam[-1]) @ T[-1])[:3]) < 0.1
 

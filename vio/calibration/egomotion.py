@@ -83,19 +83,15 @@ def _links(tracks: FeatureTracks) -> tuple[IntArray, IntArray]:
     return a[by_frame], b[by_frame]
 
 
-def camera_motion(
-    camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray, guess: FloatArray | None = None
-) -> CameraMotion | NotObservable:
+def camera_motion(camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray) -> CameraMotion | NotObservable:
     """Estimate the camera's motion for a calibration; not observable if too few short intervals have one.
 
     Args:
         camera: rectified pair.
         tracks: stereo features.
         times_ns: (F,) frame times.
-        guess: (F - 1, 6) twists to start from; None: standstill.
     """
-    start = np.zeros((len(times_ns) - 1, 6)) if guess is None else guess
-    found = stereo_twists(camera, tracks, times_ns, start)
+    found = stereo_twists(camera, tracks, times_ns, np.zeros((len(times_ns) - 1, 6)))
     dt = np.diff(times_ns)[found.frames] * _NS
     brief = dt < _LARGEST_GAP_S
     found = CameraMotion(times_ns, found.frames[brief], found.twists[brief])

@@ -30,6 +30,16 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frontend", metavar="NAME", help="same as --set frontend.name=NAME")
 
 
+def add_span_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the range of frames."""
+    parser.add_argument(
+        "--start", type=bound, default=0, metavar="N", help="first frame, or time such as 12s (default 0)"
+    )
+    parser.add_argument(
+        "--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time such as 60s"
+    )
+
+
 def bound(text: str) -> int | Seconds:
     """Parse a frame number, or a time after the first frame such as 12.5s."""
     from vio.datasets.span import parse_bound

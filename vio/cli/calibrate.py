@@ -4,19 +4,25 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from vio.calibration.findings import NotObservable
+    from vio.calibration.inertial import ImuAlignment
     from vio.calibration.intrinsics import Intrinsics
+    from vio.calibration.lever_arm import LeverArm
     from vio.calibration.stereo import RowResiduals, StereoEstimate
-    from vio.offline.calibrate import CalibrationReport, ImuReport
+    from vio.offline.calibrate import CalibrationReport
     from vio.offline.self_calibration import SelfCalibration
     from vio.protocols import Dataset, Frontend
 
 MARKER = "calibration.json"
 _PAIRS = 30
 _FRAMES = 1200
+_Rows: TypeAlias = list[tuple[str, str]]
+_Part = TypeVar("_Part")
 
 
 def add_parser(commands: Any) -> None:
@@ -131,19 +137,25 @@ def _finite(values: Any) -> Any:
 
 
 def _rows(report: CalibrationReport) -> list[tuple[str, str]]:
-    rows = [*_stereo_rows(report.stereo), *_alignment_rows(report.rows), *_intrinsics_rows(report.intrinsics)]
-    rows += _imu_rows(report.imu)
+    rows = _observed("left and right", report.stereo, _stereo_rows)
+    rows += _observed("rows", report.rows, _alignment_rows)
+    rows += _observed("intrinsics", report.intrinsics, _intrinsics_rows)
+    rows += _observed("IMU", report.imu.alignment, _imu_rows)
+    rows += _observed("lever arm", report.imu.lever_arm, _lever_arm_rows)
     rows += [("note", note) for note in report.notes]
     rows.append(("not checked", "; ".join(_unchecked(report))))
     rows += [("FOUND", str(finding)) for finding in report.findings]
     return rows if report.findings else [*rows, ("verdict", "no fault found in what could be observed")]
 
 
-def _intrinsics_rows(found: Intrinsics | NotObservable) -> list[tuple[str, str]]:
+def _observed(name: str, found: _Part | NotObservable, rows: Callable[[_Part], _Rows]) -> _Rows:
+    """Return the rows of a part of the calibration, or why it was not observable."""
     from vio.calibration.findings import NotObservable
 
-    if isinstance(found, NotObservable):
-        return [("intrinsics", str(found))]
+    return [(name, str(found))] if isinstance(found, NotObservable) else rows(found)
+
+
+def _intrinsics_rows(found: Intrinsics) -> _Rows:
     (u, v), (su, sv) = found.centre_off_px, found.centre_sigma_px
     return [
         (
@@ -172,14 +184,11 @@ def _unchecked(report: CalibrationReport) -> list[str]:
     return [*out, "cameras exposed at different times"]
 
 
-def _stereo_rows(stereo: StereoEstimate | NotObservable) -> list[tuple[str, str]]:
+def _stereo_rows(stereo: StereoEstimate) -> _Rows:
     import numpy as np
 
-    from vio.calibration.findings import NotObservable
     from vio.geometry.lie import so3_log
 
-    if isinstance(stereo, NotObservable):
-        return [("left and right", str(stereo))]
     x, y, z = np.degrees(so3_log(stereo.R_cam1_cam0))
     u, v, w = stereo.direction
     return [
@@ -195,13 +204,9 @@ def _stereo_rows(stereo: StereoEstimate | NotObservable) -> list[tuple[str, str]
     ]
 
 
-def _alignment_rows(r: RowResiduals | NotObservable) -> list[tuple[str, str]]:
+def _alignment_rows(r: RowResiduals) -> _Rows:
     import numpy as np
 
-    from vio.calibration.findings import NotObservable
-
-    if isinstance(r, NotObservable):
-        return [("rows", str(r))]
     summary = (
         f"median {r.median_px:+.3f} px, spread {r.spread_px:.3f} px; {100 * r.positive_disparity:.1f} % of "
         f"{r.matches} matches have a positive disparity"
@@ -210,27 +215,21 @@ def _alignment_rows(r: RowResiduals | NotObservable) -> list[tuple[str, str]]:
     return [("rows vl - vr", summary), *(("  over the image", line) for line in grid)]
 
 
-def _imu_rows(imu: ImuReport) -> list[tuple[str, str]]:
+def _imu_rows(a: ImuAlignment) -> _Rows:
     import numpy as np
 
-    from vio.calibration.findings import NotObservable
     from vio.geometry.lie import so3_log
 
-    rows: list[tuple[str, str]] = []
-    if isinstance(imu.alignment, NotObservable):
-        rows.append(("IMU", str(imu.alignment)))
-    else:
-        a = imu.alignment
-        x, y, z = np.degrees(so3_log(a.R_cam0_imu))
-        p, q, r = a.rotation_sigma_deg
-        rows += [
-            ("IMU-camera rotation", f"{x:+.3f} {y:+.3f} {z:+.3f} deg (IMU to cam0), sigma {p:.3f} {q:.3f} {r:.3f}"),
-            ("IMU minus camera clock", f"{1e3 * a.time_offset_s:+.2f} ms, sigma {1e3 * a.time_offset_sigma_s:.2f} ms"),
-        ]
-        if a.weak is not None:
-            rows.append(("  not observable", f"the motion leaves unobservable the {a.weak}"))
-    if isinstance(imu.lever_arm, NotObservable):
-        return [*rows, ("lever arm", str(imu.lever_arm))]
-    x, y, z = imu.lever_arm.t_cam0_imu
-    p, q, r = imu.lever_arm.sigma_m
-    return [*rows, ("IMU in cam0", f"{x:+.4f} {y:+.4f} {z:+.4f} m, sigma {p:.4f} {q:.4f} {r:.4f}")]
+    x, y, z = np.degrees(so3_log(a.R_cam0_imu))
+    p, q, r = a.rotation_sigma_deg
+    rows = [
+        ("IMU-camera rotation", f"{x:+.3f} {y:+.3f} {z:+.3f} deg (IMU to cam0), sigma {p:.3f} {q:.3f} {r:.3f}"),
+        ("IMU minus camera clock", f"{1e3 * a.time_offset_s:+.2f} ms, sigma {1e3 * a.time_offset_sigma_s:.2f} ms"),
+    ]
+    weak = [] if a.weak is None else [("  not observable", f"the motion leaves unobservable the {a.weak}")]
+    return rows + weak
+
+
+def _lever_arm_rows(found: LeverArm) -> _Rows:
+    (x, y, z), (p, q, r) = found.t_cam0_imu, found.sigma_m
+    return [("IMU in cam0", f"{x:+.4f} {y:+.4f} {z:+.4f} m, sigma {p:.4f} {q:.4f} {r:.4f}")]

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_config_arguments, bound, config_from
+from vio.cli.arguments import add_config_arguments, add_span_arguments, config_from
 
 MARKER = "conversion.json"
 _FORMS = ("euroc", "kitti", "plain", "rosbag2", "mcap")
@@ -27,8 +27,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--to", choices=(*_FORMS, "tum"), required=True, help="form of the output")
     parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder or file to write (atomically)")
     parser.add_argument("--times", type=Path, metavar="FILE", help="times of a KITTI trajectory, one a line")
-    parser.add_argument("--start", type=bound, default=0, metavar="N", help="first frame, or time such as 12s")
-    parser.add_argument("--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time")
+    add_span_arguments(parser)
     add_config_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(execute=execute)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_config_arguments, bound, config_from
+from vio.cli.arguments import add_config_arguments, add_span_arguments, config_from
 
 
 def add_parser(commands: Any) -> None:
@@ -21,12 +21,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("source", metavar="RECORDING", help="a recording: folder or file, or kind:path")
     parser.add_argument("--map", type=Path, required=True, metavar="FILE", help="a map that vio run --map made")
     add_config_arguments(parser)
-    parser.add_argument(
-        "--start", type=bound, default=0, metavar="N", help="first frame, or time such as 12s (default 0)"
-    )
-    parser.add_argument(
-        "--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time such as 60s"
-    )
+    add_span_arguments(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_config_arguments, add_lengths_argument, bound, config_from
+from vio.cli.arguments import add_config_arguments, add_lengths_argument, add_span_arguments, config_from
 
 
 def add_parser(commands: Any) -> None:
@@ -22,12 +22,7 @@ def add_parser(commands: Any) -> None:
     what.add_argument("--resume", type=Path, metavar="RUN", help="go on with the unfinished run in this folder")
     add_config_arguments(parser)
     parser.add_argument("--reference", type=Path, metavar="F", help="ground truth (TUM, KITTI or EuRoC format)")
-    parser.add_argument(
-        "--start", type=bound, default=0, metavar="N", help="first frame, or time such as 12s (default 0)"
-    )
-    parser.add_argument(
-        "--stop", "--end", type=bound, metavar="N", help="frame after the last one, or time such as 60s"
-    )
+    add_span_arguments(parser)
     add_lengths_argument(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the results (default runs/NAME)")
     parser.add_argument("--save-observations", action="store_true", help="also write the front end's observations")

@@ -524,7 +524,7 @@ def _as_place(views: list[PlaceView], number: int, seen: Guided, features: Keyfr
     a, b, f = seen.row[own], seen.row_here[own], views[most].shown.features
     matches = LoopMatches(f.z[a], features.z[b], f.has_right[a], features.has_right[b])
     pose = RelativePose(se3_inverse(best.place.T_i_j) @ seen.pose.T_i_j, seen.pose.covariance)
-    return FoundPlace(best.keyframe, number, Verified(pose, seen.inliers, len(seen.row), a, b, matches), needed)
+    return FoundPlace(best.keyframe, number, Verified(pose, seen.inliers, len(seen.row), matches), needed)
 
 
 def _squared(r: FloatArray, covariance: FloatArray) -> float:

@@ -26,6 +26,7 @@ from vio.mapping.loop_geometry import (
     Fitted,
     StereoPoints,
     Terms,
+    differing_bits,
     fit_terms,
     points_of,
     pose_of_most,
@@ -349,23 +350,15 @@ def _best_in_windows(
 ) -> None:
     """Find for each point the feature around its pixel (N, 2) whose descriptor differs least; -1: none does well.
 
-    Features z (M, 2) are in the order of their columns. Bits are counted by sums over pairs, fours and bytes.
+    Features z (M, 2) are in the order of their columns.
     """
-    pairs, fours = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
-    bytes_, ones = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
     for i in range(len(uv)):
         least = np.uint64(_MOST_BITS + 1)
         j = np.searchsorted(z[:, 0], uv[i, 0] - radius[i])
         while j < len(z) and z[j, 0] <= uv[i, 0] + radius[i]:
             ratio = sizes[j] / size[i]
             if abs(z[j, 1] - uv[i, 1]) <= radius[i] and ratio < _LEVELS and ratio * _LEVELS > 1.0:
-                total = np.uint64(0)
-                for w in range(a.shape[1]):
-                    x = a[i, w] ^ b[j, w]
-                    x = x - ((x >> np.uint64(1)) & pairs)
-                    x = (x & fours) + ((x >> np.uint64(2)) & fours)
-                    x = (x + (x >> np.uint64(4))) & bytes_
-                    total += (x * ones) >> np.uint64(56)
+                total = differing_bits(a[i], b[j])
                 if total < least:
                     least, best[i] = total, j
             j += 1

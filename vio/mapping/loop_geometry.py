@@ -48,8 +48,6 @@ class Verified:
     pose: RelativePose  # of camera j in camera i
     inliers: int
     pairs: int  # of descriptors
-    rows_i: IntArray  # (inliers,) features of i
-    rows_j: IntArray  # (inliers,) features of j
     matches: LoopMatches  # their pixels
 
 
@@ -76,19 +74,25 @@ def _differing_bits(i: KeyframeFeatures, j: KeyframeFeatures) -> npt.NDArray[np.
 
 @compiled
 def _count_bits(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64], out: npt.NDArray[np.int32]) -> None:
-    """Count in which bits the rows of two arrays (N, W) and (M, W) differ, by sums over pairs, fours and bytes."""
-    pairs, fours = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
-    bytes_, ones = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
+    """Count in which bits the rows of two arrays (N, W) and (M, W) differ."""
     for i in range(len(a)):
         for j in range(len(b)):
-            total = np.uint64(0)
-            for w in range(a.shape[1]):
-                x = a[i, w] ^ b[j, w]
-                x = x - ((x >> np.uint64(1)) & pairs)
-                x = (x & fours) + ((x >> np.uint64(2)) & fours)
-                x = (x + (x >> np.uint64(4))) & bytes_
-                total += (x * ones) >> np.uint64(56)
-            out[i, j] = total
+            out[i, j] = differing_bits(a[i], b[j])
+
+
+@compiled
+def differing_bits(a: npt.NDArray[np.uint64], b: npt.NDArray[np.uint64]) -> np.uint64:
+    """Count in which bits two descriptors (W,) differ, by sums over pairs, fours and bytes."""
+    pairs, fours = np.uint64(0x5555555555555555), np.uint64(0x3333333333333333)
+    bytes_, ones = np.uint64(0x0F0F0F0F0F0F0F0F), np.uint64(0x0101010101010101)
+    total = np.uint64(0)
+    for w in range(len(a)):
+        x = a[w] ^ b[w]
+        x = x - ((x >> np.uint64(1)) & pairs)
+        x = (x & fours) + ((x >> np.uint64(2)) & fours)
+        x = (x + (x >> np.uint64(4))) & bytes_
+        total += (x * ones) >> np.uint64(56)
+    return total
 
 
 def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, j: KeyframeFeatures) -> Verified | None:
@@ -114,7 +118,7 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
     if good.sum() < max(LEAST_INLIERS, _LEAST_SHARE * len(pairs)):
         return None
     a, b = a[good], b[good]
-    return Verified(pose, len(a), len(pairs), a, b, LoopMatches(i.z[a], j.z[b], i.has_right[a], j.has_right[b]))
+    return Verified(pose, len(a), len(pairs), LoopMatches(i.z[a], j.z[b], i.has_right[a], j.has_right[b]))
 
 
 def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:

@@ -56,11 +56,6 @@ class Uprights:
     sigma_rad: FloatArray  # (U,)
 
 
-def no_uprights() -> Uprights:
-    """Return none, as without an IMU."""
-    return Uprights(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0))
-
-
 @dataclass(frozen=True, slots=True)
 class Optimum:
     """Poses that fit a graph best."""

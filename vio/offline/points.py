@@ -16,6 +16,7 @@ from vio.records import BoolArray, IntArray, Landmarks
 _MIN_DISPARITY_PX = 0.5
 MIN_DEPTH_M = 0.05
 _POINT_STEPS = 8
+_LEAST_VIEWS = 2  # of a point
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,9 +40,9 @@ class PointTracks:
 
 
 def build_tracks(
-    run: TrackedPath, keyframes: IntArray, T_world_cam0: FloatArray, *, gate_px: float = 3.0, least_views: int = 2
+    run: TrackedPath, keyframes: IntArray, T_world_cam0: FloatArray, *, gate_px: float = 3.0
 ) -> PointTracks:
-    """Turn a run's observations in keyframes into points, each seen in at least `least_views` of them.
+    """Turn a run's observations in keyframes into points, each seen in at least two of them.
 
     The features that agree with the run's loops are points of their own, with ids after those of the tracks.
 
@@ -50,7 +51,6 @@ def build_tracks(
         keyframes: (K,) rows of the trajectory.
         T_world_cam0: (K, 4, 4) poses of the keyframes.
         gate_px: a row with a larger reprojection error (in any coordinate) is an outlier.
-        least_views: keyframes that must observe a point.
 
     Raises:
         EstimationError: no track is consistent.
@@ -67,7 +67,7 @@ def build_tracks(
     has_right = np.concatenate([*(o.has_right for o in fresh), loops.has_right])[order]
     names, point = np.unique(ids, return_inverse=True)
     tracks = PointTracks(names, np.zeros((len(names), 3)), point.astype(np.int64), keyframe, z, has_right, loops_from)
-    tracks = keep_rows(tracks, np.ones(len(point), dtype=np.bool_), least_views=least_views)
+    tracks = keep_rows(tracks, np.ones(len(point), dtype=np.bool_))
     for _ in range(3):
         if not len(tracks.ids):
             break
@@ -75,23 +75,23 @@ def build_tracks(
         tracks = replace(tracks, p_world=p_world)
         residual, ahead = reprojection(run.camera, T_world_cam0, tracks)
         good = ahead & valid[tracks.point] & (np.abs(residual).max(axis=1) < gate_px)
-        tracks = keep_rows(tracks, good, least_views=least_views)
+        tracks = keep_rows(tracks, good)
         if good.all():
             break
     if not len(tracks.ids):
         raise EstimationError(
-            f"{run.where}: not observable because no feature is seen consistently in {least_views} keyframes; the "
+            f"{run.where}: not observable because no feature is seen consistently in {_LEAST_VIEWS} keyframes; the "
             "views do not overlap, the scene has no texture, or the run's poses are wrong"
         )
     return tracks
 
 
-def keep_rows(tracks: PointTracks, rows: BoolArray, *, least_views: int = 2) -> PointTracks:
+def keep_rows(tracks: PointTracks, rows: BoolArray) -> PointTracks:
     """Return the rows selected by a mask (R,), without points that then have too few views or no stereo row."""
     count = len(tracks.ids)
     views = np.bincount(tracks.point[rows], minlength=count)
     stereo = np.bincount(tracks.point[rows & tracks.has_right], minlength=count)
-    points = (views >= least_views) & (stereo > 0)
+    points = (views >= _LEAST_VIEWS) & (stereo > 0)
     rows = rows & points[tracks.point]
     renumbered = np.cumsum(points) - 1
     return PointTracks(
@@ -122,11 +122,11 @@ def _in_camera(T_cam0_world: FloatArray, tracks: PointTracks) -> tuple[FloatArra
 
 
 def triangulate_tracks(
-    camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks, *, width_px: float = 1.0
+    camera: StereoCamera, T_world_cam0: FloatArray, tracks: PointTracks
 ) -> tuple[FloatArray, BoolArray]:
     """Triangulate points (M, 3) from all views by robust Gauss-Newton; also return a mask (M,) of those determined.
 
-    Starts from the stereo pair with the largest disparity; a Geman-McClure weight of `width_px` limits outliers.
+    Starts from the stereo pair with the largest disparity; a Geman-McClure weight of one pixel limits outliers.
     """
     count = len(tracks.ids)
     disparity = np.where(tracks.has_right, tracks.z[:, 0] - tracks.z[:, 2], -np.inf)
@@ -148,7 +148,7 @@ def triangulate_tracks(
         H = z_D_p_cam(camera, q) @ R
         r[~tracks.has_right, 2:] = 0
         H[~tracks.has_right, 2:] = 0
-        width = width_px * 2.0 ** max(3 - step, 0)
+        width = 2.0 ** max(3 - step, 0)
         weight = ahead / (1 + np.sum(r**2, axis=1) / width**2) ** 2
         weighted = H * weight[:, None, None]
         normal = np.add.reduceat((np.swapaxes(weighted, 1, 2) @ H)[by_point], begins)

@@ -24,8 +24,6 @@ def align_to_points(
     p_world: FloatArray,
     z: FloatArray,
     has_right: BoolArray,
-    *,
-    width_px: float = 1.0,
 ) -> FloatArray | None:
     """Estimate one frame's pose (4, 4) from known points (P, 3) and pixels (P, 4); None: too few of them fit.
 
@@ -42,7 +40,7 @@ def align_to_points(
         H = np.concatenate([z_D_p, -z_D_p @ so3_hat(q)], axis=2)
         r[~has_right, 2:] = 0
         H[~has_right, 2:] = 0
-        width = width_px * 2.0 ** max(4 - step, 0)
+        width = 2.0 ** max(4 - step, 0)
         weight = ahead / (1 + np.sum(r**2, axis=1) / width**2) ** 2
         if (weight > 0.25).sum() < _LEAST_ROWS:
             return None

@@ -28,6 +28,8 @@ from vio.sim.errors import SimulationError
 logger = logging.getLogger(__name__)
 
 _S_PER_NS = 1e-9
+_ACCELERATION_MPS2 = 2.0  # of a car along the road, at most
+_RAMP_S = 2.0  # from standstill to full speed of a hand-held rig
 _ROBUST_ROUNDS = 8
 _OUTLIER_SIGMAS = 5.0
 _OUTLIER_FLOOR = (0.002, 0.01)  # m, rad: smaller residuals are smoothing, not outliers
@@ -368,13 +370,13 @@ def _smooth_periodic(values: FloatArray, width: float) -> FloatArray:
     return out
 
 
-def _limit_acceleration(speed: FloatArray, step: float, limit_mps2: float = 2.0) -> FloatArray:
+def _limit_acceleration(speed: FloatArray, step: float) -> FloatArray:
     """Lower speeds so that braking and accelerating stay within a limit, around the loop."""
     square = np.concatenate([speed, speed, speed]) ** 2
     for order in (range(1, len(square)), range(len(square) - 2, -1, -1)):
         shift = -1 if order.step > 0 else 1
         for i in order:
-            square[i] = min(square[i], square[i + shift] + 2 * limit_mps2 * step)
+            square[i] = min(square[i], square[i + shift] + 2 * _ACCELERATION_MPS2 * step)
     n = len(speed)
     return np.sqrt(square[n : 2 * n])
 
@@ -432,11 +434,11 @@ def hand_held(
     return fit_spline(times, se3_from_parts(R, p + shake[:, 3:]), knot_s=0.1)[0]
 
 
-def _ramped_time(t: FloatArray, ramp_s: float = 2.0) -> FloatArray:
+def _ramped_time(t: FloatArray) -> FloatArray:
     """Warped time: its rate grows smoothly (quintic) from 0 at standstill to 1 over the ramp."""
-    u = np.clip(t / ramp_s, 0.0, 1.0)
+    u = np.clip(t / _RAMP_S, 0.0, 1.0)
     integral = u**4 * (2.5 + u * (u - 3))  # of 10 u^3 - 15 u^4 + 6 u^5
-    return ramp_s * integral + np.maximum(t - ramp_s, 0.0)
+    return _RAMP_S * integral + np.maximum(t - _RAMP_S, 0.0)
 
 
 # --- recorded motion ------------------------------------------------------------------------------------------------

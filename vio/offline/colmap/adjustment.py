@@ -18,6 +18,7 @@ from vio.offline.points import PointTracks, keep_rows, reprojection
 from vio.records import BoolArray
 
 _LEAST_SIGMA_PX = 1e-3  # of exact pixels, as simulated ones may be
+_GATE_SIGMAS = 5.0  # robust standard deviations beyond which rows are excluded from the second round
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,6 @@ def adjust(
     tracks: PointTracks,
     *,
     priors: PositionPriors | None = None,
-    gate_sigma: float = 5.0,
     threads: int = 1,
     progress: Callable[[], None] = lambda: None,
 ) -> Adjustment:
@@ -61,7 +61,6 @@ def adjust(
         T_world_cam0: (K, 4, 4) initial poses.
         tracks: points and rows.
         priors: a Gaussian on each camera position, weighted against the pixels' standard deviation.
-        gate_sigma: rows beyond so many robust standard deviations are excluded from the second round.
         threads: of the solver; one makes the result repeatable.
         progress: called after each of the two rounds.
 
@@ -74,7 +73,7 @@ def adjust(
     residual, ahead = reprojection(camera, first_T, replace(tracks, p_world=first_points))
     sigma_px = _sigma_px(residual, tracks.has_right, ~tracks.by_loop)
     sigmas = np.where(tracks.by_loop, _sigma_px(residual, tracks.has_right, tracks.by_loop), sigma_px)
-    good = ahead & (np.abs(residual).max(axis=1) < gate_sigma * sigmas)
+    good = ahead & (np.abs(residual).max(axis=1) < _GATE_SIGMAS * sigmas)
     start = keep_rows(tracks, good)
     if not len(start.ids):
         raise EstimationError("not observable because no track is consistent over the keyframes; check the run's poses")

@@ -32,9 +32,9 @@ _VIRTUAL_PARAMS = (_VIRTUAL_PX, _VIRTUAL_PX, 0.0, 0.0)
 _ESSENTIAL_PX = 1.0
 
 
-def sift_matches(left: Image, right: Image, *, threads: int = 1) -> tuple[FloatArray, FloatArray]:
+def sift_matches(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
     """Return pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), including outliers."""
-    options = pycolmap.FeatureExtractionOptions(num_threads=threads)
+    options = pycolmap.FeatureExtractionOptions(num_threads=1)
     options.sift.max_num_features = SIFT_FEATURES
     extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
     (keys0, features0), (keys1, features1) = (_features(extractor, image) for image in (left, right))
