@@ -43,7 +43,7 @@ def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: Ray
     swapped = _judge_order(estimate, R_given, given)
     if swapped is not None:
         return (swapped,)
-    clear = estimate.stretches is not None or (
+    clear = estimate.segments is not None or (
         epipolar_spread(R_given, given, inliers)
         > _CLEARLY_WORSE * epipolar_spread(estimate.R_cam1_cam0, estimate.direction, inliers)
     )
@@ -102,7 +102,7 @@ def _opposite(estimate: StereoEstimate, given: FloatArray) -> bool:
 
 
 def _turn_limit_deg(estimate: StereoEstimate) -> float:
-    least = _NAMED_ROTATION_DEG if estimate.stretches is None else _NAMED_IN_MOTION_DEG
+    least = _NAMED_ROTATION_DEG if estimate.segments is None else _NAMED_IN_MOTION_DEG
     return max(least, _NAMED_SIGMAS * estimate.rotation_sigma_deg)
 
 

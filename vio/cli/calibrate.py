@@ -115,7 +115,7 @@ def _parameters(found: SelfCalibration) -> dict[str, Any]:
     rows = zip(NAMES, found.values.tolist(), found.sigmas.tolist(), strict=True)
     return {
         "off": {name: {"value": value, "sigma": sigma} for name, value, sigma in rows},
-        "stretches": found.stretches,
+        "segments": found.segments,
         "points": found.points,
         "residual_px": found.residual_px,
     }

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.calibration.found_rig import found_rig
+from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import CalibratedRig
 from vio.cameras.camera_rig import CameraRig
 from vio.cameras.rig import Rig
@@ -365,7 +365,7 @@ class Odometry:
             if self.camera.is_cylinder:
                 raise DataError("no lens model holds a cylinder; give Odometry the rig of the raw cameras")
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
-        return found_rig(rig, estimate, is_cylinder=self.camera.is_cylinder, where="live images")
+        return estimated_rig(rig, estimate, is_cylinder=self.camera.is_cylinder, where="live images")
 
     @property
     def map_session(self) -> MapSession | None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
-from vio.calibration.found_rig import found_rig
+from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import CalibratedRig
 from vio.live.chain import BACKENDS, build_backend
 from vio.config import BackendName, Config
@@ -87,7 +87,7 @@ class RunResult:
         if self.rig is None:
             return None
         recording = self.recording
-        return found_rig(
+        return estimated_rig(
             self.rig, self.estimates[-1], is_cylinder=recording.camera.is_cylinder, where=str(recording.path)
         )
 
