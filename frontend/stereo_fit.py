@@ -88,7 +88,7 @@ class StereoFit:
         return self._search(left.half, shifted_rows(right.half, offset), points, correlation)
 
     def _best_offset(self, left: View, right: View, points: FloatArray, offset: int) -> int:
-        """Row difference, in pixels at half resolution, at which most points match well; the present one if in doubt.
+        """Row difference, in pixels at half resolution, at which most points match well, else the present one.
 
         Rows may be far apart where the right camera has been pitched since it was calibrated.
         """

@@ -330,7 +330,7 @@ class TurnComparison:
 
     @property
     def differ(self) -> bool:
-        """Whether they differ beyond doubt, and beyond what calibrations leave."""
+        """Whether they differ significantly, and by more than calibrations leave."""
         return self.sigma < _TURNS_SIGMA and abs(self.excess) > max(_TURNS_OFF, _TURNS_SIGMAS * self.sigma)
 
     @property
@@ -340,7 +340,7 @@ class TurnComparison:
 
     @property
     def settled(self) -> bool:
-        """Whether they agree beyond doubt, so that they will not be found to differ."""
+        """Whether they agree significantly, so that they will not be found to differ."""
         return abs(self.excess) + _TURNS_SIGMAS * self.sigma < _TURNS_OFF
 
 
@@ -468,7 +468,7 @@ class Recording:
     motion: frozenset[MotionSource]  # which motion samples the events carry
     reference: Trajectory | None  # ground truth lying in the recording
     landmarks_reference: Landmarks | None = None  # surveyed landmark positions, covariance zero
-    notes: tuple[str, ...] = ()  # what the reader found and mended; each is logged once as a warning
+    notes: tuple[str, ...] = ()  # what the reader found and corrected; each is logged once as a warning
     run_motion: RunMotion | None = None  # observation logs: what the run behind the log used; None: not known
 
     @property

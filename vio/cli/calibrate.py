@@ -109,7 +109,7 @@ def _plain(record: Any) -> dict[str, Any]:
 
 
 def _parameters(found: SelfCalibration) -> dict[str, Any]:
-    """Return what a bundle adjustment says of the calibration, by name."""
+    """Return the results of a bundle adjustment on the calibration, by name."""
     from vio.offline.self_calibration import NAMES
 
     rows = zip(NAMES, found.values.tolist(), found.sigmas.tolist(), strict=True)
@@ -156,7 +156,7 @@ def _intrinsics_rows(found: Intrinsics | NotObservable) -> list[tuple[str, str]]
 
 
 def _unchecked(report: CalibrationReport) -> list[str]:
-    """Return what the report says nothing about."""
+    """Return what the report does not cover."""
     from vio.calibration.findings import NotObservable
 
     out = ["the length of the baseline"]

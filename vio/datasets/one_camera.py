@@ -96,13 +96,13 @@ class OneCameraDataset:
 
 
 def images_of_one_camera(path: Path) -> Path | None:
-    """Return the folder of images that a folder holds, whether or not anything else tells what they are."""
+    """Return the folder of images that a folder holds, whether or not anything else identifies them."""
     layout = _layout(path)
     return None if layout is None else layout.left
 
 
 def is_mono_folder(path: Path) -> bool:
-    """Return whether a folder holds the images of one camera, and a calibration or an IMU tells what they are."""
+    """Return whether a folder holds the images of one camera, and a calibration or an IMU identifies them."""
     layout = _layout(path)
     return layout is not None and calibration_beside(layout) is not None
 
@@ -150,7 +150,7 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> OneCameraDataset:
 
     Raises:
         DataError: images, times or samples cannot be used; the message names file and remedy.
-        CalibrationError: there is no calibration, it is invalid, or nothing tells the unit of the depths.
+        CalibrationError: there is no calibration, it is invalid, or the unit of the depths is not given.
     """
     if all((path / name).is_file() for name in _TUM_LISTS):
         frames = _tum_frames(path)
@@ -248,7 +248,7 @@ def _read(layout: Layout, frames: _Frames, settings: DatasetSettings, kind: str)
 def _calibration(
     layout: Layout, settings: DatasetSettings, size: tuple[int, int], *, tum: Path | None
 ) -> tuple[Path, CameraRig]:
-    """Return the calibration and its file; TUM RGB-D has none, and its folder's name tells the camera.
+    """Return the calibration and its file; TUM RGB-D has none; its folder's name identifies the camera.
 
     Raises:
         CalibrationError: there is none.
@@ -277,7 +277,7 @@ def _depth_factor(rig: CameraRig, settings: DatasetSettings, where: Path) -> tup
     factor = settings.depth_factor or rig.depth_factor
     if factor is None:
         raise CalibrationError(
-            f"{where}: nothing tells the unit of its depth images; add depth_factor (levels per metre, 1000 for "
+            f"{where}: the unit of its depth images is not given; add depth_factor (levels per metre, 1000 for "
             "millimetres) to cam0 of the calibration, or --set dataset.depth_factor=1000"
         )
     if settings.depth_factor is None or rig.depth_factor in (None, factor):

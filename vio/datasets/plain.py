@@ -53,7 +53,7 @@ _FOLDERS = (
     ("infra1", "infra2"),
 )
 _INSIDE = ("data", "images", "")
-_ASSUMED_HZ = 10.0  # where nothing tells the times and no other sensor needs them
+_ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 
 
 def is_plain_folder(path: Path) -> bool:

@@ -147,7 +147,7 @@ class Odometry:
         self._lock = threading.RLock()
         self._blas = BlasLimit()
         if map is not None and (self._config.backend != "msckf" or backend is not None):
-            raise ConfigError("a map needs the back end msckf, which tells the covariance of motions; configure that")
+            raise ConfigError("a map needs the back end msckf, which gives the covariance of motions; configure that")
         self._map = self._opened(map, localise=localise) if isinstance(map, (str, Path)) else map
         self.reset()
 
@@ -326,7 +326,7 @@ class Odometry:
             return self._add(event)
 
     def finish(self) -> list[FrameResult]:
-        """Process the frames that still wait, and let the checks say what they have not yet said."""
+        """Process the frames that still wait, and let the checks report what is left."""
         with self._lock:
             results = self._process(self._order.flush())
             self._deliver(results)
@@ -399,7 +399,7 @@ class Odometry:
         half a second at most.
 
         Raises:
-            DataError: there is no estimate yet, or the time lies before it.
+            DataError: there is no estimate yet, or the time is before it.
         """
         return self._predictor.predict(_time(t_ns))
 

@@ -1,7 +1,7 @@
 """Where a keyframe stands, by looking for the points of a place where they should be seen.
 
-Where the motion to a place is roughly known, each of its points needs to be told from the few features around its
-predicted pixel alone, in place of all features of the image (search by projection, as in Mur-Artal et al. 2015). Points
+Where the motion to a place is roughly known, each of its points competes only with the few features around its
+predicted pixel, in place of all features of the image (search by projection, as in Mur-Artal et al. 2015). Points
 come from several keyframes, so that one of them shows each from a similar view.
 
 A window always holds some feature that looks alike. What agrees by chance is counted with the same search where

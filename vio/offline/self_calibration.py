@@ -1,4 +1,4 @@
-"""Bundle adjustment of segments of video with the calibration of the stereo pair free: what motion tells of it.
+"""Bundle adjustment of segments of video with the calibration of the stereo pair free: what motion determines of it.
 
 All segments share the calibration; each has its own poses and points, which are eliminated. A prior decides where
 neither matches nor motion do. Standard deviations come from the scatter of what regions of the image say (a sandwich
@@ -68,7 +68,7 @@ class SelfCalibration:
     """What the calibration is off by."""
 
     values: FloatArray  # (18,) in the order and units of `NAMES`
-    sigmas: FloatArray  # (18,) standard deviations; those of the prior where the motion tells nothing
+    sigmas: FloatArray  # (18,) standard deviations; those of the prior where the motion determines nothing
     covariance: FloatArray  # (18, 18)
     told: FloatArray  # (18,) share of the prior's variance that the data removed
     segments: int
@@ -76,7 +76,7 @@ class SelfCalibration:
     residual_px: float  # robust standard deviation of a pixel coordinate
 
     def right_camera(self) -> tuple[FloatArray, FloatArray, float, float]:
-        """Return how the right camera lies as far as the image's centre tells, with standard deviations.
+        """Return how the right camera lies as far as the image's centre determines it, with standard deviations.
 
         A turn about the vertical or horizontal axis, a principal point and a tangential distortion move pixels almost
         alike; the turn that moves the image's centre as all of them do together is well determined, and is returned.

@@ -361,7 +361,7 @@ def _check(recording: Recording, config: Config, start: int, stop: int | None) -
     if start < 0 or (stop is not None and stop <= start):
         raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
     if start >= len(recording.frame_times_ns):
-        raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
+        raise ConfigError(f"--start {start} is past the last frame, {len(recording.frame_times_ns) - 1}")
     if config.lag_frames and (config.backend != "msckf" or config.lag_frames >= config.msckf.clones):
         raise ConfigError(f"lag_frames={config.lag_frames}: needs backend msckf, and must be below msckf.clones")
 

@@ -105,7 +105,7 @@ def _read(path: Path, image_size: Size | None) -> Rig:
 
 
 def _euroc(path: Path) -> Rig:
-    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it lies beside them, `imu0/sensor.yaml`."""
+    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it is beside them, `imu0/sensor.yaml`."""
     mav = path.parent.parent
     (cam0, T_body_cam0), (cam1, T_body_cam1) = (
         read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")

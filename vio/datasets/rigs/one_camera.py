@@ -49,7 +49,7 @@ def load_camera(path: str | os.PathLike[str], *, image_size: tuple[int, int] | N
 
 
 def _euroc(path: Path) -> CameraRig:
-    """Read a camera's `sensor.yaml` and, where it lies beside it, `imu0/sensor.yaml`."""
+    """Read a camera's `sensor.yaml` and, where it is beside it, `imu0/sensor.yaml`."""
     model, T_body_cam = read_camera_yaml(path)
     T_body_imu, noise = np.eye(4), None
     if (imu := path.parent.parent / "imu0" / "sensor.yaml").is_file():
