@@ -121,7 +121,7 @@ def _thumbnail(image: Image) -> Image:
 
 
 def _judge(found: MatchCounts, likely: Order) -> Order:
-    """Decide by matches about a frame that looks exchanged; where they say too little, it is as likely before."""
+    """Decide by matches about a frame that looks exchanged; where they are too few, the decision is as before."""
     if found.points < _LEAST_POINTS or max(found.negative, found.positive) < _SOME * found.points:
         return likely
     if found.negative < 2 * found.positive:

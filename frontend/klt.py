@@ -123,7 +123,7 @@ class KltFrontend:
         return 0 if self._rested else round(missing * (1.0 + _SPARE_CORNERS))
 
     def _take_lines(self) -> tuple[str, ...]:
-        """Return what the frame says of the images, one line an event."""
+        """Return the events of a frame, one line each."""
         return tuple(line for check in self._checks for line in check.take_lines())
 
     def _view(self, image: Image) -> ImageLevels:

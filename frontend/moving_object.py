@@ -131,7 +131,7 @@ class ObjectReport(ImageCheck):
 
     @property
     def active(self) -> bool:
-        """Whether the prediction has told an object from the scene in some of the last frames."""
+        """Whether the prediction has distinguished an object from the scene in some of the last frames."""
         return self._active
 
     def frame(self, index: int, motions: TwoMotions) -> None:

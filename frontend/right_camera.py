@@ -24,7 +24,7 @@ _STRIDE = 4  # of the half-resolution images' pixels that are compared
 _FROZEN_SHARE = 0.3  # change of a frozen camera's image over that of the other's, at most: sensor noise is left
 _CONTRAST = 50.0  # gray levels that both images are scaled to, so that neither exposure nor gain counts as a change
 _MOST_NOISE = 3.0  # change of a frozen camera's image by noise of the sensor or an encoder, gray levels of these
-_LEAST_CHANGE = 1.0  # the same of the other camera's image: where it changes by less, nothing can be said
+_LEAST_CHANGE = 1.0  # the same of the other camera's image: where it changes by less, nothing can be concluded
 _RATIO_GAIN = 0.1  # how fast the usual ratio of the two changes is learned, which depends on gains and scene
 _LEAST_POINTS = 20  # with fewer points of known depth, matches say nothing
 _CONTRADICTS = 0.3  # share of confirmed points below which the images contradict each other; usual is 0.8 to 1
@@ -142,7 +142,7 @@ class RightCamera(ImageCheck):
         return self._cause is None
 
     def _distrust(self, cause: Cause, since: int, index: int) -> None:
-        """Note a cause; one that lasts is said once."""
+        """Note a cause; one that lasts is reported once."""
         if self._cause is None:
             self._since, self._count, self._untested = since, 0, 0
         self._cause, self._agreeing = cause, 0
@@ -165,7 +165,7 @@ class RightCamera(ImageCheck):
         self._reset()
 
     def _count_left(self, since: int, index: int) -> None:
-        """Count frames with a frozen left image, and say it once."""
+        """Count frames with a frozen left image, and report it once."""
         self._left_frozen += 1
         if self._left_frozen == _FRAMES:
             self._lines.append(

@@ -84,7 +84,7 @@ class RightDelay(ImageCheck):
         return (before == 0.0) != (self.frames == 0.0)
 
     def _decide(self, index: int, frame_s: float) -> None:
-        """Take a delay out where it is significant, and say so once."""
+        """Take a delay out where it is significant, and report it once."""
         small = abs(self._solution[_TERMS]) <= _LEAST_DELAY
         if self._frames < _LEAST_FRAMES or (self.frames == 0.0 and small):
             return

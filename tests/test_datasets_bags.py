@@ -188,7 +188,7 @@ def test_odometry_is_velocity_and_reference(tmp_path: Path) -> None:
     np.testing.assert_allclose(dataset.recording.reference.positions[:, 0], range(4))
     by_itself = open_dataset(named, DatasetSettings(calibration=calibration)).recording
     assert by_itself.motion == {"velocity"}
-    assert any("/odom may be ground truth: say so with --topics reference=/NAME" in n for n in by_itself.notes)
+    assert any("/odom may be ground truth: if so, give --topics reference=/NAME" in n for n in by_itself.notes)
 
 
 def test_a_file_beside_the_bag_that_is_no_calibration_leaves_camera_info(tmp_path: Path) -> None:

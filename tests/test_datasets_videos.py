@@ -160,7 +160,7 @@ def test_bounds_in_seconds(videos: Path) -> None:
     assert frames_between(recording, 2, 4) == (2, 4)
     with pytest.raises(ValueError, match="invalid literal"):
         parse_bound("12m")
-    with pytest.raises(DataError, match=r"--start 9s lies after its last frame at 0.7\d* s"):
+    with pytest.raises(DataError, match=r"--start 9s is after its last frame at 0.7\d* s"):
         frames_between(recording, Seconds(9.0), None)
 
 

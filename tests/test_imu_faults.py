@@ -166,7 +166,7 @@ def test_a_clean_imu_gives_no_line() -> None:
 @pytest.mark.parametrize(
     ("fault", "expected"),
     [
-        (_one_gyro_spike, ["gyro spike: one sample at 1775000000 ns lies 30 rad/s from both its neighbours"]),
+        (_one_gyro_spike, ["gyro spike: one sample at 1775000000 ns is 30 rad/s from both its neighbours"]),
         (
             _two_per_mille,
             ["gyro spike: one sample at", "accelerometer spike: one", "3 of 601 IMU samples were gyro spikes", "3 of"],

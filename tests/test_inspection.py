@@ -133,7 +133,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
         "rest: accelerometer units: .* in g: multiply by 9.81",
     ),
     "IMU at 10 Hz": (_imu(lambda rows: rows[::20]), "IMU: 10 Hz are too few to integrate .*; record at least 50 Hz"),
-    "black images": (_black, "images: .* are black, white or without content; mend the exposure"),
+    "black images": (_black, "images: .* are black, white or without content; correct the exposure"),
     "exchanged cameras": (_swapped, "stereo: .* left and right images are exchanged; exchange the folders"),
     "one camera twice": (_same, "images: left and right are the same images"),
     "rows shifted": (_shifted_rows, r"stereo: rows differ by -6\.. px .* exchanged, .*; run `vio calibrate`"),

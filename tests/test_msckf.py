@@ -656,7 +656,7 @@ def test_wrong_matches_do_not_capture_it() -> None:
     errors, _, _ = Flight().run(MsckfSettings(), "imu", spoil=spoil, limit=120)
     distances = np.linalg.norm(errors[:, :3], axis=1)
     assert distances.max() < 0.4  # without the rejection of views: 5.2
-    # The harm is done in the first frames, where tracks have two views and nothing tells the wrong one.
+    # The harm is done in the first frames, where tracks have two views and nothing identifies the wrong one.
     assert np.linalg.norm(errors[-1, :3] - errors[10, :3]) < 0.15
 
 

@@ -160,7 +160,7 @@ def test_a_prediction_before_the_estimate_is_refused() -> None:
     with pytest.raises(DataError, match="before the first estimate"):
         odometry.predict(0)
     _fly(odometry, 3)
-    with pytest.raises(DataError, match="lies before the newest estimate"):
+    with pytest.raises(DataError, match="is before the newest estimate"):
         odometry.predict(0)
 
 

@@ -9,7 +9,7 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.mapping.pose_graph import (
     Edges,
-    Uprights,
+    UpDirections,
     optimise,
     r_D_poses,
     residual,
@@ -20,7 +20,7 @@ COUNT = 60
 SIGMA = np.repeat([0.02, 0.004], 3)  # of a step of the odometry, m and rad
 LOOP_SIGMA = np.repeat([0.01, 0.002], 3)
 RNG = np.random.default_rng
-NO_UPRIGHTS = Uprights(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0))  # as without an IMU
+NO_UP_DIRECTIONS = UpDirections(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0))  # as without an IMU
 
 
 def _circle() -> FloatArray:
@@ -76,14 +76,14 @@ def test_jacobians_of_a_motion_agree_with_differences_far_from_the_optimum() -> 
 
 def test_jacobian_of_the_vertical_agrees_with_differences() -> None:
     T = se3_exp(RNG(4).normal(size=(1, 6)))
-    ups = Uprights(np.array([0]), np.array([[0.0, 0.6, 0.8]]), np.array([0.1]))
+    ups = UpDirections(np.array([0]), np.array([[0.0, 0.6, 0.8]]), np.array([0.1]))
     numeric = numeric_jacobian(lambda X: up_residual(X[None], ups)[0][0], T[0], right_retract)
     np.testing.assert_allclose(up_residual(T, ups)[1][0], numeric, atol=1e-8)
 
 
 def test_loops_take_the_drift_away() -> None:
     T, start, odometry, loops = _problem(1)
-    best = optimise(start, odometry, loops, NO_UPRIGHTS, _fixed())
+    best = optimise(start, odometry, loops, NO_UP_DIRECTIONS, _fixed())
     assert best.kept.all()
     assert _rmse_m(best.T_map_cam, T) < 0.5 * _rmse_m(start, T)
     np.testing.assert_array_equal(best.T_map_cam[0], start[0])
@@ -91,15 +91,15 @@ def test_loops_take_the_drift_away() -> None:
 
 def test_without_loops_the_odometry_is_the_optimum() -> None:
     _, start, odometry, _ = _problem(1)
-    best = optimise(start, odometry, Edges.of([]), NO_UPRIGHTS, _fixed())
+    best = optimise(start, odometry, Edges.of([]), NO_UP_DIRECTIONS, _fixed())
     np.testing.assert_allclose(best.T_map_cam, start, atol=1e-9)
 
 
 def test_false_loops_end_without_weight_and_change_nothing() -> None:
     _, start, odometry, loops = _problem(2)
     _, _, _, mixed = _problem(2, false_loops=4)
-    clean = optimise(start, odometry, loops, NO_UPRIGHTS, _fixed())
-    robust = optimise(start, odometry, mixed, NO_UPRIGHTS, _fixed())
+    clean = optimise(start, odometry, loops, NO_UP_DIRECTIONS, _fixed())
+    robust = optimise(start, odometry, mixed, NO_UP_DIRECTIONS, _fixed())
     assert robust.kept[: len(loops)].all()
     assert not robust.kept[len(loops) :].any()
     np.testing.assert_allclose(robust.T_map_cam, clean.T_map_cam, atol=1e-5)
@@ -110,7 +110,7 @@ def test_the_error_at_the_optimum_is_that_of_its_covariance() -> None:
     squared = []
     for seed in range(12):
         _, start, odometry, loops = _problem(seed)
-        best = optimise(start, odometry, loops, NO_UPRIGHTS, _fixed()).T_map_cam
+        best = optimise(start, odometry, loops, NO_UP_DIRECTIONS, _fixed()).T_map_cam
         r = np.concatenate([residual(best, odometry).ravel(), residual(best, loops).ravel()])
         sigma = np.concatenate([np.tile(SIGMA, len(odometry)), np.tile(LOOP_SIGMA, len(loops))])
         squared.append(float(np.sum((r / sigma) ** 2)))
@@ -121,10 +121,10 @@ def test_the_error_at_the_optimum_is_that_of_its_covariance() -> None:
 
 def test_the_vertical_keeps_the_map_upright() -> None:
     T, start, odometry, loops = _problem(5)
-    ups = Uprights(np.arange(COUNT), T[:, 2, :3], np.full(COUNT, 0.002))
+    ups = UpDirections(np.arange(COUNT), T[:, 2, :3], np.full(COUNT, 0.002))
     tilt = [
         np.abs(best.T_map_cam[:, 2, :3] - T[:, 2, :3]).max()
-        for best in (optimise(start, odometry, loops, given, _fixed()) for given in (NO_UPRIGHTS, ups))
+        for best in (optimise(start, odometry, loops, given, _fixed()) for given in (NO_UP_DIRECTIONS, ups))
     ]
     assert tilt[1] < 0.3 * tilt[0]
     assert tilt[1] < 0.004
@@ -134,7 +134,7 @@ def test_fixed_poses_stay_and_the_others_follow() -> None:
     T, start, odometry, loops = _problem(6)
     fixed = np.arange(COUNT) < COUNT // 2
     start[fixed] = T[fixed]
-    best = optimise(start, odometry, loops, NO_UPRIGHTS, fixed)
+    best = optimise(start, odometry, loops, NO_UP_DIRECTIONS, fixed)
     np.testing.assert_array_equal(best.T_map_cam[fixed], T[fixed])
     assert np.linalg.norm(se3_log(se3_inverse(best.T_map_cam[-1]) @ T[-1])[:3]) < 0.1
 
@@ -149,7 +149,7 @@ def test_a_tilt_of_the_first_pose_does_not_bend_the_map() -> None:
     tilt = np.eye(4)
     tilt[:3, :3] = se3_exp([0, 0, 0, 0.003, -0.004, 0.0])[:3, :3]
     start = tilt @ truth
-    ups = Uprights(np.arange(COUNT), truth[:, 2, :3], np.full(COUNT, 1e-3))
+    ups = UpDirections(np.arange(COUNT), truth[:, 2, :3], np.full(COUNT, 1e-3))
     held = optimise(start, odometry, Edges.of([]), ups, _fixed()).T_map_cam
     best = optimise(start, odometry, Edges.of([]), ups, _fixed(), levelled=0).T_map_cam
     bent, straight = (float(np.abs(residual(T, odometry)).max()) for T in (held, best))

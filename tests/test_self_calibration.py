@@ -15,8 +15,8 @@ from vio.geometry.stereo import StereoCamera, project
 from vio.offline.points import PointTracks
 from vio.offline.self_calibration import (
     NAMES,
+    Segment,
     SelfCalibration,
-    Stretch,
     _larger,
     intrinsics_of,
     project_off,
@@ -39,7 +39,7 @@ def _poses(turning: float) -> FloatArray:
     return np.array([se3_from_parts(so3_exp(w), t) for w, t in zip(turns, places, strict=True)])
 
 
-def _stretch(x: FloatArray, turning: float, seed: int = 0) -> Stretch:
+def _segment(x: FloatArray, turning: float, seed: int = 0) -> Segment:
     """Noisy rows of a pair that is off by parameters (18,), with poses and points as the given calibration has them."""
     rng = np.random.default_rng(seed)
     T = _poses(turning)
@@ -66,11 +66,11 @@ def _stretch(x: FloatArray, turning: float, seed: int = 0) -> Stretch:
         np.concatenate(z)[rows],
         np.ones(int(rows.sum()), dtype=np.bool_),
     )
-    return Stretch(T, tracks)
+    return Segment(T, tracks)
 
 
 def _found(x: FloatArray, turning: float = 0.3, *, intrinsics: bool = False) -> SelfCalibration:
-    return self_calibrate(CAMERA, [_stretch(x, turning)], intrinsics=intrinsics)
+    return self_calibrate(CAMERA, [_segment(x, turning)], intrinsics=intrinsics)
 
 
 def test_a_pair_that_is_right_projects_as_the_rectified_camera() -> None:
@@ -127,12 +127,12 @@ def test_uncertainty_that_lens_models_leave_is_in_the_verdict() -> None:
 
 def test_rows_of_a_region_share_their_error() -> None:
     """An error that all rows of each region share counts once a region, not once a row."""
-    stretch = _stretch(_off(), 0.3)
-    alone = self_calibrate(CAMERA, [stretch], intrinsics=False)
-    cell = (stretch.tracks.z[:, 0] // 94 + 8 * (stretch.tracks.z[:, 1] // 120)).astype(int)
+    segment = _segment(_off(), 0.3)
+    alone = self_calibrate(CAMERA, [segment], intrinsics=False)
+    cell = (segment.tracks.z[:, 0] // 94 + 8 * (segment.tracks.z[:, 1] // 120)).astype(int)
     shared = np.random.default_rng(3).normal(0, 0.3, 32)[cell]
-    z = stretch.tracks.z + np.outer(shared, [0.0, 0.0, 1.0, 0.0])
-    off = self_calibrate(CAMERA, [replace(stretch, tracks=replace(stretch.tracks, z=z))], intrinsics=False)
+    z = segment.tracks.z + np.outer(shared, [0.0, 0.0, 1.0, 0.0])
+    off = self_calibrate(CAMERA, [replace(segment, tracks=replace(segment.tracks, z=z))], intrinsics=False)
     k = NAMES.index("right_fu")
     assert off.sigmas[k] > 2 * alone.sigmas[k]
     assert abs(off.values[k]) < 3.5 * off.sigmas[k]
@@ -148,10 +148,10 @@ def test_the_larger_of_two_matrices_is_not_smaller_than_either() -> None:
 
 
 def test_what_is_no_rigid_scene_is_refused() -> None:
-    stretch = _stretch(_off(), 0.3)
-    z = stretch.tracks.z + np.random.default_rng(0).normal(0, 20, stretch.tracks.z.shape)
+    segment = _segment(_off(), 0.3)
+    z = segment.tracks.z + np.random.default_rng(0).normal(0, 20, segment.tracks.z.shape)
     with pytest.raises(EstimationError, match=r"disagree by|no track"):
-        self_calibrate(CAMERA, [replace(stretch, tracks=replace(stretch.tracks, z=z))], intrinsics=False)
-    empty = replace(stretch.tracks, ids=np.zeros(0, dtype=np.int64))
+        self_calibrate(CAMERA, [replace(segment, tracks=replace(segment.tracks, z=z))], intrinsics=False)
+    empty = replace(segment.tracks, ids=np.zeros(0, dtype=np.int64))
     with pytest.raises(EstimationError, match="no track is consistent"):
-        self_calibrate(CAMERA, [replace(stretch, tracks=empty)], intrinsics=False)
+        self_calibrate(CAMERA, [replace(segment, tracks=empty)], intrinsics=False)

@@ -19,7 +19,7 @@ from tests import test_filter_truth
 from tests.euroc_maker import EQUIDISTANT_RIG, RADTAN_RIG
 from tests.test_filter_truth import Course
 from tests.test_stereo_calibration import _turned_right
-from vio.calibration.found_rig import found_rig
+from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import (
     PARAMETERS,
     DisplacementField,
@@ -330,7 +330,7 @@ def test_a_field_that_no_rig_has_is_refused(bend: float) -> None:
     """Half or all of a radian over the image: the fit leaves the possible rigs, or misses the field by 1e5 px."""
     field = np.array([0.0] * 4 + [bend] + [0.0] * 10)
     with pytest.raises(CalibrationError, match=r"^made: no rig .* \(rows by 0\.30 px rms\); .* calibrate the cameras"):
-        found_rig(RECTIFIED, _estimate(field), CAMERA, "made")
+        estimated_rig(RECTIFIED, _estimate(field), CAMERA, "made")
 
 
 def test_results_are_written_where_no_rig_has_the_field_that_was_found(

@@ -31,7 +31,7 @@ _PYTEST = ("-q", "--tb=no", "-p", "no:cacheprovider", "--hypothesis-profile=once
 
 
 class MutationError(Exception):
-    """The list or the repository is not fit for mutations; the message says what to mend."""
+    """The list or the repository is not fit for mutations; the message says what to correct."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ def mutated(mutation: Mutation, text: str) -> str:
     count = text.count(mutation.old)
     if count != 1:
         raise MutationError(
-            f"{mutation.name!r}: {mutation.old!r} occurs {count} times in {mutation.file}; mend tools/mutations.txt"
+            f"{mutation.name!r}: {mutation.old!r} occurs {count} times in {mutation.file}; correct tools/mutations.txt"
         )
     return text.replace(mutation.old, mutation.new)
 

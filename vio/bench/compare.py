@@ -1,7 +1,7 @@
 """What became better or worse from one bench to another, beyond chance: paired by sequence and seed.
 
 Of each figure the logarithm of the ratio B / A is taken for every pair and averaged over the seeds of a sequence. Over
-the sequences, the change is beyond chance where two independent views of the same numbers say so: the bootstrap's
+the sequences, the change is beyond chance where two independent tests of the same numbers agree: the bootstrap's
 interval of the mean excludes no change, and the change is one of the few most extreme among all flips of signs. The
 level is divided by the number of tests (Bonferroni). Single sequences are judged by the spread over their seeds, and
 without seeds by a factor.
@@ -30,8 +30,8 @@ _RESAMPLES = 10_000
 _MANY = 1000  # sequences; beyond, the mean is normal, and its interval needs fewer resamples
 _EXACT_FLIPS = 14  # up to so many sequences all flips of signs are counted, beyond a sample of them
 _COMPARED = ("ate_m", "rpe_m", "drift_percent", "drift_deg_per_100m", "coverage", "cpu_ms", "memory_mib")
-# CPU time and memory depend on the machine: told, but no regression.
-_TOLD_ONLY = ("cpu_ms", "memory_mib")
+# CPU time and memory depend on the machine: reported, but no regression.
+_NOT_JUDGED = ("cpu_ms", "memory_mib")
 # Below this, in the unit of the figure, two values are the same: ATE of 0.01 mm is that of a recording at rest.
 _FLOOR = 1e-5
 
@@ -75,7 +75,7 @@ class Comparison:
     @property
     def is_worse(self) -> bool:
         """Whether anything became worse."""
-        judged = [c.verdict for c in self.changes if c.metric not in _TOLD_ONLY]
+        judged = [c.verdict for c in self.changes if c.metric not in _NOT_JUDGED]
         return "worse" in (*judged, *(s.verdict for s in self.sequences)) or bool(self.lost)
 
     def as_dict(self) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def compare_outcomes(
     systems = list(dict.fromkeys(old.system for old, _ in pairs))
     metrics = [metric for metric in METRICS if metric.name in _COMPARED]
     tables = {(s, m.name): _log_ratios([p for p in pairs if p[0].system == s], m) for s in systems for m in metrics}
-    tests = sum(bool(table) for (_, name), table in tables.items() if name not in _TOLD_ONLY)
+    tests = sum(bool(table) for (_, name), table in tables.items() if name not in _NOT_JUDGED)
     level = LEVEL / max(tests, 1)
     changes = [
         _change(system, metric, [float(np.mean(v)) for v in table.values()], level)
@@ -245,9 +245,9 @@ def comparison_lines(result: Comparison) -> Iterator[str]:
     yield f"{'configuration':<16} {'figure':<14} {'B / A':>8}  {'interval':<18} {'p':>7}  n  verdict"
     for c in result.changes:
         interval = f"{number(c.low, 3)} to {number(c.high, 3)}"
-        told = f"{c.verdict} (machine, not judged)" if c.metric in _TOLD_ONLY else c.verdict
+        verdict = f"{c.verdict} (machine, not judged)" if c.metric in _NOT_JUDGED else c.verdict
         head = f"{c.system:<16} {titles[c.metric]:<14} {number(c.ratio, 4):>8}"
-        yield f"{head}  {interval:<18} {c.p:>7.4f}  {c.sequences}  {told}"
+        yield f"{head}  {interval:<18} {c.p:>7.4f}  {c.sequences}  {verdict}"
     for s in result.sequences:
         values = f"ATE {number(s.before, 3)} to {number(s.after, 3)} m"
         yield f"{s.sequence}, {s.system}: {s.verdict}, {values} ({s.reason})"

@@ -36,7 +36,7 @@ def judged_observable(
     centre_off: tuple[float, float],
     centre_sigma: tuple[float, float],
 ) -> Intrinsics | NotObservable:
-    """Return the intrinsics with the uncertainty that lens models leave, where the motion tells enough.
+    """Return the intrinsics with the uncertainty that lens models leave, where the motion determines enough.
 
     A camera that does not turn sees the same with any focal length and principal point: the scene is only stretched.
 

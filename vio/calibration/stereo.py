@@ -63,7 +63,7 @@ class StereoEstimate:
     matches: int  # inliers
     pairs: int
     residual_deg: float  # robust spread of the epipolar angle over single pairs
-    stretches: int | None = None  # stretches of video that the values come from; None: single pairs alone
+    segments: int | None = None  # segments of video that the values come from; None: single pairs alone
 
 
 def epipolar_angles(R_cam1_cam0: FloatArray, direction: FloatArray, matches: RayMatches) -> FloatArray:

@@ -21,7 +21,7 @@ _EXCHANGED_DEG = 0.2  # largest epipolar angle of a calibration that fits
 _OPPOSITE_DEG = 20.0  # a direction so close to the negative of another is taken as inverted
 _NAMED_SIGMAS = 5.0  # a difference must exceed so many standard deviations …
 _NAMED_ROTATION_DEG = 0.3  # … and these limits, to be called a fault
-_NAMED_IN_MOTION_DEG = 0.05  # where motion has told a turn from the lens model: half a pixel of disparity
+_NAMED_IN_MOTION_DEG = 0.05  # where motion has separated a rotation from the lens model: half a pixel of disparity
 _NAMED_DIRECTION_DEG = 1.0
 _NAMED_IMU_ROTATION_DEG = 0.5
 _INVERSE_DEG = 5.0  # an inverse that fits so well is taken as the explanation
@@ -43,7 +43,7 @@ def judge_stereo(estimate: StereoEstimate, T_cam0_cam1: FloatArray, inliers: Ray
     swapped = _judge_order(estimate, R_given, given)
     if swapped is not None:
         return (swapped,)
-    clear = estimate.stretches is not None or (
+    clear = estimate.segments is not None or (
         epipolar_spread(R_given, given, inliers)
         > _CLEARLY_WORSE * epipolar_spread(estimate.R_cam1_cam0, estimate.direction, inliers)
     )
@@ -102,7 +102,7 @@ def _opposite(estimate: StereoEstimate, given: FloatArray) -> bool:
 
 
 def _turn_limit_deg(estimate: StereoEstimate) -> float:
-    least = _NAMED_ROTATION_DEG if estimate.stretches is None else _NAMED_IN_MOTION_DEG
+    least = _NAMED_ROTATION_DEG if estimate.segments is None else _NAMED_IN_MOTION_DEG
     return max(least, _NAMED_SIGMAS * estimate.rotation_sigma_deg)
 
 

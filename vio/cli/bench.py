@@ -15,7 +15,7 @@ def add_parser(commands: Any) -> None:
         help="run a suite of recordings into one table, or compare two",
         description="Run every sequence of a suite with every configuration and seed, side by side, and write tables "
         "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, kitti, euroc, tumvi. "
-        "'vio bench compare A B' tells what became better or worse from one output folder to another beyond chance.",
+        "'vio bench compare A B' lists what became significantly better or worse from one output folder to another.",
     )
     parser.add_argument("suite", metavar="SUITE", help="YAML file, name of a shipped suite, or 'compare'")
     parser.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="compare: two output folders, A and B")

@@ -115,13 +115,13 @@ def _plain(record: Any) -> dict[str, Any]:
 
 
 def _parameters(found: SelfCalibration) -> dict[str, Any]:
-    """Return what a bundle adjustment says of the calibration, by name."""
+    """Return the results of a bundle adjustment on the calibration, by name."""
     from vio.offline.self_calibration import NAMES
 
     rows = zip(NAMES, found.values.tolist(), found.sigmas.tolist(), strict=True)
     return {
         "off": {name: {"value": value, "sigma": sigma} for name, value, sigma in rows},
-        "stretches": found.stretches,
+        "segments": found.segments,
         "points": found.points,
         "residual_px": found.residual_px,
     }
@@ -168,7 +168,7 @@ def _intrinsics_rows(found: Intrinsics) -> _Rows:
 
 
 def _unchecked(report: CalibrationReport) -> list[str]:
-    """Return what the report says nothing about."""
+    """Return what the report does not cover."""
     from vio.calibration.findings import NotObservable
 
     out = ["the length of the baseline"]

@@ -154,7 +154,7 @@ def _process(
     resume: bool,
     view: str | None = None,
 ) -> dict[str, Any]:
-    """Run, write the results and return the metrics; a run that was interrupted says so and how to go on."""
+    """Run, write the results and return the metrics; an interrupted run reports how to go on."""
     recording, reference = dataset.recording, request["reference"]
     truth = recording.reference if reference is None else read_trajectory(Path(reference))
     start, stop, save_observations = request["start"], request["stop"], request["save_observations"]

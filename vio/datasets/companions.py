@@ -1,4 +1,4 @@
-"""What lies beside the images of a plain recording: calibration, motion samples, ground truth, and the rest."""
+"""What is beside the images of a plain recording: calibration, motion samples, ground truth, and the rest."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from typing import overload
 
 
 def stem_of(name: str) -> str:
-    """Return a file's name without its suffix, as `Path.stem`, which keeps a copy of each name for good."""
+    """Return a file's name without its suffix, as `Path.stem`, which keeps a copy of each name for the process."""
     return os.path.splitext(name)[0]
 
 

@@ -34,7 +34,7 @@ WHITE_16 = 65535  # the level of white in an image that uses all of its 16 bits
 MOST_PIXELS = 2**26  # 8192 x 8192; a header may state 2^62, and decoding would try to get the memory
 _MOST_BYTES = 2**29  # of a file: more than 64 Mpx of 16 bits in colour
 _SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
-_WHITE_SHARE = 0.999  # of the pixels are no brighter than the level that tells the bits in use
+_WHITE_SHARE = 0.999  # of the pixels are no brighter than the level that shows the bits in use
 _JPEG_FRAMES = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})  # start-of-frame markers, with the image size
 _PNG_LEVEL = 1  # files a tenth larger than at the usual level 3, in a third of the time
 

@@ -30,7 +30,7 @@ def reference_of_body(truth: Trajectory, rig: Rig, rectifier: Rectifier) -> Traj
     if rig.T_cam0_imu is not None:
         return truth.in_imu(rig.T_cam0_imu)
     if truth.body == "imu":
-        # Without extrinsics nothing tells the IMU from the camera; a TUM file without a comment is the camera's.
+        # Without extrinsics IMU and camera cannot be distinguished; a TUM file without a comment is the camera's.
         truth = replace(truth, body="cam0")
     R_rect_cam0: FloatArray = rectifier.T_rect0_imu[:3, :3]
     return replace(truth, T_world_body=truth.T_world_body @ se3_inverse(se3_from_parts(R_rect_cam0, np.zeros(3))))

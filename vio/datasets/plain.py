@@ -53,7 +53,7 @@ _PAIRS: tuple[tuple[str, ...], ...] = (
 )
 _ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
 _INSIDE = ("data", "images", "")
-_ASSUMED_HZ = 10.0  # where nothing tells the times and no other sensor needs them
+_ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 
 
 def is_plain_folder(path: Path) -> bool:

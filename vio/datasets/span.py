@@ -35,13 +35,13 @@ def frames_between(recording: Recording, start: int | Seconds, stop: int | Secon
     The start is the first frame at or after its time, the stop the first one at or after its own.
 
     Raises:
-        DataError: the start lies after the last frame.
+        DataError: the start is after the last frame.
     """
     first = _frame(recording, start)
     count = len(recording.frame_times_ns)
     if isinstance(start, Seconds) and first >= count:
         length_s = float(recording.frame_times_ns[-1] - recording.frame_times_ns[0]) / NS_PER_S
-        raise DataError(f"{recording.path}: --start {start.seconds:g}s lies after its last frame at {length_s:.3f} s")
+        raise DataError(f"{recording.path}: --start {start.seconds:g}s is after its last frame at {length_s:.3f} s")
     return first, None if stop is None else _frame(recording, stop)
 
 

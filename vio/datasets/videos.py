@@ -1,4 +1,4 @@
-"""Two video files, left and right, with a calibration and, as in a plain folder, what else lies beside them.
+"""Two video files, left and right, with a calibration and, as in a plain folder, what else is beside them.
 
 Frame k of the one file belongs to frame k of the other. Frames are decoded in order, from the first on, because seeking
 in compressed video is not exact. Times come from `times.txt`, else from the frame rate that the files state.

@@ -42,7 +42,7 @@ def attitude_note(R_est: FloatArray, R_ref: FloatArray, sigma_rad: float) -> str
     if min(of_body, left[words]) > _CONSTANT * off_deg:
         return f"{head}, and no exchange of axes explains it; check what the reference's orientations mean"
     if _BETTER * left[words] < of_body:
-        return f"{head}: the reference's orientations are {words}{_NO_MEASURE}; mend the file that it was written from"
+        return f"{head}: the reference's orientations are {words}{_NO_MEASURE}; correct the file it was written from"
     return (
         f"{head}, always by the same rotation ({_name(_mean(body))}): the reference describes a body with other axes"
         f"{_NO_MEASURE}; compare positions, or turn the reference's poses by it"

@@ -51,7 +51,7 @@ def lock_path(path: Path) -> int | None:
         if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
             os.close(descriptor)
             return None
-        # A file system without locks: nothing can be told to be left over.
+        # A file system without locks: nothing can be known to be left over.
     return descriptor
 
 
@@ -160,7 +160,7 @@ def check_new_file(path: Path, sign: bytes | None = None) -> None:
 
     Args:
         path: to be written.
-        sign: what our own files of this kind hold, which may be replaced; None: none can be told from others.
+        sign: what our own files of this kind hold, which may be replaced; None: none can be distinguished from others.
 
     Raises:
         DataError: it exists and is another's.

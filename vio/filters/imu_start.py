@@ -24,7 +24,7 @@ _MOST_TILT_RAD = np.pi / 4  # beyond, the direction of gravity is unknown; a lar
 
 @dataclass(frozen=True, slots=True)
 class ImuStart:
-    """What the samples before the first frame say."""
+    """What the samples before the first frame determine."""
 
     still: bool  # whether they look like a standstill (or like a steady turn or acceleration)
     force: FloatArray  # (3,) mean specific force in the body frame of the first frame, m/s^2

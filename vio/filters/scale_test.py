@@ -88,6 +88,6 @@ class ScaleTest(SeparateBias):
 
     @property
     def contradicted(self) -> bool:
-        """Whether the scale is off beyond doubt, beyond harm, and beyond what the sensor's noise passes for."""
+        """Whether the scale is off significantly, by more than is harmless and than the sensor's noise explains."""
         s, sigma = self.estimate()
         return abs(s) > max(_LEAST + _BY_NOISE * self.frames / self._information, _SIGMAS * sigma)

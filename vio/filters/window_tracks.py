@@ -79,7 +79,7 @@ class WindowTracks:
         self.table.points *= factor
 
     def choose(self, clones: int) -> IntArray:
-        """Rows of the tracks that say something of the poses: two views or more, the most telling first if too many."""
+        """Rows of the tracks that constrain the poses: two views or more, the most informative first if too many."""
         rows = self.table.rows()
         seen = self.table.seen(rows)
         length = seen.sum(axis=1)
@@ -230,7 +230,7 @@ class WindowTracks:
         """Remove what has been absorbed and what has ended.
 
         Args:
-            spent: rows whose views have had their say; the tracks go on without them.
+            spent: rows whose views have been used; the tracks go on without them.
             promoted: rows that have become landmarks.
             newest: column of the newest clone; tracks that were not seen in it have ended.
         """

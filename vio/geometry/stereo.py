@@ -127,7 +127,7 @@ class StereoCamera:
 
     @property
     def baseline_fault(self) -> str | None:
-        """What is said of a baseline that no rig has, as that of a calibration in millimetres; None: it is plausible.
+        """The warning on a baseline that no rig has, as that of a calibration in millimetres; None: it is plausible.
 
         Of stereo pairs; those of one camera and of depth images are made up.
         """

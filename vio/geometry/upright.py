@@ -15,7 +15,7 @@ def upright_axes(T_world_cam0: FloatArray, up_world: FloatArray | None = None) -
     Args:
         T_world_cam0: poses (N, 4, 4) of the left camera.
         up_world: (3,) opposite to gravity where it is known; None: cameras are mounted upright, so the upper edge of
-            the first image tells.
+            the first image shows.
     """
     first = T_world_cam0[0]
     up = -first[:3, 1] if up_world is None else np.asarray(up_world, dtype=np.float64)

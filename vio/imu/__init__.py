@@ -1,1 +1,1 @@
-"""What can be said of IMU samples by themselves: faults, standstill, clocks."""
+"""Checks of IMU samples by themselves: faults, standstill, clocks."""

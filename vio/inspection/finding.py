@@ -1,4 +1,4 @@
-"""What an inspection says."""
+"""A finding of an inspection."""
 
 from __future__ import annotations
 

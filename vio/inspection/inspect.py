@@ -69,7 +69,7 @@ def camera_part(recording: Recording) -> Part:
     if c.baseline_fault is not None:
         faults.append(c.baseline_fault)
     if c.width is not None and c.height is not None and not (0 < c.cu < c.width and 0 < c.cv < c.height):
-        faults.append(f"the principal point {c.cu:.0f}, {c.cv:.0f} lies outside the image; check its size")
+        faults.append(f"the principal point {c.cu:.0f}, {c.cv:.0f} is outside the image; check its size")
     if stereo:
         one_px_m = c.fu * c.baseline_m  # the depth of one pixel of disparity
         form = " to a cylinder" if c.is_cylinder else ""

@@ -61,7 +61,7 @@ def images_part(frames: Sequence[StereoFrame]) -> Part:
     flat = [e for side in found for e in side if e.spread < _FLAT or not _DARK < e.mean < _BRIGHT]
     if 2 * len(flat) > cameras * len(shown):
         faults.append(
-            f"{len(flat)} of {cameras * len(shown)} images are black, white or without content; mend the exposure"
+            f"{len(flat)} of {cameras * len(shown)} images are black, white or without content; correct the exposure"
         )
     if cameras == 2 and all(np.array_equal(images[0], images[1]) for images in shown):
         faults.append("left and right are the same images, so there is no depth; give the other camera's images")
@@ -140,7 +140,7 @@ def _rows_faults(found: RowResiduals) -> list[str]:
         return [
             f"rows differ by {found.median_px:+.1f} px with spread {found.spread_px:.1f} px: a camera has been turned "
             "since the calibration, left and right images are exchanged, the calibration is not that of these images, "
-            "or they are not rectified; run `vio calibrate`, which tells which, and give its file with --calibration"
+            "or they are not rectified; run `vio calibrate`, which finds which, and give its file with --calibration"
         ]
     return []
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from vio.calibration.found_rig import found_rig
+from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import CalibratedRig
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
@@ -270,7 +270,7 @@ class Odometry:
             return self._add_frame(StereoFrame(self._frames, time_ns, None, None))
 
     def finish(self) -> list[FrameResult]:
-        """Process the frames that still wait, and let the checks say what they have not yet said."""
+        """Process the frames that still wait, and let the checks report what is left."""
         with self._lock:
             with self._blas():
                 results = self._processor.finish()
@@ -305,7 +305,7 @@ class Odometry:
             if self.camera.is_cylinder:
                 raise DataError("no lens model holds a cylinder; give Odometry the rig of the raw cameras")
             raise DataError("the rectified camera has no image size; give StereoCamera its width and height")
-        return found_rig(rig, estimate, self.camera, "live images")
+        return estimated_rig(rig, estimate, self.camera, "live images")
 
     @property
     def motion(self) -> MotionSource | None:
@@ -340,7 +340,7 @@ class Odometry:
         half a second at most.
 
         Raises:
-            DataError: there is no estimate yet, or the time lies before it.
+            DataError: there is no estimate yet, or the time is before it.
         """
         return self._predictor.predict(checked_time(t_ns))
 

@@ -85,13 +85,13 @@ class PosePredictor:
         """Return the pose at a time at or after the newest estimate.
 
         Raises:
-            DataError: there is no estimate yet, or the time lies before it.
+            DataError: there is no estimate yet, or the time is before it.
         """
         states = self._states
         if not states:
             raise DataError("no pose can be predicted before the first estimate")
         if time_ns < states[0].time_ns:
-            raise DataError(f"{time_ns} ns lies before the newest estimate at {states[0].time_ns} ns; take that one")
+            raise DataError(f"{time_ns} ns is before the newest estimate at {states[0].time_ns} ns; take that one")
         state = next(state for state in reversed(states) if state.time_ns <= time_ns)
         R, p, v = _moved(state, min((time_ns - state.time_ns) * _NS, _LONGEST_STEP_S))
         return PredictedPose(time_ns, se3_from_parts(R, p), v)

@@ -326,7 +326,7 @@ class MapBuilder:
         return refined if self._fits(refined.first, k, refined.seen, drift) else None
 
     def _search(self, number: int, features: KeyframeFeatures, allowed: BoolArray) -> FoundPlace | None:
-        """Look for the points of the places that the odometry says should be seen, where it says they are.
+        """Look for the points of the places that should be visible by the odometry, at the pixels that it predicts.
 
         Args:
             number: of the keyframe.

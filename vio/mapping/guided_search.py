@@ -1,7 +1,7 @@
 """Where a keyframe stands, by looking for the points of a place where they should be seen.
 
-Where the motion to a place is roughly known, each of its points needs to be told from the few features around its
-predicted pixel alone, in place of all features of the image (search by projection, as in Mur-Artal et al. 2015). Points
+Where the motion to a place is roughly known, each of its points competes only with the few features around its
+predicted pixel, in place of all features of the image (search by projection, as in Mur-Artal et al. 2015). Points
 come from several keyframes, so that one of them shows each from a similar view.
 
 A window always holds some feature that looks alike. What agrees by chance is counted with the same search where
@@ -72,7 +72,7 @@ class PlaceView(NamedTuple):
     keyframe: int
     shown: Shown
     place: RelativePose  # in the frame of the place's first keyframe
-    middle: int = 0  # keyframe in the middle of its stretch of the path, along which the odometry knows the motions
+    middle: int = 0  # keyframe in the middle of its segment of the path, along which the odometry knows the motions
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +93,7 @@ class PlacePoints:
         return PlacePoints(self.views, *a, self.view[rows], self.row[rows])
 
     def main_stretch(self) -> IntArray:
-        """Return the points (K,) of the stretch of the path that shows most of them."""
+        """Return the points (K,) of the segment of the path that shows most of them."""
         middle = np.array([view.middle for view in self.views])[self.view]
         values, counts = np.unique(middle, return_counts=True)
         return np.flatnonzero(middle == values[np.argmax(counts)])
@@ -196,9 +196,9 @@ def search(
 
 
 def _of_one_stretch(points: PlacePoints, here: KeyframeFeatures, rows: IntArray, agree: IntArray) -> IntArray:
-    """Return those of the pairs that `agree` which are of the stretch that shows most of them, or all if too few are.
+    """Return those of the pairs that `agree` which are of the segment that shows most of them, or all if too few are.
 
-    How stretches stand to each other is what the map says so far, which is not to come back as a measurement.
+    How segments stand to each other is what the map says so far, which is not to come back as a measurement.
     """
     own = agree[points.take(agree).main_stretch()]
     return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree

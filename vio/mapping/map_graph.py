@@ -10,7 +10,7 @@ import numpy.typing as npt
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse
 from vio.geometry.relative_pose import RelativePose
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
-from vio.mapping.pose_graph import Edges, Uprights, optimise
+from vio.mapping.pose_graph import Edges, UpDirections, optimise
 from vio.records import BoolArray, IntArray
 
 # What the odometry may be off by beyond its own covariance, since errors of the calibration add up along the path:
@@ -161,22 +161,22 @@ class MapGraph:
         scaled = [(i, j, RelativePose(m.T_i_j, self.odometry_scale * m.covariance)) for i, j, m in odometry]
         inside = [n for n, o in enumerate(self.loops) if rows[o.first] and rows[o.second]]
         loops = [(int(place[o.first]), int(place[o.second]), o.pose) for o in (self.loops[n] for n in inside)]
-        uprights = self._uprights(rows, place)
+        up_directions = self._up_directions(rows, place)
         best = optimise(
             self.T_map_cam.rows[rows],
             Edges.of(scaled),
             Edges.of(loops),
-            uprights,
+            up_directions,
             fixed[rows],
-            levelled=0 if level and len(uprights.pose) else None,
+            levelled=0 if level and len(up_directions.pose) else None,
         )
         self.T_map_cam.rows[rows] = best.T_map_cam
         for n, kept in zip(inside, best.kept.tolist(), strict=True):
             self.loops[n] = replace(self.loops[n], kept=kept)
 
-    def _uprights(self, rows: BoolArray, place: IntArray) -> Uprights:
+    def _up_directions(self, rows: BoolArray, place: IntArray) -> UpDirections:
         ups = [up for up in self._ups if rows[up[0]]] if self._is_upright(rows) else []
-        return Uprights(
+        return UpDirections(
             np.array([place[k] for k, _, _ in ups], dtype=np.int64),
             np.array([up for _, up, _ in ups]).reshape(-1, 3),
             np.array([sigma for _, _, sigma in ups]),

@@ -48,7 +48,7 @@ class Edges:
 
 
 @dataclass(frozen=True, slots=True)
-class Uprights:
+class UpDirections:
     """The direction of the vertical, as the IMU gives it in each camera."""
 
     pose: IntArray  # (U,) index
@@ -69,7 +69,7 @@ def optimise(
     T_map_cam: FloatArray,
     odometry: Edges,
     loops: Edges,
-    uprights: Uprights,
+    up_directions: UpDirections,
     fixed: BoolArray,
     *,
     levelled: int | None = None,
@@ -77,33 +77,33 @@ def optimise(
     """Return the poses (K, 4, 4) that minimise the squared errors of odometry, gravity and truncated loops.
 
     Args:
-        T_map_cam: (K, 4, 4) where to start; the map's z axis is up if there are uprights.
+        T_map_cam: (K, 4, 4) where to start; the map's z axis is up if there are up_directions.
         odometry: edges that are trusted.
         loops: edges that may be wrong.
-        uprights: directions of the vertical.
+        up_directions: directions of the vertical.
         fixed: (K,) poses that stay; at least one of each connected part.
         levelled: one of the fixed poses whose position and heading alone stay, so that its roll and pitch follow the
-            uprights; None: all of them stay.
+            up_directions; None: all of them stay.
     """
     free = _Free(fixed, levelled)
     limit = float(chi_square_quantile(_TRUNCATION, 6))
     T, weight = T_map_cam.copy(), np.ones(len(loops))
     if not len(loops):
-        return Optimum(_descend(T, odometry, loops, weight, uprights, free, _MOST_STEPS), weight > 0.5, weight)
-    T = _descend(T, odometry, loops, weight, uprights, free, _MOST_STEPS)
+        return Optimum(_descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS), weight > 0.5, weight)
+    T = _descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS)
     squared = _squared(T, loops)
     worst = float(squared.max())
     if worst > limit:  # else every loop fits with full weight, and there is nothing to decide
         mu = limit / (2 * worst - limit)
         for _ in range(_MOST_GNC_STEPS):
             weight = _gnc_weight(squared, mu, limit)
-            T = _descend(T, odometry, loops, weight, uprights, free, 2)
+            T = _descend(T, odometry, loops, weight, up_directions, free, 2)
             squared = _squared(T, loops)
             if ((weight == 0) | (weight == 1)).all() and mu > 1:
                 break
             mu *= _MU_GROWTH
         weight = (squared < limit).astype(np.float64)
-        T = _descend(T, odometry, loops, weight, uprights, free, _MOST_STEPS)
+        T = _descend(T, odometry, loops, weight, up_directions, free, _MOST_STEPS)
     return Optimum(T, weight > 0.5, weight)
 
 
@@ -134,12 +134,12 @@ def r_D_poses(T: FloatArray, edges: Edges, r: FloatArray) -> tuple[FloatArray, F
     return -r_D_j @ se3_adjoint(se3_inverse(T[edges.second]) @ T[edges.first]), r_D_j
 
 
-def up_residual(T: FloatArray, uprights: Uprights) -> tuple[FloatArray, FloatArray]:
+def up_residual(T: FloatArray, up_directions: UpDirections) -> tuple[FloatArray, FloatArray]:
     """Residuals (U, 3) `R^T e_z - up_cam` at poses (K, 4, 4), and their Jacobians (U, 3, 6), equation (G3)."""
-    up = T[uprights.pose, 2, :3]  # R^T e_z
+    up = T[up_directions.pose, 2, :3]  # R^T e_z
     D = np.zeros((len(up), 3, 6))
     D[:, :, 3:] = so3_hat(up)
-    return up - uprights.up_cam, D
+    return up - up_directions.up_cam, D
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,11 +162,17 @@ class _Free:
 
 
 def _descend(
-    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, uprights: Uprights, free: _Free, steps: int
+    T: FloatArray,
+    odometry: Edges,
+    loops: Edges,
+    weight: FloatArray,
+    up_directions: UpDirections,
+    free: _Free,
+    steps: int,
 ) -> FloatArray:
     """Gauss-Newton with fixed weights (L,) of the loops."""
     for _ in range(steps):
-        xi = _step(T, odometry, loops, weight, uprights, free)
+        xi = _step(T, odometry, loops, weight, up_directions, free)
         T = T @ se3_exp(xi)
         if np.abs(xi).max(initial=0.0) < _CONVERGED:
             break
@@ -174,7 +180,7 @@ def _descend(
 
 
 def _step(
-    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, uprights: Uprights, free: _Free
+    T: FloatArray, odometry: Edges, loops: Edges, weight: FloatArray, up_directions: UpDirections, free: _Free
 ) -> FloatArray:
     """Solve the normal equations (G4) for xi (K, 6)."""
     count = len(T)
@@ -192,11 +198,11 @@ def _step(
         blocks += [(i, i, AW @ A), (j, j, BW @ B), (i, j, AB), (j, i, np.swapaxes(AB, 1, 2))]
         np.add.at(gradient, i, -np.einsum("eij,ej->ei", AW, r))
         np.add.at(gradient, j, -np.einsum("eij,ej->ei", BW, r))
-    if len(uprights.pose):
-        r, D = up_residual(T, uprights)
-        D, r = D / uprights.sigma_rad[:, None, None], r / uprights.sigma_rad[:, None]
-        blocks.append((uprights.pose, uprights.pose, np.swapaxes(D, 1, 2) @ D))
-        np.add.at(gradient, uprights.pose, -np.einsum("eji,ej->ei", D, r))
+    if len(up_directions.pose):
+        r, D = up_residual(T, up_directions)
+        D, r = D / up_directions.sigma_rad[:, None, None], r / up_directions.sigma_rad[:, None]
+        blocks.append((up_directions.pose, up_directions.pose, np.swapaxes(D, 1, 2) @ D))
+        np.add.at(gradient, up_directions.pose, -np.einsum("eji,ej->ei", D, r))
     P = free.directions(T)
     xi = P @ splu((P.T @ _sparse(blocks, count) @ P).tocsc()).solve(P.T @ gradient.ravel())
     return np.asarray(xi).reshape(count, 6)

@@ -99,7 +99,7 @@ class RunHealth:
         if field.rows_rms_px > _OTHER_PAIR_PX:
             return [
                 f"{seen}: left and right are exchanged, the calibration is not that of these images, or a camera was "
-                "moved; `vio calibrate` tells which; what the calibration is off by is estimated while running, which "
+                "moved; `vio calibrate` finds which; what the calibration is off by is estimated while running, which "
                 "may not suffice (msckf.calibrate_stereo)"
             ]
         return [
@@ -108,7 +108,7 @@ class RunHealth:
         ]
 
     def _scale(self, index: int, estimate: Estimate) -> list[str]:
-        """Report once that baseline or focal length differ from the calibration beyond doubt and beyond harm."""
+        """Report once that baseline or focal length differ from the calibration significantly and harmfully."""
         lines: list[str] = []
         found = {} if estimate.stereo_scale is None else estimate.stereo_scale.percent()
         for name, (percent, sigma) in found.items():

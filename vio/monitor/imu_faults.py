@@ -60,6 +60,6 @@ class ImuFaultReport:
         if len(self._spikes[fault.kind]) > 1:
             return []
         return [
-            f"frame {self._frame}: {fault.kind}: one sample at {fault.start_ns} ns lies {fault.size:.3g} "
+            f"frame {self._frame}: {fault.kind}: one sample at {fault.start_ns} ns is {fault.size:.3g} "
             f"{_UNITS[fault.kind]} from both its neighbours, a fault of the sensor or its transfer; it is left out"
         ]

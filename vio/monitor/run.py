@@ -120,7 +120,7 @@ class RunWatch:
         return frame if repeated is None else replace(frame, depth=np.zeros_like(frame.depth))
 
     def observations(self, seen: Observations, warnings: tuple[str, ...] = ()) -> None:
-        """Add the front end's observations, before feature selection, and what it says of the images."""
+        """Add the front end's observations, before feature selection, and its warnings on the images."""
         self._take_new()
         if self._baseline_fault is not None and not self._frames:
             self._report([f"{self._baseline_fault}, or the path has another unit"])
@@ -157,14 +157,14 @@ class RunWatch:
         self.frames_refused += 1
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
-        """Add a frame without a pose, as the back end's start is not observable yet; `why` is said at the end."""
+        """Add a frame without a pose, as the back end's start is not observable yet; `why` is reported at the end."""
         self._waits_for = why
         if self._waiting_since is None:
             self._waiting_since = frame.time_ns
         self.frames_waiting += 1
 
     def begun(self, frame: StereoFrame, scale_sigma: float | None) -> None:
-        """Add a frame with a pose of a back end that may have waited: the first one says how it began."""
+        """Add a frame with a pose of a back end that may have waited: for the first one, report the start."""
         since, self._waiting_since = self._waiting_since, None
         if since is None:
             return
@@ -210,7 +210,7 @@ class RunWatch:
                 findings = tuple(f for f in findings if f.group != "overlap")
             self._report_findings(findings)
         if self._waiting_since is not None:
-            why = "mend the fault of the IMU that is named above first" if self._imu_at_fault else self._waits_for
+            why = "correct the fault of the IMU that is named above first" if self._imu_at_fault else self._waits_for
             self._report([f"one camera: {self.frames_waiting} frames have no pose; {why}"])
 
     def _report_findings(self, findings: Iterable[InertialFinding]) -> None:

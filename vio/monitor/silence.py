@@ -1,4 +1,4 @@
-"""Watch a run's IMU stamps for silences: before its first sample, between two, and after its last one."""
+"""Check a run's IMU stamps for gaps: before its first sample, between two, and after its last one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _RECENT = 200  # samples whose median distance is the usual one
 
 
 class ImuSilence:
-    """Takes the stamps of samples and frames; says each silence once, in one line, when its length is known."""
+    """Takes the stamps of samples and frames; reports each gap once, in one line, when its length is known."""
 
     def __init__(self) -> None:
         self._times: deque[int] = deque(maxlen=_RECENT)

@@ -34,17 +34,17 @@ from vio.geometry.lie import FloatArray, so3_log
 from vio.geometry.rectify import rectify_pixels
 from vio.geometry.stereo import StereoCamera, left_rays
 from vio.offline.colmap.pairs import adjust_rig, relative_pose, sift_matches
-from vio.offline.keyframes import choose_keyframes, tracked_stretches
+from vio.offline.keyframes import choose_keyframes, tracked_segments
 from vio.offline.points import build_tracks
-from vio.offline.self_calibration import SelfCalibration, Stretch, intrinsics_of, self_calibrate
+from vio.offline.self_calibration import Segment, SelfCalibration, intrinsics_of, self_calibrate
 from vio.offline.source import CalibrationSource, track
 from vio.protocols import Dataset, Frontend
 from vio.records import BoolArray, FeatureTracks, IntArray, MotionSample, Recording
 
 log = logging.getLogger(__name__)
 
-_STRETCH, _STRETCHES, _STRETCH_KEYFRAMES = 36, 6, 20  # frames, pieces, keyframes of each, for the rig in motion
-_STRETCH_GATE_PX = 8.0  # wide: wrong extrinsics displace every point
+_SEGMENT, _SEGMENTS, _SEGMENT_KEYFRAMES = 36, 6, 20  # frames, pieces, keyframes of each, for the rig in motion
+_SEGMENT_GATE_PX = 8.0  # wide: wrong extrinsics displace every point
 # What the gate leaves of a camera that is far off is biased: it is measured again with what was found taken out, until
 # less than this is left.
 _ROUNDS, _SETTLED_DEG = 5, 0.05
@@ -223,7 +223,7 @@ def _measure_stereo(matches: RayMatches) -> tuple[StereoEstimate | NotObservable
 def _measure_in_motion(
     source: CalibrationSource, stereo: StereoEstimate, tracks: FeatureTracks
 ) -> tuple[StereoEstimate, Intrinsics | NotObservable, SelfCalibration | None]:
-    """Estimate the calibration by bundle adjustment over stretches of video; unchanged where there are none."""
+    """Estimate the calibration by bundle adjustment over segments of video; unchanged where there are none."""
     assert source.dataset is not None
     width, height = source.image_size(tracks.z)
     recording = source.dataset.recording
@@ -231,7 +231,7 @@ def _measure_in_motion(
     off: FloatArray = np.zeros(len(PARAMETERS))
     try:
         for _ in range(_ROUNDS):
-            pieces = _stretches(source, camera, _corrected(camera, tracks, off), recording.frame_times_ns)
+            pieces = _segments(source, camera, _corrected(camera, tracks, off), recording.frame_times_ns)
             if not pieces:
                 return stereo, NotObservable(_INTRINSICS, "there are no 20 frames in a row whose motion is known"), None
             step = self_calibrate(camera, pieces, intrinsics=False)
@@ -253,7 +253,7 @@ def _measure_in_motion(
         direction=direction,
         rotation_sigma_deg=rotation_deg,
         direction_sigma_deg=direction_deg,
-        stretches=held.stretches,
+        segments=held.segments,
     )
     return found, intrinsics_of(camera, free), held
 
@@ -263,19 +263,19 @@ def _corrected(camera: StereoCamera, tracks: FeatureTracks, off: FloatArray) -> 
     return replace(tracks, z=field_of(camera, off).without(tracks.z, tracks.has_right)) if np.any(off) else tracks
 
 
-def _stretches(
+def _segments(
     source: CalibrationSource, camera: StereoCamera, tracks: FeatureTracks, times_ns: IntArray
-) -> list[Stretch]:
+) -> list[Segment]:
     """Return keyframes, points and rows of pieces of the recording with tracked features."""
     motion = stereo_twists(camera, tracks, times_ns, np.zeros((len(times_ns) - 1, 6)))
     out = []
-    for piece in tracked_stretches(source.path, camera, tracks, motion, longest=_STRETCH, most=_STRETCHES):
+    for piece in tracked_segments(source.path, camera, tracks, motion, longest=_SEGMENT, most=_SEGMENTS):
         try:
-            keyframes = choose_keyframes(piece, most=_STRETCH_KEYFRAMES)
+            keyframes = choose_keyframes(piece, most=_SEGMENT_KEYFRAMES)
             T_world_cam0 = piece.trajectory.T_world_body[keyframes]
-            out.append(Stretch(T_world_cam0, build_tracks(piece, keyframes, T_world_cam0, gate_px=_STRETCH_GATE_PX)))
+            out.append(Segment(T_world_cam0, build_tracks(piece, keyframes, T_world_cam0, gate_px=_SEGMENT_GATE_PX)))
         except EstimationError as error:
-            log.warning("a stretch of video was left out: %s", error)
+            log.warning("a segment of video was left out: %s", error)
     return out
 
 

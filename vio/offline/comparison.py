@@ -44,7 +44,7 @@ class KeyframeComparison:
 
     total: int  # keyframes compared
     frames: IntArray  # (R,) frame numbers
-    piece: BoolArray  # (R,) keyframes of the longest stretch without a jump of either trajectory
+    piece: BoolArray  # (R,) keyframes of the longest segment without a jump of either trajectory
     aligned: FloatArray  # (R, 4, 4) the other poses in the run's world, after SE(3) alignment of this piece
     difference_m: FloatArray  # (R,)
     difference_deg: FloatArray  # (R,)
@@ -132,7 +132,7 @@ def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray) -> 
 
 
 def _longest_piece(T_own: FloatArray, T_other: FloatArray) -> BoolArray:
-    """Return the rows (R,) of the longest stretch in which no motion differs by more than its own length."""
+    """Return the rows (R,) of the longest segment in which no motion differs by more than its own length."""
     if len(T_own) < _LEAST_MOTIONS:
         return np.ones(len(T_own), dtype=bool)
     moved_m = np.linalg.norm(np.diff(T_own[:, :3, 3], axis=0), axis=1)

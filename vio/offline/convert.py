@@ -179,7 +179,7 @@ def _finish_kitti(out: Path, recording: Recording, written: _Written, noise: Imu
     if written.imu:
         record = _record(written.imu)
         write_text(out / "imu.csv", _imu_text(replace(record, times_ns=record.times_ns - first_ns)))
-        notes.append("KITTI's form has no IMU: imu.csv lies beside it, and makes the folder one of kind plain")
+        notes.append("KITTI's form has no IMU: imu.csv is beside it, and makes the folder one of kind plain")
     truth = recording.reference
     if truth is None or truth.times_ns is None:
         return notes

@@ -26,7 +26,7 @@ class BagCounts:
     velocities: int = 0
 
     def notes(self, recording: Recording) -> list[str]:
-        """Return what a reader of the bag must be told."""
+        """Return what a reader of the bag must be given."""
         if not self.velocities:
             return []
         if recording.T_cam0_imu is None:

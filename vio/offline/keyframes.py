@@ -99,7 +99,7 @@ def _median_depth_m(run: TrackedPath) -> float:
     return float(run.camera.fu * run.camera.baseline_m / np.median(disparity))
 
 
-def tracked_stretches(
+def tracked_segments(
     where: Path, camera: StereoCamera, tracks: FeatureTracks, motion: CameraMotion, *, longest: int, most: int
 ) -> list[TrackedPath]:
     """Return pieces of a recording, with poses concatenated from frame to frame.

@@ -1,8 +1,8 @@
-"""Bundle adjustment of stretches of video with the calibration of the stereo pair free: what motion tells of it.
+"""Bundle adjustment of segments of video with the calibration of the stereo pair free: what motion determines of it.
 
-All stretches share the calibration; each has its own poses and points, which are eliminated. A prior decides where
+All segments share the calibration; each has its own poses and points, which are eliminated. A prior decides where
 neither matches nor motion do. Standard deviations come from the scatter of what regions of the image say (a sandwich
-estimate clustered by region and stretch), as errors of a lens model, of features that wander along edges and of moving
+estimate clustered by region and segment), as errors of a lens model, of features that wander along edges and of moving
 objects are shared by all rows of a region.
 References: Triggs et al., Bundle adjustment: a modern synthesis (2000) for the elimination; Liang & Zeger, Longitudinal
 data analysis using generalized linear models, Biometrika (1986) for the covariance.
@@ -56,7 +56,7 @@ _LEAST_RESIDUAL_PX = 0.02  # of exact tracks, so that weights stay finite
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class Segment:
     """Keyframes of a piece of video, with points and their rows."""
 
     T_world_cam0: FloatArray  # (K, 4, 4)
@@ -68,15 +68,15 @@ class SelfCalibration:
     """What the calibration is off by."""
 
     values: FloatArray  # (18,) in the order and units of `NAMES`
-    sigmas: FloatArray  # (18,) standard deviations; those of the prior where the motion tells nothing
+    sigmas: FloatArray  # (18,) standard deviations; those of the prior where the motion determines nothing
     covariance: FloatArray  # (18, 18)
     told: FloatArray  # (18,) share of the prior's variance that the data removed
-    stretches: int
+    segments: int
     points: int
     residual_px: float  # robust standard deviation of a pixel coordinate
 
     def right_camera(self) -> tuple[FloatArray, FloatArray, float, float]:
-        """Return how the right camera lies as far as the image's centre tells, with standard deviations.
+        """Return how the right camera lies as far as the image's centre determines it, with standard deviations.
 
         A turn about the vertical or horizontal axis, a principal point and a tangential distortion move pixels almost
         alike; the turn that moves the image's centre as all of them do together is well determined, and is returned.
@@ -148,21 +148,21 @@ def project_off(camera: StereoCamera, x: FloatArray, p: FloatArray) -> FloatArra
     return out
 
 
-def self_calibrate(camera: StereoCamera, stretches: Sequence[Stretch], *, intrinsics: bool) -> SelfCalibration:
-    """Estimate what a rectified pair's calibration is off by, from stretches of video.
+def self_calibrate(camera: StereoCamera, segments: Sequence[Segment], *, intrinsics: bool) -> SelfCalibration:
+    """Estimate what a rectified pair's calibration is off by, from segments of video.
 
     The length of the baseline is held: it is the scale.
 
     Args:
         camera: the pair as calibrated, with image size.
-        stretches: at least one; rows with gross outliers are weighted down and left out.
+        segments: at least one; rows with gross outliers are weighted down and left out.
         intrinsics: whether focal length, its ratio and the principal point are free, too; else they are as given.
 
     Raises:
-        EstimationError: no stretch has a consistent track.
+        EstimationError: no segment has a consistent track.
     """
     x = np.zeros(len(NAMES))
-    pieces = [s for s in stretches if len(s.tracks.ids)]
+    pieces = [s for s in segments if len(s.tracks.ids)]
     if not pieces:
         raise EstimationError("not observable because no track is consistent over the keyframes")
     width = np.where(np.isin(NAMES, INTRINSICS) & (not intrinsics), _HELD, _PRIOR)
@@ -175,9 +175,9 @@ def self_calibrate(camera: StereoCamera, stretches: Sequence[Stretch], *, intrin
 
 
 def _optimum(
-    camera: StereoCamera, x: FloatArray, pieces: list[Stretch], width: FloatArray
-) -> tuple[FloatArray, list[Stretch]]:
-    """Return parameters (18,) and stretches at the least robust cost, by Levenberg-Marquardt."""
+    camera: StereoCamera, x: FloatArray, pieces: list[Segment], width: FloatArray
+) -> tuple[FloatArray, list[Segment]]:
+    """Return parameters (18,) and segments at the least robust cost, by Levenberg-Marquardt."""
     damping = _FIRST_DAMPING
     for _ in range(_STEPS):
         sigma = _spread(camera, x, pieces)
@@ -197,7 +197,7 @@ def _optimum(
 
 
 def _with_covariance(
-    camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch], width: FloatArray
+    camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment], width: FloatArray
 ) -> SelfCalibration:
     """Return parameters (18,) at the optimum with their sandwich covariance; the prior has a `width` (18,)."""
     sigma, prior = _spread(camera, x, pieces), np.diag(1 / (width**2 + x**2))
@@ -213,12 +213,12 @@ def _with_covariance(
     return SelfCalibration(x, sigmas, covariance, 1 - sigmas**2 / allowed, len(pieces), points, sigma)
 
 
-def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch]) -> float:
+def _spread(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment]) -> float:
     """Return the robust standard deviation of a pixel coordinate."""
     return max(robust_sigma(np.concatenate([_residuals(camera, x, s)[1] for s in pieces])), _LEAST_RESIDUAL_PX)
 
 
-def _cost(camera: StereoCamera, x: FloatArray, pieces: Sequence[Stretch], sigma: float, width: FloatArray) -> float:
+def _cost(camera: StereoCamera, x: FloatArray, pieces: Sequence[Segment], sigma: float, width: FloatArray) -> float:
     """Return what the steps decrease: Cauchy losses of rows and parameters (18,)."""
     squares = [np.sum(_residuals(camera, x, piece)[0] ** 2, axis=1) / sigma**2 for piece in pieces]
     rows = sum(float(np.sum(2 * _CAUCHY**2 * np.log1p(q / (4 * _CAUCHY**2)))) for q in squares)
@@ -234,7 +234,7 @@ def _larger(A: FloatArray, B: FloatArray) -> FloatArray:
     return out
 
 
-def _residuals(camera: StereoCamera, x: FloatArray, piece: Stretch) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _residuals(camera: StereoCamera, x: FloatArray, piece: Segment) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return residuals (R, 4), zero where not measured; those measured (n,); and points in the camera (R, 3)."""
     tracks, T = piece.tracks, se3_inverse(piece.T_world_cam0)[piece.tracks.keyframe]
     q = np.einsum("nij,nj->ni", T[:, :3, :3], tracks.p_world[tracks.point]) + T[:, :3, 3]
@@ -246,7 +246,7 @@ def _residuals(camera: StereoCamera, x: FloatArray, piece: Stretch) -> tuple[Flo
     return r, r[measured], q
 
 
-def _without_outliers(camera: StereoCamera, x: FloatArray, piece: Stretch, sigma: float) -> Stretch:
+def _without_outliers(camera: StereoCamera, x: FloatArray, piece: Segment, sigma: float) -> Segment:
     r, _, _ = _residuals(camera, x, piece)
     kept = keep_rows(piece.tracks, np.abs(r).max(axis=1) < _GATE * sigma)
     return replace(piece, tracks=kept) if len(kept.ids) else piece
@@ -254,7 +254,7 @@ def _without_outliers(camera: StereoCamera, x: FloatArray, piece: Stretch, sigma
 
 @dataclass(frozen=True, slots=True)
 class _Normal:
-    """Normal equations of a stretch, with its poses and points eliminated."""
+    """Normal equations of a segment, with its poses and points eliminated."""
 
     A: FloatArray  # (18, 18)
     b: FloatArray  # (18,)
@@ -262,8 +262,8 @@ class _Normal:
     dp: tuple[FloatArray, FloatArray]  # steps of the points (3M,), by poses and parameters (3M, C)
     dpose: tuple[FloatArray, FloatArray]  # steps of the poses (6(K-1),), by the parameters (6(K-1), 18)
 
-    def moved(self, piece: Stretch, dx: FloatArray) -> Stretch:
-        """Return the stretch at the optimum after a step (18,) of the parameters."""
+    def moved(self, piece: Segment, dx: FloatArray) -> Segment:
+        """Return the segment at the optimum after a step (18,) of the parameters."""
         first, by_x = self.dpose
         dpose = first - by_x @ dx
         own, by_all = self.dp
@@ -271,10 +271,10 @@ class _Normal:
         T_cam0_world = se3_inverse(piece.T_world_cam0)
         T_cam0_world[1:] = se3_exp(dpose.reshape(-1, 6)) @ T_cam0_world[1:]
         p = piece.tracks.p_world + dp.reshape(-1, 3)
-        return Stretch(se3_inverse(T_cam0_world), replace(piece.tracks, p_world=p))
+        return Segment(se3_inverse(T_cam0_world), replace(piece.tracks, p_world=p))
 
 
-def _normal_equations(camera: StereoCamera, x: FloatArray, piece: Stretch, sigma: float, damping: float) -> _Normal:
+def _normal_equations(camera: StereoCamera, x: FloatArray, piece: Segment, sigma: float, damping: float) -> _Normal:
     tracks, K, M, X = piece.tracks, len(piece.T_world_cam0), len(piece.tracks.ids), len(NAMES)
     r, _, q = _residuals(camera, x, piece)
     J_q, J_x = _derivatives(camera, x, q)

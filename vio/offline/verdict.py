@@ -1,4 +1,4 @@
-"""What the comparison of a run with COLMAP's reconstructions says, in one sentence."""
+"""The conclusion of the comparison of a run with COLMAP's reconstructions, in one sentence."""
 
 from __future__ import annotations
 

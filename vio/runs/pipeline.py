@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
 
-from vio.calibration.found_rig import found_rig
+from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import CalibratedRig
 from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
@@ -83,7 +83,7 @@ class RunResult:
         if self.rig is None:
             return None
         recording = self.recording
-        return found_rig(self.rig, self.estimates[-1], recording.camera, str(recording.path))
+        return estimated_rig(self.rig, self.estimates[-1], recording.camera, str(recording.path))
 
     @property
     def trajectory(self) -> Trajectory:

@@ -192,13 +192,13 @@ def _shared(a: str, b: str) -> int:
 
 
 def _reference(filled: Sequence[Topic], notes: list[str]) -> Topic | None:
-    """Choose ground truth: a pose topic whose name says so; other poses may be another estimate and are only said."""
+    """Choose ground truth: a pose topic whose name states it; other poses, maybe estimates, are only reported."""
     poses = [t for t in filled if t.kind in (*POSES, ODOMETRY)]
     named = [t for t in poses if _TRUTH.search(t.name)]
     if named:
         return named[0]
     if poses:
-        notes.append(f"{_list([t.name for t in poses])} may be ground truth: say so with --topics reference=/NAME")
+        notes.append(f"{_list([t.name for t in poses])} may be ground truth: if so, give --topics reference=/NAME")
     return None
 
 

@@ -13,7 +13,7 @@ from vio.records import Estimate
 _MOST_LEFT_PX = 5.0  # a rig that leaves more of what the run saw is none of these cameras; true ones leave 0.3 px
 
 
-def found_rig(given: Rig, estimate: Estimate, camera: StereoCamera, where: str) -> CalibratedRig:
+def estimated_rig(given: Rig, estimate: Estimate, camera: StereoCamera, where: str) -> CalibratedRig:
     """Return a given rig with all that a run estimated of it.
 
     On a cylinder left and right stay as given: its stereo field is not expressed as a rig.
