@@ -14,11 +14,11 @@ rosbags = pytest.importorskip("rosbags", reason="needs the extra bags")
 
 from tests.bag_maker import Script, noise_frames  # noqa: E402
 from tests.same_events import assert_same_events  # noqa: E402
-from vio.cameras.camera_rig import CameraRig  # noqa: E402
+from vio.cameras.rig import Rig  # noqa: E402
 from vio.config import Config  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
-from vio.datasets.bags.one_camera import OneCameraBag  # noqa: E402
-from vio.datasets.rigs.kalibr import kalibr_camera_text  # noqa: E402
+from vio.datasets.bags.reader import BagDataset  # noqa: E402
+from vio.datasets.rigs.kalibr import kalibr_text  # noqa: E402
 from vio.errors import CalibrationError, ConfigError, DataError  # noqa: E402
 from vio.geometry.distortion import CameraModel  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402
@@ -31,7 +31,7 @@ START_NS = 10**18
 T_CAM0_IMU = se3_exp([0.1, -0.05, 0.02, 1.2, -1.2, 1.2])
 T_BASE_IMU = se3_exp([0.3, 0.2, -0.1, 0.1, 0.0, 0.4])
 LENS = (-0.3, 0.1, 0.001, -0.002)
-RIG = CameraRig(CameraModel(40.0, 41.0, 31.0, 23.0, 64, 48, "radtan", LENS), T_CAM0_IMU)
+RIG = Rig(CameraModel(40.0, 41.0, 31.0, 23.0, 64, 48, "radtan", LENS), T_cam0_imu=T_CAM0_IMU)
 FRAMES = [(time_ns, left) for time_ns, left, _ in noise_frames(4)]
 SAMPLES = [ImuSample(START_NS + 5_000_000 * k, np.array([0.1, 0.2, k]), np.array([0.0, 0, 9.8])) for k in range(-4, 34)]
 
@@ -79,7 +79,7 @@ def test_a_flight_of_one_camera_is_the_same_recording_to_the_bit(
     np.testing.assert_allclose(truth.T_world_body, b.reference.T_world_body, atol=1e-12)
     assert_same_events(folder, bag)
     assert_same_events(folder, bag, 5, 9)
-    assert isinstance(bag, OneCameraBag)
+    assert isinstance(bag, BagDataset)
     assert b.notes == ()
 
 
@@ -112,7 +112,7 @@ def folder_of_one(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "left").mkdir()
     for time_ns, image in FRAMES:
         cv2.imwrite(str(folder / "left" / f"{time_ns}.png"), image)
-    (folder / "calibration.yaml").write_text(kalibr_camera_text(RIG))
+    (folder / "calibration.yaml").write_text(kalibr_text(RIG))
     rows = [",".join([str(s.time_ns), *(repr(float(x)) for x in (*s.gyro, *s.accel))]) for s in SAMPLES]
     header = "#timestamp [ns],w_x [rad s^-1],w_y,w_z,a_x [m s^-2],a_y,a_z"
     (folder / "imu.csv").write_text("\n".join([header, *rows]))
@@ -136,12 +136,12 @@ def test_camera_info_and_static_frames_are_the_calibration(storage: str, folder_
 def test_a_file_beside_the_bag_is_read_before_camera_info(folder_of_one: Path, tmp_path: Path) -> None:
     path = script_of().write(tmp_path / "f")
     other = replace(RIG, cam0=replace(RIG.cam0, fu=50.0))
-    (path / "calibration.yaml").write_text(kalibr_camera_text(other))
+    (path / "calibration.yaml").write_text(kalibr_text(other))
     recording = open_dataset(path).recording
-    assert recording.camera == other.undistorter().camera
+    assert recording.camera == other.rectifier().camera
     assert "the calibration is calibration.yaml, not the bag's CameraInfo" in recording.notes
     settings = DatasetSettings(calibration=folder_of_one / "calibration.yaml")
-    assert open_dataset(path, settings).recording.camera == RIG.undistorter().camera
+    assert open_dataset(path, settings).recording.camera == RIG.rectifier().camera
 
 
 def test_rectified_images_take_the_projection_matrix_alone(tmp_path: Path) -> None:
@@ -176,7 +176,7 @@ def test_raw_and_compressed_images_of_one_camera_are_one_camera(
         script.compressed("/camera/image_raw/compressed", time_ns, image)
     for sample in SAMPLES:
         script.imu("/imu", sample)
-    (tmp_path / "c.yaml").write_text(kalibr_camera_text(RIG))
+    (tmp_path / "c.yaml").write_text(kalibr_text(RIG))
     path = script.write(tmp_path / "f")
     bag = open_dataset(path, DatasetSettings(calibration=tmp_path / "c.yaml"))
     assert bag.recording.camera.kind == "mono"

@@ -167,7 +167,7 @@ def test_topics_may_be_named(tmp_path: Path) -> None:
     calibration.write_text(kalibr_text(RIG))
     dataset = open_dataset(path, DatasetSettings(topics="left=/a, right=b", calibration=calibration))
     assert isinstance(dataset, BagDataset)
-    assert [topic.name for topic in dataset.roles.cameras] == ["/a", "/b"]
+    assert [topic.name for topic in dataset.topics] == ["/a", "/b"]
     assert "not used: /left/image_raw, /right/image_raw" in dataset.recording.notes
 
 
@@ -198,7 +198,7 @@ def test_a_file_beside_the_bag_that_is_no_calibration_leaves_camera_info(tmp_pat
     assert recording.camera.baseline_m == pytest.approx(0.11, abs=1e-12)
     (note,) = [note for note in recording.notes if "CameraInfo" in note]
     assert note.startswith("the bag's CameraInfo serves, as ")
-    assert "calibration.yaml: is no stereo calibration of a known format" in note
+    assert "calibration.yaml: is no calibration of a known format" in note
 
 
 def test_the_moving_frames_of_tf_are_ground_truth_where_they_are_named(tmp_path: Path) -> None:

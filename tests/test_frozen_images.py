@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from vio.cameras.camera_rig import with_virtual_baseline
+from vio.cameras.rig import with_virtual_baseline
 from vio.config import load_config
 from vio.evaluation.trajectories import evaluate
 from vio.geometry.lie import se3_exp

@@ -17,11 +17,10 @@ import vio
 from tests.test_frontend_scene import CAMERA as WALL_CAMERA
 from tests.test_frontend_scene import SLANTED
 from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
-from vio.cameras.camera_rig import CameraRig, with_virtual_baseline
-from vio.cameras.rig import Rig
+from vio.cameras.rig import Rig, with_virtual_baseline
 from vio.config import Config
 from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.rigs.kalibr import kalibr_camera_text
+from vio.datasets.rigs.kalibr import kalibr_text
 from vio.errors import CalibrationError, ConfigError, DataError
 from vio.evaluation.trajectories import nees_bounds
 from vio.filters.alignment import Bearings, FreeMotion, align, gyro_bias
@@ -273,7 +272,7 @@ def test_virtual_baseline_makes_the_noise_of_depths_that_of_disparities(depth_m:
 
 # --- recordings -----------------------------------------------------------------------------------------------------
 
-RIG = CameraRig(CameraModel(300.0, 300.0, 239.5, 149.5, 480, 300), np.eye(4), depth_factor=1000.0)
+RIG = Rig(CameraModel(300.0, 300.0, 239.5, 149.5, 480, 300), T_cam0_imu=np.eye(4), depth_factor=1000.0)
 
 
 def _mono_folder(folder: Path, name: str = "left") -> Path:
@@ -281,7 +280,7 @@ def _mono_folder(folder: Path, name: str = "left") -> Path:
     for k in range(4):
         cv2.imwrite(str(folder / name / f"{k}.png"), _walls()[k][0])
     (folder / "times.txt").write_text("\n".join(f"{k * 0.05:.2f}" for k in range(4)))
-    (folder / "calibration.yaml").write_text(kalibr_camera_text(RIG))
+    (folder / "calibration.yaml").write_text(kalibr_text(RIG))
     rows = [f"{int(k * 5e6)},0,0,0,0,0,9.81" for k in range(60)]
     header = "#timestamp [ns],w_x [rad s^-1],w_y,w_z,a_x [m s^-2],a_y,a_z"
     (folder / "imu.csv").write_text("\n".join([header, *rows]))
@@ -315,7 +314,7 @@ def test_folder_with_depth_images_is_read_in_metres(tmp_path: Path) -> None:
     frame = next(e for e in dataset.events() if isinstance(e, StereoFrame))
     assert frame.depth is not None
     np.testing.assert_allclose(frame.depth, _walls()[0][1], atol=6e-4)
-    (folder / "calibration.yaml").write_text(kalibr_camera_text(replace(RIG, depth_factor=None)))
+    (folder / "calibration.yaml").write_text(kalibr_text(replace(RIG, depth_factor=None)))
     with pytest.raises(CalibrationError, match="depth_factor"):
         open_dataset(folder)
 
@@ -479,7 +478,7 @@ def test_inspect_shows_depth_images_and_a_wrong_unit(tmp_path: Path, capsys: pyt
     true = np.median(_walls()[0][1])
     assert report["parts"]["depth"]["median_m"] == pytest.approx(true, rel=0.1)
     assert report["parts"]["tracking"]["matched_median"] > 40
-    (folder / "calibration.yaml").write_text(kalibr_camera_text(replace(RIG, depth_factor=1.0)))
+    (folder / "calibration.yaml").write_text(kalibr_text(replace(RIG, depth_factor=1.0)))
     status, report = _inspected(folder, capsys)
     assert status == 1
     assert "check depth_factor" in report["faults"][0]

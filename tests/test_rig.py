@@ -432,13 +432,13 @@ def _lonely_ros(folder: Path) -> Path:
 BAD = {
     "no such file": (lambda f: f / "none.yaml", r"none\.yaml does not exist; give Kalibr's camchain"),
     "empty folder": (lambda f: f, "holds no calibration; looked for Kalibr's"),
-    "another YAML file": (_text("a.yaml", "colour: green\n"), "is no stereo calibration of a known format"),
+    "another YAML file": (_text("a.yaml", "colour: green\n"), "is no calibration of a known format"),
     "no YAML": (_text("a.yaml", "cam0: [1, 2\n"), "not a YAML file"),
     "a list": (_text("a.yaml", "- 1\n- 2\n"), "holds no calibration"),
     "YAML with tags": (_text("a.yaml", "cam0: !!python/object/apply:os.system ['ls']\n"), "write plain numbers"),
     "deeply nested YAML": (_text("a.yaml", "a: " + "[" * 1200 + "]" * 1200), "not a YAML file"),
     "binary": (_text("a.yaml", "\0\1\2"), "not a YAML file"),
-    "one camera": (_camchain(lambda c: c.pop("cam1")), "is no stereo calibration of a known format"),
+    "one camera": (_camchain(lambda c: c.pop("cam1")), "is the calibration of one camera; name the pair"),
     "no pose": (
         _camchain(lambda c: (c["cam1"].pop("T_cn_cnm1"), c["cam1"].pop("T_cam_imu"))),
         "states no pose of cam1; add T_cn_cnm1",
@@ -490,7 +490,7 @@ BAD = {
 def test_bad_calibrations_are_refused_in_one_line(name: str, tmp_path: Path) -> None:
     make, message = BAD[name]
     with pytest.raises(CalibrationError, match=message) as caught:
-        vio.load_rig(make(tmp_path))
+        vio.load_rig(make(tmp_path), cameras=2)
     assert "\n" not in str(caught.value).strip()
 
 

@@ -11,23 +11,19 @@ from typing import TYPE_CHECKING
 from vio._version import __version__
 
 if TYPE_CHECKING:
-    from vio.cameras.camera_rig import CameraRig
     from vio.cameras.rig import Rig
     from vio.config import load_config
     from vio.datasets import open_dataset
     from vio.datasets.rigs import load_rig
-    from vio.datasets.rigs.one_camera import load_camera
     from vio.evaluation.trajectories import evaluate
     from vio.live.odometry import Odometry
     from vio.runs.pipeline import run
 
 __all__ = [
-    "CameraRig",
     "Odometry",
     "Rig",
     "__version__",
     "evaluate",
-    "load_camera",
     "load_config",
     "load_rig",
     "open_dataset",
@@ -35,11 +31,9 @@ __all__ = [
 ]
 
 _MODULES = {  # loaded when the name is first used
-    "CameraRig": "vio.cameras.camera_rig",
     "Odometry": "vio.live.odometry",
     "Rig": "vio.cameras.rig",
     "evaluate": "vio.evaluation.trajectories",
-    "load_camera": "vio.datasets.rigs.one_camera",
     "load_config": "vio.config",
     "load_rig": "vio.datasets.rigs",
     "open_dataset": "vio.datasets",

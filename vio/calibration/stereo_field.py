@@ -206,9 +206,10 @@ def _scaled(rig: Rig, baseline: float, focal: float) -> Rig:
         factor = math.exp(focal)
         return replace(camera, fu=factor * camera.fu, fv=factor * camera.fv, coefficients=coefficients)
 
-    T = rig.T_cam1_cam0.copy()
+    cam1, T_cam1_cam0 = rig.right
+    T = T_cam1_cam0.copy()
     T[:3, 3] *= math.exp(baseline)
-    return replace(rig, cam0=lens(rig.cam0), cam1=lens(rig.cam1), T_cam1_cam0=T)
+    return replace(rig, cam0=lens(rig.cam0), cam1=lens(cam1), T_cam1_cam0=T)
 
 
 def field_of(camera: StereoCamera, parameters: FloatArray) -> PixelField:
@@ -253,8 +254,8 @@ def _with_field(given: Rig, field: StereoFieldEstimate) -> CalibratedRig:
 
 def _expressible(given: Rig) -> BoolArray:
     """Return which parameters (14,) the lens models of a rig can hold."""
-    bends = all(c.model in _BENDS for c in (given.cam0, given.cam1))
-    radial = all(c.model != "double_sphere" for c in (given.cam0, given.cam1))
+    bends = all(c.model in _BENDS for c in given.cameras)
+    radial = all(c.model != "double_sphere" for c in given.cameras)
     held = {"p1": bends, "p2": bends, "q1": bends, "q2": bends, "k": radial, "k2": radial}
     return np.array([held.get(name, True) for name in PARAMETERS])
 
@@ -287,7 +288,7 @@ class _Frame:
             return self.given
         given, named = self.given, dict(zip(PARAMETERS, x.tolist(), strict=True))
         k, k2, q1, q2 = (named[name] for name in _BOTH)
-        b = given.cam1
+        b, T_cam1_cam0 = given.right
         b = replace(
             b,
             cu=b.cu + b.fu * named["cu"],
@@ -297,7 +298,7 @@ class _Frame:
         )
         cam0, cam1 = _bent(given.cam0, (k, k2), q1, q2), _bent(b, (k, k2), q1 + named["p1"], q2 + named["p2"])
         R = self.R_rect_cam1.T @ so3_exp(x[:3]) @ self.R_rect_cam0
-        centre = se3_inverse(given.T_cam1_cam0)[:3, 3]
+        centre = se3_inverse(T_cam1_cam0)[:3, 3]
         down = self.R_rect_cam0[1] * named["ty"] * np.linalg.norm(centre)
         centre = (centre + down) / np.hypot(1.0, named["ty"])
         return replace(given, cam0=cam0, cam1=cam1, T_cam1_cam0=se3_from_parts(R, -R @ centre))
@@ -305,10 +306,11 @@ class _Frame:
     def as_seen(self, x: FloatArray) -> FloatArray:
         """Return where the given rectification shows the grid's pixels (N, 4) if it is off by parameters (14,)."""
         true, out = self.moved(x), np.empty(self.grid.shape)
-        turn1 = true.T_cam1_cam0[:3, :3] @ self.R_rect_cam0.T
+        cam1, T_cam1_cam0 = true.right
+        turn1 = T_cam1_cam0[:3, :3] @ self.R_rect_cam0.T
         sides = (
             (self.given.cam0, true.cam0, self.R_rect_cam0.T, self.R_rect_cam0),
-            (self.given.cam1, true.cam1, turn1, self.R_rect_cam1),
+            (self.given.right[0], cam1, turn1, self.R_rect_cam1),
         )
         for column, (believed, real, turn, R_rect_cam) in zip((0, 2), sides, strict=True):
             raw, _ = project_point(real, left_rays(self.camera, self.grid[:, column : column + 2]) @ turn.T)

@@ -1,4 +1,4 @@
-"""The stereo rig that recordings, calibration files and callers of the library describe, and its rectification."""
+"""The one or two cameras that recordings, calibration files and callers describe, and their rectification."""
 
 from __future__ import annotations
 
@@ -19,39 +19,55 @@ from vio.geometry.rectify import (
     field_of_view,
     rectified_cameras,
     rectify,
+    undistorted,
 )
-from vio.geometry.stereo import StereoCamera
-from vio.records import Image, ImuDensities
+from vio.geometry.stereo import StereoCamera, one_camera
+from vio.records import Image, ImuDensities, StereoFrame
 
 _ROTATION_TOLERANCE = 1e-3  # largest entry of R^T R - I accepted as rounding
 _EXACT = 1e-12  # rotations this close to orthonormal keep their bits
 _PARTS = 32  # of a pixel, in which OpenCV's remap counts
+# Standard deviation of a virtual disparity over that of the pixels of a track, which are those of two exposures.
+_DISPARITY_SIGMAS = 2**0.5
+_PIXEL_SIGMA_PX = 0.2  # of a tracked feature; what the filter learns on real images is 0.1 to 0.3
 LookUp: TypeAlias = tuple[npt.NDArray[Any], npt.NDArray[Any]]  # maps for cv2.remap: u and v, or those of `fixed_point`
 
 
 @dataclass(frozen=True, slots=True)
 class Rectifier:
-    """The rectification of a rig's raw images."""
+    """The rectification of a rig's raw images; of one camera, its undistortion, which keeps its direction."""
 
-    rig: StereoRig
-    camera: StereoCamera  # rectified
+    lenses: StereoRig | CameraModel  # the raw cameras, or the only one
+    camera: StereoCamera  # rectified; of kind "mono" or "rgbd" for one camera
     T_rect0_imu: FloatArray  # (4, 4)
-    maps: tuple[LookUp, LookUp] | None  # left, right; None: nothing to do
+    maps: tuple[LookUp, ...] | None  # left, and right where there is one; None: nothing to do
     interpolation: Interpolation
     time_offset_s: float = 0.0  # of the calibration; readers take it out of the IMU's stamps
+
+    @property
+    def rig(self) -> StereoRig:
+        """The raw cameras.
+
+        Raises:
+            CalibrationError: there is one camera.
+        """
+        if isinstance(self.lenses, CameraModel):
+            raise CalibrationError("this calibration has one camera, where a stereo pair is needed")
+        return self.lenses
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What rectifying keeps of a wide lens; nothing for a lens that a planar image can hold."""
         if self.maps is None:
             return ()
-        seen, kept = (np.degrees(field_of_view(camera)) for camera in (self.rig.cam0, self.camera))
+        lens = self.lenses if isinstance(self.lenses, CameraModel) else self.lenses.cam0
+        seen, kept = (np.degrees(field_of_view(camera)) for camera in (lens, self.camera))
         if seen.max() <= 2 * np.degrees(PINHOLE_REACH):
             return ()
         form = "a cylinder about the baseline" if self.camera.is_cylinder else "a pinhole's image"
         return (
             f"the lens shows {seen[0]:.0f} x {seen[1]:.0f} deg; rectified to {form}, {kept[0]:.0f} x {kept[1]:.0f} deg "
-            f"are kept, at {self.camera.fu:.0f} px per radian in the middle (the lens: {self.rig.cam0.fu:.0f})",
+            f"are kept, at {self.camera.fu:.0f} px per radian in the middle (the lens: {lens.fu:.0f})",
         )
 
     def __call__(self, left: Image, right: Image) -> tuple[Image, Image]:
@@ -61,8 +77,24 @@ class Rectifier:
         return self.left(left), remap(right, self.maps[1], self.interpolation)
 
     def left(self, image: Image) -> Image:
-        """Rectify a raw left image (H, W) alone."""
+        """Rectify a raw left image (H, W) alone, or the image of one camera."""
         return image if self.maps is None else remap(image, self.maps[0], self.interpolation)
+
+    def depth(self, depth_m: FloatArray) -> FloatArray:
+        """Undistort a depth image (H, W) in metres: each pixel takes the nearest depth, as means cross outlines."""
+        if self.maps is None:
+            return depth_m
+        u, v = (np.rint(m).astype(np.int64) for m in self.maps[0])
+        inside = (u >= 0) & (v >= 0) & (u < depth_m.shape[1]) & (v < depth_m.shape[0])
+        out: FloatArray = np.where(inside, depth_m[np.where(inside, v, 0), np.where(inside, u, 0)], 0.0)
+        return out
+
+    def frame(
+        self, index: int, time_ns: int, left: Image, right: Image | None = None, *, depth_m: FloatArray | None = None
+    ) -> StereoFrame:
+        """Return the rectified frame of raw images (H, W) and, where there is one, a depth image (H, W) in metres."""
+        left_image, right_image = (self.left(left), None) if right is None else self(left, right)
+        return StereoFrame(index, time_ns, left_image, right_image, None if depth_m is None else self.depth(depth_m))
 
 
 def rectifier_of(
@@ -100,27 +132,48 @@ def remap(image: Image, maps: LookUp, interpolation: Interpolation) -> Image:
     return np.asarray(out, dtype=np.uint8)
 
 
+def with_virtual_baseline(camera: StereoCamera, depth_noise: float) -> StereoCamera:
+    """Return a camera with depth images as a pair whose disparities are as uncertain as the depths.
+
+    A depth's standard deviation `k z^2` makes one of `fu b k` of the disparity `fu b / z`, at every depth. The baseline
+    b is chosen so that it is that of a stereo match, of which each pixel has the noise of a tracked feature.
+    Reference: Khoshelham & Elberink, Accuracy and resolution of Kinect depth data, Sensors (2012), for `k z^2`.
+
+    Args:
+        camera: undistorted.
+        depth_noise: k, 1/m; 0.0012 to 0.0019 for structured light.
+    """
+    baseline_m = _DISPARITY_SIGMAS * _PIXEL_SIGMA_PX / (camera.fu * depth_noise)
+    return replace(camera, baseline_m=baseline_m, kind="rgbd")
+
+
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """Two cameras and, where there is one, an inertial sensor, as calibrated.
+    """One camera or two and, where there is one, an inertial sensor, as calibrated.
 
-    Build one with `Rig.rectified`, `Rig.raw` or `vio.load_rig`. Images of raw cameras are rectified by `rectifier`; the
-    estimator works with `camera` and `T_rect0_imu`, those of the rectified images.
+    Build a pair with `Rig.rectified` or `Rig.raw`, one camera as `Rig(camera_model, T_cam0_imu=T)`, any with
+    `vio.load_rig`. Raw images are rectified by `rectifier`; the estimator works with `camera` and `T_rect0_imu`, those
+    of the rectified images.
     """
 
-    cam0: CameraModel  # left
-    cam1: CameraModel  # right
-    T_cam1_cam0: FloatArray  # (4, 4) maps points of the left camera to the right one, metres
+    cam0: CameraModel  # left, or the only one
+    cam1: CameraModel | None = None  # right; None: there is one camera
+    T_cam1_cam0: FloatArray | None = None  # (4, 4) maps points of the left camera to the right one, metres
     T_cam0_imu: FloatArray | None = None  # (4, 4) of the left camera as calibrated; None: no sensor, the body is cam0
     imu_noise: ImuDensities | None = None
     time_offset_s: float = 0.0  # a frame stamped t was exposed at t + offset of the IMU's clock
     notes: tuple[str, ...] = ()  # what a reader of calibration files found and assumed
     residual_px: float = 0.0  # by how much pixels are known to be off still (rms): what the lens models cannot hold
+    depth_factor: float | None = None  # levels of its depth images in a metre; None: not stated, or there are none
 
     def __post_init__(self) -> None:
-        _check_rigid(self.T_cam1_cam0, "T_cam1_cam0")
-        if self.T_cam0_imu is not None:
-            _check_rigid(self.T_cam0_imu, "T_cam0_imu")
+        if (self.cam1 is None) != (self.T_cam1_cam0 is None):
+            raise CalibrationError("give both cam1 and T_cam1_cam0 or, for one camera, neither")
+        for name, T in (("T_cam1_cam0", self.T_cam1_cam0), ("T_cam0_imu", self.T_cam0_imu)):
+            if T is not None:
+                _check_rigid(T, name)
+        if self.depth_factor is not None and not self.depth_factor > 0:
+            raise CalibrationError(f"the depth factor is {self.depth_factor:g}; give levels per metre, such as 1000")
         if not np.isfinite(self.time_offset_s):
             raise CalibrationError(f"the time offset of camera and IMU is {self.time_offset_s}; give finite seconds")
 
@@ -204,23 +257,46 @@ class Rig:
         return cls(cam0, cam1, T, _rigid(T_cam0_imu, "T_cam0_imu"), imu_noise, time_offset_s)
 
     @property
+    def cameras(self) -> tuple[CameraModel, ...]:
+        """The cameras: left and right, or the only one."""
+        return (self.cam0,) if self.cam1 is None else (self.cam0, self.cam1)
+
+    @property
+    def right(self) -> tuple[CameraModel, FloatArray]:
+        """The right camera and `T_cam1_cam0` (4, 4).
+
+        Raises:
+            CalibrationError: there is one camera.
+        """
+        if self.cam1 is None or self.T_cam1_cam0 is None:
+            raise CalibrationError("this rig has one camera, where a stereo pair is needed")
+        return self.cam1, self.T_cam1_cam0
+
+    @property
     def stereo(self) -> StereoRig:
-        """The cameras mounted on the body: on the IMU, or on cam0 where there is none."""
+        """The cameras mounted on the body: on the IMU, or on cam0 where there is none.
+
+        Raises:
+            CalibrationError: there is one camera.
+        """
+        cam1, T_cam1_cam0 = self.right
         T_imu_cam0 = np.eye(4) if self.T_cam0_imu is None else se3_inverse(self.T_cam0_imu)
-        return StereoRig(self.cam0, self.cam1, T_imu_cam0, T_imu_cam0 @ se3_inverse(self.T_cam1_cam0))
+        return StereoRig(self.cam0, cam1, T_imu_cam0, T_imu_cam0 @ se3_inverse(T_cam1_cam0))
 
     @property
     def is_rectified(self) -> bool:
-        """Whether the images need no rectification: equal pinhole cameras, rows aligned to 0.01 px."""
-        return rectified_pair(self.stereo) is not None
+        """Whether images need no rectification: a pinhole, or equal pinholes with rows aligned to 0.01 px."""
+        return self.cam0.model == "pinhole" if self.cam1 is None else rectified_pair(self.stereo) is not None
 
     @property
     def camera(self) -> StereoCamera:
-        """The rectified pair: that of the images themselves, or of what `rectifier` makes of them.
+        """The rectified pair, or one undistorted camera: of the images, or of what `rectifier` makes of them.
 
         Raises:
             CalibrationError: the cameras coincide, diverge, are swapped, or share no field of view.
         """
+        if self.cam1 is None:
+            return _undistorted(self.cam0)[0]
         pair = rectified_pair(self.stereo)
         camera = rectified_cameras(self.stereo, "auto").camera if pair is None else self._exact(pair)
         return replace(camera, residual_px=self.residual_px)
@@ -228,18 +304,32 @@ class Rig:
     @property
     def T_rect0_imu(self) -> FloatArray | None:
         """Extrinsics (4, 4) of the rectified left camera, as the estimator takes them; None: no inertial sensor."""
-        if self.T_cam0_imu is None or self.is_rectified:
+        if self.T_cam0_imu is None or self.cam1 is None or self.is_rectified:
             return self.T_cam0_imu
         return rectified_cameras(self.stereo).T_rect0_imu
 
-    def rectifier(self, interpolation: Interpolation = "linear", projection: ProjectionMode = "auto") -> Rectifier:
-        """Return the map of raw image pairs (H, W) to rectified ones; the identity for a rectified rig.
+    def rectifier(
+        self,
+        interpolation: Interpolation = "linear",
+        projection: ProjectionMode = "auto",
+        *,
+        depth_noise: float | None = None,
+    ) -> Rectifier:
+        """Return what rectifies raw images (H, W), or undistorts those of one camera; the identity where none is raw.
 
-        `projection` is that of the rectified images: a cylinder about the baseline for wide lenses by default.
+        Args:
+            interpolation: how gray values between pixels are found.
+            projection: of rectified pairs: a cylinder about the baseline for wide lenses by default.
+            depth_noise: of one camera, `k` of a depth's standard deviation `k depth^2`, 1/m; None: no depth images.
 
         Raises:
             CalibrationError: as `camera`.
         """
+        if self.cam1 is None:
+            camera, maps = _undistorted(self.cam0)
+            camera = camera if depth_noise is None else with_virtual_baseline(camera, depth_noise)
+            T = np.eye(4) if self.T_cam0_imu is None else self.T_cam0_imu
+            return Rectifier(self.cam0, camera, T, maps, interpolation, self.time_offset_s)
         made = rectifier_of(self.stereo, interpolation, projection)
         camera = replace(made.camera, residual_px=self.residual_px)
         made = replace(made, camera=camera, time_offset_s=self.time_offset_s)
@@ -250,13 +340,26 @@ class Rig:
 
     def _exact(self, pair: StereoCamera) -> StereoCamera:
         """Return a rectified pair with the baseline as stated, which the way through the body would round."""
-        x, y, z = self.T_cam1_cam0[:3, 3].tolist()
-        stated = not np.any(self.T_cam1_cam0[:3, :3] != np.eye(3)) and y == z == 0
+        _, T = self.right
+        x, y, z = T[:3, 3].tolist()
+        stated = not np.any(T[:3, :3] != np.eye(3)) and y == z == 0
         return replace(pair, baseline_m=-x) if stated else pair
 
     def noting(self, *notes: str) -> Rig:
         """Return the rig with further notes."""
         return replace(self, notes=(*self.notes, *notes))
+
+    def left_alone(self) -> Rig:
+        """Return the left camera, with its inertial sensor, as a rig of one camera."""
+        return replace(self, cam1=None, T_cam1_cam0=None, residual_px=0.0)
+
+
+def _undistorted(lens: CameraModel) -> tuple[StereoCamera, tuple[LookUp] | None]:
+    """Return one camera without its distortion, and the map of its images; None: it has none."""
+    if lens.model == "pinhole":
+        return one_camera(lens.fu, lens.fv, lens.cu, lens.cv, lens.width, lens.height), None
+    camera, maps = undistorted(lens)
+    return camera, (maps,)
 
 
 def camera_from_matrix(

@@ -41,13 +41,13 @@ def _plain(path: Path, settings: DatasetSettings) -> Dataset:
 
 
 def _mono(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.one_camera import read_mono
+    from vio.datasets.plain import read_mono
 
     return read_mono(path, settings)
 
 
 def _rgbd(path: Path, settings: DatasetSettings) -> Dataset:
-    from vio.datasets.one_camera import read_rgbd
+    from vio.datasets.plain import read_rgbd
 
     return read_rgbd(path, settings)
 
@@ -182,7 +182,7 @@ def _detect(path: Path) -> str:
 
 def _unknown(path: Path) -> str:
     """Say what is missing where a folder holds images, else what was looked for."""
-    from vio.datasets.one_camera import images_of_one_camera
+    from vio.datasets.plain import images_of_one_camera
 
     images = images_of_one_camera(path) if path.is_dir() else None
     if images is None:
@@ -199,8 +199,13 @@ def _folder_kind(path: Path) -> str | None:
     from vio.datasets.gtsam import factor_files
     from vio.datasets.kitti import is_kitti_folder
     from vio.datasets.kitti_raw import is_kitti_raw_folder
-    from vio.datasets.one_camera import is_mono_folder, is_rgbd_folder
-    from vio.datasets.plain import holds_more_than_kitti, image_folders, is_plain_folder, lacks_sensor_yaml
+    from vio.datasets.plain import (
+        holds_more_than_kitti,
+        is_mono_folder,
+        is_plain_folder,
+        is_rgbd_folder,
+        lacks_sensor_yaml,
+    )
     from vio.datasets.videos import video_files
 
     try:
@@ -220,7 +225,7 @@ def _folder_kind(path: Path) -> str | None:
         return "plain" if holds_more_than_kitti(path) else "kitti"
     if is_kitti_raw_folder(path):
         return "kitti_raw"
-    if is_euroc_folder(path) and image_folders(path) is None and is_mono_folder(path):
+    if is_euroc_folder(path) and not is_plain_folder(path) and is_mono_folder(path):
         return "mono"
     if is_euroc_folder(path):
         return "plain" if lacks_sensor_yaml(path) else "euroc"

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
-from vio.cameras.camera_rig import CameraRig, Undistorter
 from vio.cameras.rig import Rectifier, Rig
 from vio.datasets.common import naming
+from vio.datasets.image_pairs import ImageSize
 from vio.datasets.kitti import read_extrinsics
 from vio.datasets.overlap import check_overlap, reference_of_body
 from vio.datasets.rigs import find_calibration
 from vio.datasets.samples import imu_samples, in_time_order
+from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import read_imu_table, read_velocity_table
-from vio.datasets.unused import Layout
+from vio.datasets.unused import Layout, unused_note
 from vio.errors import CalibrationError, DataError
 from vio.files.trajectories import read_trajectory
-from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource, Trajectory
+from vio.records import NS_PER_S, IntArray, MotionSample, Recording, Trajectory
 
-AnyRig = TypeVar("AnyRig", Rig, CameraRig)
 IMU_FILES = ("imu.csv", "imu.txt", "imu0.csv", "imu_data.csv", "imu0/data.csv")
 _REFERENCES = (
     "reference.tum",
@@ -62,7 +61,68 @@ def find_calibration_of(layout: Layout) -> Path:
     )
 
 
-def with_extrinsics(rig: AnyRig, layout: Layout, file: Path) -> tuple[AnyRig, list[Path]]:
+@dataclass(frozen=True, slots=True)
+class Companions:
+    """A recording of image files or videos, and what its frames are read with."""
+
+    recording: Recording
+    motion: Sequence[MotionSample]  # in time order
+    rectifier: Rectifier
+    sizes: tuple[ImageSize, ...]  # of each camera
+
+
+def read_companions(
+    kind: str,
+    layout: Layout,
+    calibration: tuple[Path, Rig],
+    settings: DatasetSettings,
+    times: tuple[IntArray, Path | None],
+    notes: Sequence[str],
+    used: Sequence[Path],
+    *,
+    has_depths: bool = False,
+) -> Companions:
+    """Read what lies beside images: the pose of the IMU, its samples, velocities and ground truth.
+
+    Args:
+        kind: of the recording.
+        layout: where its parts lie.
+        calibration: the file and its rig.
+        settings: reader settings.
+        times: of the frames (F,), and the file that they are from; None: assumed.
+        notes: about images and times.
+        used: further files and folders that were read, or are known not to matter.
+        has_depths: whether one camera has depth images.
+
+    Raises:
+        DataError: samples or ground truth cannot be used.
+        CalibrationError: the rig cannot be rectified, or samples need the pose of their sensor.
+    """
+    (file, rig), (times_ns, times_file) = calibration, times
+    rig, extrinsics = _with_extrinsics(rig, layout, file)
+    motion, motion_files, motion_notes = _read_motion(layout, rig, times_ns, times_file is not None)
+    with naming(file):
+        depth_noise = settings.depth_noise if has_depths else None
+        rectifier = rig.rectifier(settings.interpolation, settings.projection, depth_noise=depth_noise)
+    reference, reference_file = _read_reference(layout, rig, rectifier, times_ns)
+    read = [file, times_file, *extrinsics, *motion_files, reference_file, *used]
+    unused = unused_note(layout, [source for source in read if source is not None])
+    has_body = rig.T_cam0_imu is not None and (rig.cam1 is not None or len(motion_files) > 0)
+    recording = Recording(
+        kind=kind,
+        path=layout.root,
+        camera=rectifier.camera,
+        T_cam0_imu=rectifier.T_rect0_imu if has_body else None,
+        frame_times_ns=times_ns,
+        has_images=True,
+        motion=frozenset("velocity" if file.name == "velocity.csv" else "imu" for file in motion_files),
+        reference=reference,
+        notes=(*notes, *rig.notes, *rectifier.notes, *motion_notes, *unused),
+    )
+    return Companions(recording, motion, rectifier, tuple(ImageSize(c.width, c.height, file) for c in rig.cameras))
+
+
+def _with_extrinsics(rig: Rig, layout: Layout, file: Path) -> tuple[Rig, list[Path]]:
     """Add `T_cam0_imu.txt` where the calibration itself has none."""
     path = layout.root / "T_cam0_imu.txt"
     if rig.T_cam0_imu is not None or not path.is_file():
@@ -70,8 +130,8 @@ def with_extrinsics(rig: AnyRig, layout: Layout, file: Path) -> tuple[AnyRig, li
     return replace(rig, T_cam0_imu=read_extrinsics(path)), [path]
 
 
-def read_motion(
-    layout: Layout, rig: Rig | CameraRig, times_ns: IntArray, timed: bool
+def _read_motion(
+    layout: Layout, rig: Rig, times_ns: IntArray, timed: bool
 ) -> tuple[Sequence[MotionSample], list[Path], list[str]]:
     """Read the IMU and the velocities, on the clock of the images; return the samples, their files and notes."""
     imu = next((f for base in (layout.root, layout.base) for n in IMU_FILES if (f := base / n).is_file()), None)
@@ -104,13 +164,8 @@ def read_motion(
     return in_time_order(*parts), files, notes
 
 
-def sources_of(files: Sequence[Path]) -> frozenset[MotionSource]:
-    """Return the kinds of motion samples that files hold."""
-    return frozenset("velocity" if file.name == "velocity.csv" else "imu" for file in files)
-
-
-def read_reference(
-    layout: Layout, rig: Rig | CameraRig, rectifier: Rectifier | Undistorter, times_ns: IntArray
+def _read_reference(
+    layout: Layout, rig: Rig, rectifier: Rectifier, times_ns: IntArray
 ) -> tuple[Trajectory | None, Path | None]:
     """Read the ground truth as that of the body: the IMU, or the rectified left camera where there is none."""
     bases = (layout.root, layout.base, layout.root / "dso")
@@ -124,6 +179,3 @@ def read_reference(
         truth = replace(truth, times_ns=times_ns[: len(truth)], frame_indices=np.arange(len(truth)))
     with naming(file):
         return reference_of_body(truth, rig, rectifier), file
-
-
-# --- what is not used -----------------------------------------------------------------------------------------------

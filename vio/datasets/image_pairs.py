@@ -1,4 +1,4 @@
-"""Recordings of two image folders: paired by name, prefetched, with unusable frames skipped."""
+"""Recordings of one or two image folders: paired by name, prefetched, with unusable frames skipped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from vio.records import Event, Image, MotionSample, Observations, Recording, Ste
 logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item")
-ImagePairs = Sequence[tuple[Path, Path]]  # left and right image of each frame
+ImagePairs = Sequence[tuple[Path, Path]]  # left and right image of each frame; of one camera, the same twice
 
 _NAMED = 5  # skipped frames that get a line each; the others are counted in one at the end
 
@@ -114,6 +114,19 @@ def first_readable(pairs: ImagePairs) -> tuple[Path, Image, int]:
     return last, *load_gray(last)
 
 
+def measured_images(pairs: ImagePairs) -> tuple[Path, tuple[int, int], int, tuple[str, ...]]:
+    """Return the first left image that can be read, its width and height, the level of white of all, and notes.
+
+    Raises:
+        UnreadableImageError: all left images are unreadable.
+    """
+    path, image, bits = first_readable(pairs)
+    white, notes = full_scale(pairs)
+    if bits == 16 and not notes:
+        notes = (f"images have 16 bits ({path.name}); scaled to 8 bits by 1/257",)
+    return path, (image.shape[1], image.shape[0]), white, notes
+
+
 @dataclass(frozen=True, slots=True)
 class ImageSize:
     """The size that the images of one camera must have."""
@@ -133,12 +146,12 @@ class ImageSize:
 
 @dataclass(frozen=True, slots=True)
 class ImageDataset:
-    """Implements `vio.protocols.Dataset` over pairs of image files that are rectified."""
+    """Implements `vio.protocols.Dataset` over image files that are rectified."""
 
     recording: Recording
     pairs: ImagePairs
     motion: Sequence[MotionSample]  # in time order
-    sizes: tuple[ImageSize, ImageSize]  # of the left and the right files
+    sizes: tuple[ImageSize, ...]  # of the left and the right files; one of one camera
     settings: DatasetSettings
     white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
 
@@ -158,26 +171,17 @@ class ImageDataset:
         """Return None: the recording holds images only."""
         return None
 
-    def prepared(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Preprocess a pair as read from the files (H, W each); returned unchanged, as it is rectified."""
-        return left, right
-
-    def prepared_left(self, left: Image) -> Image:
-        """Preprocess a left image (H, W) alone, as `prepared` does."""
-        return left
-
-    def _frame(self, index: int, left: Image | None, right: Image | None) -> StereoFrame:
+    def frame(self, index: int, left: Image, right: Image | None = None) -> StereoFrame:
+        """Return a frame of images as read from the files (H, W each), which are rectified."""
         return StereoFrame(index, int(self.recording.frame_times_ns[index]), left, right)
 
     def _load(self, index: int) -> StereoFrame | BadFrame:
         """Read one frame; runs in the prefetch thread."""
-        paths = self.pairs[index][: self.settings.cameras]
         try:
-            images = [load_gray(path, self.white)[0] for path in paths]
-            for size, image, path in zip(self.sizes, images, paths, strict=False):
-                size.check(image, path)
+            images = []
+            for size, path in zip(self.sizes[: self.settings.cameras], self.pairs[index], strict=False):
+                images.append(load_gray(path, self.white)[0])
+                size.check(images[-1], path)
+            return self.frame(index, *images)
         except UnreadableImageError as error:
             return BadFrame(index, str(error))
-        if len(images) == 1:
-            return self._frame(index, self.prepared_left(images[0]), None)
-        return self._frame(index, *self.prepared(*images))

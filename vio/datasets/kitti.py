@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from vio.datasets.common import check_intrinsics, checked_transform, clock_ns, naming, numbers_in
-from vio.datasets.image_pairs import ImageDataset, ImageSize, first_readable, full_scale, pair_images
+from vio.datasets.image_pairs import ImageDataset, ImageSize, measured_images, pair_images
 from vio.datasets.samples import velocity_samples
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.unused import Layout, unused_note
@@ -52,8 +52,8 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
     calibration = read_calibration(path / "calib.txt", cameras)
     pairs = pair_images(*(path / f"image_{k}" for k in cameras))
     times_ns = _read_times(path / "times.txt", path / f"image_{cameras[0]}", len(pairs))
-    measured, image, bits = first_readable(pairs)
-    size = ImageSize(image.shape[1], image.shape[0], measured)
+    measured, (width, height), white, depth_notes = measured_images(pairs)
+    size = ImageSize(width, height, measured)
     motion = _read_velocity(path / "velocity.csv", times_ns)
     T_cam0_imu = read_extrinsics(path / "T_cam0_imu.txt")
     if motion and T_cam0_imu is None:
@@ -61,10 +61,7 @@ def read_kitti(path: Path, settings: DatasetSettings) -> ImageDataset:
             f"{path}: velocity.csv needs T_cam0_imu.txt, the transform from the IMU to camera 0; add it, or "
             "remove velocity.csv to use the images alone"
         )
-    white, notes_on_depth = full_scale(pairs)
-    notes = list(notes_on_depth)
-    if bits == 16 and not notes:
-        notes.append(f"images have {bits} bits ({measured.name}); scaled to 8 bits by 1/257")
+    notes = list(depth_notes)
     if calibration.off_axis_m > _OFF_AXIS_NOTE_M:
         notes.append(
             f"the camera of image_{cameras[1]} is {1e3 * calibration.off_axis_m:.1f} mm off the x axis of that of "

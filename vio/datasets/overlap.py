@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.cameras.camera_rig import CameraRig, Undistorter
 from vio.cameras.rig import Rectifier, Rig
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse
@@ -22,7 +21,7 @@ def check_overlap(frame_times_ns: IntArray, times_ns: IntArray, where: Path | st
         raise DataError(f"{where}: no sample is within the time of the images; {finding.message}; or remove it")
 
 
-def reference_of_body(truth: Trajectory, rig: Rig | CameraRig, rectifier: Rectifier | Undistorter) -> Trajectory:
+def reference_of_body(truth: Trajectory, rig: Rig, rectifier: Rectifier) -> Trajectory:
     """Return ground truth of the raw left camera or of the IMU as that of the run's body.
 
     Raises:

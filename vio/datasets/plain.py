@@ -1,44 +1,43 @@
-"""A plain folder of stereo images: two image folders, a calibration, and what else lies there.
+"""A plain folder of images: one image folder, two, or one with depth images, a calibration, and what else lies there.
 
 Images: `left right`, `image_0 image_1`, `cam0 cam1` and other usual names, the files in the folder or in its `data` or
 `images`. Calibration: any that `vio.load_rig` reads. Optional: `times.txt`, `imu.csv`, `velocity.csv`,
 `T_cam0_imu.txt`, and ground truth in `reference.tum`. TUM-VI in both of its forms is such a folder. What lies there
 and is not used is named in the recording's notes.
+
+Without the right images it is a recording of one camera (`mono`). With `depth/`, whose files are named as the images,
+or in the layout of TUM RGB-D, it is one with depth images (`rgbd`): they have 16 bits, 0 being unknown, and show what
+the images show, pixel by pixel.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from vio.datasets.common import naming
-from vio.datasets.companions import (
-    IMU_FILES,
-    calibration_beside,
-    find_calibration_of,
-    read_motion,
-    read_reference,
-    sources_of,
-    with_extrinsics,
-)
+from vio.cameras.rig import Rig
+from vio.datasets.companions import IMU_FILES, calibration_beside, find_calibration_of, read_companions
 from vio.datasets.dates import drive_times, is_date
 from vio.datasets.euroc_files import stamped_rows
 from vio.datasets.image_files import FilePairs, ImageFiles
-from vio.datasets.image_pairs import ImagePairs, ImageSize, first_readable, full_scale
+from vio.datasets.image_pairs import ImagePairs, measured_images
 from vio.datasets.images import SUFFIXES, list_images
 from vio.datasets.pairing import pair_stamps
 from vio.datasets.rectified import RectifiedDataset
 from vio.datasets.rigs import find_calibration, load_rig
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import parse_stamps
-from vio.datasets.unused import Layout, unused_note
-from vio.errors import DataError
+from vio.datasets.tum_rgbd import LISTS, associated_images, is_tum_folder, published_camera
+from vio.datasets.unused import Layout
+from vio.errors import CalibrationError, DataError
 from vio.files.text import text_lines
-from vio.records import NS_PER_S, IntArray, Recording
+from vio.records import NS_PER_S, IntArray
 
-_FOLDERS = (
+_PAIRS: tuple[tuple[str, ...], ...] = (
     ("left", "right"),
     ("Left", "Right"),
     ("cam0", "cam1"),
@@ -52,6 +51,7 @@ _FOLDERS = (
     ("image_lcam_front", "image_rcam_front"),
     ("infra1", "infra2"),
 )
+_ALONE = ("left", "Left", "cam0", "image_0", "image_00", "image", "images", "rgb", "color", "mono")
 _INSIDE = ("data", "images", "")
 _ASSUMED_HZ = 10.0  # where no times are given and no other sensor needs them
 
@@ -78,28 +78,54 @@ def lacks_sensor_yaml(path: Path) -> bool:
     return calibration_beside(layout) is not None
 
 
-def image_folders(path: Path) -> tuple[Path, Path] | None:
-    """Return the left and right image folder of a plain folder; None: it has none."""
-    found = _layout(path)
-    return None if found is None else (found.left, found.right)
+def images_of_one_camera(path: Path) -> Path | None:
+    """Return the folder of images that a folder holds, whether or not anything else identifies them."""
+    layout = _layout_of_one(path)
+    return None if layout is None else layout.left
 
 
-def _layout(path: Path) -> Layout | None:
+def is_mono_folder(path: Path) -> bool:
+    """Return whether a folder holds the images of one camera, and a calibration identifies them."""
+    layout = _layout_of_one(path)
+    return layout is not None and calibration_beside(layout) is not None
+
+
+def is_rgbd_folder(path: Path) -> bool:
+    """Return whether a folder holds images and depth images."""
+    layout = _layout_of_one(path)
+    return is_tum_folder(path) or (layout is not None and _holds_images(layout.base / "depth"))
+
+
+def _layout(path: Path, choices: Sequence[tuple[str, ...]] = _PAIRS) -> Layout | None:
     for base in (path, path / "mav0"):
-        for names in _FOLDERS:
+        for names in choices:
             for inside in _INSIDE:
-                left, right = (base / name / inside for name in names)
-                if _holds_images(left) and _holds_images(right):
-                    return Layout(path, base, left, right)
+                folders = [base / name / inside for name in names]
+                if all(map(_holds_images, folders)):
+                    return Layout(path, base, folders[0], folders[-1])
     return None
+
+
+def _layout_of_one(path: Path) -> Layout | None:
+    return _layout(path, [(name,) for name in _ALONE])
 
 
 def _holds_images(folder: Path) -> bool:
     return folder.is_dir() and any(child.suffix.lower() in SUFFIXES for child in folder.iterdir())
 
 
+@dataclass(frozen=True, slots=True)
+class _Images:
+    """The image files of the frames."""
+
+    pairs: ImagePairs  # of one camera, each image twice
+    notes: tuple[str, ...] = ()
+    depths: Sequence[Path] | None = None  # depth images; None: there are none
+    listed_ns: IntArray | None = None  # times in TUM's lists; None: those of any plain folder
+
+
 def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
-    """Read a plain folder.
+    """Read a plain folder of stereo images.
 
     Raises:
         DataError: images, times or samples cannot be used; the message names file and remedy.
@@ -107,43 +133,110 @@ def read_plain(path: Path, settings: DatasetSettings) -> RectifiedDataset:
     """
     layout = _layout(path)
     if layout is None:
-        names = ", ".join(f"{a} {b}" for a, b in _FOLDERS[:4])
+        names = ", ".join(" ".join(names) for names in _PAIRS[:4])
         raise DataError(f"{path}: holds no pair of image folders ({names} or others); give one with left/ and right/")
     pairs, notes = pair_files(list_images(layout.left), list_images(layout.right))
-    measured, image, bits = first_readable(pairs)
-    white, depth_notes = full_scale(pairs)
-    if bits == 16 and not depth_notes:
-        depth_notes = (f"images have 16 bits ({measured.name}); scaled to 8 bits by 1/257",)
-    file = settings.calibration or find_calibration_of(layout)
-    rig = load_rig(file, image_size=(image.shape[1], image.shape[0]))
-    rig, used = with_extrinsics(rig, layout, file)
-    times_ns, times_file, time_notes = frame_times(layout, pairs)
-    motion, motion_files, motion_notes = read_motion(layout, rig, times_ns, times_file is not None)
-    with naming(file):
-        rectifier = rig.rectifier(settings.interpolation, settings.projection)
-    reference, reference_file = read_reference(layout, rig, rectifier, times_ns)
-    sources = [file, times_file, *used, *motion_files, reference_file]
-    recording = Recording(
-        kind="plain",
-        path=path,
-        camera=rectifier.camera,
-        T_cam0_imu=None if rig.T_cam0_imu is None else rectifier.T_rect0_imu,
-        frame_times_ns=times_ns,
-        has_images=True,
-        motion=sources_of(motion_files),
-        reference=reference,
-        notes=(
-            *notes,
-            *depth_notes,
-            *rig.notes,
-            *rectifier.notes,
-            *time_notes,
-            *motion_notes,
-            *unused_note(layout, [s for s in sources if s is not None]),
-        ),
+    return _read("plain", layout, _Images(pairs, notes), settings)
+
+
+def read_mono(path: Path, settings: DatasetSettings) -> RectifiedDataset:
+    """Read a folder of one camera.
+
+    Raises:
+        DataError: as `read_plain`.
+        CalibrationError: as `read_plain`.
+    """
+    layout = _layout_of_one(path)
+    if layout is None:
+        raise DataError(f"{path}: holds no folder of images ({', '.join(_ALONE[:4])} or others); give one with left/")
+    files = list_images(layout.left)
+    return _read("mono", layout, _Images(FilePairs(files, files)), settings)
+
+
+def read_rgbd(path: Path, settings: DatasetSettings) -> RectifiedDataset:
+    """Read a folder of images and depth images.
+
+    Raises:
+        DataError: as `read_plain`.
+        CalibrationError: as `read_plain`, or the unit of the depths is not given.
+    """
+    if is_tum_folder(path):
+        listed, depths, times_ns, notes = associated_images(path)
+        folder = listed[0].parent
+        images = _Images(FilePairs(listed, listed), notes, depths, times_ns)
+        return _read("rgbd", Layout(path, path, folder, folder), images, settings)
+    layout = _layout_of_one(path)
+    if layout is None or not _holds_images(layout.base / "depth"):
+        raise DataError(f"{path}: holds no images beside depth/; give rgb.txt and depth.txt, or left/ and depth/")
+    lefts, depth_images = list_images(layout.left), list_images(layout.base / "depth")
+    depth_of = {file.stem: k for k, file in enumerate(depth_images)}
+    files = lefts.take(k for k, file in enumerate(lefts) if file.stem in depth_of)
+    if not files:
+        raise DataError(f"{layout.base / 'depth'}: no file is named as one of {layout.left}; name them alike")
+    depths_of_files = depth_images.take(depth_of[file.stem] for file in files)
+    return _read("rgbd", layout, _Images(FilePairs(files, files), depths=depths_of_files), settings)
+
+
+def _read(kind: str, layout: Layout, images: _Images, settings: DatasetSettings) -> RectifiedDataset:
+    """Read what goes with the images: calibration, times, motion samples and ground truth."""
+    _, size, white, notes = measured_images(images.pairs)
+    is_tum, used = images.listed_ns is not None, list[Path]()
+    file = settings.calibration or (calibration_beside(layout) if is_tum else find_calibration_of(layout))
+    if file is None:
+        file, rig = layout.root / LISTS[0], published_camera(layout.root, size)
+    else:
+        rig = load_rig(file, image_size=size, cameras=2 if kind == "plain" else 1)
+    depth_factor = 1.0
+    if images.depths is not None:
+        depth_factor, factor_notes = _depth_factor(rig, settings, layout.root)
+        notes = (*notes, *factor_notes)
+        used += [layout.base / "depth", *(layout.root / name for name in LISTS)]
+    if images.listed_ns is None:
+        times_ns, times_file, time_notes = frame_times(layout, images.pairs)
+        notes = (*notes, *time_notes)
+    else:
+        times_ns, times_file = images.listed_ns, layout.root / LISTS[0]
+    if kind != "plain" and times_file == layout.left:  # EuRoC's list repeats the times that the images are named by
+        used.append(layout.left.parent / "data.csv")
+    found = read_companions(
+        kind,
+        layout,
+        (file, rig),
+        settings,
+        (times_ns, times_file),
+        (*images.notes, *notes),
+        used,
+        has_depths=images.depths is not None,
     )
-    sizes = (ImageSize(rig.cam0.width, rig.cam0.height, file), ImageSize(rig.cam1.width, rig.cam1.height, file))
-    return RectifiedDataset(recording, pairs, motion, sizes, settings, rectifier, rig.imu_noise, white=white)
+    return RectifiedDataset(
+        found.recording,
+        images.pairs,
+        found.motion,
+        found.sizes,
+        settings,
+        found.rectifier,
+        rig.imu_noise,
+        images.depths,
+        depth_factor,
+        white=white,
+    )
+
+
+def _depth_factor(rig: Rig, settings: DatasetSettings, where: Path) -> tuple[float, tuple[str, ...]]:
+    """Return the levels per metre of depth images, and a note where setting and calibration differ.
+
+    Raises:
+        CalibrationError: nothing states them.
+    """
+    factor = settings.depth_factor or rig.depth_factor
+    if factor is None:
+        raise CalibrationError(
+            f"{where}: the unit of its depth images is not given; add depth_factor (levels per metre, 1000 for "
+            "millimetres) to cam0 of the calibration, or --set dataset.depth_factor=1000"
+        )
+    if settings.depth_factor is None or rig.depth_factor in (None, factor):
+        return factor, ()
+    return factor, (f"dataset.depth_factor {factor:g} takes the place of the calibration's {rig.depth_factor:g}",)
 
 
 # --- images and times -----------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,9 +11,10 @@ import numpy as np
 from vio.cameras.rig import Rectifier, rectifier_of
 from vio.datasets.common import naming
 from vio.datasets.image_pairs import ImageDataset, ImageSize
-from vio.datasets.images import write_png
+from vio.datasets.images import UnreadableImageError, load_depth, write_png
 from vio.errors import DataError
 from vio.geometry.distortion import StereoRig
+from vio.geometry.lie import FloatArray
 from vio.geometry.rectify import Interpolation, ProjectionMode
 from vio.protocols import Progress
 from vio.records import Image, ImuDensities, IntArray, StereoFrame
@@ -37,7 +38,7 @@ def make_rectifier(
         return rectifier_of(rig, interpolation, projection)
 
 
-def rig_sizes(rig: StereoRig, calibrated_in: tuple[Path, Path]) -> tuple[ImageSize, ImageSize]:
+def rig_sizes(rig: StereoRig, calibrated_in: tuple[Path, Path]) -> tuple[ImageSize, ...]:
     """Return the calibrated sizes of left and right images, and the files that specify them."""
     left, right = calibrated_in
     return ImageSize(rig.cam0.width, rig.cam0.height, left), ImageSize(rig.cam1.width, rig.cam1.height, right)
@@ -45,18 +46,32 @@ def rig_sizes(rig: StereoRig, calibrated_in: tuple[Path, Path]) -> tuple[ImageSi
 
 @dataclass(frozen=True, slots=True)
 class RectifiedDataset(ImageDataset):
-    """Implements `vio.protocols.Dataset` over image files of real cameras, rectified as they are read."""
+    """Implements `vio.protocols.Dataset` over image files of one or two real cameras, rectified as they are read."""
 
     rectifier: Rectifier
     imu_noise: ImuDensities | None = None
+    depths: Sequence[Path] | None = None  # depth image of each frame; None: there are none
+    depth_factor: float = 1.0  # levels of a depth image per metre
 
-    def prepared(self, left: Image, right: Image) -> tuple[Image, Image]:
-        """Rectify one raw pair, each image (H, W) of its camera's size."""
-        return self.rectifier(left, right)
+    def frame(self, index: int, left: Image, right: Image | None = None) -> StereoFrame:
+        """Return the rectified frame of raw images (H, W each), with its depths.
 
-    def prepared_left(self, left: Image) -> Image:
-        """Rectify a raw left image (H, W) alone."""
-        return self.rectifier.left(left)
+        Raises:
+            UnreadableImageError: the depth image cannot be read, or is of another size.
+        """
+        depth_m = None if self.depths is None else _depth_m(self.depths[index], left, self.depth_factor)
+        return self.rectifier.frame(index, int(self.recording.frame_times_ns[index]), left, right, depth_m=depth_m)
+
+
+def _depth_m(file: Path, image: Image, factor: float) -> FloatArray:
+    """Read the depths (H, W) of an image (H, W), metres."""
+    levels = load_depth(file)
+    if levels.shape != image.shape:
+        raise UnreadableImageError(
+            f"{file} is {levels.shape[1]} x {levels.shape[0]} pixels, but its image is {image.shape[1]} x "
+            f"{image.shape[0]}; depth images must be registered to the images"
+        )
+    return levels / factor
 
 
 def check_not_rectified(dataset: RectifiedDataset) -> None:

@@ -15,20 +15,14 @@ from typing import Any
 import numpy as np
 
 from vio.cameras.rig import Rectifier
-from vio.datasets.common import chosen_frames, merge_events, naming
-from vio.datasets.companions import (
-    find_calibration_of,
-    read_motion,
-    read_reference,
-    sources_of,
-    with_extrinsics,
-)
+from vio.datasets.common import blank_frames, chosen_frames, merge_events
+from vio.datasets.companions import find_calibration_of, read_companions
 from vio.datasets.image_pairs import ImageSize
 from vio.datasets.images import prefetch
 from vio.datasets.plain import times_of
 from vio.datasets.rigs import load_rig
 from vio.datasets.settings import DatasetSettings
-from vio.datasets.unused import Layout, unused_note
+from vio.datasets.unused import Layout
 from vio.errors import DataError
 from vio.records import (
     NS_PER_S,
@@ -80,29 +74,13 @@ def read_video(path: Path, settings: DatasetSettings) -> VideoDataset:
             "with one trigger, or write image folders"
         )
     layout = Layout(path, path, *files)
-    calibration = settings.calibration or find_calibration_of(layout)
-    rig, used = with_extrinsics(load_rig(calibration, image_size=(left.width, left.height)), layout, calibration)
+    file = settings.calibration or find_calibration_of(layout)
+    rig = load_rig(file, image_size=(left.width, left.height), cameras=2)
     times_ns, times_file, notes = _times(path, files, min(left.count, right.count), left.rate_hz)
     if left.count != right.count:
         notes.append(f"{files[0].name} states {left.count} frames, {files[1].name} {right.count}; the shorter counts")
-    motion, motion_files, motion_notes = read_motion(layout, rig, times_ns, times_file is not None)
-    with naming(calibration):
-        rectifier = rig.rectifier(settings.interpolation, settings.projection)
-    reference, reference_file = read_reference(layout, rig, rectifier, times_ns)
-    sources = [f for f in (*files, calibration, times_file, *used, *motion_files, reference_file) if f is not None]
-    recording = Recording(
-        kind="video",
-        path=path,
-        camera=rectifier.camera,
-        T_cam0_imu=None if rig.T_cam0_imu is None else rectifier.T_rect0_imu,
-        frame_times_ns=times_ns,
-        has_images=True,
-        motion=sources_of(motion_files),
-        reference=reference,
-        notes=(*rig.notes, *rectifier.notes, *notes, *motion_notes, *unused_note(layout, sources)),
-    )
-    sizes = tuple(ImageSize(camera.width, camera.height, calibration) for camera in (rig.cam0, rig.cam1))
-    return VideoDataset(recording, files, motion, (sizes[0], sizes[1]), settings, rectifier, rig.imu_noise)
+    found = read_companions("video", layout, (file, rig), settings, (times_ns, times_file), notes, files)
+    return VideoDataset(found.recording, files, found.motion, found.sizes, settings, found.rectifier, rig.imu_noise)
 
 
 def _facts(file: Path) -> _Facts:
@@ -139,7 +117,7 @@ class VideoDataset:
     recording: Recording
     files: tuple[Path, Path]
     motion: Sequence[MotionSample] = field(repr=False)
-    sizes: tuple[ImageSize, ImageSize]
+    sizes: tuple[ImageSize, ...]
     settings: DatasetSettings
     rectifier: Rectifier
     imu_noise: ImuDensities | None = None
@@ -151,11 +129,7 @@ class VideoDataset:
             DataError: the range holds no frame, or a frame cannot be decoded.
         """
         chosen = chosen_frames(self.recording, start, stop, self.settings.max_frame_rate)
-        times = self.recording.frame_times_ns
-        if images:
-            frames = self._frames(chosen)
-        else:
-            frames = (StereoFrame(k, int(times[k]), None, None) for k in chosen)
+        frames = self._frames(chosen) if images else blank_frames(self.recording, chosen)
         return merge_events(self.recording, chosen, self.motion, frames)
 
     def observations(self, index: int) -> Observations | None:
@@ -175,10 +149,7 @@ class VideoDataset:
                 for _ in range(after[index], index):
                     capture.grab()
             images = [self._gray(capture, side, index) for side, capture in enumerate(captures)]
-            time_ns = int(self.recording.frame_times_ns[index])
-            if len(images) == 1:
-                return StereoFrame(index, time_ns, self.rectifier.left(images[0]), None)
-            return StereoFrame(index, time_ns, *self.rectifier(*images))
+            return self.rectifier.frame(index, int(self.recording.frame_times_ns[index]), *images)
 
         try:
             with contextlib.closing(prefetch(load, chosen, self.settings.prefetch_frames)) as loaded:

@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from vio.calibration.estimated_rig import estimated_rig
 from vio.calibration.stereo_field import CalibratedRig
-from vio.cameras.camera_rig import CameraRig
 from vio.cameras.rig import Rig
 from vio.config import Config
 from vio.datasets.frame_rate import FrameRateLimit
@@ -50,7 +49,6 @@ from vio.records import (
 from vio.selection.selectors import build_selector
 
 if TYPE_CHECKING:
-    from vio.cameras.camera_rig import Undistorter
     from vio.cameras.rig import Rectifier
     from vio.mapping.session import MapSession
 
@@ -92,7 +90,7 @@ class Odometry:
 
     def __init__(
         self,
-        rig: Rig | CameraRig | StereoCamera,
+        rig: Rig | StereoCamera,
         config: Config | None = None,
         *,
         T_cam0_imu: FloatArray | None = None,
@@ -106,8 +104,8 @@ class Odometry:
         """Prepare; the first frame begins the trajectory.
 
         Args:
-            rig: the calibration, as `vio.load_rig` returns it; or a rectified pair. One camera, as `vio.load_camera`
-                returns it, needs an IMU or, where it has a `depth_factor`, depth images.
+            rig: the calibration, as `vio.load_rig` returns it; or a rectified pair. One camera needs an IMU or, where
+                it has a `depth_factor`, depth images.
             config: every setting; None: the defaults. `motion` auto means the IMU where the rig has one.
             T_cam0_imu: (4, 4) extrinsics, only beside a rectified pair; a `Rig` has its own.
             frontend: used in place of the configured front end.
@@ -126,17 +124,15 @@ class Odometry:
         self._rectifier: Rectifier | None = None
         self._rig: Rig | None = None  # as given; None: a rectified pair
         self._offset_ns = 0
-        self._undistorter: Undistorter | None = None  # of a rig with one camera
         if isinstance(rig, StereoCamera):
             self.camera = rig
-        elif isinstance(rig, CameraRig):
-            self._undistorter = rig.undistorter(depth_noise=None if rig.depth_factor is None else _depth_noise(config))
-            self.camera, T_cam0_imu = self._undistorter.camera, rig.T_cam0_imu
-            self._offset_ns = round(1e9 * rig.time_offset_s)
         else:
             self._rig = rig
             # Maps know pinholes only.
-            self._rectifier = rig.rectifier(projection=self._config.dataset.projection if map is None else "pinhole")
+            self._rectifier = rig.rectifier(
+                projection=self._config.dataset.projection if map is None else "pinhole",
+                depth_noise=None if rig.depth_factor is None else self._config.dataset.depth_noise,
+            )
             self.camera = self._rectifier.camera
             T_cam0_imu = rig.T_rect0_imu
             self._offset_ns = round(1e9 * rig.time_offset_s)
@@ -235,10 +231,7 @@ class Odometry:
             time_ns = self._new_time("frame", t_ns, kind="images")
             if not self._is_used(time_ns):
                 return None
-            left_image, right_image = images
-            if self._rectifier is not None:
-                left_image, right_image = self._rectifier(left_image, right_image)
-            return self._add_frame(StereoFrame(self._frames, time_ns, left_image, right_image))
+            return self._add_frame(self._rectified(time_ns, *images))
 
     def add_images(
         self,
@@ -265,26 +258,21 @@ class Odometry:
             return self.add_stereo(t_ns, left, right)
         with self._lock:
             if self.camera.kind == "stereo":
-                raise DataError(
-                    "this rig has two cameras, but one image came; give both, or a rig of one camera (vio.load_camera)"
-                )
+                raise DataError("this rig has two cameras, but one image came; give both, or load_rig(..., cameras=1)")
             if (depth_m is not None) != (self.camera.kind == "rgbd"):
                 raise DataError(
-                    "depths came, but the rig has no depth_factor; give CameraRig one"
+                    "depths came, but the rig has no depth_factor; give the rig one"
                     if depth_m is not None
                     else "this rig has depth images (a depth_factor), but no depths came; give depth_m"
                 )
             image = _gray(left, "left")
-            made = self._undistorter
             if self.camera.width is not None and self.camera.height is not None:
                 _check_size(image, (self.camera.height, self.camera.width), "left")
             depth = None if depth_m is None else _depths(depth_m, image.shape)
             time_ns = self._new_time("frame", t_ns, kind="images")
             if not self._is_used(time_ns):
                 return None
-            if made is not None:
-                image, depth = made(image), None if depth is None else made.depth(depth)
-            return self._add_frame(StereoFrame(self._frames, time_ns, image, None, depth))
+            return self._add_frame(self._rectified(time_ns, image, depth_m=depth))
 
     def add_observations(
         self, t_ns: int, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None = None
@@ -492,6 +480,13 @@ class Odometry:
                 self._predictor.sample(sample)
                 self._deliver(self._add(sample))
 
+    def _rectified(
+        self, time_ns: int, left: Image, right: Image | None = None, *, depth_m: FloatArray | None = None
+    ) -> StereoFrame:
+        if self._rectifier is None:
+            return StereoFrame(self._frames, time_ns, left, right, depth_m)
+        return self._rectifier.frame(self._frames, time_ns, left, right, depth_m=depth_m)
+
     def _add_frame(self, frame: StereoFrame) -> Estimate | None:
         self._frames += 1
         results = self._add(frame)
@@ -669,10 +664,6 @@ def _depths(depth_m: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray:
     if array.shape != shape:
         raise DataError(f"the depths have shape {array.shape}, but the image {shape}; register them to the image")
     return array
-
-
-def _depth_noise(config: Config | None) -> float:
-    return (Config() if config is None else config).dataset.depth_noise
 
 
 def _check_size(image: Image, expected: tuple[int, int], name: str) -> None:

@@ -33,8 +33,8 @@ def write_calibration(folder: Path, report: CalibrationReport) -> None:
     stereo = _measured_stereo(report, rig)
     T_cam0_imu, offset_s = _measured_imu(report, rig)
     T_imu_cam0 = se3_inverse(T_cam0_imu)
-    poses = {"cam0": T_imu_cam0, "cam1": T_imu_cam0 @ se3_inverse(stereo.T_cam1_cam0)}
-    cameras = {"cam0": stereo.cam0, "cam1": stereo.cam1}
+    poses = {"cam0": T_imu_cam0, "cam1": T_imu_cam0 @ se3_inverse(stereo.right[1])}
+    cameras = dict(zip(("cam0", "cam1"), stereo.cameras, strict=True))
     dataset = report.source.dataset
     times = np.zeros(0, dtype=np.int64) if dataset is None else dataset.recording.frame_times_ns
     rate_hz = median_rate_hz(times) or _USUAL_RATE_HZ
@@ -58,7 +58,7 @@ def _measured_stereo(report: CalibrationReport, given: StereoRig) -> Rig:
     R = report.stereo.R_cam1_cam0
     if report.in_motion is not None:  # what lenses and principal point share with the rotation, is apart there
         rig = rig_off_by(rig, report.in_motion.rig_parameters())
-        R = rig.T_cam1_cam0[:3, :3]
+        R = rig.right[1][:3, :3]
     return replace(rig, T_cam1_cam0=se3_from_parts(R, -length * R @ report.stereo.direction))
 
 

@@ -221,7 +221,8 @@ def given_rig(dataset: Dataset) -> Rig | None:
     For features it is that of the rectified images that they come from.
     """
     recording = dataset.recording
-    if not isinstance(dataset, RectifyingDataset) or dataset.rectifier.maps is None:
+    stereo = recording.camera.kind == "stereo"
+    if not (stereo and isinstance(dataset, RectifyingDataset)) or dataset.rectifier.maps is None:
         return rig_of_rectified(recording.camera, recording.T_cam0_imu)
     made, T_cam0_imu = dataset.rectifier, recording.T_cam0_imu
     rig = made.rig

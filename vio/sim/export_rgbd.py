@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from vio.cameras.camera_rig import CameraRig
+from vio.cameras.rig import Rig
 from vio.datasets.euroc_files import imu_csv
 from vio.datasets.images import write_png
-from vio.datasets.rigs.kalibr import kalibr_camera_text
+from vio.datasets.rigs.kalibr import kalibr_text
 from vio.files.atomic import atomic_folder
 from vio.files.text import seconds_text, write_text
 from vio.files.trajectories import write_tum
@@ -42,7 +42,8 @@ def export_rgbd(
     """
     simulation = recording.simulation
     T_cam0_imu = se3_inverse(simulation.calibration.T_imu_cam0)
-    rig = CameraRig(simulation.calibration.cam0, None if simulation.imu is None else T_cam0_imu, depth_factor=_FACTOR)
+    T_stated = None if simulation.imu is None else T_cam0_imu
+    rig = Rig(simulation.calibration.cam0, T_cam0_imu=T_stated, depth_factor=_FACTOR)
     truth = recording.reference if simulation.imu is not None else recording.reference.in_cam0(T_cam0_imu)
     stamps = simulation.stamps_ns.tolist()
     with atomic_folder(out, replace=replace, marker=MARKER) as folder:
@@ -50,7 +51,7 @@ def export_rgbd(
             (folder / name).mkdir()
             lines = [f"{seconds_text(t)} {name}/{seconds_text(t)}.png" for t in stamps]
             write_text(folder / f"{name}.txt", "\n".join(["# timestamp filename", *lines]) + "\n")
-        write_text(folder / "calibration.yaml", kalibr_camera_text(rig))
+        write_text(folder / "calibration.yaml", kalibr_text(rig))
         write_tum(folder / "groundtruth.txt", truth)
         if simulation.imu is not None:
             write_text(folder / "imu.csv", imu_csv(simulation.imu))

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
-from vio.cameras.camera_rig import CameraRig
 from vio.cameras.rig import Rig
 from vio.datasets.bags import bag_files
 from vio.datasets.bags.index import BagIndex, index_bag, info_topic
@@ -16,14 +14,14 @@ from vio.datasets.bags.store import Bag, Topic
 from vio.datasets.bags.topics import Roles, choose
 from vio.datasets.images import UnreadableImageError, decode_gray
 from vio.datasets.overlap import check_overlap
-from vio.datasets.rigs import find_calibration
+from vio.datasets.rigs import find_calibration, load_rig
+from vio.datasets.rigs.camera_info import rig_from_camera_infos
 from vio.datasets.samples import imu_samples, in_time_order
 from vio.datasets.settings import DatasetSettings
 from vio.datasets.tables import imu_notes
 from vio.errors import CalibrationError
 from vio.records import NS_PER_S, IntArray, MotionSample, MotionSource
 
-AnyRig = TypeVar("AnyRig", Rig, CameraRig)
 Size = tuple[int, int]
 
 
@@ -85,27 +83,40 @@ def _compressed_size(bag: Bag, topic: Topic) -> tuple[int, int] | None:
     return None
 
 
-def chosen_rig(
-    found: Contents, settings: DatasetSettings, read: Callable[[Path | None], AnyRig]
-) -> tuple[AnyRig, Path | None, list[str]]:
+def chosen_rig(found: Contents, settings: DatasetSettings) -> tuple[Rig, Path | None, list[str]]:
     """Return the rig of the named file, else of one beside the bag, else of the CameraInfos; its file; and notes.
 
-    `read` reads the rig of a file; of None, that of the CameraInfos. Where the calibration states no pose of the IMU,
-    the static frames do.
+    Where the calibration states no pose of the IMU, the static frames do.
+
+    Raises:
+        CalibrationError: there is no calibration, or it is invalid.
     """
     named, beside = settings.calibration, found.beside
     if named is not None or beside is None:
-        return _with_static_pose(read(named), found), named, []
+        return _with_static_pose(_rig(found, named), found), named, []
     try:
-        rig = read(beside)
+        rig = _rig(found, beside)
     except CalibrationError as error:
         if None in found.infos:
             raise
-        return _with_static_pose(read(None), found), None, [f"the bag's CameraInfo serves, as {error}"]
+        return _with_static_pose(_rig(found, None), found), None, [f"the bag's CameraInfo serves, as {error}"]
     return _with_static_pose(rig, found), beside, [f"the calibration is {beside.name}, not the bag's CameraInfo"]
 
 
-def _with_static_pose(rig: AnyRig, found: Contents) -> AnyRig:
+def _rig(found: Contents, file: Path | None) -> Rig:
+    """Return the rig of a calibration file; of None, that of the CameraInfos."""
+    topics, infos = found.roles.cameras, found.infos
+    if file is not None:
+        return load_rig(file, image_size=found.size, cameras=1 if len(topics) == 1 else 2)
+    stated = [found.index.infos[name] for name in infos if name is not None and name in found.index.infos]
+    if len(stated) != len(topics):
+        raise CalibrationError(f"{found.path}: no CameraInfo could be read; give --calibration FILE")
+    if len(set(infos)) != len(topics):
+        raise CalibrationError(f"{infos[0]} belongs to both images; give --calibration FILE")
+    return rig_from_camera_infos(stated, rectified=_is_rectified(topics[0]))
+
+
+def _with_static_pose(rig: Rig, found: Contents) -> Rig:
     index = found.index
     if rig.T_cam0_imu is not None or found.roles.imu is None:
         return rig
@@ -113,16 +124,16 @@ def _with_static_pose(rig: AnyRig, found: Contents) -> AnyRig:
     if T is None or index.left.frame_id == index.imu_frame:
         return rig
     note = f"the IMU's pose is that of /tf_static ({index.imu_frame} in {index.left.frame_id})"
-    return replace(rig, T_cam0_imu=T, notes=(*rig.notes, note))
+    return replace(rig, T_cam0_imu=T).noting(note)
 
 
-def is_rectified(topic: Topic) -> bool:
+def _is_rectified(topic: Topic) -> bool:
     """Return whether a topic's name says that its images are those after ROS's rectification."""
     return "rect" in topic.name.removesuffix("/compressed").rsplit("/", 1)[-1]
 
 
 def motion_of(
-    found: Contents, rig: Rig | CameraRig, times_ns: IntArray
+    found: Contents, rig: Rig, times_ns: IntArray
 ) -> tuple[Sequence[MotionSample], frozenset[MotionSource], list[str]]:
     """Return the samples in time order on the cameras' clock, their kinds, and notes."""
     index, roles = found.index, found.roles

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -48,17 +49,21 @@ _IN_FOLDER = (
 )
 
 
-def load_rig(path: str | os.PathLike[str], *, image_size: Size | None = None) -> Rig:
-    """Read a stereo calibration; the format is detected from the content.
+def load_rig(
+    path: str | os.PathLike[str], *, image_size: Size | None = None, cameras: Literal[1, 2] | None = None
+) -> Rig:
+    """Read the calibration of one camera or of a stereo pair; the format is detected from the content.
 
     Args:
         path: a calibration file, or a folder that holds one.
         image_size: width and height of the images in pixels, for formats that do not state it (KITTI's calib.txt,
             OpenCV). With KITTI's calib_cam_to_cam.txt, the size decides between the raw and the rectified cameras.
+        cameras: 1: of a pair, the left camera alone; 2: a pair; None: whichever the calibration holds.
 
     Raises:
-        CalibrationError: there is no calibration of a known format, an entry is missing or impossible, or the image
-            size is neither stated nor given; the message names file, entry and remedy.
+        CalibrationError: there is no calibration of a known format, an entry is missing or impossible, the image size
+            is neither stated nor given, or there is one camera of the two asked for; the message names file, entry and
+            remedy.
     """
     file = Path(path)
     if not file.exists():
@@ -68,7 +73,13 @@ def load_rig(path: str | os.PathLike[str], *, image_size: Size | None = None) ->
         if found is None:
             raise CalibrationError(f"{file}: holds no calibration; looked for {KNOWN}")
         file = found
-    return _read(file, image_size)
+    rig = _read(file, image_size, cameras)
+    if cameras == 2 and rig.cam1 is None:
+        raise CalibrationError(
+            f"{file}: is the calibration of one camera; name the pair left.yaml and right.yaml (ROS), or add cam1 and "
+            "its pose (Kalibr)"
+        )
+    return rig.left_alone() if cameras == 1 else rig
 
 
 def find_calibration(folder: Path) -> Path | None:
@@ -83,7 +94,7 @@ def find_calibration(folder: Path) -> Path | None:
     return None if pair is None else pair[0]
 
 
-def _read(path: Path, image_size: Size | None) -> Rig:
+def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
     suffix = path.suffix.lower()
     if path.name == CAMERAS:
         return _kitti_raw(path, image_size)
@@ -95,24 +106,28 @@ def _read(path: Path, image_size: Size | None) -> Rig:
     if is_camchain(entries):
         return read_camchain(path)
     if "T_BS" in entries:
-        return _euroc(path)
+        return _euroc(path, cameras)
     if is_camera_info(entries):
-        return _camera_infos(path)
+        pair = None if cameras == 1 else pair_of_files(path)
+        return rig_from_camera_infos([read_camera_info(file) for file in pair or (path,)])
     whole = read_entries(path)
     if is_opencv(whole):
         return rig_from_opencv(whole, str(path), image_size)
-    raise CalibrationError(f"{path}: is no stereo calibration of a known format; give {KNOWN}")
+    raise CalibrationError(f"{path}: is no calibration of a known format; give {KNOWN}")
 
 
-def _euroc(path: Path) -> Rig:
+def _euroc(path: Path, cameras: int | None) -> Rig:
     """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it is beside them, `imu0/sensor.yaml`."""
     mav = path.parent.parent
-    (cam0, T_body_cam0), (cam1, T_body_cam1) = (
-        read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")
-    )
     T_body_imu, noise = np.eye(4), None
     if (imu := mav / "imu0" / "sensor.yaml").is_file():
         T_body_imu, noise = read_imu_yaml(imu)
+    if cameras == 1 or (cameras is None and not (mav / "cam1" / "sensor.yaml").is_file()):
+        camera, T_body_cam = read_camera_yaml(path)
+        return Rig(camera, T_cam0_imu=se3_inverse(T_body_cam) @ T_body_imu, imu_noise=noise)
+    (cam0, T_body_cam0), (cam1, T_body_cam1) = (
+        read_camera_yaml(mav / name / "sensor.yaml") for name in ("cam0", "cam1")
+    )
     T_imu_cam0, T_imu_cam1 = (se3_inverse(T_body_imu) @ T for T in (T_body_cam0, T_body_cam1))
     with naming(mav):
         return Rig(cam0, cam1, se3_inverse(T_imu_cam1) @ T_imu_cam0, se3_inverse(T_imu_cam0), noise)
@@ -147,11 +162,3 @@ def _kitti_raw(path: Path, image_size: Size | None) -> Rig:
             T = None if T_cam0_imu is None else turn @ T_cam0_imu
             return Rig(c.rect0, c.rect1, c.T_rect1_rect0, T, notes=notes)
         return Rig(c.cam0, c.cam1, c.T_cam1_cam0, T_cam0_imu, notes=notes)
-
-
-def _camera_infos(path: Path) -> Rig:
-    pair = pair_of_files(path)
-    if pair is None:
-        raise CalibrationError(f"{path}: is the calibration of one camera; name the pair left.yaml and right.yaml")
-    left, right = (read_camera_info(file) for file in pair)
-    return rig_from_camera_infos(left, right)

@@ -1,4 +1,4 @@
-"""ROS CameraInfo, as messages of a bag or as the two YAML files of `camera_calibration` (`left.yaml`, `right.yaml`).
+"""ROS CameraInfo, as messages of a bag or as YAML files of `camera_calibration` (a pair: `left.yaml`, `right.yaml`).
 
 `K` and `D` are those of the raw image, `R` rotates the camera to the rectified one, `P = K' [I | t]` projects from the
 rectified left camera; `P[0, 3]` of the right camera is -focal length times baseline.
@@ -7,18 +7,18 @@ Reference: the definition of sensor_msgs/CameraInfo.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from vio.cameras.camera_rig import CameraRig
 from vio.cameras.rig import Rig, camera_from_matrix
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.rigs.opencv import CoefficientsError, trimmed_coefficients
 from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
 from vio.errors import CalibrationError
-from vio.geometry.distortion import DistortionModel
+from vio.geometry.distortion import CameraModel, DistortionModel
 from vio.geometry.lie import FloatArray, se3_from_parts
 
 _MODELS: dict[str, DistortionModel] = {
@@ -49,7 +49,7 @@ class CameraInfo:
 
 def is_camera_info(entries: Entries) -> bool:
     """Return whether entries are those of a CameraInfo file."""
-    return "camera_matrix" in entries and "projection_matrix" in entries
+    return "camera_matrix" in entries and ("projection_matrix" in entries or "image_width" in entries)
 
 
 def pair_of_files(path: Path) -> tuple[Path, Path] | None:
@@ -70,7 +70,7 @@ def pair_of_files(path: Path) -> tuple[Path, Path] | None:
 
 
 def read_camera_info(path: Path) -> CameraInfo:
-    """Read the YAML file of one camera.
+    """Read the YAML file of one camera; that of a camera alone may lack the entries of a rectification.
 
     Raises:
         CalibrationError: an entry is missing or malformed.
@@ -78,36 +78,43 @@ def read_camera_info(path: Path) -> CameraInfo:
     entries, where = read_yaml(path, "the camera's calibration"), str(path)
     size = [numbers(entries, key, where, 1)[0] for key in ("image_width", "image_height")]
     width, height = image_size(size, where)
-    found = {
-        key: section(entries, key, where) for key in ("camera_matrix", "rectification_matrix", "projection_matrix")
-    }
+    alone = "projection_matrix" not in entries
+    wanted = ("camera_matrix",) if alone else ("camera_matrix", "rectification_matrix", "projection_matrix")
+    found = {key: section(entries, key, where) for key in wanted}
+    D = entries.get("distortion_coefficients", [] if alone else None)
     return CameraInfo(
         where,
         width,
         height,
         str(entries.get("distortion_model") or ""),
-        tuple(np.ravel(matrix(entries.get("distortion_coefficients"), None, f"{where}, distortion_coefficients"))),
+        tuple(np.ravel(matrix(D, None, f"{where}, distortion_coefficients")).tolist()),
         matrix(found["camera_matrix"], (3, 3), f"{where}, camera_matrix"),
-        matrix(found["rectification_matrix"], (3, 3), f"{where}, rectification_matrix"),
-        matrix(found["projection_matrix"], (3, 4), f"{where}, projection_matrix"),
+        np.eye(3) if alone else matrix(found["rectification_matrix"], (3, 3), f"{where}, rectification_matrix"),
+        np.zeros((3, 4)) if alone else matrix(found["projection_matrix"], (3, 4), f"{where}, projection_matrix"),
     )
 
 
-def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, *, rectified: bool = False) -> Rig:
-    """Return the rig of two CameraInfos.
+def rig_from_camera_infos(infos: Sequence[CameraInfo], *, rectified: bool = False) -> Rig:
+    """Return the rig of the CameraInfo of one camera, or of those of a left and a right camera.
 
     Args:
-        left: left camera.
-        right: right camera.
+        infos: one, or left and right.
         rectified: the images are those after ROS's rectification (`image_rect`), so that only P applies.
 
     Raises:
-        CalibrationError: a camera is not calibrated (K or P of zeros), or the two are no stereo pair.
+        CalibrationError: a camera is not calibrated (K or P of zeros; of one camera, the one that applies), its lens is
+            not read, or the two are no stereo pair.
     """
-    for info in (left, right):
+    if len(infos) == 1:
+        K, name = (infos[0].P[:, :3], "P") if rectified else (infos[0].K, "K")
+        if not K[0, 0] > 0:
+            raise CalibrationError(f"{infos[0].where}: not calibrated ({name} is zero); give a calibration file")
+        return Rig(_camera(infos[0], rectified=rectified))
+    for info in infos:
         if not (info.K[0, 0] > 0 and info.P[0, 0] > 0):
             raise CalibrationError(f"{info.where}: not calibrated (K or P is zero); give a calibration file")
-    offsets = [np.linalg.solve(info.P[:, :3], info.P[:, 3]) for info in (left, right)]
+    left, right = infos
+    offsets = [np.linalg.solve(info.P[:, :3], info.P[:, 3]) for info in infos]
     shift = offsets[1] - offsets[0]  # rectified left to rectified right
     if not shift[0] < 0:
         raise CalibrationError(
@@ -115,35 +122,19 @@ def rig_from_camera_infos(left: CameraInfo, right: CameraInfo, *, rectified: boo
             "camera is -focal * baseline); the cameras are swapped, or were not calibrated as a pair"
         )
     if rectified:
-        K, size = left.P[:, :3], (left.width, left.height)
+        cam = _camera(left, rectified=True)
         with naming(left.where):
-            cam = camera_from_matrix(K, *size, name="P")
-            return Rig.rectified(cam.fu, cam.fv, cam.cu, cam.cv, float(-shift[0]), *size)
-    R0, R1 = (checked_transform(np.column_stack([i.R, np.zeros(3)]), f"{i.where}, R")[:3, :3] for i in (left, right))
-    cameras = []
-    for info in (left, right):
-        model, D = _lens(info)
-        with naming(info.where):
-            cameras.append(camera_from_matrix(info.K, info.width, info.height, model, D))
-    return Rig(cameras[0], cameras[1], se3_from_parts(R1.T @ R0, R1.T @ shift))
+            return Rig.rectified(cam.fu, cam.fv, cam.cu, cam.cv, float(-shift[0]), cam.width, cam.height)
+    R0, R1 = (checked_transform(np.column_stack([i.R, np.zeros(3)]), f"{i.where}, R")[:3, :3] for i in infos)
+    cam0, cam1 = (_camera(info, rectified=False) for info in infos)
+    return Rig(cam0, cam1, se3_from_parts(R1.T @ R0, R1.T @ shift))
 
 
-def rig_from_camera_info(info: CameraInfo, *, rectified: bool = False) -> CameraRig:
-    """Return the rig of the CameraInfo of one camera.
-
-    Args:
-        info: the camera.
-        rectified: the images are those after ROS's rectification (`image_rect`), so that only P applies.
-
-    Raises:
-        CalibrationError: the camera is not calibrated (K, or P of rectified images, is zero), or its lens is not read.
-    """
-    K, name = (info.P[:, :3], "P") if rectified else (info.K, "K")
-    if not K[0, 0] > 0:
-        raise CalibrationError(f"{info.where}: not calibrated ({name} is zero); give a calibration file")
+def _camera(info: CameraInfo, *, rectified: bool) -> CameraModel:
     model, D = ("pinhole", ()) if rectified else _lens(info)
+    K, name = (info.P[:, :3], "P") if rectified else (info.K, "K")
     with naming(info.where):
-        return CameraRig(camera_from_matrix(K, info.width, info.height, model, D, name))
+        return camera_from_matrix(K, info.width, info.height, model, D, name)
 
 
 def _lens(info: CameraInfo) -> tuple[DistortionModel, tuple[float, ...]]:

@@ -7,14 +7,13 @@ Reference: the page "yaml formats" of Kalibr's documentation.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from vio.cameras.camera_rig import CameraRig
 from vio.cameras.rig import Rig
 from vio.datasets.common import checked_transform, image_size, naming
 from vio.datasets.yaml_files import Entries, matrix, numbers, read_yaml, section
@@ -41,8 +40,9 @@ _SAME_M, _SAME_RAD = 2e-3, 5e-3  # how far the two statements of the stereo pose
 
 
 def is_camchain(entries: Entries) -> bool:
-    """Return whether entries are those of a camchain."""
-    return all(isinstance(entries.get(name), dict) and "intrinsics" in entries[name] for name in ("cam0", "cam1"))  # type: ignore[operator]
+    """Return whether entries are those of a camchain, of one camera or more."""
+    cameras = [entries.get("cam0"), *([entries["cam1"]] if "cam1" in entries else [])]
+    return all(isinstance(camera, dict) and "intrinsics" in camera for camera in cameras)
 
 
 def is_imu_sheet(entries: Entries) -> bool:
@@ -51,33 +51,55 @@ def is_imu_sheet(entries: Entries) -> bool:
 
 
 def read_camchain(path: Path) -> Rig:
-    """Read a camchain and, beside it, the IMU's file.
+    """Read a camchain of one camera or two and, beside it, the IMU's file.
+
+    A depth camera's `depth_factor`, levels per metre, is no entry of Kalibr's and may be added to cam0.
 
     Raises:
         CalibrationError: an entry is missing or impossible, or a model is not known; the message names it.
     """
-    entries = read_yaml(path, "Kalibr's calibration of both cameras")
+    entries = read_yaml(path, "Kalibr's calibration of the cameras")
     if not is_camchain(entries):
-        raise CalibrationError(f"{path}: is no camchain of Kalibr; it must hold the blocks cam0 and cam1 (stereo)")
-    left, right = (section(entries, name, str(path)) for name in ("cam0", "cam1"))
-    cam0, cam1 = (_camera(block, f"{path}, {name}") for block, name in ((left, "cam0"), (right, "cam1")))
-    T_cam0_imu, T_cam1_imu = (_pose(b, "T_cam_imu", f"{path}, {n}") for b, n in ((left, "cam0"), (right, "cam1")))
-    T_cam1_cam0 = _pose(right, "T_cn_cnm1", f"{path}, cam1")
+        raise CalibrationError(f"{path}: is no camchain of Kalibr; it must hold the block cam0 and, for stereo, cam1")
+    names = [name for name in ("cam0", "cam1") if name in entries]
+    blocks = [section(entries, name, str(path)) for name in names]
+    where = [f"{path}, {name}" for name in names]
+    cameras = [_camera(*of_one) for of_one in zip(blocks, where, strict=True)]
+    T_cam0_imu = _pose(blocks[0], "T_cam_imu", where[0])
     notes: list[str] = []
+    T_cam1_cam0 = _stereo_pose(blocks[1], T_cam0_imu, path, notes) if "cam1" in names else None
+    if further := sorted(name for name in entries if name.startswith("cam") and name not in names):
+        notes.append(f"{path}: {' and '.join(names)} are used, {', '.join(further)} not")
+    noise, imu_notes = _imu_beside(path)
+    offset_s, residual_px = _time_shift(blocks, where), _residual(blocks[-1], where[-1])
+    factor = numbers(blocks[0], "depth_factor", where[0], 1)[0] if "depth_factor" in blocks[0] else None
+    with naming(path):
+        return Rig(
+            cameras[0],
+            cameras[1] if "cam1" in names else None,
+            T_cam1_cam0,
+            T_cam0_imu,
+            noise,
+            offset_s,
+            (*notes, *imu_notes),
+            residual_px,
+            factor,
+        )
+
+
+def _stereo_pose(right: Mapping[str, Any], T_cam0_imu: FloatArray | None, path: Path, notes: list[str]) -> FloatArray:
+    """Return `T_cam1_cam0` (4, 4) as stated, or by way of the IMU; add a note where both are stated and disagree."""
+    where = f"{path}, cam1"
+    T_cam1_imu, T_cam1_cam0 = _pose(right, "T_cam_imu", where), _pose(right, "T_cn_cnm1", where)
     if T_cam0_imu is not None and T_cam1_imu is not None:
         through_imu = T_cam1_imu @ se3_inverse(T_cam0_imu)
         if T_cam1_cam0 is None:
-            T_cam1_cam0 = through_imu
-        elif _apart(T_cam1_cam0, through_imu):
+            return through_imu
+        if _apart(T_cam1_cam0, through_imu):
             notes.append(f"{path}: T_cn_cnm1 of cam1 and the T_cam_imu of both cameras disagree; T_cn_cnm1 is used")
     if T_cam1_cam0 is None:
         raise CalibrationError(f"{path}: states no pose of cam1; add T_cn_cnm1 to cam1, or T_cam_imu to both cameras")
-    if further := sorted(name for name in entries if name.startswith("cam") and name not in ("cam0", "cam1")):
-        notes.append(f"{path}: cam0 and cam1 are used, {', '.join(further)} not")
-    noise, imu_notes = _imu_beside(path)
-    offset_s, residual_px = _time_shift(left, right, path), _residual(right, f"{path}, cam1")
-    with naming(path):
-        return Rig(cam0, cam1, T_cam1_cam0, T_cam0_imu, noise, offset_s, (*notes, *imu_notes), residual_px)
+    return T_cam1_cam0
 
 
 def _camera(block: Mapping[str, Any], where: str) -> CameraModel:
@@ -117,11 +139,11 @@ def _apart(A: FloatArray, B: FloatArray) -> bool:
     return bool(np.linalg.norm(difference[:3, 3]) > _SAME_M or np.abs(difference[:3, :3] - np.eye(3)).max() > _SAME_RAD)
 
 
-def _time_shift(left: Mapping[str, Any], right: Mapping[str, Any], path: Path) -> float:
-    """Return the mean of the shifts of both cameras, which one exposure shares."""
+def _time_shift(blocks: Sequence[Mapping[str, Any]], where: Sequence[str]) -> float:
+    """Return the mean of the shifts of the cameras, which one exposure shares."""
     shifts = [
-        numbers(block, "timeshift_cam_imu", f"{path}, {name}", 1)[0]
-        for block, name in ((left, "cam0"), (right, "cam1"))
+        numbers(block, "timeshift_cam_imu", name, 1)[0]
+        for block, name in zip(blocks, where, strict=True)
         if "timeshift_cam_imu" in block
     ]
     return sum(shifts) / len(shifts) if shifts else 0.0
@@ -170,34 +192,26 @@ def _imu_block(entries: Entries) -> Entries:
 
 
 def kalibr_text(rig: Rig) -> str:
-    """Return the camchain of a rig, with all digits."""
-    T_cam0_imu = np.eye(4) if rig.T_cam0_imu is None else rig.T_cam0_imu
-    poses = {"cam0": T_cam0_imu, "cam1": rig.T_cam1_cam0 @ T_cam0_imu}
+    """Return the camchain of a rig, with all digits, as `read_camchain` reads it."""
     chain: dict[str, Any] = {}
-    for name, camera in (("cam0", rig.cam0), ("cam1", rig.cam1)):
+    T_cam_imu = rig.T_cam0_imu
+    for name, camera in zip(("cam0", "cam1"), rig.cameras, strict=False):
         sheet: dict[str, Any] = {}
-        if rig.T_cam0_imu is not None:
-            sheet["T_cam_imu"] = poses[name].tolist()
+        if name == "cam1" and T_cam_imu is not None:
+            T_cam_imu = rig.right[1] @ T_cam_imu
+        if T_cam_imu is not None:
+            sheet["T_cam_imu"] = T_cam_imu.tolist()
         if name == "cam1":
-            sheet["T_cn_cnm1"] = rig.T_cam1_cam0.tolist()
+            sheet["T_cn_cnm1"] = rig.right[1].tolist()
             if rig.residual_px:
                 sheet["residual_px"] = float(rig.residual_px)
         sheet |= _camera_sheet(camera)
-        if rig.T_cam0_imu is not None:
+        if T_cam_imu is not None:
             sheet["timeshift_cam_imu"] = float(rig.time_offset_s)
+        if name == "cam0" and rig.depth_factor is not None:
+            sheet["depth_factor"] = float(rig.depth_factor)
         chain[name] = sheet
     return yaml.safe_dump(chain, sort_keys=False, default_flow_style=None)
-
-
-def kalibr_camera_text(rig: CameraRig) -> str:
-    """Return the camchain of one camera, with all digits, as `read_one_camera` reads it."""
-    sheet: dict[str, Any] = {}
-    if rig.T_cam0_imu is not None:
-        sheet |= {"T_cam_imu": rig.T_cam0_imu.tolist(), "timeshift_cam_imu": float(rig.time_offset_s)}
-    sheet |= _camera_sheet(rig.cam0)
-    if rig.depth_factor is not None:
-        sheet["depth_factor"] = float(rig.depth_factor)
-    return yaml.safe_dump({"cam0": sheet}, sort_keys=False, default_flow_style=None)
 
 
 def _camera_sheet(camera: CameraModel) -> dict[str, Any]:
@@ -219,26 +233,3 @@ def _kalibr_names(camera: CameraModel) -> tuple[str, str, list[float], tuple[flo
     if camera.model == "unified":
         return "omni", "radtan" if len(c) > 1 else "none", [float(c[0])], c[1:]
     return "pinhole", "none" if camera.model == "pinhole" else camera.model, [], c
-
-
-def is_one_camera(entries: Entries) -> bool:
-    """Return whether entries are those of a camchain with cam0 alone."""
-    cam0 = entries.get("cam0")
-    return isinstance(cam0, dict) and "intrinsics" in cam0 and "cam1" not in entries
-
-
-def read_one_camera(path: Path) -> CameraRig:
-    """Read cam0 of a camchain and, beside it, the IMU's file.
-
-    A depth camera's `depth_factor`, levels per metre, is no entry of Kalibr's and may be added to cam0.
-
-    Raises:
-        CalibrationError: an entry is missing or impossible, or a model is not known; the message names it.
-    """
-    entries = read_yaml(path, "Kalibr's calibration of the camera")
-    block, where = section(entries, "cam0", str(path)), f"{path}, cam0"
-    noise, notes = _imu_beside(path)
-    factor = numbers(block, "depth_factor", where, 1)[0] if "depth_factor" in block else None
-    offset_s = _time_shift(block, {}, path)
-    with naming(path):
-        return CameraRig(_camera(block, where), _pose(block, "T_cam_imu", where), noise, offset_s, notes, factor)

@@ -125,7 +125,7 @@ def rig_from_opencv(entries: Entries, where: str, image_size: tuple[int, int] | 
         rig = _rectified(entries, where, width, height)
     else:
         rig = _raw(entries, where, width, height)
-    baseline = float(np.linalg.norm(rig.T_cam1_cam0[:3, 3]))
+    baseline = float(np.linalg.norm(rig.right[1][:3, 3]))
     if baseline <= _TOO_WIDE_M:
         return rig
     return rig.noting(
