@@ -79,13 +79,13 @@ def lacks_sensor_yaml(path: Path) -> bool:
 
 
 def images_of_one_camera(path: Path) -> Path | None:
-    """Return the folder of images that a folder holds, whether or not anything else tells what they are."""
+    """Return the folder of images that a folder holds, whether or not anything else identifies them."""
     layout = _layout_of_one(path)
     return None if layout is None else layout.left
 
 
 def is_mono_folder(path: Path) -> bool:
-    """Return whether a folder holds the images of one camera, and a calibration tells what they are."""
+    """Return whether a folder holds the images of one camera, and a calibration identifies them."""
     layout = _layout_of_one(path)
     return layout is not None and calibration_beside(layout) is not None
 
@@ -158,7 +158,7 @@ def read_rgbd(path: Path, settings: DatasetSettings) -> RectifiedDataset:
 
     Raises:
         DataError: as `read_plain`.
-        CalibrationError: as `read_plain`, or nothing tells the unit of the depths.
+        CalibrationError: as `read_plain`, or the unit of the depths is not given.
     """
     if is_tum_folder(path):
         listed, depths, times_ns, notes = associated_images(path)
@@ -231,7 +231,7 @@ def _depth_factor(rig: Rig, settings: DatasetSettings, where: Path) -> tuple[flo
     factor = settings.depth_factor or rig.depth_factor
     if factor is None:
         raise CalibrationError(
-            f"{where}: nothing tells the unit of its depth images; add depth_factor (levels per metre, 1000 for "
+            f"{where}: the unit of its depth images is not given; add depth_factor (levels per metre, 1000 for "
             "millimetres) to cam0 of the calibration, or --set dataset.depth_factor=1000"
         )
     if settings.depth_factor is None or rig.depth_factor in (None, factor):

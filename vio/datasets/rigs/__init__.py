@@ -117,7 +117,7 @@ def _read(path: Path, image_size: Size | None, cameras: int | None) -> Rig:
 
 
 def _euroc(path: Path, cameras: int | None) -> Rig:
-    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it lies beside them, `imu0/sensor.yaml`."""
+    """Read EuRoC's `cam0/sensor.yaml`, `cam1/sensor.yaml` and, where it is beside them, `imu0/sensor.yaml`."""
     mav = path.parent.parent
     T_body_imu, noise = np.eye(4), None
     if (imu := mav / "imu0" / "sensor.yaml").is_file():
