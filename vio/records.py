@@ -398,17 +398,18 @@ class Estimate:
     accel_bias_sigma: FloatArray | None = field(default=None, metadata=_kept(3))
     # m/s^2, where the world is not upright (an IMU that began late).
     gravity_world: FloatArray | None = field(default=None, metadata=_kept(3))
-    # The calibration, where the filter estimates it; a frame stamped t was exposed at t + offset of the IMU's clock.
+    # The calibration, where the filter estimates it.
     T_cam0_imu: FloatArray | None = field(default=None, metadata=_kept(4, 4))
     # Of xi in T_cam0_imu = T_hat exp(xi), [rho; phi], m and rad.
     T_cam0_imu_covariance: FloatArray | None = field(default=None, metadata=_kept(6, 6))
+    # Scale and misalignment of accelerometer and gyro, as IMU_ENTRIES; standard deviations, zero where not estimated.
+    imu_terms: FloatArray | None = field(default=None, metadata=_kept(15))
+    imu_terms_sigma: FloatArray | None = field(default=None, metadata=_kept(15))
+    # A frame stamped t was exposed at t + offset of the IMU's clock.
     time_offset_s: float | None = field(default=None, metadata=_kept())
     time_offset_sigma_s: float | None = field(default=None, metadata=_kept())
     stereo_field: StereoFieldEstimate | None = None
     stereo_scale: StereoScaleEstimate | None = None
-    # Scale and misalignment of accelerometer and gyro, as IMU_ENTRIES; standard deviations, zero where not estimated.
-    imu_terms: FloatArray | None = field(default=None, metadata=_kept(15))
-    imu_terms_sigma: FloatArray | None = field(default=None, metadata=_kept(15))
     # One camera: standard deviation of the scale of the last frames' motion, over it.
     scale_sigma: float | None = field(default=None, metadata=_kept())
     # The pose in a map; None without one, or without a place in it yet.
