@@ -386,7 +386,9 @@ def _flip(path: Path, place: int = -200) -> None:
 
 @pytest.mark.parametrize("name", ["estimates", "frames", "observations", "seen", "samples"])
 @pytest.mark.parametrize(
-    "spoil", [lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]), _flip, Path.unlink], ids=str
+    "spoil",
+    [lambda p: p.write_bytes(p.read_bytes()[: p.stat().st_size // 2]), _flip, Path.unlink],
+    ids=["halved", "flipped", "gone"],
 )
 def test_a_damaged_table_is_not_gone_on_with(
     name: str, spoil: Callable[[Path], Any], stopped: Path, capsys: pytest.CaptureFixture[str]
@@ -571,7 +573,11 @@ def test_what_a_checkpoint_holds_comes_back_with_its_types_layouts_and_reference
     assert back["data"] == (dataset, dataset.observations)
 
 
-@pytest.mark.parametrize("value", [Path("x"), print, lambda: 0, np.array([{}]), int, threading.Lock()], ids=str)
+@pytest.mark.parametrize(
+    "value",
+    [Path("x"), print, lambda: 0, np.array([{}]), int, threading.Lock()],
+    ids=["path", "function", "lambda", "objects", "class", "lock"],
+)
 def test_what_a_checkpoint_cannot_hold_is_named_when_it_is_saved(value: Any, state: tuple[Path, Dataset]) -> None:
     with pytest.raises(NotSavableError, match="does not belong into a checkpoint"):
         save_checkpoint(state[0], [value], state[1])

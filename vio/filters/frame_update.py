@@ -13,6 +13,7 @@ from vio.cameras.rectification_error import TERMS, error_jacobian
 from vio.filters import track_loops
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
+    MIN_DEPTH,
     LandmarkResiduals,
     Views,
     eliminate_points,
@@ -32,9 +33,10 @@ from vio.filters.tracks import measured, rows_of
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior
 from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, WindowTracks
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat, transform_points
+from vio.geometry.stereo import depth_of, project
 from vio.numerics.robust import median
-from vio.records import BoolArray, IntArray, Observations, UpdateReport
+from vio.records import BoolArray, IntArray, MotionPrior, Observations, TrackPrior, UpdateReport
 
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 # Standard deviations of a point's inverse depth over itself, at most. A landmark is linearised and marginalised frame
@@ -62,6 +64,19 @@ class FrameUpdate:
         self.tracks = WindowTracks(rig.camera, settings)
         self.smoothed: WindowPosterior | None = None  # after the last frame
         self._landmark_gate = LandmarkGate(settings.gate_probability)
+
+    def expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
+        """Predict the pixels of all tracks with a point from a camera pose (4, 4) at a coming frame."""
+        table, camera = self.tracks.table, self._rig.camera
+        rows = table.rows()
+        rows = rows[table.has_point[rows]]
+        ids = np.concatenate([table.ids(rows), window.landmark_ids])
+        p_cam = transform_points(T_cam0_world, np.concatenate([table.points[rows], window.landmarks]))
+        ahead = depth_of(camera, p_cam) > MIN_DEPTH * camera.baseline_m
+        z, field = project(camera, p_cam[ahead]), self._rig.field(window)
+        if field is not None:
+            z = field.seen(z)
+        return TrackPrior(ids[ahead], z, motion.T_curr_prev[:3, :3], motion)
 
     def forget(self) -> None:
         """Forget all tracks and poses."""

@@ -19,7 +19,6 @@ from vio.errors import ConfigError, DivergedError, EstimationError
 from vio.filters.frame_update import FrameUpdate
 from vio.filters.imu_terms import IMU_TERMS
 from vio.filters.inputs import InputOrder, check_parts, checked_extrinsics
-from vio.filters.multiview import MIN_DEPTH
 from vio.filters.navigation import DIM, ZERO_RATE_SIGMA_RADPS, ZERO_VELOCITY_SIGMA_MPS, ImuMotion, NavState
 from vio.filters.noise import MotionNoise
 from vio.filters.online_calibration import Calibration, all_imu_terms, first_calibration
@@ -30,21 +29,19 @@ from vio.filters.rig_calibration import RigCalibration
 from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Clone, Window
-from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_exp, so3_log, transform_points
+from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_exp, so3_log
 from vio.geometry.relative_pose import RelativePose
-from vio.geometry.stereo import StereoCamera, depth_of, project
+from vio.geometry.stereo import StereoCamera
 from vio.protocols import Backend
 from vio.records import (
     Estimate,
     ImuSample,
     Landmarks,
-    MotionPrior,
     MotionSample,
     MotionSource,
     Observations,
     Prediction,
     RotationComparison,
-    TrackPrior,
     UpdateReport,
     VelocitySample,
     no_landmarks,
@@ -152,19 +149,7 @@ class Msckf(Backend):
         if window is None or not window.clones or time_ns < self._propagation.time_ns:
             return None
         predicted = self._propagation.predict(window, time_ns)
-        return None if predicted is None else Prediction(self._expected_tracks(window, *predicted), predicted[1])
-
-    def _expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
-        table, camera = self._frame.tracks.table, self._rig.camera
-        rows = table.rows()
-        rows = rows[table.has_point[rows]]
-        ids = np.concatenate([table.ids(rows), window.landmark_ids])
-        p_cam = transform_points(T_cam0_world, np.concatenate([table.points[rows], window.landmarks]))
-        ahead = depth_of(camera, p_cam) > MIN_DEPTH * camera.baseline_m
-        z, field = project(camera, p_cam[ahead]), self._rig.field(window)
-        if field is not None:
-            z = field.seen(z)
-        return TrackPrior(ids[ahead], z, motion.T_curr_prev[:3, :3], motion)
+        return None if predicted is None else Prediction(self._frame.expected_tracks(window, *predicted), predicted[1])
 
     def update(self, observations: Observations) -> UpdateReport:
         """Propagate to the time of the frame and update with its observations.
@@ -201,7 +186,7 @@ class Msckf(Backend):
         if window.clones and not len(seen):
             # A frame that shows nothing ends no track; what is seen next decides.
             propagation.blind = True
-            if not self._is_sane(window):
+            if not _is_sane(window, self._source):
                 raise DivergedError(_lost(observations.frame_index))
             return UpdateReport(0, 0, 0, len(window.landmarks), None, None)
         propagation.blind = False
@@ -222,7 +207,7 @@ class Msckf(Backend):
             self._keep_first_yaw(window, before)
         except np.linalg.LinAlgError as error:
             raise DivergedError(_lost(observations.frame_index)) from error
-        if not self._is_sane(window):
+        if not _is_sane(window, self._source):
             raise DivergedError(_lost(observations.frame_index))
         if report.used >= report.gated:
             self._good = GoodState(
@@ -281,12 +266,6 @@ class Msckf(Backend):
         window = Window(self._propagation.motion, nav, np.asarray(block_diag(P, own)), calibration)
         self._rig.follow_constants(window, self._source)
         return window
-
-    def _is_sane(self, window: Window) -> bool:
-        """Whether the state is made of numbers, and with an IMU of a possible speed."""
-        if not np.isfinite(window.prior.P).all() or not np.isfinite(window.nav.T_world_imu).all():
-            return False
-        return self._source != "imu" or float(np.linalg.norm(window.nav.velocity)) < _MOST_SPEED_MPS
 
     def estimate(self) -> Estimate:
         """Return the estimate at the time of the last event."""
@@ -419,3 +398,10 @@ def _half_tangent(R: FloatArray) -> FloatArray:
     half = 0.5 * float(np.linalg.norm(phi))
     out: FloatArray = phi * (0.5 * np.tan(half) / half if half > 1e-6 else 0.5)
     return out
+
+
+def _is_sane(window: Window, source: MotionSource | None) -> bool:
+    """Whether the state is made of numbers, and with an IMU of a possible speed."""
+    if not np.isfinite(window.prior.P).all() or not np.isfinite(window.nav.T_world_imu).all():
+        return False
+    return source != "imu" or float(np.linalg.norm(window.nav.velocity)) < _MOST_SPEED_MPS
