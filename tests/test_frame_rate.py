@@ -19,7 +19,7 @@ from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.frame_rate import FrameRateLimit
 from vio.errors import DataError
 from vio.live.odometry import Odometry
-from vio.monitor.run import RunWatch
+from vio.monitor.run import RunMonitor
 from vio.records import StereoFrame
 from vio.runs.pipeline import run
 
@@ -129,16 +129,16 @@ def test_an_inspection_may_look_at_any_frame(flight: Path) -> None:
 
 
 def test_refused_frames_in_a_row_are_one_line(caplog: pytest.LogCaptureFixture) -> None:
-    watch = RunWatch(CAMERA, T_CAM0_IMU, imu=False)
+    monitor = RunMonitor(CAMERA, T_CAM0_IMU, imu=False)
     for index in (0, 2, 4, 6):
-        watch.repeats(StereoFrame(index, index * STEP_NS, None, None), None)
+        monitor.repeats(StereoFrame(index, index * STEP_NS, None, None), None)
         if index > 0:
-            watch.refused(index, "left and right look swapped")
-    assert len(watch.lines) == 1
-    watch.repeats(StereoFrame(8, 8 * STEP_NS, None, None), None)
-    watch.repeats(StereoFrame(10, 10 * STEP_NS, None, None), None)
-    watch.refused(10, "left and right look swapped")
-    assert len(watch.lines) == 2
+            monitor.refused(index, "left and right look swapped")
+    assert len(monitor.lines) == 1
+    monitor.repeats(StereoFrame(8, 8 * STEP_NS, None, None), None)
+    monitor.repeats(StereoFrame(10, 10 * STEP_NS, None, None), None)
+    monitor.refused(10, "left and right look swapped")
+    assert len(monitor.lines) == 2
 
 
 def test_coverage_is_of_the_frames_that_are_used(flight: Path) -> None:

@@ -15,7 +15,7 @@ from vio.geometry.lie import FloatArray
 from vio.imu.clocks import SampleCoverage
 from vio.imu.faults import ImuSampleCheck
 from vio.live.event_order import EventOrder
-from vio.monitor.run import RunWatch
+from vio.monitor.run import RunMonitor
 from vio.records import Event, ImuSample, StereoFrame
 
 FRAMES = 60
@@ -140,19 +140,19 @@ def test_a_reading_given_twice_is_not_a_second_measurement_but_no_fault_either()
 
 
 def _lines(samples: list[ImuSample]) -> list[str]:
-    """All lines of a run's watch, with the flight's features at every tenth sample."""
-    watch, flight = RunWatch(CAMERA, T_CAM0_IMU, imu=True), Flight(FRAMES)
+    """All lines of a run monitor, with the flight's features at every tenth sample."""
+    monitor, flight = RunMonitor(CAMERA, T_CAM0_IMU, imu=True), Flight(FRAMES)
     rng = np.random.default_rng(0)
     events: list[Event] = [*samples, *(StereoFrame(k, k * 50_000_000, None, None) for k in range(FRAMES))]
     order = EventOrder(wait_for_imu=True)
     ready = [e for event in sorted(events, key=lambda e: e.time_ns) for e in order.add(event)]
     for event in [*ready, *order.flush()]:
         if isinstance(event, StereoFrame):
-            watch.observations(flight.observe(event.index, 0.1, rng))
+            monitor.observations(flight.observe(event.index, 0.1, rng))
         else:
-            watch.sample(event)
-    watch.close()
-    return watch.lines
+            monitor.sample(event)
+    monitor.close()
+    return monitor.lines
 
 
 def _faulty(change: Change) -> list[ImuSample]:

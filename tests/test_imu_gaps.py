@@ -16,7 +16,7 @@ from vio.filters.navigation import ImuMotion, NavState
 from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log
 from vio.live.event_order import EventOrder
-from vio.monitor.run import RunWatch
+from vio.monitor.run import RunMonitor
 from vio.records import Event, ImuSample, StereoFrame, UpdateReport, VelocitySample
 
 QUIET = MsckfSettings()
@@ -208,17 +208,17 @@ def test_a_gap_hides_what_a_brownian_bridge_hides_and_a_hold_what_brownian_motio
 
 
 def _lines(times_s: list[float], frames_s: list[float]) -> list[str]:
-    watch = RunWatch(CAMERA, T_CAM0_IMU, imu=True)
+    monitor = RunMonitor(CAMERA, T_CAM0_IMU, imu=True)
     flight, rng = Flight(), np.random.default_rng(0)
     events: list[Event] = [_sample(round(1e9 * t)) for t in times_s]
     events += [_frame(k, round(1e9 * t)) for k, t in enumerate(frames_s)]
     for event in _ordered(sorted(events, key=lambda e: e.time_ns)):
         if isinstance(event, StereoFrame):
-            watch.observations(replace(flight.observe(0, 0.5, rng), frame_index=event.index, time_ns=event.time_ns))
+            monitor.observations(replace(flight.observe(0, 0.5, rng), frame_index=event.index, time_ns=event.time_ns))
         else:
-            watch.sample(event)
-    watch.close()
-    return [line for line in watch.lines if line.startswith(("frame", "no IMU"))]
+            monitor.sample(event)
+    monitor.close()
+    return [line for line in monitor.lines if line.startswith(("frame", "no IMU"))]
 
 
 FRAMES_S = [0.05 * k for k in range(100)]

@@ -21,7 +21,7 @@ from vio.geometry.stereo import StereoCamera, project
 from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
 from vio.monitor.inertial import InertialCheck
-from vio.monitor.run import RunWatch
+from vio.monitor.run import RunMonitor
 from vio.records import ImuSample, Observations, observations
 from vio.sim.imu import ImuNoise, simulate_imu
 from vio.sim.motion import MotionSpline, car_loop, fit_spline, hand_held, motion_at, rotate_body_axes
@@ -275,24 +275,24 @@ def test_the_filter_judges_no_baseline_by_an_imu_that_looks_faulty(name: str, at
     """From the frame on in which the fault shows; units show at once, axes and signs with motion."""
     it = _recording("room")
     samples = _CORRUPTED[name][0](it) if name else it.samples
-    watch = RunWatch(it.camera, it.T_cam0_imu, imu=True)
+    monitor = RunMonitor(it.camera, it.T_cam0_imu, imu=True)
     agree = []
     for event in sorted([*samples, *it.frames[: at + 60]], key=lambda e: e.time_ns):
         if isinstance(event, ImuSample):
-            watch.sample(event)
+            monitor.sample(event)
         else:
-            watch.observations(event)
-            agree.append(watch.rotation_comparison is not None and watch.rotation_comparison.agree)
+            monitor.observations(event)
+            agree.append(monitor.rotation_comparison is not None and monitor.rotation_comparison.agree)
     assert any(agree[at + 20 :]) == (name == "")
 
 
 @pytest.mark.parametrize("factor", [1.0, 1000.0])
 def test_a_run_says_once_that_its_baseline_is_in_another_unit(factor: float) -> None:
     it = _recording("room")
-    watch = RunWatch(replace(it.camera, baseline_m=factor * it.camera.baseline_m), it.T_cam0_imu, imu=False)
+    monitor = RunMonitor(replace(it.camera, baseline_m=factor * it.camera.baseline_m), it.T_cam0_imu, imu=False)
     for seen in it.frames[:3]:
-        watch.observations(seen)
-    said = [line for line in watch.lines if "m is implausible; translations are metres: check the unit" in line]
+        monitor.observations(seen)
+    said = [line for line in monitor.lines if "m is implausible; translations are metres: check the unit" in line]
     assert len(said) == (factor > 1)
 
 

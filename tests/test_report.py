@@ -23,7 +23,7 @@ from vio.records import LoopEvent, MapKeyframes
 from vio.report.page import page
 from vio.report.words import run_figures, summary
 from vio.runs.curves import curves_of
-from vio.runs.finished import read_finished_run, with_distinct_names
+from vio.runs.finished import _read_frames, read_finished_run, with_distinct_names
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -46,6 +46,12 @@ def test_the_folder_of_a_run_tells_its_errors_without_the_recording(runs: tuple[
     run = read_finished_run(runs[0])
     assert run.evaluation is not None
     assert run.evaluation.ate_m.rmse == pytest.approx(metrics["ate_m"], rel=1e-6)
+
+
+def test_frame_logs_of_older_versions_are_read_by_the_names_of_today(tmp_path: Path) -> None:
+    (tmp_path / "frames.csv").write_text("index,watch_ms\n0,0.5\n1,\n", encoding="utf-8")
+    frames = _read_frames(tmp_path / "frames.csv", 2)
+    np.testing.assert_array_equal(frames["monitor_ms"], [0.5, np.nan])
 
 
 def test_the_words_and_the_table_hold_the_figures_of_the_run(runs: tuple[Path, Path]) -> None:

@@ -549,7 +549,7 @@ def no_map_keyframes() -> MapKeyframes:
     return MapKeyframes(none, none, none, np.zeros(0, dtype=np.bool_), np.zeros((0, 4, 4)))
 
 
-STAGES = ("read", "frontend", "watch", "select", "filter")  # of a frame's wall time
+STAGES = ("read", "frontend", "monitor", "select", "filter")  # of a frame's wall time
 
 
 @dataclass(frozen=True, slots=True)
@@ -560,7 +560,7 @@ class FrameLog:
     time_ns: int
     read_ms: float
     frontend_ms: float
-    watch_ms: float
+    monitor_ms: float
     select_ms: float
     filter_ms: float
     detected: int

@@ -332,7 +332,7 @@ class Msckf(Backend):
         return self._points.take()
 
     def _wait(self, observations: Observations) -> UpdateReport:
-        """Let a frame pass that comes before the first motion sample; the run's watch says so."""
+        """Let a frame pass that comes before the first motion sample; the run monitor reports it."""
         self._propagation.time_ns = observations.time_ns
         return UpdateReport(0, 0, 0, 0, None, None)
 

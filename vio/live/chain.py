@@ -7,7 +7,7 @@ import time
 from vio.errors import DataError, DivergedError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
-from vio.monitor.run import RunWatch
+from vio.monitor.run import RunMonitor
 from vio.protocols import Backend, Frontend, Selector
 from vio.records import (
     FrameLog,
@@ -49,7 +49,7 @@ class Chain:
             use_prior: whether the front end is offered the pixels that the filter expects.
         """
         self.frontend, self.selector, self.backend = frontend, selector, backend
-        self.watch = RunWatch(camera, T_cam0_body, imu=motion == "imu")
+        self.monitor = RunMonitor(camera, T_cam0_body, imu=motion == "imu")
         self._motion = motion
         self._use_prior = use_prior
         self._propagate_ms = 0.0  # since the last frame
@@ -57,13 +57,13 @@ class Chain:
     def sample(self, sample: MotionSample) -> None:
         """Take one motion sample."""
         start = time.perf_counter()
-        self.watch.sample(sample)
+        self.monitor.sample(sample)
         if self._motion is not None:
             self.backend.propagate(sample)
         self._propagate_ms += 1e3 * (time.perf_counter() - start)
 
     def frame(self, frame: StereoFrame) -> FrameResult | None:
-        """Process one frame; None where the front end refused it, which the watch says.
+        """Process one frame; None where the front end refused it, which the monitor reports.
 
         Raises:
             EstimationError: the filter is lost.
@@ -72,33 +72,33 @@ class Chain:
         expected = self.backend.predict(frame.time_ns)
         timer.end("predict")
         try:
-            if self.watch.repeats(frame, expected):
+            if self.monitor.repeats(frame, expected):
                 output = no_features(frame)
             else:
-                shown = self.watch.without_repeated_depth(frame)
+                shown = self.monitor.without_repeated_depth(frame)
                 output = self.frontend.process(shown, expected.tracks if expected and self._use_prior else None)
         except DataError as error:
-            self.watch.refused(frame.index, str(error))
+            self.monitor.refused(frame.index, str(error))
             return None
         timer.end("frontend")
-        self.watch.observations(output.observations, output.warnings)
-        timer.end("watch")
+        self.monitor.observations(output.observations, output.warnings)
+        timer.end("monitor")
         seen = output.observations
         if self.backend.stereo_only:
             seen = seen.take(seen.has_right)
         selection = self.selector.select(seen, expected.motion if expected else None)
         timer.end("select")
         if self._motion == "imu":
-            self.backend.take_rotation_comparison(self.watch.rotation_comparison)
+            self.backend.take_rotation_comparison(self.monitor.rotation_comparison)
         report = self._update(seen.take(selection.chosen))
         initialisation = self.backend.initialisation
         if not report.started:
-            self.watch.waiting(frame, initialisation.waits_for or "the state is not observable yet")
+            self.monitor.waiting(frame, initialisation.waits_for or "the state is not observable yet")
             return None
-        self.watch.begun(frame, initialisation.scale_sigma)
+        self.monitor.begun(frame, initialisation.scale_sigma)
         estimate = self.backend.estimate()
         timer.end("update")
-        self.watch.update(frame.index, report, estimate)
+        self.monitor.update(frame.index, report, estimate)
         timer.ms["filter"] = timer.ms["predict"] + timer.ms["update"] + self._propagate_ms
         self._propagate_ms = 0.0
         return FrameResult(
@@ -112,9 +112,9 @@ class Chain:
         except DivergedError as error:
             report = self.backend.restart(seen)
             if report.started:
-                self.watch.restarted(seen.frame_index, str(error), self.backend.estimate())
+                self.monitor.restarted(seen.frame_index, str(error), self.backend.estimate())
             else:
-                self.watch.lost(seen.frame_index, str(error))
+                self.monitor.lost(seen.frame_index, str(error))
             return report
 
 
@@ -140,7 +140,7 @@ def _frame_log(
         time_ns=frame.time_ns,
         read_ms=0.0,  # who reads the images, knows
         frontend_ms=ms["frontend"],
-        watch_ms=ms["watch"],
+        monitor_ms=ms["monitor"],
         select_ms=ms["select"],
         filter_ms=ms["filter"],
         detected=output.detected,

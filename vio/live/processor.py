@@ -49,7 +49,7 @@ class EventProcessor:
     def finish(self) -> list[FrameResult]:
         """Process the frames that still wait, and let the checks report what they have not yet reported."""
         results = self._process(self._order.flush())
-        self._chain.watch.close()
+        self._chain.monitor.close()
         if self.map is not None:
             self.map.finish()
         return results
@@ -62,17 +62,17 @@ class EventProcessor:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the checks have found so far, one line each."""
-        return tuple(self._chain.watch.lines)
+        return tuple(self._chain.monitor.lines)
 
     @property
     def frames_refused(self) -> int:
         """Number of frames that the front end refused."""
-        return self._chain.watch.frames_refused
+        return self._chain.monitor.frames_refused
 
     @property
     def frames_waiting(self) -> int:
         """Number of frames without a pose, as the back end could not be initialised yet."""
-        return self._chain.watch.frames_waiting
+        return self._chain.monitor.frames_waiting
 
     def landmarks(self) -> Landmarks:
         """Return the points of the map so far, after the first frame with a pose."""

@@ -92,7 +92,7 @@ class PlacePoints:
         a = self.p[rows], self.eye[rows], self.size_px[rows], self.descriptors[rows]
         return PlacePoints(self.views, *a, self.view[rows], self.row[rows])
 
-    def main_stretch(self) -> IntArray:
+    def main_segment(self) -> IntArray:
         """Return the points (K,) of the segment of the path that shows most of them."""
         middle = np.array([view.middle for view in self.views])[self.view]
         values, counts = np.unique(middle, return_counts=True)
@@ -188,19 +188,19 @@ def search(
     chance = _chance(pairs, target)
     if inliers < min(_OVER_CHANCE * chance, LEAST_CORNERS + 0.5 * _OVER_CHANCE * chance):
         return None
-    own = _of_one_stretch(points, here, rows, agree)
+    own = _of_one_segment(points, here, rows, agree)
     weak = None if prior is None else RelativePose(prior.T_i_j, prior.covariance / _PRIOR_SHARE)
     terms = Terms(stereo.take(own), camera, here, rows[own], inverse=True)
     measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_LEAST_SAMPLE)
     return None if measured is None else _guided(measured, points.take(own), rows[own], inliers, chance)
 
 
-def _of_one_stretch(points: PlacePoints, here: KeyframeFeatures, rows: IntArray, agree: IntArray) -> IntArray:
+def _of_one_segment(points: PlacePoints, here: KeyframeFeatures, rows: IntArray, agree: IntArray) -> IntArray:
     """Return those of the pairs that `agree` which are of the segment that shows most of them, or all if too few are.
 
     How segments stand to each other is what the map says so far, which is not to come back as a measurement.
     """
-    own = agree[points.take(agree).main_stretch()]
+    own = agree[points.take(agree).main_segment()]
     return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree
 
 

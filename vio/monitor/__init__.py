@@ -1,4 +1,8 @@
-"""Monitoring of a run without influence on it: plausibility of the IMU data and of the estimate.
+"""Monitoring of a run: plausibility of images, IMU data and estimate.
+
+It reports, and changes one thing: a frame whose images repeat an earlier exposure is dropped before the front end, and
+a depth image that does so is left out of its frame. It also compares the camera's rotations with the gyro's for the
+filter, which may then estimate the focal length. Nothing else depends on it.
 
 This package does not depend on readers, front ends or filters.
 """

@@ -35,8 +35,11 @@ log = logging.getLogger(__name__)
 _PREVENTS_START = ("size", "overlap")  # groups of faults without whose cure one camera finds no scale
 
 
-class RunWatch:
-    """Monitor all events of a run in time order; log warnings, and keep them in `lines`."""
+class RunMonitor:
+    """Monitor all events of a run in time order; log warnings, and keep them in `lines`.
+
+    `repeats` and `without_repeated_depth` decide which frames and depth images are dropped.
+    """
 
     def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, *, imu: bool) -> None:
         """Create the monitors.

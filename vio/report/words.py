@@ -74,7 +74,7 @@ def _work_ms(run: FinishedRun) -> Any:
     return np.sum([run.frames[name] for name in run.frames if name in _TIMES], axis=0)
 
 
-_TIMES = ("read_ms", "frontend_ms", "watch_ms", "select_ms", "filter_ms")
+_TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
 
 
 def run_figures(run: FinishedRun) -> dict[str, str]:

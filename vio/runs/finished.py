@@ -27,6 +27,8 @@ from vio.files.trajectories import read_trajectory
 
 log = logging.getLogger(__name__)
 
+_FORMER = {"watch_ms": "monitor_ms"}  # columns of frames.csv by their names until 0.2
+
 _PLY_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "sigma")])
 _MOST_PLY_BYTES = 2 << 30
 
@@ -138,7 +140,8 @@ def _read_frames(path: Path, count: int) -> dict[str, FloatArray]:
         raise DataError(f"{path}: has {len(lines)} frames where estimates.npy has {count}; repeat the run")
     try:
         return {
-            name: np.array([float(line[k]) if line[k] else np.nan for line in lines]) for k, name in enumerate(header)
+            _FORMER.get(name, name): np.array([float(line[k]) if line[k] else np.nan for line in lines])
+            for k, name in enumerate(header)
         }
     except ValueError as error:
         raise DataError(f"{path}: {error}; repeat the run") from error

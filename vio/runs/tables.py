@@ -46,7 +46,7 @@ ESTIMATE = np.dtype(
 )
 _STAGES = 16  # of the front end, at most
 _COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")
-_TIMES = ("read_ms", "frontend_ms", "watch_ms", "select_ms", "filter_ms")
+_TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
 _NUMBERS = ("innovation_median_px", "nis_per_dof")
 FRAME = np.dtype(
     [
