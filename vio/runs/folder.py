@@ -187,7 +187,7 @@ def _write_files(
     if evaluation is not None:
         times_ns = result.trajectory.times_ns
         assert times_ns is not None
-        # The poses that were compared, each at the time of its estimate: the folder alone then tells the errors.
+        # The poses that were compared, each at the time of its estimate: the folder alone then gives the errors.
         write_tum(target / RunFile.REFERENCE, replace(evaluation.reference, times_ns=times_ns[evaluation.rows]))
     if result.dead_reckoning is not None:
         write_tum(target / RunFile.DEAD_RECKONING, result.dead_reckoning)
