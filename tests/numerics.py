@@ -20,6 +20,7 @@ TESTED_JACOBIANS = {
     "vio.filters.navigation.rate_D_error",
     "vio.filters.navigation.tilt_D_terms",
     "vio.filters.window.body_D_error",
+    "vio.filters.online_calibration.camera_D_error",
     "vio.filters.window.camera_D_own",
     "vio.filters.stereo_calibration.point_D_stereo",
     "vio.filters.stereo_calibration.rows_D_common",

@@ -424,13 +424,13 @@ def test_eval_aligns_as_requested(recording: Path, tmp_path: Path, capsys: pytes
     assert main(["eval", str(estimate), str(larger), "--lengths", "5,10"]) == 0
     printed = capsys.readouterr().out.splitlines()
     assert [line[:10].strip() for line in printed] == [
-        *("compared", "path", "alignment", "ATE", "attitude", "RPE", "drift", "5 m", "10 m"),
+        *("compared", "path", "alignment", "ATE", "scale", "attitude", "RPE", "drift", "5 m", "10 m"),
     ]
     with pytest.raises(SystemExit):
         main(["eval", str(estimate), str(larger), "--lengths", "far"])
     assert "'far' is no list of path lengths; give metres above 0, as in 25,50" in capsys.readouterr().err
-    assert printed[6].endswith("over 5 to 10 m")
-    assert {len(line) - len(line.lstrip()) for line in (row[11:] for row in printed[7:])} <= {2, 3}, "aligned"
+    assert printed[7].endswith("over 5 to 10 m")
+    assert {len(line) - len(line.lstrip()) for line in (row[11:] for row in printed[8:])} <= {2, 3}, "aligned"
 
 
 def test_evo_reads_every_trajectory_file(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,7 @@ from vio.evaluation.trajectories import rotation_angle_deg
 from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, so3_exp, transform_points
 from vio.geometry.stereo import project
+from vio.live.build import Parts
 from vio.offline.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px, write_model
 from vio.offline.colmap.reconstruction import pairs_to_match
 from vio.offline.colmap.trajectory import read_colmap_trajectory
@@ -57,7 +58,7 @@ def _make_run(simulation: Simulation, folder: Path, *, stop: int | None = None, 
     dataset = SimulatedRecording(simulation)
     config = replace(Config(), backend="vislam", motion="none")
     front = OracleFrontend(simulation, settings, seed=4)
-    result = process(dataset, config, frontend=front, stop=stop, keep_observations=True)
+    result = process(dataset, config, parts=Parts(frontend=front), stop=stop, keep_observations=True)
     write_run_folder(folder, result, dataset.recording.reference, save_observations=True)
     return folder
 
@@ -394,7 +395,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     dataset = open_dataset(place / "kitti")
     front = OracleFrontend(plan, OracleSettings(max_features=80, sigma_px=0.1), seed=1)
     config = replace(Config(), backend="vislam", motion="none")
-    result = process(dataset, config, frontend=front, keep_observations=True)
+    result = process(dataset, config, parts=Parts(frontend=front), keep_observations=True)
     write_run_folder(place / "run", result, dataset.recording.reference, save_observations=True)
     _add_loop(place / "run", (3, 7))
     return place / "kitti", place / "run"

@@ -216,6 +216,10 @@ def test_jacobian_of_the_cloned_camera_equals_central_differences() -> None:
     numeric = numeric_jacobian(camera, np.zeros(DIM + 7))
     np.testing.assert_allclose(analytic, numeric, atol=1e-6)
     np.testing.assert_array_equal(noise, 0.0)
+    for name in ("extrinsics", "time_offset"):
+        column = online_calibration.BLOCKS[name].camera_D_error(window.nav.T_world_imu, exposed, twist)
+        assert column is not None
+        np.testing.assert_allclose(column, numeric[:, window.state[name]], atol=1e-6)
 
 
 def test_moving_the_means_moves_cameras_and_bodies_as_their_errors_say() -> None:

@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from collections.abc import Callable
 
 from vio.protocols import Backend
 
 __all__ = ["BACKENDS", "backend_class"]
 
-# Where each back end is, by its name in the configuration; its settings are the section of the same name, if any.
-BACKENDS = {
-    "vislam": "vio.filters.vislam:Vislam",
-    "msckf": "vio.filters.msckf:Msckf",
-}
+
+def _vislam() -> type[Backend]:
+    from vio.filters.vislam import Vislam
+
+    return Vislam
+
+
+def _msckf() -> type[Backend]:
+    from vio.filters.msckf import Msckf
+
+    return Msckf
+
+
+# The back ends by their names in the configuration; the settings of one are the section of the same name, if any.
+BACKENDS: dict[str, Callable[[], type[Backend]]] = {"vislam": _vislam, "msckf": _msckf}
 
 
 def backend_class(name: str) -> type[Backend]:
     """Return the class of the back end called `name`, a key of `BACKENDS`."""
-    module, _, found = BACKENDS[name].partition(":")
-    backend: type[Backend] = getattr(import_module(module), found)
-    return backend
+    return BACKENDS[name]()
