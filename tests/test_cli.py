@@ -495,7 +495,10 @@ def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: py
         "last_frame": 29,
         "path_length_m": 9.0,
         "stages_ms": {},
-        "ms_per_frame": 20.0,
+        "ms_per_frame_median": 20.0,
+        "ms_per_frame_95": 30.0,
+        "start_s": 0.0,
+        "refused_share": None,
     }
     metrics |= {"backend": "msckf", "motion": None, "camera": {}, "stereo_field": field, "out": "runs/drive"}
     print_result({}, metric_rows(metrics | dict.fromkeys(absent)), as_json=False)

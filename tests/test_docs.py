@@ -207,7 +207,7 @@ def test_readme_shows_what_the_demo_prints(
 
     monkeypatch.chdir(readme_folder)
     metrics = yaml.safe_load((readme_folder / "demo/run/metrics.json").read_text(encoding="utf-8"))
-    shown_drift = {"t_err_percent": 0.05, "r_err_deg_per_100m": 0.039, "drift_lengths_m": [100]}
+    shown_drift = {"start_s": 0.0, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039, "drift_lengths_m": [100]}
     print_result({}, metric_rows({**metrics, **shown_drift}), as_json=False)
     shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
     assert re.sub(r"[\d.]+\d", "#", capsys.readouterr().out) == re.sub(r"[\d.]+\d", "#", shown)

@@ -64,7 +64,8 @@ def test_the_words_and_the_table_hold_the_figures_of_the_run(runs: tuple[Path, P
     figures = run_figures(run)
     assert figures["ATE (m)"] == f"{run.metrics['ate_m']:.4f}"
     assert figures["path (m)"] == f"{run.metrics['path_length_m']:.2f}"
-    assert figures["ms a frame, mean"] == f"{run.metrics['ms_per_frame']:.1f}"
+    assert figures["ms a frame, median"] == f"{run.metrics['ms_per_frame_median']:.1f}"
+    assert figures["observations refused (%)"] == f"{100 * run.metrics['refused_share']:.1f}"
 
 
 def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -> None:

@@ -33,6 +33,7 @@ METRICS = (
     Metric("drift_deg_per_100m", "deg/100 m", 3),
     Metric("coverage", "coverage", 3, larger_is_better=True),
     Metric("nees", "NEES of 6", 3),
+    Metric("refused_share", "refused", 2),
     Metric("cpu_ms", "CPU ms a frame", 3, measured=True),
     Metric("memory_mib", "peak MiB", 3, measured=True),
 )

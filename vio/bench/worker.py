@@ -149,7 +149,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
     """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
     import cv2
 
-    from vio.runs.folder import growing_folder
+    from vio.runs.folder import growing_folder, refused_share
     from vio.runs.pipeline import RunControl, run  # loads compiled functions: not for what cannot be opened
 
     cv2.setNumThreads(1)  # tasks run side by side; the figures do not depend on it
@@ -162,6 +162,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             "frames": len(result.frames),
             "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
             "coverage": coverage(_used(truth, config), trajectory),
+            "refused_share": refused_share(result.frames),
         }
         record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}
         if truth.reference is not None:

@@ -61,13 +61,14 @@ def _path_m(run: FinishedRun) -> float:
 
 
 def _speed(run: FinishedRun) -> str:
-    ms = float(np.nanmean(_work_ms(run)))
+    ms = float(np.nanmedian(_work_ms(run)))
     frames, span_s = len(run.estimates), float(run.seconds[-1])
     if frames < 2 or span_s <= 0:
-        return f"A frame took {ms:.1f} ms."
+        return f"A frame took {ms:.1f} ms in the median."
     given_ms = 1e3 * span_s / (frames - 1)
     verdict = "faster than" if ms < given_ms else "slower than"
-    return f"A frame took {ms:.1f} ms; the recording has one every {given_ms:.1f} ms, so this is {verdict} real time."
+    every = f"the recording has one every {given_ms:.1f} ms, so this is {verdict} real time"
+    return f"A frame took {ms:.1f} ms in the median; {every}."
 
 
 def _work_ms(run: FinishedRun) -> Any:
@@ -75,6 +76,11 @@ def _work_ms(run: FinishedRun) -> Any:
 
 
 _TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
+
+
+def _refused_percent(run: FinishedRun) -> str:
+    used, refused = (float(np.nansum(run.frames[name])) for name in ("used", "gated"))
+    return f"{100 * refused / (used + refused):.1f}" if used + refused else "–"
 
 
 def run_figures(run: FinishedRun) -> dict[str, str]:
@@ -92,7 +98,8 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
         "drift (%)": "–" if kitti is None else f"{kitti.t_err_percent:.3f}",
         "drift of rotation": "–" if kitti is None else rotation_drift_text(kitti.r_err_deg_per_100m, kitti.lengths_m),
         "features used, median": f"{np.nanmedian(run.frames['used']):.0f}",
-        "ms a frame, mean": f"{np.nanmean(work):.1f}",
+        "observations refused (%)": _refused_percent(run),
+        "ms a frame, median": f"{np.nanmedian(work):.1f}",
         "ms a frame, 95 %": f"{np.nanpercentile(work, 95):.1f}",
         "landmarks": str(len(run.points)),
         "warnings": str(len(m.get("warnings") or [])),

@@ -8,7 +8,7 @@ import math
 import platform
 import shutil
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -40,6 +40,7 @@ from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, 
 log = logging.getLogger(__name__)
 
 _OF_THE_OUTPUT = ("source", "reference", "lengths_m", "save_calibration")  # of a request: it may move, or be compared anew
+_SLOW = 10.0  # times the median; frames that take longer compile, or wait for something else
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 
 
@@ -255,6 +256,18 @@ def score(
         return None, None
 
 
+def start_s(work_ms: FloatArray) -> float:
+    """Return the seconds that slow frames took beyond the median, as the first ones do that compile the loops."""
+    median = float(np.median(work_ms))
+    return float(np.sum(work_ms[work_ms > _SLOW * median] - median)) * 1e-3
+
+
+def refused_share(frames: Iterable[FrameLog]) -> float | None:
+    """Return which share of the observations the gates refused in a run; None: there was nothing to refuse."""
+    used, refused = np.sum([(f.used, f.gated) for f in frames], axis=0)
+    return float(refused / (used + refused)) if used + refused else None
+
+
 def metrics_of(
     result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None, folder: Path
 ) -> dict[str, Any]:
@@ -281,7 +294,9 @@ def metrics_of(
         "ms_per_frame": float(work_ms.mean()),
         "ms_per_frame_median": float(np.median(work_ms)),
         "ms_per_frame_95": float(np.percentile(work_ms, 95)),
-        "stages_ms": {name: float(np.mean([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES},
+        "start_s": start_s(work_ms),
+        "stages_ms": {name: float(np.median([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES},
+        "refused_share": refused_share(frames),
         "landmarks": len(result.landmarks.ids),
         "ate_m": None if scores is None else scores["ate_m"],
         "rpe": None if scores is None else scores["rpe"],
