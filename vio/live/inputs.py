@@ -12,17 +12,22 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.records import Image, IntArray
 
+_MOST_NS = 2**62  # differences of times stay within 64 bits
+
 
 def checked_time(t_ns: Any) -> int:
     """Return a time as an integer.
 
     Raises:
-        DataError: it is none.
+        DataError: it is none, or further from the epoch than 146 years.
     """
     try:
-        return operator.index(t_ns)
+        time_ns = operator.index(t_ns)
     except TypeError as error:
         raise DataError(f"a time must be an integer number of nanoseconds, got {t_ns!r}") from error
+    if abs(time_ns) > _MOST_NS:
+        raise DataError(f"{time_ns} ns is no time of a clock; give nanoseconds")
+    return time_ns
 
 
 def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[int], list[FloatArray]]:
@@ -46,6 +51,8 @@ def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[i
             raise DataError(f"{name} at {np.atleast_1d(times)[0]} ns is not finite: {array}")
         rows.append(array.reshape(-1, 3).copy())
     times = np.atleast_1d(times)
+    if np.any((times > _MOST_NS) | (times < -_MOST_NS)):
+        raise DataError(f"{times[0]} to {times[-1]} ns are no times of a clock; give nanoseconds")
     if (np.diff(times) <= 0).any():
         raise DataError("times of samples must increase; sort them and give each once")
     return times.tolist(), rows
