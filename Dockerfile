@@ -6,7 +6,7 @@ COPY pyproject.toml setup.py constraints.txt README.md LICENSE ./
 COPY vio vio
 COPY frontend frontend
 RUN python -m venv /opt/vio \
-    && /opt/vio/bin/pip install --no-cache-dir -c constraints.txt '.[bags]'
+    && /opt/vio/bin/pip install --no-cache-dir -c constraints.txt .
 
 FROM python:3.11-slim
 # OpenCV's wheel needs glib, pycolmap's OpenMP.

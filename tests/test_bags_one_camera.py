@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-rosbags = pytest.importorskip("rosbags", reason="needs the extra bags")
+rosbags = pytest.importorskip("rosbags", reason="needs rosbags")
 
 from tests.bag_maker import Script, noise_frames  # noqa: E402
 from tests.same_events import assert_same_events  # noqa: E402

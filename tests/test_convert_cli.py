@@ -66,7 +66,7 @@ def test_a_conversion_never_removes_its_source_nor_what_others_put_beside_it(
 
 def _needs_rosbags(form: str) -> None:
     if form in BAGS:
-        pytest.importorskip("rosbags", reason="needs the extra bags")
+        pytest.importorskip("rosbags", reason="needs rosbags")
 
 
 @pytest.mark.parametrize("form", BAGS)

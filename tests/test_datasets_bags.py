@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-rosbags = pytest.importorskip("rosbags", reason="needs the extra bags")
+rosbags = pytest.importorskip("rosbags", reason="needs rosbags")
 
 from tests.bag_maker import Script, noise_frames, of_stereo  # noqa: E402
 from tests.same_events import assert_same_events  # noqa: E402

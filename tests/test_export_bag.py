@@ -13,7 +13,7 @@ from vio.geometry.lie import rotation_from_quat_xyzw, se3_exp, se3_inverse, so3_
 from vio.offline.export_bag import ros_covariance
 from vio.runs.finished import read_finished_run
 
-rosbags = pytest.importorskip("rosbags", reason="needs the extra bags")
+rosbags = pytest.importorskip("rosbags", reason="needs rosbags")
 
 
 @pytest.fixture(scope="module")

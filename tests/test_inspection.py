@@ -205,7 +205,7 @@ def test_rest_and_the_direction_of_gravity() -> None:
 @pytest.mark.parametrize("name", ["tumvi_room1_head", "ros2_s3e_db3"])
 def test_real_recordings(name: str, data_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if name == "ros2_s3e_db3":
-        pytest.importorskip("rosbags", reason="needs the extra bags")
+        pytest.importorskip("rosbags", reason="needs rosbags")
         assert main(["inspect", str(data_dir / name)]) == 1
         assert "holds no CameraInfo" in capsys.readouterr().err
         return

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-pytest.importorskip("rosbags", reason="needs the extra bags")
+pytest.importorskip("rosbags", reason="needs rosbags")
 
 from tests.bag_maker import Script
 from vio.cli import main

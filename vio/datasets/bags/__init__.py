@@ -1,4 +1,4 @@
-"""ROS bags: ROS 1 `.bag`, ROS 2 folders, `.db3` and `.mcap` files, read with the library rosbags (extra `bags`)."""
+"""ROS bags: ROS 1 `.bag`, ROS 2 folders, `.db3` and `.mcap` files, read with the library rosbags."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from vio.errors import DataError, MissingDependencyError
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
-MISSING = "{} ROS bags needs the package rosbags; install it with: pip install 'stereo-vio[bags]'"
+MISSING = "{} ROS bags needs the package rosbags; install it with: pip install rosbags"
 
 
 @dataclass(frozen=True, slots=True)

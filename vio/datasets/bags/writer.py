@@ -1,4 +1,4 @@
-"""Write ROS 2 bags, message by message, with the library rosbags (extra `bags`); SQLite or MCAP."""
+"""Write ROS 2 bags, message by message, with the library rosbags; SQLite or MCAP."""
 
 from __future__ import annotations
 
