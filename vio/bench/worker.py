@@ -162,7 +162,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             "frames": len(result.frames),
             "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
             "coverage": coverage(_used(truth, config), trajectory),
-            "refused_share": refused_share(result.frames),
+            "refused_share": refused_share(result.frames.column("used"), result.frames.column("gated")),
         }
         record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}
         if truth.reference is not None:

@@ -66,7 +66,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
     from vio.errors import EvaluationError
-    from vio.evaluation.trajectories import evaluate
+    from vio.evaluation.trajectories import LEAST_POSES, evaluate
 
     estimate, T_cam0_imu = _read(args.estimate)
     reference, other = _read(args.reference)
@@ -85,8 +85,8 @@ def execute(args: argparse.Namespace) -> int:
         T_cam0_imu=other if T_cam0_imu is None else T_cam0_imu,
         lengths_m=args.lengths,
     )
-    if result.matched < 3:
-        raise EvaluationError(f"only {result.matched} poses match; a comparison needs at least 3")
+    if result.matched < LEAST_POSES:
+        raise EvaluationError(f"only {result.matched} poses match; a comparison needs at least {LEAST_POSES}")
     for note in result.notes:
         log.warning("%s", note)
     return print_result(result.as_dict(), _rows(result), as_json=args.json)

@@ -37,7 +37,7 @@ _UNIT_SHARE = 0.1  # a ratio of path lengths so near one of these is no chance; 
 _PATH_LEAST_M = 1.0  # paths below this may consist of noise
 _MATCHED_SHARE = 0.5  # of the shorter trajectory; below, clocks or recordings may differ
 _MATCHED_ESTIMATE = 0.2  # span of the matched poses, of the estimate; below, the figures are those of a part
-_LEAST_POSES = 3  # that determine a scale, and make a figure
+LEAST_POSES = 3  # that determine a scale, and make a figure
 _STATIONARY = 1e-12  # extent, relative to the size of the coordinates, below which points coincide, to rounding
 
 
@@ -379,7 +379,7 @@ def _about_path(alignment: Alignment, T_est: FloatArray, T_ref: FloatArray) -> t
 
 def _scale_free(T_est: FloatArray, T_ref: FloatArray) -> ScaleFree | None:
     """Return the scale of M poses (M, 4, 4) and their error without it; None with too few poses or without motion."""
-    if len(T_est) < _LEAST_POSES:
+    if len(T_est) < LEAST_POSES:
         return None
     try:
         fit = align_poses(T_est, T_ref, "sim3")

@@ -9,6 +9,7 @@ import numpy as np
 
 from vio.evaluation.trajectories import lengths_text, rotation_drift_text
 from vio.runs.finished import FinishedRun
+from vio.runs.folder import refused_share
 
 _MOTION = {"imu": "an IMU", "velocity": "velocities", "none": "images alone"}
 
@@ -78,16 +79,12 @@ def _work_ms(run: FinishedRun) -> Any:
 _TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
 
 
-def _refused_percent(run: FinishedRun) -> str:
-    used, refused = (float(np.nansum(run.frames[name])) for name in ("used", "gated"))
-    return f"{100 * refused / (used + refused):.1f}" if used + refused else "–"
-
-
 def run_figures(run: FinishedRun) -> dict[str, str]:
     """Return a run's figures for a table, in a fixed order; a dash where there is none."""
     m, evaluation = run.metrics, run.evaluation
     work = _work_ms(run)
     kitti = None if evaluation is None else evaluation.kitti
+    refused = refused_share(run.frames["used"], run.frames["gated"])
     return {
         "frames": str(len(run.estimates)),
         "path (m)": f"{_path_m(run):.2f}",
@@ -98,7 +95,7 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
         "drift (%)": "–" if kitti is None else f"{kitti.t_err_percent:.3f}",
         "drift of rotation": "–" if kitti is None else rotation_drift_text(kitti.r_err_deg_per_100m, kitti.lengths_m),
         "features used, median": f"{np.nanmedian(run.frames['used']):.0f}",
-        "observations refused (%)": _refused_percent(run),
+        "observations refused (%)": "–" if refused is None else f"{100 * refused:.1f}",
         "ms a frame, median": f"{np.nanmedian(work):.1f}",
         "ms a frame, 95 %": f"{np.nanpercentile(work, 95):.1f}",
         "landmarks": str(len(run.points)),

@@ -8,13 +8,14 @@ import math
 import platform
 import shutil
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from vio._version import __version__
 from vio.files.atomic import atomic_folder, check_own
@@ -262,10 +263,13 @@ def start_s(work_ms: FloatArray) -> float:
     return float(np.sum(work_ms[work_ms > _SLOW * median] - median)) * 1e-3
 
 
-def refused_share(frames: Iterable[FrameLog]) -> float | None:
-    """Return which share of the observations the gates refused in a run; None: there was nothing to refuse."""
-    used, refused = np.sum([(f.used, f.gated) for f in frames], axis=0)
-    return float(refused / (used + refused)) if used + refused else None
+def refused_share(used: npt.ArrayLike, gated: npt.ArrayLike) -> float | None:
+    """Return which share of the observations the gates refused, by the numbers (F,) used and gated in each frame.
+
+    None: there was nothing to refuse.
+    """
+    kept, refused = float(np.nansum(used)), float(np.nansum(gated))
+    return refused / (kept + refused) if kept + refused else None
 
 
 def metrics_of(
@@ -296,7 +300,7 @@ def metrics_of(
         "ms_per_frame_95": float(np.percentile(work_ms, 95)),
         "start_s": start_s(work_ms),
         "stages_ms": {name: float(np.median([getattr(f, f"{name}_ms") for f in frames])) for name in STAGES},
-        "refused_share": refused_share(frames),
+        "refused_share": refused_share(frames.column("used"), frames.column("gated")),
         "landmarks": len(result.landmarks.ids),
         "ate_m": None if scores is None else scores["ate_m"],
         "rpe": None if scores is None else scores["rpe"],
