@@ -433,6 +433,13 @@ def test_eval_aligns_as_requested(recording: Path, tmp_path: Path, capsys: pytes
     assert {len(line) - len(line.lstrip()) for line in (row[11:] for row in printed[8:])} <= {2, 3}, "aligned"
 
 
+def test_eval_refuses_two_poses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    short = tmp_path / "short.tum"
+    short.write_text("1 0 0 0 0 0 0 1\n2 1 0 0 0 0 0 1\n")
+    assert main(["eval", str(short), str(short)]) == 1
+    assert "only 2 poses match; a comparison needs at least 3" in capsys.readouterr().err
+
+
 def test_evo_reads_every_trajectory_file(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from evo.tools import file_interface
 
