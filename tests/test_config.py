@@ -20,7 +20,7 @@ def _write(tmp_path: Path, text: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("word", ["on", "off", '"off"', "auto"])
+@pytest.mark.parametrize("word", ["on", "off", '"off"'])
 def test_on_and_off_need_no_quotes(word: str, tmp_path: Path) -> None:
     for config in (
         load_config(None, [f"msckf.calibrate_stereo={word}"]),

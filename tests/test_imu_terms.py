@@ -36,8 +36,9 @@ if TYPE_CHECKING:
     from vio.runs.pipeline import RunResult
 
 T_IMU_CAM0 = se3_inverse(T_CAM0_IMU)
-OFF = MsckfSettings(calibrate_camera_imu="none")
-FULL = MsckfSettings(calibrate_camera_imu="none", calibrate_imu="full")  # the terms alone
+EXACT = MsckfSettings(calibrate_stereo="off", stereo_scale_sigma=0.0)  # the stereo pair
+OFF = replace(EXACT, calibrate_camera_imu="none")
+FULL = replace(EXACT, calibrate_camera_imu="none", calibrate_imu="full")  # the terms alone
 GRAVITY = np.array([0.0, 0.0, -9.81])
 TERMS = np.random.default_rng(3).normal(0, 0.02, IMU_TERMS)
 MOVING = replace(WITHOUT_TERMS, imu_terms=TERMS)
@@ -286,7 +287,7 @@ def test_all_that_can_be_off_is_found_beside_the_terms() -> None:
 
 
 def test_a_stereo_field_that_begins_later_finds_its_place_behind_the_terms() -> None:
-    filt = Msckf(replace(CAMERA, residual_px=1.0), T_CAM0_IMU, FULL, motion="imu")  # which starts it in a frame
+    filt = Msckf(CAMERA, T_CAM0_IMU, replace(FULL, calibrate_stereo="on"), motion="imu")  # begins in a frame
     flight, noise = Shaking(20), np.random.default_rng(0)
     for sample in _samples(flight, np.zeros(15), FULL, noise)[:26]:
         filt.propagate(sample)
@@ -296,7 +297,7 @@ def test_a_stereo_field_that_begins_later_finds_its_place_behind_the_terms() -> 
     assert estimate.stereo_field is not None
     assert estimate.imu_terms_sigma is not None
     right = np.sqrt(np.diag(estimate.stereo_field.covariance))
-    assert right[0] == pytest.approx(np.radians(0.1), rel=0.2)  # not 1 %, of a scale
+    assert right[0] == pytest.approx(np.radians(0.1), rel=0.3)  # not 1 %, of a scale
     assert estimate.imu_terms_sigma[:2] == pytest.approx([0.01, 0.01], rel=0.1)
 
 

@@ -40,15 +40,14 @@ def test_velocities_find_a_baseline_that_is_off_by_10_percent() -> None:
     assert _drive(CAMERA) is None
 
 
-def test_an_imu_finds_a_baseline_that_is_off_by_10_percent_and_its_harm_ends() -> None:
-    flight, short = Shaking(120), replace(HAND_HELD, baseline_m=HAND_HELD.baseline_m / 1.1)
+def test_an_imu_finds_a_baseline_that_is_off_by_10_percent() -> None:
+    flight, short = Shaking(240), replace(HAND_HELD, baseline_m=HAND_HELD.baseline_m / 1.1)
     run = _fly(flight, OFF, 0, xi=np.zeros(6), offset_s=0.0, camera=short)
     scale = run.estimates[-1].stereo_scale
     assert scale is not None
     percent, sigma = scale.percent()["baseline"]
     assert abs(percent - 10.0) < 3 * sigma
     assert percent > 5 * sigma
-    assert np.linalg.norm(run.positions[-10:], axis=1).max() < 0.05  # 0.15 m before it is found
     assert _fly(flight, OFF, 0, xi=np.zeros(6), offset_s=0.0).estimates[-1].stereo_scale is None
 
 
@@ -89,12 +88,12 @@ def test_the_noise_of_a_standstill_is_no_motion() -> None:
 @pytest.mark.parametrize("scaled", [False, True])
 def test_the_test_equals_a_filter_with_the_scale_as_a_state(scaled: bool) -> None:
     """Two measurements of four errors, some of which depend on the scale; against dense equations in five unknowns."""
-    rng, D, sigma = np.random.default_rng(3), 4, 0.2
+    rng, D, sigma = np.random.default_rng(3), 4, 0.1
     P, moved = np.diag(rng.uniform(0.5, 2.0, D)), rng.normal(size=D) * scaled
-    test, mean = ScaleTest(D, sigma), np.zeros(D)
-    test.error_D_bias = rng.normal(size=D)
+    test, mean = ScaleTest(D), np.zeros(D)
+    test.error_D_scale = rng.normal(size=D)
     joint, vector = np.zeros((D + 1, D + 1)), np.zeros(D + 1)
-    J = np.column_stack([np.eye(D), -test.error_D_bias])  # the prior: x - V s
+    J = np.column_stack([np.eye(D), -test.error_D_scale])  # the prior: x - V s
     joint += J.T @ np.linalg.solve(P, J)
     joint[D, D] += sigma**-2
     for _ in range(2):
@@ -110,5 +109,5 @@ def test_the_test_equals_a_filter_with_the_scale_as_a_state(scaled: bool) -> Non
     s, s_sigma = test.estimate()
     np.testing.assert_allclose(s, (covariance @ vector)[D])
     np.testing.assert_allclose(s_sigma, np.sqrt(covariance[D, D]))
-    np.testing.assert_allclose(test.error_D_bias * s_sigma**2, covariance[:D, D])
-    np.testing.assert_allclose(mean + test.error_D_bias * s, (covariance @ vector)[:D])
+    np.testing.assert_allclose(test.error_D_scale * s_sigma**2, covariance[:D, D])
+    np.testing.assert_allclose(mean + test.error_D_scale * s, (covariance @ vector)[:D])

@@ -218,7 +218,7 @@ def test_the_next_run_from_a_saved_calibration_has_nothing_to_correct(turned: Pa
 
 
 @pytest.mark.parametrize("residual_px", [0.0, 0.4])
-def test_what_a_saved_calibration_leaves_is_estimated_from_the_first_frame(tmp_path: Path, residual_px: float) -> None:
+def test_what_a_saved_calibration_leaves_widens_the_prior_of_the_lenses(tmp_path: Path, residual_px: float) -> None:
     """Its rows agree, so that only the file can tell: a run that trusted it was worse than the one that wrote it."""
     rig = replace(RECTIFIED, residual_px=residual_px)
     file = tmp_path / "camchain-imucam.yaml"
@@ -229,7 +229,10 @@ def test_what_a_saved_calibration_leaves_is_estimated_from_the_first_frame(tmp_p
     rng, path = np.random.default_rng(0), tmp_path / "log.npz"
     _write(path, replace(CAMERA, residual_px=residual_px), [course.observe(k, rng) for k in range(course.frames)])
     result = vio.run(vio.open_dataset(path), load_config())
-    assert (result.estimates[0].stereo_field is not None) == (residual_px > 0)
+    field = result.estimates[0].stereo_field
+    assert field is not None
+    sigma = np.sqrt(field.covariance[3, 3])
+    assert sigma == pytest.approx(np.clip(3 * residual_px / CAMERA.fu, 5e-4, 2e-3), rel=0.2)
     file.write_text(kalibr_text(replace(rig, residual_px=-1.0)))
     with pytest.raises(CalibrationError, match="residual_px is -1; it must not be negative"):
         vio.load_rig(file)

@@ -54,7 +54,22 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def wide_run(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("wide") / "run"
-    assert main(["run", str(flight), "--save-observations", "--out", str(out), "--json", "--quiet"]) == 0
+    assert (
+        main(
+            [
+                "run",
+                str(flight),
+                "--save-observations",
+                "--out",
+                str(out),
+                "--json",
+                "--quiet",
+                "--set",
+                "msckf.calibrate_stereo=off",
+            ]
+        )
+        == 0
+    )
     return out
 
 
@@ -279,7 +294,8 @@ def test_rows_show_a_turned_right_camera() -> None:
     rng = np.random.default_rng(5)
     for k in range(20):
         rows.update(observations(k, k, np.arange(300), z + rng.normal(0, 0.1, z.shape)))
-    assert rows.is_significant
+    assert rows.offset_px is not None
+    assert rows.offset_px > 0.2
     np.testing.assert_allclose(rows.coefficients[[0, 1, 3]], [-2e-3, -1.5e-3, 1e-3], atol=1e-4)
     np.testing.assert_allclose(rows.coefficients[[2, 4, 5]], 0.0, atol=1e-4)
 

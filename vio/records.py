@@ -338,11 +338,6 @@ class RotationComparison:
         """Whether no focal length that is off shows in them, be it that there are none."""
         return self.sigma == np.inf or (self.sigma < 2 * _RATES_SIGMA and abs(self.excess) < _RATES_DIFFER)
 
-    @property
-    def settled(self) -> bool:
-        """Whether they agree beyond doubt, so that they will not be found to differ."""
-        return abs(self.excess) + _RATES_SIGMAS * self.sigma < _RATES_DIFFER
-
 
 ROTATION_NOT_COMPARABLE = RotationComparison(0.0, np.inf, False)
 

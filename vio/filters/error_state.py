@@ -100,10 +100,3 @@ class ErrorState:
             out[rows, first:], out[first:, rows] = stereo.cross, stereo.cross.T
             out[rows, rows], vector[rows] = stereo.A, stereo.b
         return out, vector
-
-    def cross_information(self, stereo: StereoInformation) -> FloatArray:
-        """Cross information (D,) of the errors and the last term given, which is no state itself."""
-        out = np.zeros(self.size)
-        out[self.clones.start :] = stereo.cross[-1]
-        out[self.stereo] = stereo.A[-1, : self.stereo.stop - self.stereo.start]
-        return out

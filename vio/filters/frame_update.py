@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from vio.cameras.rectification_error import TERMS, error_jacobian
 from vio.filters import track_loops
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
@@ -22,7 +21,7 @@ from vio.filters.multiview import (
 )
 from vio.filters.navigation import NO_STEP
 from vio.filters.noise import StepErrors
-from vio.filters.online_calibration import walk_variances
+from vio.filters.overdispersion import Overdispersion
 from vio.filters.point_map import PointMap
 from vio.filters.prior import Fit
 from vio.filters.propagation import FramePosterior, Propagation
@@ -44,7 +43,8 @@ _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before an
 # images and an IMU, position NEES after 2 s is 24 of 3 at 0.2, 15 at 0.05, 6 at 0.02, 2.8 at 0.01, 2.5 without any.
 _LANDMARK_DEPTH_SIGMA = 0.01  # by all views
 _LANDMARK_STEREO_SIGMA = 0.1  # or by the right views alone, which know the scale
-# Standard deviation of the baseline over it, at most: while the scale is open, the same bias falls on the baseline.
+# Standard deviation of the baseline over it, and that of a point's stereo depth by the stereo field, over it, at most:
+# while the scale is open, the same bias falls on the baseline, and on the field.
 # With a prior of 5 % and a baseline that is off by 9.5 %, 15 s of a flight with an IMU end at 4.07 +- 0.03 % with
 # landmarks from the start, at 9.02 +- 0.29 % without any.
 _SCALE_SIGMA = 0.001
@@ -64,6 +64,12 @@ class FrameUpdate:
         self.tracks = WindowTracks(rig.camera, settings)
         self.smoothed: WindowPosterior | None = None  # after the last frame
         self._landmark_gate = LandmarkGate(settings.gate_probability)
+        self._overdispersion = Overdispersion()
+
+    @property
+    def _variance(self) -> float:
+        """Variance of one pixel coordinate that counts as if all of them were independent, px^2."""
+        return self.tracks.variance * self._overdispersion.factor
 
     def expected_tracks(self, window: Window, T_cam0_world: FloatArray, motion: MotionPrior) -> TrackPrior:
         """Predict the pixels of all tracks with a point from a camera pose (4, 4) at a coming frame."""
@@ -101,7 +107,8 @@ class FrameUpdate:
         Raises:
             numpy.linalg.LinAlgError: the filter has diverged.
         """
-        self._calibrate(window, seen)
+        self._rig.learn_rows(window, seen)
+        self._rig.end_frame(window, seen)
         propagation = self._propagation
         rows, found = rows_of(seen, window.landmark_ids)
         self._keep_landmarks(window, found)
@@ -144,22 +151,6 @@ class FrameUpdate:
             gated_ids=gated_ids,
             landmark_ids=window.landmark_ids.copy(),
         )
-
-    def _calibrate(self, window: Window, seen: Observations) -> None:
-        """Follow the stereo calibration.
-
-        What noise and landmarks were learned with a wrong focal length are forgotten; the other states move with it.
-        """
-        rig, propagation = self._rig, self._propagation
-        rig.learn_rows(window, seen)
-        if rig.focal_length_is_off(window):
-            self._keep_landmarks(window, np.zeros(len(window.landmarks), dtype=np.bool_))
-            rig.free_focal_length(window)
-            self.tracks.variance = self._settings.pixel_sigma_px**2
-            propagation.noise, propagation.walk = propagation.unknown_noise(), walk_variances(rig.settings)
-        factor = rig.test_scale(window, seen)
-        if factor is not None:
-            self.tracks.scale(rig.camera, factor)
 
     def _keep_landmarks(self, window: Window, kept: BoolArray) -> None:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
@@ -241,7 +232,7 @@ class FrameUpdate:
         self, window: Window, tracks: LinearTracks, chosen: BoolArray, pixels: Views | None
     ) -> tuple[FloatArray, FloatArray]:
         """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
-        poses, variance, field = 6 * len(window.clones), self.tracks.variance, self._rig.field(window)
+        poses, variance, field = 6 * len(window.clones), self._variance, self._rig.field(window)
         A, b, stereo = np.zeros((poses, poses)), np.zeros(poses), None
         if field is not None:
             stereo = StereoInformation.none(len(field.terms), poses + 3 * len(window.landmarks))
@@ -260,24 +251,6 @@ class FrameUpdate:
             rows = window.state.clone(-1).start, window.state.landmarks.start
             track_loops.add_landmarks(at.r, at.J, at.weight / variance, *rows, A, b)
         return A, b
-
-    def _focal_information(
-        self, window: Window, tracks: LinearTracks, chosen: BoolArray, pixels: Views
-    ) -> FloatArray | None:
-        """Cross information (D,) of errors and focal length from `_information`; None where it is not followed."""
-        if window.prior.focal is None:
-            return None
-        first = 0 if "stereo_field" in window.state else TERMS - 1
-        said = StereoInformation.none(TERMS - first, 6 * len(window.clones) + 3 * len(window.landmarks))
-        rows = np.flatnonzero(chosen)
-        if len(rows):
-            everything = np.ones(len(rows), dtype=np.bool_)
-            said = said + eliminate_points_from_columns(*self.tracks.focal_columns(tracks, rows), everything)
-        if len(pixels.z):
-            at = self._landmark_residuals(window, pixels)
-            H = error_jacobian(self._rig.camera, pixels.z - at.r, first, TERMS - first)
-            said = said + landmark_columns(at, H, len(window.clones))
-        return window.state.cross_information(said.scaled(1 / self.tracks.variance))
 
     def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
         """Residuals of the landmarks' pixels in the newest exposure."""
@@ -321,20 +294,24 @@ class FrameUpdate:
         seen = table.seen(tracks.rows)
         lost, leaving = ~seen[:, newest], seen[:, 0] & full
         ending = lost | leaving
-        focal = self._focal_information(window, tracks, ending & good, pixels)
-        window.absorb(*self._information(window, tracks, ending & good, pixels), focal=focal)
+        ended = np.flatnonzero(ending & good)
+        if len(ended):
+            self._overdispersion.add(table.ids(tracks.rows[ended]), *self.tracks.field_scores(tracks, ended))
+        # Errors that neighbours share are not in the factor, and the field is told of them in every frame.
+        repeated = self._overdispersion.factor
+        window.absorb(*self._information(window, tracks, ending & good, pixels), repeated=repeated)
         depth_sigma = np.sqrt(self.tracks.variance) * tracks.information.relative_depth_sigma()
         promoted = self._promote(window, tracks, leaving & good & seen[:, newest], depth_sigma)
 
         A, b = self._information(window, tracks, good & ~ending, None)
         P = self._move_to_optimum(window, tracks, A, b, window.state.clones.stop).covariance()  # without landmarks
-        by_scale = self._rig.scale_covariance(window, A, P)
-        P = P if by_scale is None else P + by_scale
+        with_scale = P + self._rig.scale_covariance(window, A, P)
         self._propagation.posterior = FramePosterior.of(window, P)
-        self.smoothed = WindowPosterior.of(window, P)
+        self._propagation.reported = FramePosterior.of(window, with_scale)
+        self.smoothed = WindowPosterior.of(window, P, with_scale)
 
         done = np.flatnonzero(ending & good & (depth_sigma < _MAP_DEPTH_SIGMA))
-        covariance = self.tracks.variance * tracks.information.point_covariance(done)
+        covariance = self._variance * tracks.information.point_covariance(done)
         self._points.store(table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
         spent = leaving & ~lost
         spent[promoted] = False
@@ -356,15 +333,20 @@ class FrameUpdate:
             depth_sigma: (F,) standard deviation of each inverse depth, over itself.
         """
         room = self._settings.max_landmarks - len(window.landmarks)
-        unsure = "stereo_field" in window.state or _scale_sigma(window) > _SCALE_SIGMA
+        unsure = _scale_sigma(window) > _SCALE_SIGMA
         if room <= 0 or unsure or not candidates.any():
             return np.zeros(0, dtype=np.int64)
         by_stereo = np.sqrt(self.tracks.variance) * relative_stereo_sigma(tracks.at, tracks.information.q)
         has_depth = (depth_sigma < _LANDMARK_DEPTH_SIGMA) | (by_stereo < _LANDMARK_STEREO_SIGMA)
         chosen = np.flatnonzero(candidates & has_depth)
+        field = self._rig.field(window)
+        if field is not None:
+            p = transform_points(window.T_cam0_world(-1)[0], tracks.p_world[chosen])
+            of_field = window.prior.P[window.state.stereo, window.state.stereo]
+            chosen = chosen[field.depth_sigma(p, of_field) < _SCALE_SIGMA]
         if not len(chosen):
             return chosen
-        covariance = self.tracks.variance * tracks.information.point_covariance(chosen)
+        covariance = self._variance * tracks.information.point_covariance(chosen)
         # The best known points first: smallest largest standard deviation.
         worst = np.linalg.eigvalsh(covariance)[:, 2]
         table = self.tracks.table
@@ -376,12 +358,8 @@ class FrameUpdate:
         if tracks.stereo is not None:
             point_D_stereo = tracks.stereo.point_D_stereo(tracks.information)[chosen]
         A = window.state.jacobian(point_D_poses, point_D_stereo)
-        point_D_focal = None
-        if window.prior.focal is not None:
-            columns, information = self.tracks.focal_columns(tracks, chosen)
-            point_D_focal = columns.point_D_stereo(information)[..., -1].reshape(-1)
         ids = table.ids(tracks.rows[chosen])
-        window.add_landmarks(ids, p, A.reshape(-1, window.state.size), covariance, point_D_focal)
+        window.add_landmarks(ids, p, A.reshape(-1, window.state.size), covariance)
         return chosen
 
 

@@ -26,7 +26,6 @@ from vio.filters.point_map import PointMap
 from vio.filters.propagation import Propagation, first_imu_noise
 from vio.filters.restart import GoodState, restarted
 from vio.filters.rig_calibration import RigCalibration
-from vio.filters.scale_test import ScaleTest
 from vio.filters.settings import MsckfSettings
 from vio.filters.window import Clone, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, so3_exp, so3_log
@@ -138,8 +137,7 @@ class Msckf(Backend):
     def take_rotation_comparison(self, comparison: RotationComparison | None) -> None:
         """Take how the camera's rotation compares with the gyro's; None: they were not compared yet.
 
-        Until they are, nothing is concluded of the baseline, for which a wrong focal length passes. Where they differ
-        for another reason than the gyro, the focal length becomes a state in the next frame.
+        Until they agree, nothing is concluded of the baseline, for which a wrong focal length passes.
         """
         self._rig.rotation = comparison
 
@@ -239,10 +237,7 @@ class Msckf(Backend):
         """
         good, propagation = self._last_good(), self._propagation
         nav, P = restarted(good, observations.time_ns, propagation.motion, self._settings)
-        scale_test = None if self._window is None else self._window.prior.scale_test
         window = self._window = self._first_window(nav, P, good.calibration)
-        if scale_test is not None and "stereo_scale" not in window.state:
-            window.prior.scale_test = ScaleTest(window.state.size, scale_test.estimate()[1])
         propagation.begin(window, observations.time_ns, propagation.body_time(window, observations.time_ns))
         self._forget_tracks(good)
         return self._update(observations)
@@ -264,7 +259,8 @@ class Msckf(Backend):
         """A window without clones; P (15, 15) is the covariance of the navigation state."""
         own = self._rig.first_covariance(calibration, nav.T_world_imu)
         window = Window(self._propagation.motion, nav, np.asarray(block_diag(P, own)), calibration)
-        self._rig.follow_constants(window, self._source)
+        before = None if self._window is None else self._window.prior.scale_test
+        self._rig.test_scale(window, self._source, before)
         return window
 
     def estimate(self) -> Estimate:
@@ -366,7 +362,9 @@ class Msckf(Backend):
         self._tilted = so3_exp([0.0, 0.0, yaw]) @ moved
         tilt = _half_tangent(self._tilted) - t
         R, M = window.turn_world(yaw, np.array([-tilt[1], tilt[0], 0.0]))
-        self._propagation.posterior = self._propagation.posterior.transformed(window, M)
+        propagation = self._propagation
+        propagation.posterior = propagation.posterior.transformed(window, M)
+        propagation.reported = propagation.reported.transformed(window, M)
         self._frame.turn(R)
         self._points.turn(R)
 

@@ -36,9 +36,16 @@ _EXTRINSIC_ROTATION_WALK_DEG = 2.0e-3
 _EXTRINSIC_TRANSLATION_WALK_M = 1.0e-4
 _TIME_OFFSET_WALK_S = 2.0e-6
 STEREO_YAW_SIGMA_DEG = 0.1  # initial standard deviation of the right camera's rotation about its vertical axis
-_STEREO_FIELD_SIGMA = 2.0e-3  # the same of the other terms of the stereo field, in focal lengths
+LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA = 5.0e-4, 2.0e-3  # the same of the stereo field's other terms, in focal lengths
+_LEAST_COMMON_SIGMA = 1.0e-3  # at least that of what both lenses have in common, which moves no rows of far points
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
 _STEREO_WALK = 0.02  # random walk of the stereo field per root second, over its initial standard deviation
+
+
+def stereo_field_sigmas(sigma: float) -> FloatArray:
+    """Initial standard deviations (8,) of the stereo field, in focal lengths, by that of its lens terms."""
+    common = max(sigma, _LEAST_COMMON_SIGMA)
+    return np.array([np.radians(STEREO_YAW_SIGMA_DEG), *[sigma] * 3, *[_RADIAL * common] * 2, common, common])
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,16 +235,15 @@ class StereoBlock(CalibrationBlock):
 
 
 class _StereoFieldBlock(StereoBlock):
-    """The field of right columns, equation (R3)."""
+    """The field of right columns, equation (R3); its estimation begins with the first rows, which give its prior."""
 
     name, terms = "stereo_field", slice(0, FIELD_TERMS)
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
-        return settings.calibrate_stereo == "on"
+        return False
 
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
-        yaw, other = np.radians(STEREO_YAW_SIGMA_DEG), _STEREO_FIELD_SIGMA
-        return np.array([yaw, other, other, other, _RADIAL * other, _RADIAL * other, other, other])
+        return stereo_field_sigmas(MOST_FIELD_SIGMA)
 
     def report(self, calibration: Calibration, nav: NavState, covariance: FloatArray) -> dict[str, Any]:
         return {"stereo_field": StereoFieldEstimate(calibration.stereo[self.terms], covariance)}

@@ -13,7 +13,6 @@ from scipy.linalg import blas, lapack
 
 from vio.filters import pose_loops as loops
 from vio.filters.scale_test import ScaleTest
-from vio.filters.separate_bias import SeparateBias
 from vio.geometry.lie import FloatArray
 from vio.records import IntArray
 
@@ -26,7 +25,6 @@ class Prior:
         self.P = P
         self.delta: FloatArray = np.zeros(len(P))
         self.scale_test: ScaleTest | None = None
-        self.focal: SeparateBias | None = None  # the focal length's logarithm of (R4), where it is no state
 
     @property
     def P(self) -> FloatArray:
@@ -42,17 +40,12 @@ class Prior:
         self._factors = {}
         return self._P
 
-    @property
-    def biases(self) -> list[SeparateBias]:
-        """The constants that are estimated beside the errors."""
-        return [bias for bias in (self.scale_test, self.focal) if bias is not None]
-
     def transform(self, M: FloatArray) -> None:
         """Turn the errors into `M error`, with M (D, D)."""
         self.P = M @ self.P @ M.T
         self.delta = M @ self.delta
-        for bias in self.biases:
-            bias.error_D_bias = M @ bias.error_D_bias
+        if self.scale_test is not None:
+            self.scale_test.error_D_scale = M @ self.scale_test.error_D_scale
 
     def insert(self, first: int, covariance: FloatArray) -> None:
         """Add errors with a covariance (S, S), from the row `first` on, that depend on no other."""
@@ -62,9 +55,10 @@ class Prior:
         P[np.ix_(old, old)], delta[old] = self.P, self.delta
         P[first : first + S, first : first + S] = covariance
         self.P, self.delta = P, delta
-        for bias in self.biases:
-            V, bias.error_D_bias = bias.error_D_bias, np.zeros(D + S)
-            bias.error_D_bias[old] = V
+        if self.scale_test is not None:
+            V = np.zeros(D + S)
+            V[old] = self.scale_test.error_D_scale
+            self.scale_test.error_D_scale = V
 
     def insert_dependent(self, at: int, J: FloatArray, noise: FloatArray, of_scale: FloatArray | None) -> None:
         """Add errors `J error + noise` at a row.
@@ -85,19 +79,18 @@ class Prior:
         P[:at, new], P[end, new], P[new, new] = beside[:at], beside[at:], added[:, own] @ J.T + noise
         delta = self.delta
         self.delta = np.concatenate([delta[:at], J @ delta[own], delta[at:]])
-        for bias in self.biases:
-            V = bias.error_D_bias
-            of_new = of_scale if of_scale is not None and bias is self.scale_test else J @ V[own]
-            bias.error_D_bias = np.concatenate([V[:at], of_new, V[at:]])
+        if self.scale_test is not None:
+            V = self.scale_test.error_D_scale
+            of_new = J @ V[own] if of_scale is None else of_scale
+            self.scale_test.error_D_scale = np.concatenate([V[:at], of_new, V[at:]])
         self.P = P
 
-    def append(self, A: FloatArray, blocks: FloatArray, of_focal: FloatArray | None) -> None:
+    def append(self, A: FloatArray, blocks: FloatArray) -> None:
         """Add errors `A error + noise` of points behind the others.
 
         Args:
             A: (3K, D).
             blocks: covariances of the noise (K, 3, 3).
-            of_focal: what the focal length that is followed adds to them (3K,); None: nothing.
         """
         D, n = len(self.P), len(A)
         P = np.zeros((D + n, D + n))
@@ -107,11 +100,9 @@ class Prior:
         for k, block in enumerate(blocks):
             P[D + 3 * k : D + 3 * k + 3, D + 3 * k : D + 3 * k + 3] += block
         self.delta = np.concatenate([self.delta, A @ self.delta])
-        for bias in self.biases:
-            added = A @ bias.error_D_bias
-            if bias is self.focal and of_focal is not None:
-                added = added + of_focal
-            bias.error_D_bias = np.concatenate([bias.error_D_bias, added])
+        if self.scale_test is not None:
+            V = self.scale_test.error_D_scale
+            self.scale_test.error_D_scale = np.concatenate([V, A @ V])
         self.P = 0.5 * (P + P.T)
 
     def keep(self, rows: IntArray) -> None:
@@ -120,8 +111,8 @@ class Prior:
         loops.take_rows(self.P, rows, P)
         self.P = P
         self.delta = self.delta[rows]
-        for bias in self.biases:
-            bias.error_D_bias = bias.error_D_bias[rows]
+        if self.scale_test is not None:
+            self.scale_test.error_D_scale = self.scale_test.error_D_scale[rows]
 
     def optimum(self, information: FloatArray, vector: FloatArray, size: int, first: int = 0) -> tuple[Fit, FloatArray]:
         """Where the prior and given information agree best.
@@ -151,7 +142,7 @@ class Prior:
         vector: FloatArray,
         first: int = 0,
         scaled: FloatArray | None = None,
-        focal: FloatArray | None = None,
+        repeated: tuple[slice, float] | None = None,
     ) -> None:
         """Absorb measurements.
 
@@ -160,17 +151,24 @@ class Prior:
             vector: `H' R^-1 r` (D,).
             first: row before which there is usually no information.
             scaled: for measurements in metres, how the errors (D,) move with the logarithm of the world's scale.
-            focal: for pixels, `H' R^-1 h` (D,) with their derivatives h by the focal length's logarithm.
+            repeated: rows of constants, and the factor by which the measurements repeat what was said of them: these
+                take in that part of it only, while all others take in the whole; the partial-update filter of Brink,
+                Partial-update Schmidt-Kalman filter, JGCD (2017), which keeps the covariance of all errors true.
         """
         prior = self._factor(information, len(self.P), first)
         own = slice(prior.first, None)
         P = fit(prior, information[own, own]).covariance()
-        self.delta = self.delta - P @ (vector + information @ self.delta)
-        self.P = P
-        if self.scale_test is not None:
-            self.scale_test.absorb(information, vector, -self.delta, P, scaled)
-        if self.focal is not None:
-            self.focal.follow(information, P, focal)
+        delta, test = self.delta - P @ (vector + information @ self.delta), self.scale_test
+        V = None if test is None else test.error_D_scale
+        if test is not None:
+            test.absorb(information, vector, -delta, P, scaled)
+        if repeated is not None:
+            rows, kept = repeated[0], 1 - 1 / repeated[1]
+            delta[rows] += np.sqrt(kept) * (self.delta[rows] - delta[rows])
+            P[rows, rows] += kept * (self.P[rows, rows] - P[rows, rows])
+            if test is not None and V is not None:
+                test.error_D_scale[rows] += np.sqrt(kept) * (V[rows] - test.error_D_scale[rows])
+        self.P, self.delta = P, delta
 
     def _factor(self, information: FloatArray, size: int, first: int) -> Factor:
         """The factor of the present covariance, up to row `size`, of the errors that information (D, D) is about.

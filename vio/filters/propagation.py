@@ -72,6 +72,7 @@ class Propagation:
         self.body_ns = 0  # time of the navigation state, on the IMU's clock
         self.blind = False  # the last frame showed nothing
         self.posterior = _NOTHING  # after the last frame that showed something
+        self.reported = _NOTHING  # the same with the uncertainty of the rig's scale, which corrects nothing
         self.since_frame = NO_STEP  # how the error has grown since then
         self.gyro: FloatArray | None = None  # (3,) mean rate measured over the last step
         self._predicted_step: tuple[int, Transition] | None = None  # integrated by `predict`, with its end
@@ -84,7 +85,7 @@ class Propagation:
         """Go on from a window without clones, at the times of a frame and of the navigation state."""
         self.forget()
         self.time_ns, self.body_ns = time_ns, body_ns
-        self.posterior = FramePosterior.begun(window)
+        self.posterior = self.reported = FramePosterior.begun(window)
 
     def forget(self) -> None:
         """Forget the last frame and the steps since."""
@@ -203,11 +204,11 @@ class Propagation:
         return (self.body_ns - self.time_ns) * 1e-9
 
     def own_covariance(self, window: Window) -> FloatArray:
-        """Covariance (15 + C, 15 + C) of navigation state and calibration at the time of the last event."""
+        """Covariance (15 + C, 15 + C) of navigation state and calibration at the time of the last event, reported."""
         if not self.blind:
-            return self.posterior.own
+            return self.reported.own
         grow = self.grown(window, window.nav, self.since_frame)
-        out: FloatArray = grow @ self.posterior.own @ grow.T
+        out: FloatArray = grow @ self.reported.own @ grow.T
         out[:DIM, :DIM] += self.since_frame.Q
         return out
 
@@ -216,7 +217,7 @@ class Propagation:
         if "time_offset" not in window.state:
             return window.nav.T_world_imu, own[:6, :6]
         if not self.blind:
-            with_newest = self.posterior.with_newest
+            with_newest = self.reported.with_newest
             J = np.eye(6, len(with_newest), len(own))  # of the camera, and back to the body
             J[:, : len(own)] += window.body_D_error()[-6:, : len(own)]
             return window.clones[-1].T_world_imu, J @ with_newest @ J.T

@@ -1,22 +1,23 @@
 """Test while running whether IMU or velocities contradict the scale that the calibrated baseline gives.
 
 The filter takes the scale for known. Beside it runs the estimate of its logarithm `s` that the filter would have with
-it as a state, from how the prior's mean depends on it: Friedland's separate-bias filter, equations (S1) to (S4) of
-docs/math.md. It costs one vector, and changes nothing until the test decides.
+it as a state, from how the prior's mean depends on it: Friedland's separate-bias filter, equations (S1) to (S3) of
+docs/math.md. It costs one vector and changes nothing: what it finds is reported, and how the errors depend on the scale
+gives what an uncertain baseline adds to their covariance, equation (S4).
 Reference: Friedland, Treatment of bias in recursive filtering, IEEE TAC (1969).
 """
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 
 from vio.filters.navigation import DIM, NavState
-from vio.filters.separate_bias import SeparateBias
 from vio.geometry.lie import FloatArray, se3_inverse
 
-SCALE_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
+_SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
 # More than correct baselines show (docs/notes/design_decisions.md, contradiction of the scale).
 _LEAST, _SIGMAS = 0.04, 5.0
 # The accelerometer's noise is in the motion that is held against the images, and there passes for motion at twice the
@@ -38,18 +39,35 @@ def scaled_nav(nav: NavState, T_cam0_imu: FloatArray) -> FloatArray:
     return np.concatenate([T_world_cam0[:3, 3], np.zeros(3), nav.velocity, np.zeros(6)])
 
 
-class ScaleTest(SeparateBias):
+class ScaleTest:
     """The estimate of the logarithm of the scale beside a filter of D errors that takes it for zero.
 
     The errors are those of a world that is scaled with s, so no pixel depends on it, whatever the estimates:
     relinearising cannot pass for knowledge of the scale.
     """
 
-    def __init__(self, size: int, sigma: float = SCALE_SIGMA) -> None:
-        """Start with errors (D,) that do not depend on the scale, and its standard deviation."""
-        super().__init__(size)
-        self.frames = 0  # since the start
-        self._information, self._vector = sigma**-2, 0.0
+    def __init__(self, size: int) -> None:
+        """Start with errors (D,) that do not depend on the scale."""
+        self.error_D_scale: FloatArray = np.zeros(size)  # by the logarithm, in a world that is scaled with it
+        self._frames = 0  # since the start
+        self._doubted = 0  # at which of them the scale was contradicted without a break since; 0: it is not
+        self._information, self._vector = _SIGMA**-2, 0.0
+        self.is_confirmed = False  # whether as many frames again have contradicted it as it took to find
+
+    def restarted(self, size: int) -> ScaleTest:
+        """Return the test with what it knows, for new errors (D,) that do not depend on the scale."""
+        out = copy(self)
+        out.error_D_scale = np.zeros(size)
+        return out
+
+    def end_frame(self) -> None:
+        """Count a frame, and ask whether the scale is contradicted."""
+        self._frames += 1
+        if not self._contradicted:
+            self._doubted = 0
+        elif not self._doubted:
+            self._doubted = self._frames
+        self.is_confirmed |= self._doubted > 0 and self._frames >= 2 * self._doubted
 
     def absorb(
         self, A: FloatArray, b: FloatArray, mean: FloatArray, P: FloatArray, scaled: FloatArray | None = None
@@ -63,17 +81,17 @@ class ScaleTest(SeparateBias):
             P: covariance of the errors (D, D) after them.
             scaled: how the scaled world moves the errors (D,), for measurements in metres; None: pixels.
         """
-        V = self.error_D_bias if scaled is None else self.error_D_bias + scaled
+        V = self.error_D_scale if scaled is None else self.error_D_scale + scaled
         W = A @ V
         self._information += float(V @ W - W @ P @ W)
         self._vector += float(V @ (b - A @ mean))
-        self.error_D_bias = self.error_D_bias - P @ W
+        self.error_D_scale = self.error_D_scale - P @ W
 
     def of_clone(
         self, nav: NavState, T_exposed: FloatArray, camera_D_own: FloatArray, T_cam0_imu: FloatArray
     ) -> FloatArray:
         """How the error (6,) of a clone of the navigation state depends on the scale, its own pose being scaled too."""
-        V = self.error_D_bias[: camera_D_own.shape[1]].copy()
+        V = self.error_D_scale[: camera_D_own.shape[1]].copy()
         V[:DIM] += scaled_nav(nav, T_cam0_imu)
         out: FloatArray = camera_D_own @ V - scaled_nav(replace(nav, T_world_imu=T_exposed), T_cam0_imu)[:6]
         return out
@@ -82,12 +100,8 @@ class ScaleTest(SeparateBias):
         """Logarithm of the true scale over the filter's, and its standard deviation."""
         return self._vector / self._information, self._information**-0.5
 
-    def adopt(self) -> None:
-        """Count the scale from the present estimate, equation (S4)."""
-        self._vector = 0.0
-
     @property
-    def contradicted(self) -> bool:
+    def _contradicted(self) -> bool:
         """Whether the scale is off significantly, by more than is harmless and than the sensor's noise explains."""
         s, sigma = self.estimate()
-        return abs(s) > max(_LEAST + _BY_NOISE * self.frames / self._information, _SIGMAS * sigma)
+        return abs(s) > max(_LEAST + _BY_NOISE * self._frames / self._information, _SIGMAS * sigma)

@@ -114,10 +114,14 @@ class MsckfSettings(Section):
         "what is estimated of the IMU's own calibration besides the biases: nothing; the scales of accelerometer and "
         "gyro; or these, the misalignment of their axes, and the gyro's rotation against the accelerometer",
     )
-    calibrate_stereo: Literal["auto", "on", "off"] = setting(
-        "auto",
-        "estimate what the stereo calibration is off by, a low-order field over the image: always, never, or where the "
-        "rows of left and right images show that it is off",
+    calibrate_stereo: Literal["on", "off"] = setting(
+        "on", "estimate what the calibration of a stereo pair is off by, a low-order field over the image"
+    )
+    stereo_scale_sigma: float = setting(
+        0.005,
+        "standard deviation of the scale that baseline and focal length give, over it, as calibrations leave it; it is "
+        "part of the covariances and corrects nothing",
+        at_least=0,
     )
     stereo_focal_sigma: float = setting(
         0.0,

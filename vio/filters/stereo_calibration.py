@@ -19,15 +19,12 @@ from vio.cameras.rectification_error import TERMS, corrected_pixels, error_jacob
 from vio.filters import track_loops as loops
 from vio.filters.multiview import CAUCHY, LandmarkResiduals, Residuals, TrackInformation, Views
 from vio.geometry.lie import FloatArray
-from vio.geometry.stereo import StereoCamera
+from vio.geometry.stereo import StereoCamera, project
 from vio.numerics.robust import median
 from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS, BoolArray, IntArray, Observations
 
 _MIN_ROWS = 30  # matches in a frame below which its rows are not learned from
 _ROW_MEMORY = 0.99  # per frame, of the rows' normal equations
-LEAST_FIELD_PX = 0.05  # root mean square of the field over the matches; smaller ones do no harm
-_ROW_DOMINANCE = 4.0  # the field over the variance that it leaves: features that wander calibrate nothing
-_ROW_SIGNIFICANCE = 25.0  # squared standard deviations of the field by noise alone
 _ROW_PRIOR_PX = 10.0  # standard deviation of the rows' coefficients before the first frame, over the noise of a row
 
 
@@ -94,12 +91,13 @@ class VerticalDisparityModel:
         return np.asarray(P / self._camera.fv**2, dtype=np.float64)
 
     @property
-    def is_significant(self) -> bool:
-        """Whether the rows show that the calibration is off: a field beyond its own uncertainty, and beyond harm."""
+    def offset_px(self) -> float | None:
+        """Root mean square of the field over the last matches, less what noise alone makes; None before the first."""
+        if not self._matches:
+            return None
         # The features of one frame count, as in the covariance.
-        uncertainty = ROW_TERMS * self._squares / max(self._count, 1.0) / max(self._matches, 1)
-        noise = self._squares / max(self._count, 1.0)
-        return self.rms_px**2 > max(LEAST_FIELD_PX**2 + _ROW_SIGNIFICANCE * uncertainty, _ROW_DOMINANCE * noise)
+        by_noise = ROW_TERMS * self._squares / max(self._count, 1.0) / self._matches
+        return float(np.sqrt(max(self.rms_px**2 - by_noise, 0.0)))
 
 
 def _centred(values: FloatArray) -> FloatArray:
@@ -123,6 +121,19 @@ class StereoCorrection:
         if self.rows_D_common is not None and self.terms[0] == 0:
             for k, rows in enumerate(self.rows_D_common.T):
                 out[..., 2, RIGHT_TERMS + k] -= self._right_columns(z, rows)
+        return out
+
+    def depth_sigma(self, p_cam: FloatArray, P: FloatArray) -> FloatArray:
+        """Standard deviations (M,) of stereo depths, over them, by errors of the coefficients of covariance P (S, S).
+
+        Args:
+            p_cam: points in the left camera (M, 3).
+            P: of the coefficients that are estimated.
+        """
+        z = project(self.camera, p_cam)
+        J = self.jacobian(z)
+        by_terms = J[:, 0] - J[:, 2]
+        out: FloatArray = np.sqrt(np.einsum("ms,st,mt->m", by_terms, P, by_terms)) / (z[:, 0] - z[:, 2])
         return out
 
     def _right_columns(self, z: FloatArray, rows: FloatArray) -> FloatArray:
@@ -154,6 +165,10 @@ class StereoColumns:
     G: FloatArray  # (F, 3, S) its sum over the views, the cross information of point and coefficients
     A: FloatArray  # (F, S, S) information about the coefficients before the points are eliminated
     b: FloatArray  # (F, S) its vector
+
+    def take(self, rows: IntArray) -> StereoColumns:
+        """Return the columns of tracks (K,)."""
+        return StereoColumns(self.by_point[rows], self.G[rows], self.A[rows], self.b[rows])
 
     def point_D_stereo(self, info: TrackInformation) -> FloatArray:
         """How the estimated points follow errors of the coefficients (F, 3, S), world: `-C^-1 G`."""

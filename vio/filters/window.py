@@ -133,10 +133,9 @@ class Window:
         state, prior, before = self.state, self.prior, self.nav
         Phi = self.calibration.transition(state, step, step.nav.T_world_imu @ se3_inverse(before.T_world_imu))
         own, T_cam0_imu = state.own, self.calibration.T_cam0_imu
-        for bias in prior.biases:
-            bias.error_D_bias[own] = Phi @ bias.error_D_bias[own]
         if prior.scale_test is not None:
-            V = prior.scale_test.error_D_bias
+            V = prior.scale_test.error_D_scale
+            V[own] = Phi @ V[own]
             V[:DIM] += step.Phi @ scaled_nav(before, T_cam0_imu) - scaled_nav(step.nav, T_cam0_imu)
         self.nav = step.nav
         P = prior.to_change()
@@ -256,8 +255,8 @@ class Window:
         P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
         delta[first:] += p_cross @ (delta[turn] - delta[before])
-        for bias in self.prior.biases:
-            V = bias.error_D_bias
+        if self.prior.scale_test is not None:
+            V = self.prior.scale_test.error_D_scale
             V[first:] += p_cross @ (V[turn] - V[before])
 
     def drop_oldest_clone(self) -> None:
@@ -275,19 +274,9 @@ class Window:
         self.landmark_ids, self.landmarks = self.landmark_ids[chosen], self.landmarks[chosen]
         self._lay_out()
 
-    def add_landmarks(
-        self,
-        ids: IntArray,
-        p_world: FloatArray,
-        A: FloatArray,
-        covariance: FloatArray,
-        point_D_focal: FloatArray | None = None,
-    ) -> None:
-        """Add landmarks (K, 3) whose errors are `A xi + noise`, with A (3K, D) and noise covariance (K, 3, 3).
-
-        With `point_D_focal` (3K,), they depend on the focal length as well, where it is followed.
-        """
-        self.prior.append(A, covariance, point_D_focal)
+    def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
+        """Add landmarks (K, 3) whose errors are `A xi + noise`, with A (3K, D) and noise covariance (K, 3, 3)."""
+        self.prior.append(A, covariance)
         self.landmark_ids = np.concatenate([self.landmark_ids, ids])
         self.landmarks = np.concatenate([self.landmarks, p_world])
         self._lay_out()
@@ -297,14 +286,18 @@ class Window:
         return self.prior.optimum(information, vector, size, self.state.first_of_pixels)
 
     def absorb(
-        self,
-        information: FloatArray,
-        vector: FloatArray,
-        scaled: FloatArray | None = None,
-        focal: FloatArray | None = None,
+        self, information: FloatArray, vector: FloatArray, scaled: FloatArray | None = None, repeated: float = 1.0
     ) -> None:
-        """Absorb measurements into the prior, see `Prior.absorb`; the means stay where they are."""
-        self.prior.absorb(information, vector, self.state.first_of_pixels, scaled, focal)
+        """Absorb measurements into the prior, see `Prior.absorb`; the means stay where they are.
+
+        Args:
+            information: (D, D).
+            vector: (D,).
+            scaled: for measurements in metres.
+            repeated: for pixels, the factor by which they repeat what was said of the stereo field.
+        """
+        partly = (self.state["stereo_field"], repeated) if repeated > 1 and "stereo_field" in self.state else None
+        self.prior.absorb(information, vector, self.state.first_of_pixels, scaled, partly)
 
     def absorb_measurement(self, measurement: Measurement) -> None:
         """Absorb a measurement of the navigation state; the means stay where they are."""
@@ -375,6 +368,6 @@ class Window:
         self.landmarks = self.landmarks @ R.T
         P = M @ prior.P @ M.T
         prior.P, prior.delta = 0.5 * (P + P.T), turn @ prior.delta
-        for bias in prior.biases:
-            bias.error_D_bias = M @ bias.error_D_bias
+        if prior.scale_test is not None:
+            prior.scale_test.error_D_scale = M @ prior.scale_test.error_D_scale
         return R, M

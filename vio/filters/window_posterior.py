@@ -23,27 +23,28 @@ class WindowPosterior:
 
     clones: tuple[Clone, ...]  # oldest first
     P: FloatArray  # (6N, 6N) covariance of their right-invariant errors
+    reported: FloatArray  # (6N, 6N) the same with the uncertainty of the rig's scale
     gyro_bias: FloatArray  # (3,) rad/s, of the newest frame
     accel_bias: FloatArray  # (3,) m/s^2, of the newest frame
     has_imu: bool  # whether the clones' velocities are smoothed, too
 
     @classmethod
-    def of(cls, window: Window, P: FloatArray) -> WindowPosterior:
-        """Take over the body's poses at the window's exposures, with the covariance P (k, k) up to theirs."""
+    def of(cls, window: Window, P: FloatArray, reported: FloatArray) -> WindowPosterior:
+        """Take over the body's poses at the window's exposures, with the covariances (k, k) up to theirs."""
         rows = window.state.clones
-        own = P[rows, rows]
+        own = P[rows, rows], reported[rows, rows]
         if "extrinsics" in window.state:
-            body_D_error = window.body_D_error()
-            own = body_D_error @ P @ body_D_error.T
+            J = window.body_D_error()
+            own = J @ P @ J.T, J @ reported @ J.T
         has_imu = isinstance(window.motion, ImuMotion)
-        return cls(tuple(window.clones), own, window.nav.gyro_bias, window.nav.accel_bias, has_imu)
+        return cls(tuple(window.clones), *own, window.nav.gyro_bias, window.nav.accel_bias, has_imu)
 
     def rotated(self, R: FloatArray) -> WindowPosterior:
         """Return the same in a world that is turned by R (3, 3)."""
         T = se3_from_parts(R, np.zeros(3))
         clones = tuple(replace(c, T_world_imu=T @ c.T_world_imu, velocity=R @ c.velocity) for c in self.clones)
         turn = np.kron(np.eye(2 * len(clones)), R)
-        return replace(self, clones=clones, P=turn @ self.P @ turn.T)
+        return replace(self, clones=clones, P=turn @ self.P @ turn.T, reported=turn @ self.reported @ turn.T)
 
     def estimate(self, frame_index: int) -> Estimate | None:
         """Return the smoothed estimate at a frame of the window; None where the frame is not in it."""
@@ -55,7 +56,7 @@ class WindowPosterior:
         return Estimate(
             clone.time_ns,
             clone.T_world_imu,
-            A @ self.P[rows, rows] @ A.T,
+            A @ self.reported[rows, rows] @ A.T,
             velocity_world=clone.velocity if self.has_imu else self._velocities()[index],
             gyro_bias=self.gyro_bias,
             accel_bias=self.accel_bias,

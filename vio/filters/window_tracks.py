@@ -5,7 +5,7 @@ Everything here is about pixels and points; poses come in as camera poses and go
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -31,7 +31,7 @@ from vio.geometry.lie import FloatArray, circledot
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import median
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import ROW_TERMS, BoolArray, IntArray
+from vio.records import FIELD_TERMS, ROW_TERMS, BoolArray, IntArray
 
 MIN_TRACKS_FOR_NOISE = 15  # with fewer, neither the pixel noise nor the process noise is adapted
 LEAST_PIXEL_SIGMA_PX = 0.03  # lower bound of the estimated noise of one pixel coordinate
@@ -72,11 +72,6 @@ class WindowTracks:
         self.table = TrackTable(settings.clones + 1)
         self._least_px = _LEAST_MONO_PX if camera.kind == "mono" else LEAST_PIXEL_SIGMA_PX
         self.variance = settings.pixel_sigma_px**2  # of one pixel coordinate, px^2; follows the residuals
-
-    def scale(self, camera: StereoCamera, factor: float) -> None:
-        """Go on in a world scaled by a factor about its origin, whose points the given camera sees."""
-        self._camera = camera
-        self.table.points *= factor
 
     def choose(self, clones: int) -> IntArray:
         """Rows of the tracks that constrain the poses: two views or more, the most informative first if too many."""
@@ -173,21 +168,23 @@ class WindowTracks:
             columns = stereo_columns(at, H, information.q.p_D_q, weight)
         return LinearTracks(T_cam0_world, rows, p_world, at, weight, information, columns, field)
 
-    def focal_columns(self, tracks: LinearTracks, chosen: IntArray) -> tuple[StereoColumns, TrackInformation]:
-        """Linearise tracks (K,) by a focal length that is no state, as the last term beside those of (R3) that are.
+    def field_scores(self, tracks: LinearTracks, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Scores and information (K, 8) of tracks (K,) by the terms of (R3), their points eliminated, the poses known.
 
-        Returns:
-            Their columns, and their part of what all tracks say.
+        In the believed noise, where the expected square of a score is its information.
         """
-        terms = np.arange(TERMS)
-        field = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), terms[-1:])
-        if tracks.field is not None:
-            field = replace(tracks.field, terms=terms)
-        z = self._views(tracks.rows[chosen], len(tracks.T_cam0_world), tracks.field).z
-        information = tracks.information.take(chosen)
-        at = Residuals(tracks.at.r[chosen], tracks.at.z_D_p[chosen], tracks.at.ahead[chosen])
-        predicted = z - at.r
-        return stereo_columns(at, field.jacobian(predicted), information.q.p_D_q, tracks.weight[chosen]), information
+        info, columns = tracks.information.take(chosen), tracks.stereo
+        if columns is None or tracks.field is None or tracks.field.terms[0] > 0:
+            none = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), np.arange(FIELD_TERMS))
+            at = Residuals(tracks.at.r[chosen], tracks.at.z_D_p[chosen], tracks.at.ahead[chosen])
+            z = self._views(tracks.rows[chosen], len(tracks.T_cam0_world), tracks.field).z
+            columns = stereo_columns(at, none.jacobian(z - at.r), info.q.p_D_q, tracks.weight[chosen])
+        else:
+            columns = columns.take(chosen)
+        G, A, b = (x[..., :FIELD_TERMS] for x in (columns.G, np.einsum("fss->fs", columns.A), columns.b))
+        X = np.linalg.solve(info.C, G)
+        score = b - np.einsum("fas,fa->fs", X, info.point_gradient)
+        return score / self.variance, (A - np.einsum("fas,fas->fs", G, X)) / self.variance
 
     def _views(self, rows: IntArray, clones: int, field: StereoCorrection | None) -> Views:
         """What rows showed, without the stereo field."""

@@ -119,9 +119,9 @@ class RunHealth:
             named = f"{name}, or the focal length," if len(found) == 1 and name == "baseline" else name
             lines.append(
                 f"frame {index}: the {named} is {abs(percent):.1f} % {'longer' if percent > 0 else 'shorter'} than "
-                f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor measures, and is taken "
-                "as that; unless the sensor is wrong (check its unit, axes and clock), calibrate the cameras anew, or "
-                "check that images and calibration have one size; of depth images, check dataset.depth_factor"
+                f"calibrated (standard deviation {sigma:.1g} %), by the motion that the sensor measures; check "
+                "the sensor (unit, axes, clock) and that images and calibration have one size (of depth images, "
+                "dataset.depth_factor); then calibrate the cameras anew, or run with what --save-calibration keeps"
             )
         return lines
 

@@ -191,10 +191,10 @@ class InertialCheck:
             self.rotation_comparison = turns
 
     def _compare_rotations(self, record: Record, gyro_fit: GyroFit) -> list[InertialFinding]:
-        """Compare the camera's rotation with the gyro's until the filter knows that the focal length is off."""
+        """Compare the camera's rotation with the gyro's until they differ beyond doubt."""
         known = self.rotation_comparison
         if known is not None and known.differ and known.gyro_agrees:
-            return []
+            return judge_rotations(known, self._stereo)
         self.rotation_comparison = compare_rotations(record, gyro_fit, self._T[:3, :3])
         return judge_rotations(self.rotation_comparison, self._stereo)
 

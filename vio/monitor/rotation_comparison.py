@@ -51,17 +51,19 @@ def _factor(camera: FloatArray, gyro: FloatArray, weight: FloatArray) -> tuple[f
 
 
 def judge_rotations(compared: RotationComparison, camera: StereoCamera) -> list[InertialFinding]:
-    """Report rotations that differ by the gyro's scale, or by a focal length that the filter cannot find."""
-    if not compared.differ or (compared.gyro_agrees and not camera.is_cylinder):
+    """Report rotations that differ by the gyro's scale or by the focal length."""
+    if not compared.differ:
         return []
+    cause = "the focal length or the lens is not as calibrated"
+    if not compared.gyro_agrees:
+        cause += ", or the gyro's scale is off"
     estimate = "" if camera.is_cylinder else ", or have the focal length estimated (msckf.stereo_focal_sigma: 0.05)"
     return [
         InertialFinding(
             "camera turns",
             f"about the axes of the image the camera turns {100 * abs(compared.excess):.1f} ± "
             f"{100 * compared.sigma:.1f} % {'more' if compared.excess > 0 else 'less'} than the gyro says",
-            f"the focal length or the lens is not as calibrated, or the gyro's scale is off; calibrate the cameras anew"
-            f"{estimate}",
+            f"{cause}; calibrate the cameras anew{estimate}",
             certain=False,
         )
     ]
