@@ -57,7 +57,7 @@ results: $(VENV)/.base
 	$(BIN)/python -m tools.results --data "$(VIO_DATA)" --work "$(WORK)" $(RESULTS)
 
 # The documentation site, into site/; a broken link or a page without a place in the menu is an error.
-docs: $(TESTED)
+docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 # Build the wheel, and run its demo in an environment and a folder of its own, with the newest versions of what it needs.
@@ -73,9 +73,13 @@ $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e .
 	@touch $@
 
+$(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
+	$(PIP_INSTALL) -e '.[docs]'
+	@touch $@ $(VENV)/.base
+
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev]'
-	@touch $@ $(VENV)/.base
+	@touch $@ $(VENV)/.docs $(VENV)/.base
 
 $(VENV)/.learned: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev,learned]'

@@ -85,8 +85,28 @@ def _pytest_renders() -> None:
     assert done.stdout.count("::test_") > 5
 
 
+def _installs() -> None:
+    """What is installed exists: the project here, the wheel's name with the present version, the extras."""
+    for command in (command for command in _commands(README) if "-m pip install" in command):
+        target = shlex.split(command)[4]
+        if target.endswith(".whl"):
+            assert target == f"stereo_vio-{vio.__version__}-py3-none-any.whl"
+    table = re.findall(r"^\| `(\w+)` \|", _text(README).partition("## Install")[2].partition("\n## ")[0], re.MULTILINE)
+    declared = _text("pyproject.toml").partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    assert sorted(table) == sorted(re.findall(r"^(\w+) = \[", declared, re.MULTILINE))
+
+
+def _docker() -> None:
+    """The image is built from this folder, and its default command is the demo with results in the mounted folder."""
+    assert 'CMD ["demo", "--out", "/data/demo"]' in _text("Dockerfile")
+
+
 # Commands of the README that are no `vio …`, and what is tested of them here.
 _ELSEWHERE: dict[str, Callable[[], None]] = {
+    "python -m pip install .": _installs,
+    "python -m pip install stereo_vio-0.2.0-py3-none-any.whl": _installs,
+    "docker build -t stereo-vio .": _docker,
+    'docker run --rm -v "$PWD/out:/data" stereo-vio': _docker,
     "make demo": _make_demo,
     "make quick": _make_quick,
     "make test": _make_test,
@@ -124,7 +144,7 @@ def _commands(name: str) -> list[str]:
     """Every command line of a document's blocks, without its comment; `a ; b` are two."""
     lines = [line for block in _blocks(name) if block.language in ("", "bash") for line in block.text.splitlines()]
     bare = (re.sub(r"\s+# .*", "", line) for line in lines)
-    return [part.strip() for line in bare for part in line.split(" ; ") if re.match(r"(vio|make|python)\b", part)]
+    return [part.strip() for line in bare for part in line.split(" ; ") if re.match(r"(vio|make|python|docker)\b", part)]
 
 
 def _snippets(name: str) -> list[str]:
