@@ -144,7 +144,9 @@ def _commands(name: str) -> list[str]:
     """Every command line of a document's blocks, without its comment; `a ; b` are two."""
     lines = [line for block in _blocks(name) if block.language in ("", "bash") for line in block.text.splitlines()]
     bare = (re.sub(r"\s+# .*", "", line) for line in lines)
-    return [part.strip() for line in bare for part in line.split(" ; ") if re.match(r"(vio|make|python|docker)\b", part)]
+    return [
+        part.strip() for line in bare for part in line.split(" ; ") if re.match(r"(vio|make|python|docker)\b", part)
+    ]
 
 
 def _snippets(name: str) -> list[str]:
