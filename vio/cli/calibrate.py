@@ -96,6 +96,7 @@ def _facts(report: CalibrationReport) -> dict[str, Any]:
         "in_motion": None if report.in_motion is None else _parameters(report.in_motion),
         "imu": _plain(report.imu.alignment),
         "lever_arm": _plain(report.imu.lever_arm),
+        "grade": None if report.stereo_error is None else report.stereo_error.grade,
         "findings": [{"fault": f.fault, "detail": f.detail} for f in report.findings],
         "notes": list(report.notes),
     }
@@ -145,7 +146,10 @@ def _rows(report: CalibrationReport) -> list[tuple[str, str]]:
     rows += [("note", note) for note in report.notes]
     rows.append(("not checked", "; ".join(_unchecked(report))))
     rows += [("FOUND", str(finding)) for finding in report.findings]
-    return rows if report.findings else [*rows, ("verdict", "no fault found in what could be observed")]
+    off = report.stereo_error
+    if off is None:
+        return rows if report.findings else [*rows, ("verdict", "no fault found in what could be observed")]
+    return [*rows, ("verdict", str(off))]
 
 
 def _observed(name: str, found: _Part | NotObservable, rows: Callable[[_Part], _Rows]) -> _Rows:

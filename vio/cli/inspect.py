@@ -71,4 +71,4 @@ def _rows(report: Inspection) -> list[tuple[str, str]]:
     rows = [(part.name, part.text) for part in report.parts]
     rows += [("note", note) for note in report.notes]
     rows += [("FAULT", fault) for fault in report.faults]
-    return rows if report.faults else [*rows, ("verdict", "nothing speaks against a run")]
+    return rows if report.faults else [*rows, ("verdict", "can be run")]
