@@ -12,6 +12,7 @@ import gc
 import io
 import logging
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -127,6 +128,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     if unknown:
         chosen = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[args.command]
         chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
+    args.command_line = shlex.join(["vio", *(sys.argv[1:] if argv is None else argv)])
     return args
 
 
