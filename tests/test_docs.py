@@ -394,7 +394,9 @@ def test_inline_code_names_what_exists(name: str) -> None:
         elif words[0] == "make":
             if not re.search(rf"^{words[1]}:", _text("Makefile"), re.MULTILINE):
                 wrong.append(code)
-        elif found := re.fullmatch(r"((?:frontend|selector|vislam|msckf|dataset)(?:\.[a-z]\w*)+)(?:[=:].*)?", code):
+        elif found := re.fullmatch(
+            r"(?:--set )?((?:frontend|selector|vislam|msckf|dataset)(?:\.[a-z]\w*)+)(?:[=:].*)?", code
+        ):
             is_module = (ROOT / (found.group(1).replace(".", "/") + ".py")).is_file()
             if found.group(1) not in _SETTINGS | sections and not is_module:
                 wrong.append(code)

@@ -16,6 +16,7 @@ import yaml
 
 pytest.importorskip("rosbags", reason="needs rosbags")
 
+import vio
 from tests.bag_maker import Script
 from vio.cli import main
 from vio.datasets import open_dataset
@@ -89,7 +90,9 @@ def test_tutorials_show_every_example_as_it_is() -> None:
     assert shown == {f'python title="examples/{name}"': text for name, text in files.items()}
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="mkdocs is not installed")
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("mkdocs", "latex2mathml")), reason="needs the extra docs"
+)
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     built: Any = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
@@ -99,4 +102,17 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
         timeout=600,
     )
     assert built.returncode == 0, built.stderr
-    assert (tmp_path / "site" / "tutorials" / "folder" / "index.html").is_file()
+    site = tmp_path / "site"
+    assert (site / "tutorials" / "folder.html").is_file()
+    assert "var __index" in (site / "search" / "search_index.js").read_text(encoding="utf-8")[:20]
+    page = (site / "math.html").read_text(encoding="utf-8")
+    numbers = re.findall(r"\\tag\{(\w+)\}", (ROOT / "docs" / "math.md").read_text(encoding="utf-8"))
+    assert len(numbers) > 50
+    assert re.findall(r'</math><span id="\w+">\((\w+)\)</span>', page) == numbers
+    assert "arithmatex" not in page
+    assert not re.search(r'(src|href)="https?://[^"]+\.(js|css|woff2?)', page), "needs no network"
+    reference = (site / "reference.html").read_text(encoding="utf-8")
+    assert "__init__" not in reference
+    assert {f'id="vio.{name}"' for name in vio.__all__ if not name.startswith("_")} <= set(
+        re.findall(r'id="vio\.\w+"', reference)
+    )

@@ -380,7 +380,7 @@ def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
             for name, x in scale.items()
         ]
         rows.append(("cameras", ", ".join(found)))
-    rows += [("", line) for line in camera_imu_findings(metrics)]
+    rows += [("IMU", line) for line in camera_imu_findings(metrics)]
     for sensor, own in (metrics.get("imu") or {}).items():
         words = [
             f"{axis} {value:+.2f} ± {own['scale_percent_sigma'][axis]:.2f}"

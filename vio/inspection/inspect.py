@@ -184,4 +184,4 @@ def _missing_part(recording: Recording) -> Part:
         missing.append("no T_cam0_imu")
     if recording.reference is None:
         missing.append("no ground truth (no ATE)")
-    return Part("missing", "; ".join(missing) or "no kind of data", {"missing": missing}, faults)
+    return Part("missing", "; ".join(missing) or "nothing is missing", {"missing": missing}, faults)

@@ -102,7 +102,7 @@ def camera_imu_findings(metrics: Mapping[str, Any]) -> list[str]:
     if "time_offset_ms" in found:
         offset = f"{found['time_offset_ms']:+.2f} ± {found['time_offset_sigma_ms']:.2f} ms"
         words.append(f"stamps off by {offset}")
-    return [f"camera and IMU: {', '.join(words)}"] if words else []
+    return [f"against the camera: {', '.join(words)}"] if words else []
 
 
 def run_figures(run: FinishedRun) -> dict[str, str]:
