@@ -18,7 +18,7 @@ TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 CONSTRAINTS ?= constraints.txt
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(addprefix -c ,$(CONSTRAINTS))
 
-.PHONY: demo quick test lint unit coverage mutations bench results wheel docs clean constraints
+.PHONY: demo quick test lint unit coverage mutations bench results wheel docs release clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -65,6 +65,11 @@ wheel: | $(BIN)/python$(EXE)
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
 	$(BIN)/python tools/check_wheel.py dist
+
+# All of a release but the upload: CONTRIBUTING.md tells the rest.
+release: $(VENV)/.base
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
+	$(BIN)/python -m tools.release
 
 $(BIN)/python$(EXE):
 	$(PYTHON) -m venv $(VENV)
