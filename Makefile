@@ -60,7 +60,7 @@ results: $(VENV)/.base
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-# Build the wheel, and run its demo in an environment and a folder of its own, with the newest versions of what it needs.
+# Build the wheel, and run it in an environment and a folder of its own, with the newest versions of what it needs.
 wheel: | $(BIN)/python$(EXE)
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .

@@ -84,7 +84,7 @@ def test_one_screen_for_people(flight: Path, capsys: pytest.CaptureFixture[str])
     assert main(["inspect", str(flight), "--pairs", "2", "--frames", "0"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) <= 24
-    assert lines[-1] == "verdict              can be run"
+    assert lines[-2:] == ["verdict              can be run", f"next                 vio run {flight}"]
 
 
 def _imu(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
