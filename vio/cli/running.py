@@ -117,7 +117,7 @@ def process(
     """Process a source into a run folder, which grows meanwhile, and return its metrics.
 
     `save_calibration` names the file for the calibration that the run found; `Path()`, one in the run's folder.
-    `command` is kept in the metrics; `finished` gets them before the picture is drawn, which takes most of a second.
+    `command` is kept in the metrics; `finished` gets them before the picture is drawn.
     """
     dataset = _opened(source, config, mapped=map_file is not None)
     for note in dataset.recording.notes:
