@@ -174,7 +174,8 @@ def _inputs(dataset: Dataset, config: Config, request: Mapping[str, Any]) -> dic
     values |= {name: value for name, value in request.items() if name not in _OF_THE_OUTPUT}
     values |= {"number of frames": len(times_ns), "checksum of their times": zlib.crc32(times_ns.tobytes())}
     values |= _flat("camera", recording.camera) | _flat("T_cam0_imu", recording.T_cam0_imu)
-    return values | _flat("calibration", given_rig(dataset))
+    values |= _flat("calibration", given_rig(dataset))
+    return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
 
 
 def _flat(name: str, value: Any) -> dict[str, Any]:
