@@ -18,7 +18,7 @@ TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 CONSTRAINTS ?= constraints.txt
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(addprefix -c ,$(CONSTRAINTS))
 
-.PHONY: demo quick test lint unit coverage mutations bench results wheel docs clean constraints
+.PHONY: demo quick test lint unit coverage mutations bench results wheel docs release clean constraints
 
 demo: $(VENV)/.base
 	$(BIN)/vio demo --out demo
@@ -57,14 +57,19 @@ results: $(VENV)/.base
 	$(BIN)/python -m tools.results --data "$(VIO_DATA)" --work "$(WORK)" $(RESULTS)
 
 # The documentation site, into site/; a broken link or a page without a place in the menu is an error.
-docs: $(TESTED)
+docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-# Build the wheel, and run its demo in an environment and a folder of its own, with the newest versions of what it needs.
+# Build the wheel, and run it in an environment and a folder of its own, with the newest versions of what it needs.
 wheel: | $(BIN)/python$(EXE)
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
 	$(BIN)/python tools/check_wheel.py dist
+
+# All of a release but the upload: CONTRIBUTING.md tells the rest.
+release: $(VENV)/.base
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check build twine
+	$(BIN)/python -m tools.release
 
 $(BIN)/python$(EXE):
 	$(PYTHON) -m venv $(VENV)
@@ -73,9 +78,13 @@ $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e .
 	@touch $@
 
+$(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
+	$(PIP_INSTALL) -e '.[docs]'
+	@touch $@ $(VENV)/.base
+
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev]'
-	@touch $@ $(VENV)/.base
+	@touch $@ $(VENV)/.docs $(VENV)/.base
 
 $(VENV)/.learned: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev,learned]'

@@ -1,6 +1,6 @@
-"""A viewer of one's own: features in the image beside the path, frame by frame, as an animated picture.
+"""A viewer of one's own: features in the image beside the path over ground truth, as an animated picture.
 
-python examples/animated_picture.py SOURCE OUT.webp
+python examples/animated_picture.py SOURCE OUT.webp [EVERY]        # every 2nd frame
 """
 
 import sys
@@ -9,51 +9,49 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from vio import load_config, open_dataset, run
-from vio.geometry.upright import upright_axes
+from vio import evaluate, load_config, open_dataset, run
 from vio.view.live import states_of
 
-WIDTH, EVERY, LONGEST = 480, 2, 10  # pixels of each half, frames between two pictures, steps of a feature's tail
+WIDTH, LONGEST = 480, 10  # pixels of each half, steps of a feature's tail
 COLOURS = np.array([(60, 130, 255), (60, 220, 130), (230, 50, 50), (170, 170, 170), (250, 150, 50)])  # as in `vio view`
 
 
-class Film:
-    """Has `frame(result)` and `close()`, and so can watch any run."""
-
-    def __init__(self, T_cam0_body):
-        self.T_body_cam0, self.axes = np.linalg.inv(T_cam0_body), None
-        self.path, self.tails, self.pictures = [], {}, []
+class Film:  # has `frame(result)` and `close()`, and so can watch any run
+    tails, pictures = {}, []
 
     def frame(self, result):
-        T_world_cam0, seen = result.estimate.T_world_imu @ self.T_body_cam0, result.output.observations
-        self.axes = upright_axes(T_world_cam0[None]) if self.axes is None else self.axes
-        self.path.append(self.axes @ T_world_cam0[:3, 3])  # right, ahead, up at the start
-        features = zip(seen.ids.tolist(), seen.z[:, :2], strict=True)
-        self.tails = {name: [*self.tails.get(name, []), pixel][-LONGEST:] for name, pixel in features}
+        seen = result.output.observations
+        self.tails = {i: [*self.tails.get(i, []), z[:2]][-LONGEST:] for i, z in zip(seen.ids, seen.z, strict=True)}
         image = cv2.cvtColor(result.frame.left, cv2.COLOR_GRAY2RGB)
         states = states_of(seen, result.selection.chosen, result.report)
         for tail, colour in zip(self.tails.values(), COLOURS[states].tolist(), strict=True):
             cv2.polylines(image, [np.round(tail).astype(np.int32)], False, colour, 1, cv2.LINE_AA)
             cv2.circle(image, np.round(tail[-1]).astype(int).tolist(), 3, colour, 1, cv2.LINE_AA)
-        if len(self.path) % EVERY == 0:
-            size = WIDTH, round(image.shape[0] * WIDTH / image.shape[1])
-            self.pictures.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+        zoom = WIDTH / image.shape[1]
+        self.pictures.append(cv2.resize(image, None, fx=zoom, fy=zoom, interpolation=cv2.INTER_AREA))
 
-    def close(self):  # here the size of the path is known
-        height, path = self.pictures[0].shape[0], np.array(self.path)[:, :2]
-        low, high = path.min(axis=0) - 1, path.max(axis=0) + 1
-        zoom = (np.array([WIDTH, height]) / (high - low)).min()
-        places = np.round((path - (low + high) / 2) * zoom * [1, -1] + [WIDTH / 2, height / 2]).astype(np.int32)
-        for k, picture in enumerate(self.pictures):
-            side, done = np.full((height, WIDTH, 3), 255, np.uint8), places[: (k + 1) * EVERY]
-            cv2.polylines(side, [done], False, (31, 95, 191), 2, cv2.LINE_AA)
-            cv2.circle(side, done[-1].tolist(), 5, (217, 130, 43), -1, cv2.LINE_AA)
-            self.pictures[k] = np.hstack([picture, side])
+    def close(self): ...
 
 
-dataset = open_dataset(sys.argv[1])
-film = Film(dataset.recording.T_cam0_body)
-run(dataset, load_config(), viewer=film)
-first, *others = map(Image.fromarray, film.pictures)
+dataset, film, every = open_dataset(sys.argv[1]), Film(), int(sys.argv[3]) if len(sys.argv) > 3 else 2
+result = run(dataset, load_config(), viewer=film)
+score = evaluate(result.trajectory, dataset.recording.reference, T_cam0_imu=result.T_cam0_body)
+truth, path = score.reference.positions, score.aligned.positions
+plane = np.linalg.svd(truth - truth.mean(axis=0), full_matrices=False)[2][:2].T  # in which the path extends furthest
+low, high = (truth @ plane).min(axis=0), (truth @ plane).max(axis=0)
+size = np.array([WIDTH, film.pictures[0].shape[0]])
+zoom = ((size - 60) / (high - low)).min()  # pixels a metre
+truth, path = (np.round(zoom * (p @ plane - (low + high) / 2) + size / 2 - [0, 10]).astype(int) for p in (truth, path))
+bar_m, bottom = 10.0 ** np.floor(np.log10(0.4 * WIDTH / zoom)), int(size[1]) - 10
+legend = f"{bar_m:g} m    gray: ground truth, blue: estimate"
+for k in range(0, len(film.pictures), every):
+    side, done = np.full_like(film.pictures[k], 255), path[: np.searchsorted(score.rows, k) + 1]
+    cv2.polylines(side, [truth], False, (190, 190, 190), 5, cv2.LINE_AA)
+    cv2.polylines(side, [done], False, (31, 95, 191), 2, cv2.LINE_AA)
+    cv2.circle(side, done[-1].tolist(), 5, (217, 130, 43), -1, cv2.LINE_AA)
+    cv2.line(side, (12, bottom), (12 + round(bar_m * zoom), bottom), (0, 0, 0), 2)
+    cv2.putText(side, legend, (12, bottom - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (0, 0, 0), 1, cv2.LINE_AA)
+    film.pictures[k] = np.hstack([film.pictures[k], side])
+first, *others = map(Image.fromarray, film.pictures[::every])
 first.save(sys.argv[2], save_all=True, append_images=others, duration=80, loop=0, quality=45, method=6)
-print(f"{sys.argv[2]}: {1 + len(others)} pictures")
+print(f"{sys.argv[2]}: {1 + len(others)} pictures, ATE {score.ate_m.rmse:.4f} m over {score.path_length_m:.0f} m")

@@ -22,6 +22,3 @@ with tempfile.TemporaryDirectory() as folder:
         end = again.trajectory.positions[-1]
         ms = 1e3 * again.wall_s / len(again.frames)
         print(f"window of {clones:2d} frames: ends at {end.round(3)}, {ms:.1f} ms a frame")
-
-# Features of another program: one call a frame, or a dataset of one's own (docs/recordings.md).
-#   odometry.add_observations(time_ns, ids, z, has_right)     # z = [ul vl ur vr], rectified pixels, (N, 4)

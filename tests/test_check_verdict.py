@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -64,8 +65,16 @@ def test_agreement_says_how_far_apart_they_are() -> None:
 def test_a_jump_of_the_run_is_laid_at_its_door() -> None:
     run = _jumped(_poses(), 0.5)
     text = overall_verdict([_result("incremental", run, _poses(1)), _result("global", run, _poses(2))])
-    assert text.startswith("the run is probably wrong at frames 190 to 200: ")
-    assert "by up to 0.50" in text
+    assert re.match(r"the run is probably off by 0\.50\d m \(1\.7 m per 100 m\) at frames 190 to 200: both", text)
+
+
+def test_a_jump_of_millimetres_is_negligible() -> None:
+    run = _jumped(_poses(), 0.03)
+    results = [_result("incremental", run, _poses(1)), _result("global", run, _poses(2))]
+    assert all(result.found is not None and result.found[1].segments for result in results)
+    text = overall_verdict(results)
+    assert text.startswith("the run and COLMAP agree: ")
+    assert re.search(r"the difference of 3[\d.]+ mm \(0\.1 m per 100 m\) at frames 190 to 200 is negligible", text)
 
 
 def test_a_model_that_broke_in_two_is_not_held_against_the_run() -> None:

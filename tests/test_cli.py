@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -304,22 +305,72 @@ def test_reports_and_skips_truncated_images_up_to_a_limit(
     assert "000003.png" in _error(capsys, *run, "--set", "dataset.max_bad_frames=0")
 
 
-def test_run_interrupted_while_its_picture_is_drawn_goes_on(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_an_interrupt_while_the_picture_is_drawn_costs_the_picture_alone(
+    recording: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     def stop(*args: object, **kwargs: object) -> None:
         raise KeyboardInterrupt
 
     out = tmp_path / "deep" / "out"
-    with monkeypatch.context() as patch:
-        patch.setattr("vio.runs.picture.plot_run", stop)
-        assert main(["run", str(recording), "--out", str(out)]) == 130
-    assert f"interrupted; what was flushed is in {out}" in capsys.readouterr().err
+    monkeypatch.setattr("vio.runs.picture.RunPicture.write", stop)
+    assert main(["run", str(recording), "--out", str(out)]) == 0
+    assert f"vio report {out} --open" in capsys.readouterr().out
+    assert "trajectory.png was not drawn: interrupted" in caplog.text
     assert len(read_trajectory(out / "trajectory.tum")) > 0
-    assert main(["run", "--resume", str(out)]) == 0
     assert not (out / "unfinished").exists()
     assert main(["run", "--resume", str(out)]) == 1
     assert "is complete" in capsys.readouterr().err
+
+
+def test_the_picture_is_drawn_after_the_results_are_printed_or_not_at_all(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    printed: list[str] = []
+    monkeypatch.setattr(
+        "vio.runs.picture.RunPicture.write", lambda picture, path: printed.append(capsys.readouterr().out)
+    )
+    assert main(["run", str(recording), "--out", str(tmp_path / "a")]) == 0
+    assert [text.count("results ") for text in printed] == [1]
+    assert main(["run", str(recording), "--out", str(tmp_path / "b"), "--no-plot"]) == 0
+    assert len(printed) == 1
+    assert "plot" not in capsys.readouterr().out
+
+
+def test_a_report_is_written_and_opened_with_the_run(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr("webbrowser.open", lambda uri: opened.append(uri) or True)
+    argv = ["run", str(recording), "--out", str(tmp_path / "a"), "--no-plot"]
+    assert main([*argv, "--report", "--open"]) == 0
+    assert opened == [(tmp_path / "a" / "report.html").resolve().as_uri()]
+    page = (tmp_path / "a" / "report.html").read_text(encoding="utf-8")
+    assert f"vio run {recording} --out {tmp_path / 'a'} --no-plot --report --open" in page
+    assert main([*argv, "--open"]) == 1
+    assert "--open shows the page of --report" in capsys.readouterr().err
+
+
+def test_several_trajectories_are_compared_and_drawn(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    runs = [str(tmp_path / name) for name in "ab"]
+    for out, motion in zip(runs, ("none", "velocity"), strict=True):
+        assert main(["run", str(recording), "--out", out, "--motion", motion, "--no-plot", "--quiet"]) == 0
+    capsys.readouterr()
+    picture = tmp_path / "eval.png"
+    truth = f"{runs[0]}/trajectory.tum"
+    assert main(["eval", *runs, truth, "--plot", str(picture)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0][-2:] for line in lines[1:3]] == ["/a", "/b"]
+    assert all(re.search(r"\d m+ +\d", line) for line in lines[1:3])
+    assert picture.stat().st_size > 10_000
+    both = _json(capsys, "eval", *runs, truth)
+    alone = [_json(capsys, "eval", out, truth) for out in runs]
+    assert [both[out]["ate_m"] for out in runs] == [one["ate_m"] for one in alone]
 
 
 def test_debug_raises_the_expected_error(tmp_path: Path) -> None:
@@ -494,7 +545,7 @@ def test_each_finding_of_the_stereo_calibration_has_a_line_of_its_own(capsys: py
     from vio.cli.running import metric_rows
 
     found = [f"right camera turned by +0.{k} deg about axis {k}" for k in range(5)]
-    field = {"rows_rms_px": 0.4, "coefficients_px": [0.2], "sigma_px": [0.01], "rig": {"lines": found}}
+    field = {"text": "worth calibrating: rows off by 0.4 px", "rig": {"lines": found}}
     absent = ("stereo_scale", "camera_imu", "ate_m", "t_err_percent", "landmark_error")
     metrics: dict[str, Any] = {
         "frames": 30,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +10,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import vio
 from tests.dataset_makers import CAMERA, T_CAM0_IMU, ece276a_arrays, make_drive, make_npz
+from vio.cameras.rig import Rig
 from vio.datasets import open_dataset
 from vio.datasets.common import read_npz
-from vio.datasets.observation_log import FORMAT, read_observation_log, write_observation_log
+from vio.datasets.observation_log import (
+    _DEFAULTED,
+    _OPTIONAL,
+    _REQUIRED,
+    FORMAT,
+    read_observation_log,
+    write_observation_log,
+)
 from vio.errors import CalibrationError, DataError
 from vio.geometry.stereo import StereoCamera
 from vio.records import (
@@ -199,6 +209,7 @@ def _corrupt_log(tmp_path: Path, **changes: object) -> Path:
         ({"z": np.zeros((2, 4), dtype=np.int64)}, "z of the observation log has type int64"),
         ({"z": np.zeros((3, 4))}, "inconsistent: 2 ids, but z is"),
         ({"offsets": [0, 2, 1]}, "the offsets do not split 2 rows into 2 frames"),
+        ({"offsets": [0, 2, 2]}, "an id occurs twice in a frame"),
         ({"frame_indices": [0, 3]}, "frame numbers do not increase within 0 to 2"),
         ({"frame_times_ns": [0, 0, 200]}, "a clock does not increase"),
         ({"motion_values": np.zeros((1, 6))}, "0 motion times"),
@@ -225,6 +236,64 @@ def test_rejects_a_corrupt_log(changes: dict[str, object], message: str, tmp_pat
 def test_rejects_a_log_with_corrupt_calibration(changes: dict[str, object], message: str, tmp_path: Path) -> None:
     with pytest.raises(CalibrationError, match=message):
         read_observation_log(_corrupt_log(tmp_path, **changes))
+
+
+def test_the_required_arrays_alone_are_a_recording(tmp_path: Path) -> None:
+    """In 32 bits, as another program may write them."""
+    arrays = {
+        "intrinsics": np.array([700, 700, 600, 180, 0.5], dtype=np.float32),
+        "frame_times_ns": np.array([5, 105]),
+        "offsets": np.array([0, 2, 3], dtype=np.int32),
+        "ids": np.array([1, 2, 1], dtype=np.int32),
+        "z": np.array([[10, 5, 8, 5], [20, 6, 0, 0], [11, 5, 9, 5]], dtype=np.float32),
+        "has_right": np.array([True, False, True]),
+    }
+    dataset = open_dataset(make_npz(tmp_path / "features.npz", arrays))
+    assert dataset.recording.kind == "log"
+    assert dataset.recording.T_cam0_imu is None
+    assert [type(event) for event in dataset.events()] == [StereoFrame, StereoFrame]
+    seen = dataset.observations(0)
+    assert seen is not None
+    assert (seen.ids.dtype, seen.z.dtype) == (np.int64, np.float64)
+    assert seen.ids.tolist() == [1, 2]
+    assert seen.has_right.tolist() == [True, False]
+    assert not seen.stale.any()
+
+
+def test_features_of_another_program_are_written_and_read(tmp_path: Path) -> None:
+    rig = Rig.rectified(700.0, 700.0, 600.0, 180.0, 0.5, 1200, 370, T_CAM0_IMU)
+    frames = [([1, 2], [[10, 5, 8, 5], [20, 6, 0, 0]], [True, False]), ([1], [[11, 5, 9, 5]], None)]
+    sample = ImuSample(50, np.zeros(3), np.array([0.0, 0.0, 9.8]))
+    vio.write_observations(tmp_path / "features.npz", rig, [0, 100], frames, motion=[sample])
+    dataset = vio.open_dataset(tmp_path / "features.npz")
+    assert dataset.recording.camera == rig.camera
+    assert _same_bits(dataset.recording.T_cam0_imu, rig.T_cam0_imu)
+    assert [type(event) for event in dataset.events()] == [StereoFrame, ImuSample, StereoFrame]
+    assert [dataset.observations(k).has_right.tolist() for k in range(2)] == [[True, False], [True]]
+
+
+@pytest.mark.parametrize(
+    ("times", "frames", "message"),
+    [
+        ([0.0, 0.1], [([1], [[1, 2, 0, 2]], None)] * 2, "one integer, in nanoseconds"),
+        ([0], [], "for 0 frames"),
+        ([5, 5], [([1], [[1, 2, 0, 2]], None)] * 2, "frame times, entry 1"),
+        ([0], [([1, 1], [[1, 2, 0, 2]] * 2, None)], "an id occurs twice"),
+        ([0], [([1], [[1, 2, 0]], None)], "frame 0"),
+    ],
+)
+def test_malformed_features_are_not_written(times: object, frames: object, message: str, tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=message):
+        vio.write_observations(tmp_path / "a.npz", CAMERA, times, frames)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_tutorial_describes_every_array() -> None:
+    page = (Path(__file__).parent.parent / "docs/tutorials/features.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`[^|]+`) \| ([^|]*) \|.*\| (yes|no)[^|]*\|$", page, re.MULTILINE)
+    named = {name: needed == "yes" for names, _, needed in rows for name in re.findall(r"`(\w+)`", names)}
+    known = {**dict.fromkeys(_REQUIRED, True), **dict.fromkeys([*_DEFAULTED, *_OPTIONAL], False)}
+    assert named == known
 
 
 def test_format_name_is_what_is_written(tmp_path: Path) -> None:

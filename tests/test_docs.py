@@ -85,9 +85,35 @@ def _pytest_renders() -> None:
     assert done.stdout.count("::test_") > 5
 
 
+def _installs() -> None:
+    """What is installed exists: the project here, the wheel's name with the present version, the extras."""
+    for command in (command for command in _commands(README) if "-m pip install" in command):
+        target = shlex.split(command)[4]
+        if target.endswith(".whl"):
+            assert target == f"stereo_vio-{vio.__version__}-py3-none-any.whl"
+    table = re.findall(r"^\| `(\w+)` \|", _text(README).partition("## Install")[2].partition("\n## ")[0], re.MULTILINE)
+    declared = _text("pyproject.toml").partition("[project.optional-dependencies]")[2].partition("\n[")[0]
+    assert sorted(table) == sorted(re.findall(r"^(\w+) = \[", declared, re.MULTILINE))
+
+
+def _vio_demo() -> None:
+    """What `readme_folder` has run, smaller: here it would take the place of that recording."""
+    assert build_parser().parse_args(["demo"]).out == Path("demo")
+
+
+def _docker() -> None:
+    """The image is built from this folder, and its default command is the demo with results in the mounted folder."""
+    assert 'CMD ["demo", "--out", "/data/demo"]' in _text("Dockerfile")
+
+
 # Commands of the README that are no `vio …`, and what is tested of them here.
 _ELSEWHERE: dict[str, Callable[[], None]] = {
+    "python -m pip install .": _installs,
+    "python -m pip install stereo_vio-0.2.0-py3-none-any.whl": _installs,
+    "docker build -t stereo-vio .": _docker,
+    'docker run --rm -v "$PWD/out:/data" stereo-vio': _docker,
     "make demo": _make_demo,
+    "vio demo": _vio_demo,
     "make quick": _make_quick,
     "make test": _make_test,
     "python -m pytest tests/test_frontend_renders.py": _pytest_renders,
@@ -124,7 +150,9 @@ def _commands(name: str) -> list[str]:
     """Every command line of a document's blocks, without its comment; `a ; b` are two."""
     lines = [line for block in _blocks(name) if block.language in ("", "bash") for line in block.text.splitlines()]
     bare = (re.sub(r"\s+# .*", "", line) for line in lines)
-    return [part.strip() for line in bare for part in line.split(" ; ") if re.match(r"(vio|make|python)\b", part)]
+    return [
+        part.strip() for line in bare for part in line.split(" ; ") if re.match(r"(vio|make|python|docker)\b", part)
+    ]
 
 
 def _snippets(name: str) -> list[str]:
@@ -175,7 +203,7 @@ def test_readme_commands_run(
 ) -> None:
     monkeypatch.chdir(readme_folder)
     program, *argv = shlex.split(f"{command} {_SMALLER.get(command, '')}")
-    if program == "vio":
+    if program == "vio" and command not in _ELSEWHERE:
         assert main(argv) == 0
         complaints = [r.getMessage() for r in caplog.records if "not used" in r.getMessage()]
         assert not complaints, "the reference that the README gives does not fit"
@@ -210,7 +238,8 @@ def test_readme_shows_what_the_demo_prints(
     shown_drift = {"start_s": 0.0, "t_err_percent": 0.05, "r_err_deg_per_100m": 0.039, "drift_lengths_m": [100]}
     print_result({}, metric_rows({**metrics, **shown_drift}), as_json=False)
     shown = next(block.text for block in _blocks(README) if block.text.startswith("frames "))
-    assert re.sub(r"[\d.]+\d", "#", capsys.readouterr().out) == re.sub(r"[\d.]+\d", "#", shown)
+    printed, shown = (re.sub(r"[\d.]+\d( m?m\b)?", "#", text) for text in (capsys.readouterr().out, shown))
+    assert printed == shown
 
 
 def test_readme_python_runs(
@@ -371,7 +400,9 @@ def test_inline_code_names_what_exists(name: str) -> None:
         elif words[0] == "make":
             if not re.search(rf"^{words[1]}:", _text("Makefile"), re.MULTILINE):
                 wrong.append(code)
-        elif found := re.fullmatch(r"((?:frontend|selector|vislam|msckf|dataset)(?:\.[a-z]\w*)+)(?:[=:].*)?", code):
+        elif found := re.fullmatch(
+            r"(?:--set )?((?:frontend|selector|vislam|msckf|dataset)(?:\.[a-z]\w*)+)(?:[=:].*)?", code
+        ):
             is_module = (ROOT / (found.group(1).replace(".", "/") + ".py")).is_file()
             if found.group(1) not in _SETTINGS | sections and not is_module:
                 wrong.append(code)

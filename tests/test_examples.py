@@ -60,6 +60,12 @@ def test_precomputed_features_run_again(flight: Path) -> None:
     assert len(re.findall(r"window of +\d+ frames", _run("precomputed_features.py", flight))) == 3
 
 
+def test_features_of_another_program_give_the_path(tmp_path: Path) -> None:
+    ahead = re.search(r"at the end ([\d.]+) m ahead", _run("foreign_features.py", tmp_path / "features.npz"))
+    assert ahead is not None
+    assert float(ahead[1]) == pytest.approx(29, abs=0.1)
+
+
 def test_results_are_read_as_arrays(flight: Path, tmp_path: Path) -> None:
     assert main(["run", str(flight), "--quiet", "--out", str(tmp_path / "run")]) == 0
     text = _run("read_results.py", tmp_path / "run")

@@ -17,15 +17,14 @@ from vio.files.printable import json_text, printable
 from vio.runs.picture import _view
 
 
-def test_the_map_of_a_drive_holds_the_path_and_that_of_a_standing_rig_its_landmarks() -> None:
-    points = np.random.default_rng(0).uniform([-12, 0], [12, 60], size=(400, 2))
+def test_the_map_holds_the_path_however_small() -> None:
     drive = np.stack([np.zeros(50), np.linspace(0, 200, 50)], axis=1)
-    low, high = _view(drive, points)
-    assert (low, high) == (pytest.approx([-30, -30]), pytest.approx([30, 230]))
-    low, high = _view(0.01 * drive[:10], points)
-    assert np.mean(np.all((points > low) & (points < high), axis=1)) > 0.75
-    assert np.all(high - low < 80)
-    assert np.array_equal(_view(drive[:1], points[:0]), ([-1, -1], [1, 1]))
+    for scale in (1.0, 0.005):
+        low, high = _view(scale * drive, 0.5)
+        assert (low, high) == (pytest.approx(scale * np.array([-60, -20])), pytest.approx(scale * np.array([60, 220])))
+    low, high = _view(drive[:, ::-1], 0.5)
+    assert (low, high) == (pytest.approx([-20, -240]), pytest.approx([220, 240]))
+    assert np.allclose(_view(drive[:1], 1.0), ([-0.02, -0.02], [0.02, 0.02]))
 
 
 NAME = os.fsdecode(b"a$1_$2 \\frac{ b\xff\x1b[31m.npz")

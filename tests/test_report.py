@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -59,10 +60,10 @@ def test_the_words_and_the_table_hold_the_figures_of_the_run(runs: tuple[Path, P
     text = " ".join(summary(run))
     assert "16 frames of flight (euroc)" in text
     assert "from an IMU by msckf" in text
-    assert f"position error is {run.metrics['ate_m']:.3g} m" in text
+    assert f"position error is {1e3 * run.metrics['ate_m']:.3g} mm" in text
     assert f"{1e3 * 0.05:.1f} ms" in text  # one frame every 50 ms
     figures = run_figures(run)
-    assert figures["ATE (m)"] == f"{run.metrics['ate_m']:.4f}"
+    assert figures["ATE"] == f"{1e3 * run.metrics['ate_m']:.3g} mm"
     assert figures["path (m)"] == f"{run.metrics['path_length_m']:.2f}"
     assert figures["ms a frame, median"] == f"{run.metrics['ms_per_frame_median']:.1f}"
     assert figures["observations refused (%)"] == f"{100 * run.metrics['refused_share']:.1f}"
@@ -71,11 +72,13 @@ def test_the_words_and_the_table_hold_the_figures_of_the_run(runs: tuple[Path, P
 def test_a_page_needs_no_network_and_shows_every_part(runs: tuple[Path, Path]) -> None:
     run = read_finished_run(runs[0])
     text = page([run])
-    assert not re.search(r"<(script|link|img)[^>]*(src|href)=", text)
+    assert not re.search(r"<(script|link|img)[^>]*(src|href)=(?!\"data:image)", text)
     assert text.count("plotly.js v") == 1
     drawn = ("Path", "Position and height", "Attitude", "Velocity", "Errors", "Features", "Innovations", "IMU biases")
-    for title in ("Summary", "Figures", *drawn, "Time"):
+    for title in ("Summary", "Figures", "Features and disparities", *drawn, "Path in three dimensions", "Time"):
         assert f"<h2>{title}</h2>" in text
+    assert f"<code>{escape(run.metrics['command'])}</code>" in text
+    assert "stamps off by" in text.partition("<h2>Calibration</h2>")[2].partition("</section>")[0]
     assert "All settings have their defaults" not in text  # --motion is one
     assert "<h2>IMU biases</h2>" not in page([read_finished_run(runs[1])])
 

@@ -17,6 +17,7 @@ from vio.offline.self_calibration import (
     NAMES,
     Segment,
     SelfCalibration,
+    _derivatives,
     _larger,
     intrinsics_of,
     project_off,
@@ -155,3 +156,18 @@ def test_what_is_no_rigid_scene_is_refused() -> None:
     empty = replace(segment.tracks, ids=np.zeros(0, dtype=np.int64))
     with pytest.raises(EstimationError, match="no track is consistent"):
         self_calibrate(CAMERA, [replace(segment, tracks=empty)], intrinsics=False)
+
+
+def test_derivatives_are_those_of_the_projection() -> None:
+    rng = np.random.default_rng(4)
+    x = 0.03 * rng.normal(size=len(NAMES))
+    q = rng.uniform([-3, -2, 2], [3, 2, 12], (40, 3))
+    J_q, J_x = _derivatives(CAMERA, x, q)
+    for k in range(3):
+        step = 1e-6 * np.eye(3)[k]
+        numeric = (project_off(CAMERA, x, q + step) - project_off(CAMERA, x, q - step)) / 2e-6
+        np.testing.assert_allclose(J_q[:, :, k], numeric, rtol=1e-6, atol=1e-4)
+    for k, name in enumerate(NAMES):
+        step = 1e-6 * np.eye(len(NAMES))[k]
+        numeric = (project_off(CAMERA, x + step, q) - project_off(CAMERA, x - step, q)) / 2e-6
+        np.testing.assert_allclose(J_x[:, :, k], numeric, rtol=1e-6, atol=1e-4, err_msg=name)

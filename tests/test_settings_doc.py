@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tools import commands_table
 from tools.settings_page import page
+from vio.cli import _COMMANDS
 from vio.config import BASIC, Config, describe
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "settings.md"
@@ -21,3 +23,9 @@ def test_every_setting_has_one_row_and_about_twenty_are_basic() -> None:
     basic = text.partition("\n## Others")[0]
     assert [key for key in keys if f"\n| `{key}` |" in basic] == list(BASIC)
     assert 15 <= len(BASIC) <= 25
+
+
+def test_the_table_of_commands_is_that_of_todays_commands() -> None:
+    text = commands_table.PAGE.read_text(encoding="utf-8")
+    assert commands_table.with_table(text) == text, "run: python -m tools.commands_table"
+    assert commands_table.table().count("`vio ") == len(_COMMANDS) == len(set(_COMMANDS))

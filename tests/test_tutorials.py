@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ import yaml
 
 pytest.importorskip("rosbags", reason="needs rosbags")
 
+import vio
 from tests.bag_maker import Script
 from vio.cli import main
 from vio.datasets import open_dataset
@@ -25,9 +27,15 @@ PAGES = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 _SLOW = ("vio calibrate",)  # tests/test_calibrate_cli.py runs it
 
 
+def _blocks(page: Path) -> list[tuple[str, str]]:
+    """The fenced blocks of a page: what follows the opening fence, and the text."""
+    text = page.read_text(encoding="utf-8")
+    return re.findall(r"^```([^`\n]*)\n(.*?)^```$", text, flags=re.DOTALL | re.MULTILINE)
+
+
 def _commands(page: Path) -> list[str]:
-    blocks = re.findall(r"^```\n(.*?)^```$", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    return [line.partition("  #")[0] for block in blocks for line in block.splitlines() if line.startswith("vio ")]
+    lines = [line for fence, text in _blocks(page) if not fence for line in text.splitlines()]
+    return [line.partition("  #")[0] for line in lines if line.startswith("vio ")]
 
 
 @pytest.fixture(scope="module")
@@ -35,6 +43,10 @@ def workplace(flight: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the recordings that the tutorials name."""
     folder = tmp_path_factory.mktemp("tutorials")
     assert main(["convert", str(flight), "--to", "plain", "--out", str(folder / "cameras")]) == 0
+    drive = folder / "dataset" / "sequences" / "07"
+    drive.parent.mkdir(parents=True)
+    assert main(["convert", str(flight), "--to", "kitti", "--out", str(drive)]) == 0
+    shutil.copytree(flight, folder / "MH_01_easy")
     _write_bag(flight, folder / "flight.bag")
     return folder
 
@@ -64,16 +76,23 @@ def test_the_commands_of_a_tutorial_run(page: Path, workplace: Path, monkeypatch
             assert main(shlex.split(command)[1:]) == 0, command
 
 
-def test_every_page_is_in_the_menu_and_every_example_in_a_tutorial() -> None:
+def test_every_page_is_in_the_menu() -> None:
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     named = set(re.findall(r"[\w/]+\.md", text))
     assert named == {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").rglob("*.md")}
-    shown = "".join(page.read_text(encoding="utf-8") for page in PAGES)
-    assert all(f'--8<-- "examples/{path.name}"' in shown for path in (ROOT / "examples").glob("*.py"))
     yaml.safe_load(text)
 
 
-@pytest.mark.skipif(importlib.util.find_spec("mkdocs") is None, reason="mkdocs is not installed")
+def test_tutorials_show_every_example_as_it_is() -> None:
+    """The code is in the pages, so that a forge shows it."""
+    shown = {fence: text for page in PAGES for fence, text in _blocks(page) if "title=" in fence}
+    files = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "examples").glob("*.py")}
+    assert shown == {f'python title="examples/{name}"': text for name, text in files.items()}
+
+
+@pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("mkdocs", "latex2mathml")), reason="needs the extra docs"
+)
 def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
     built: Any = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")],
@@ -83,4 +102,17 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
         timeout=600,
     )
     assert built.returncode == 0, built.stderr
-    assert (tmp_path / "site" / "tutorials" / "folder" / "index.html").is_file()
+    site = tmp_path / "site"
+    assert (site / "tutorials" / "folder.html").is_file()
+    assert "var __index" in (site / "search" / "search_index.js").read_text(encoding="utf-8")[:20]
+    page = (site / "math.html").read_text(encoding="utf-8")
+    numbers = re.findall(r"\\tag\{(\w+)\}", (ROOT / "docs" / "math.md").read_text(encoding="utf-8"))
+    assert len(numbers) > 50
+    assert re.findall(r'</math><span id="\w+">\((\w+)\)</span>', page) == numbers
+    assert "arithmatex" not in page
+    assert not re.search(r'(src|href)="https?://[^"]+\.(js|css|woff2?)', page), "needs no network"
+    reference = (site / "reference.html").read_text(encoding="utf-8")
+    assert "__init__" not in reference
+    assert {f'id="vio.{name}"' for name in vio.__all__ if not name.startswith("_")} <= set(
+        re.findall(r'id="vio\.\w+"', reference)
+    )

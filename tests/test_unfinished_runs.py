@@ -368,6 +368,15 @@ def stopped(flight_log: Path, tmp_path: Path) -> Path:
     return out
 
 
+def test_settings_that_name_files_are_kept_in_a_checkpoint(flight_log: Path, tmp_path: Path) -> None:
+    """A run with one of them ended at its first checkpoint, after some seconds."""
+    dataset = open_dataset(flight_log)
+    config = replace(Config(), frontend=replace(Config().frontend, features=flight_log))
+    inputs = growing_folder(tmp_path / "run", dataset, config, {"source": "", "start": 0}).inputs
+    save_checkpoint(tmp_path / "checkpoint", {"count": 1}, dataset, inputs)
+    assert load_checkpoint(tmp_path / "checkpoint", dataset, inputs) == {"count": 1}
+
+
 def _refused(folder: Path, capsys: pytest.CaptureFixture[str], pattern: str) -> None:
     """Go on with a run, which must be refused in one line and leave its tables as they are."""
     held = {path: path.read_bytes() for path in folder.rglob("*.npy")}

@@ -1,4 +1,4 @@
-"""Install a wheel into a new environment outside the repository, and run its demo there.
+"""Install a wheel into a new environment outside the repository, and run there what the README shows.
 
 python tools/check_wheel.py dist
 
@@ -14,9 +14,19 @@ import tempfile
 import venv
 from pathlib import Path
 
+_COMMANDS = (
+    "demo --out demo",
+    "render --scene room --trajectory handheld --realism real --duration 0.5 --rig small --out room",
+    "inspect demo/street",
+    "run demo/street --stop 40 --out first --save-observations --report",
+    "run first/observations.npz --out again",
+    "eval first again demo/street --plot",
+    "run room --out flight",
+)
+
 
 def main(argv: list[str]) -> int:
-    """Return 0 where the installed command runs the demo."""
+    """Return 0 where the installed commands run and write what they should."""
     if len(argv) != 1:
         print(__doc__)
         return 2
@@ -30,9 +40,13 @@ def main(argv: list[str]) -> int:
         programs = environment / ("Scripts" if os.name == "nt" else "bin")
         pip = [str(programs / "python"), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
         clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        demo = [str(programs / "vio"), "demo", "--out", "demo"]
-        for command in ([*pip, str(wheels[0])], demo):
+        installed = [[str(programs / "vio"), *command.split()] for command in _COMMANDS]
+        for command in ([*pip, str(wheels[0])], *installed):
             subprocess.run(command, cwd=folder, env=clean, check=True)
+        made = ("first/report.html", "first/features.jpg", "first/trajectory.png", "eval.png", "flight/trajectory.tum")
+        if missing := [name for name in made if not (Path(folder) / name).is_file()]:
+            print(f"error: not written: {', '.join(missing)}", file=sys.stderr)
+            return 1
     print(f"{wheels[0].name} installs and runs alone")
     return 0
 

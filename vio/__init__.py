@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from vio.cameras.rig import Rig
     from vio.config import load_config
     from vio.datasets import open_dataset
+    from vio.datasets.observation_log import write_observations
     from vio.datasets.rigs import load_rig
     from vio.evaluation.trajectories import evaluate
     from vio.live.build import MapUse, Parts
@@ -32,6 +33,7 @@ __all__ = [
     "load_rig",
     "open_dataset",
     "run",
+    "write_observations",
 ]
 
 _MODULES = {  # loaded when the name is first used
@@ -45,6 +47,7 @@ _MODULES = {  # loaded when the name is first used
     "load_rig": "vio.datasets.rigs",
     "open_dataset": "vio.datasets",
     "run": "vio.runs.pipeline",
+    "write_observations": "vio.datasets.observation_log",
 }
 
 

@@ -568,6 +568,7 @@ class FrameLog:
     landmarks: int
     innovation_median_px: float | None
     nis_per_dof: float | None
+    disparity_median_px: float | None = None  # of the features with a right match; None: there is none
     stages_ms: dict[str, float] = field(default_factory=dict)  # the front end's own stages
 
     @property

@@ -239,6 +239,8 @@ class RowResiduals:
     grid_px: FloatArray  # (3, 3) medians over the image, rows from the top; NaN where there are too few matches
     positive_disparity: float  # share of matches with ul > ur
     matches: int
+    rms_px: float  # root mean square over the matches of the median where each of them is
+    disparity_px: float  # median
 
 
 def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | NotObservable:
@@ -247,12 +249,21 @@ def row_residuals(z: FloatArray, width: float, height: float) -> RowResiduals | 
         return NotObservable("row alignment", f"only {len(z)} matches were found")
     off = z[:, 1] - z[:, 3]
     median = float(np.median(off))
-    grid = np.full((3, 3), np.nan)
+    grid, smooth = np.full((3, 3), np.nan), np.full(len(off), median)
     column = np.clip((3 * z[:, 0] / width).astype(int), 0, 2)
     row = np.clip((3 * z[:, 1] / height).astype(int), 0, 2)
     for i in range(3):
         for j in range(3):
-            here = off[(row == i) & (column == j)]
-            if len(here) >= _LEAST_IN_CELL:
-                grid[i, j] = np.median(here)
-    return RowResiduals(median, robust_sigma(off - median), grid, float(np.mean(z[:, 0] > z[:, 2])), len(z))
+            here = (row == i) & (column == j)
+            if here.sum() >= _LEAST_IN_CELL:
+                grid[i, j] = smooth[here] = np.median(off[here])
+    disparity = z[:, 0] - z[:, 2]
+    return RowResiduals(
+        median_px=median,
+        spread_px=robust_sigma(off - median),
+        grid_px=grid,
+        positive_disparity=float(np.mean(disparity > 0)),
+        matches=len(z),
+        rms_px=float(np.sqrt(np.mean(smooth**2))),
+        disparity_px=float(np.median(disparity)),
+    )

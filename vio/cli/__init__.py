@@ -12,6 +12,7 @@ import gc
 import io
 import logging
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -43,27 +44,17 @@ from vio.cli import (
 from vio.errors import StoppedError, VioError
 from vio.files.printable import printable
 
-_COMMANDS = (
-    run,
-    localise,
-    map,
-    inspect,
-    convert,
-    evaluate,
-    report,
-    bench,
-    view,
-    check,
-    refine,
-    export,
-    calibrate,
-    demo,
-    render,
-    rectify,
-    reproduce,
-    config,
-    completion,
-)
+BY_PURPOSE = {
+    "Try it": (demo,),
+    "Before a run": (inspect, calibrate, rectify, convert),
+    "Run": (run, config),
+    "Look and compare": (report, view, evaluate, export),
+    "Maps": (map, localise),
+    "Check without ground truth": (check, refine),
+    "Measure": (bench, render, reproduce),
+    "Shell": (completion,),
+}
+_COMMANDS = tuple(module for modules in BY_PURPOSE.values() for module in modules)
 
 # Objects made before Python looks for cycles among the young ones: a tenth of a command's start went into that search,
 # over modules and samples that stay.
@@ -127,6 +118,7 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     if unknown:
         chosen = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction)).choices[args.command]
         chosen.error(f"unrecognized arguments: {' '.join(unknown)}")
+    args.command_line = shlex.join(["vio", *(sys.argv[1:] if argv is None else argv)])
     return args
 
 

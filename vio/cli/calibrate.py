@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -60,7 +61,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.files.printable import json_text
     from vio.numerics.threads import one_blas_thread
     from vio.offline.calibrate import measure
-    from vio.offline.calibration_files import write_calibration_report
+    from vio.offline.calibration_files import CAMCHAIN, write_calibration_report
     from vio.offline.colmap import quiet
     from vio.offline.source import open_source
 
@@ -77,7 +78,11 @@ def execute(args: argparse.Namespace) -> int:
     with atomic_folder(out, replace=True, marker=MARKER) as folder:
         write_calibration_report(folder, report)
         (folder / MARKER).write_text(json_text(facts, indent=2) + "\n", encoding="utf-8")
-    return print_result(facts, [*_rows(report), ("results", str(out))], as_json=args.json, name_width=22)
+        written = (folder / CAMCHAIN).is_file()
+    rows = [*_rows(report), ("results", str(out))]
+    if written:
+        rows.append(("next", f"vio run {shlex.quote(args.source)} --calibration {shlex.quote(str(out / CAMCHAIN))}"))
+    return print_result(facts, rows, as_json=args.json, name_width=22)
 
 
 def _frontend(dataset: Dataset) -> Frontend:
@@ -96,6 +101,7 @@ def _facts(report: CalibrationReport) -> dict[str, Any]:
         "in_motion": None if report.in_motion is None else _parameters(report.in_motion),
         "imu": _plain(report.imu.alignment),
         "lever_arm": _plain(report.imu.lever_arm),
+        "grade": None if report.stereo_error is None else report.stereo_error.grade,
         "findings": [{"fault": f.fault, "detail": f.detail} for f in report.findings],
         "notes": list(report.notes),
     }
@@ -145,7 +151,10 @@ def _rows(report: CalibrationReport) -> list[tuple[str, str]]:
     rows += [("note", note) for note in report.notes]
     rows.append(("not checked", "; ".join(_unchecked(report))))
     rows += [("FOUND", str(finding)) for finding in report.findings]
-    return rows if report.findings else [*rows, ("verdict", "no fault found in what could be observed")]
+    off = report.stereo_error
+    if off is None:
+        return rows if report.findings else [*rows, ("verdict", "no fault found in what could be observed")]
+    return [*rows, ("verdict", str(off))]
 
 
 def _observed(name: str, found: _Part | NotObservable, rows: Callable[[_Part], _Rows]) -> _Rows:

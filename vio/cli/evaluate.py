@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vio.cli.arguments import add_lengths_argument
+from vio.files.printable import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from vio.evaluation.trajectories import Evaluation
     from vio.geometry.lie import FloatArray
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+_NAME = 32  # letters of a trajectory's name in a table of several
 _ALIGNMENTS = {
     "se3": "rotation and position",
     "sim3": "rotation, position and scale",
@@ -30,12 +32,18 @@ def add_parser(commands: Any) -> None:
     """Add the subcommand."""
     parser = commands.add_parser(
         "eval",
-        help="compare a trajectory with a reference",
-        description="Compare a trajectory, or a run's folder, with a reference: ATE, RPE and KITTI drift. Files in "
+        help="compare trajectories with a reference",
+        description="Compare trajectories, or runs' folders, with a reference: ATE, RPE and KITTI drift. Files in "
         "TUM, KITTI or EuRoC format, or a COLMAP model; a reference in KITTI format, or a model whose images are "
         "numbered, is associated by frame number, others by time.",
     )
-    parser.add_argument("estimate", type=Path, metavar="EST", help="a trajectory file or a run's folder")
+    parser.add_argument(
+        "estimates",
+        type=Path,
+        nargs="+",
+        metavar="EST",
+        help="trajectory files or runs' folders, side by side",
+    )
     parser.add_argument(
         "reference",
         type=Path,
@@ -58,18 +66,49 @@ def add_parser(commands: Any) -> None:
         help="association by time, seconds (default 0.01)",
     )
     parser.add_argument("--extrinsics", type=Path, metavar="F", help="T_cam0_imu, 3 or 4 rows of 4 numbers")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument(
+        "--plot", nargs="?", const=Path("eval.png"), type=Path, metavar="F", help="draw paths and errors (eval.png)"
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object; of several by their names")
     parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
+    from vio.files.atomic import check_new_file
+
+    if args.plot is not None:
+        check_new_file(args.plot, b"\x89PNG")
+    estimates = {str(path): _read(path) for path in args.estimates}
+    reference = _read(args.reference)
+    results = {name: _evaluated(args, estimate, reference) for name, estimate in estimates.items()}
+    if len(results) == 1:
+        (result,) = results.values()
+        print_result(result.as_dict(), _rows(result), as_json=args.json)
+    else:
+        facts = {name: result.as_dict() for name, result in results.items()}
+        print_result(facts, _side_by_side(results), as_json=args.json)
+    if args.plot is not None:
+        from vio.runs.compared import draw_comparison
+        from vio.runs.picture import write_picture
+
+        write_picture(args.plot, lambda: draw_comparison({printable(name): r for name, r in results.items()}))
+        if not args.json:
+            print_result({}, [("plot", str(args.plot))], as_json=False)
+    return 0
+
+
+def _evaluated(
+    args: argparse.Namespace,
+    estimate: tuple[Trajectory, FloatArray | None],
+    reference: tuple[Trajectory, FloatArray | None],
+) -> Evaluation:
+    """Compare one trajectory with the reference, both with their extrinsics."""
     from vio.errors import EvaluationError
     from vio.evaluation.trajectories import LEAST_POSES, evaluate
 
-    estimate, T_cam0_imu = _read(args.estimate)
-    reference, other = _read(args.reference)
+    T_cam0_imu = estimate[1]
     if args.extrinsics is not None:
         from vio.datasets.kitti import read_extrinsics
         from vio.errors import DataError
@@ -78,18 +117,33 @@ def execute(args: argparse.Namespace) -> int:
         if T_cam0_imu is None:
             raise DataError(f"{args.extrinsics} does not exist; give a file with T_cam0_imu, 3 or 4 rows of 4 numbers")
     result = evaluate(
-        estimate,
-        reference,
+        estimate[0],
+        reference[0],
         align=args.align,
         max_time_difference_s=args.max_time_difference,
-        T_cam0_imu=other if T_cam0_imu is None else T_cam0_imu,
+        T_cam0_imu=reference[1] if T_cam0_imu is None else T_cam0_imu,
         lengths_m=args.lengths,
     )
     if result.matched < LEAST_POSES:
         raise EvaluationError(f"only {result.matched} poses match; a comparison needs at least {LEAST_POSES}")
     for note in result.notes:
         log.warning("%s", note)
-    return print_result(result.as_dict(), _rows(result), as_json=args.json)
+    return result
+
+
+def _side_by_side(results: Mapping[str, Evaluation]) -> Iterator[tuple[str, str]]:
+    """Yield the main figures of several trajectories as one table, one line each."""
+    from vio.evaluation.trajectories import metres_text
+
+    names = {name: name if len(name) <= _NAME else "…" + name[1 - _NAME :] for name in results}
+    yield "", f"{'':<{_NAME}} {'poses':>7} {'ATE':>10} {'attitude':>10} {'scale':>9} {'RPE':>10} {'drift':>8}"
+    for name, r in results.items():
+        scale = "–" if r.scale_free is None else f"{100 * (r.scale_free.scale - 1):+.3f} %"
+        rpe = "–" if r.rpe is None else metres_text(r.rpe.trans_rmse_m)
+        drift = "–" if r.kitti is None else f"{r.kitti.t_err_percent:.3f} %"
+        ate = metres_text(r.ate_m.rmse)
+        figures = f"{r.matched:>7} {ate:>10} {r.ate_deg.rmse:>6.3f} deg {scale:>9} {rpe:>10} {drift:>8}"
+        yield "", f"{printable(names[name]):<{_NAME}} {figures}"
 
 
 def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
@@ -102,14 +156,22 @@ def _rows(result: Evaluation) -> Iterator[tuple[str, str]]:
     yield "compared", f"{result.matched} poses ({result.body}) by {result.association}: {share}"
     yield "path", f"{result.matched_path_length_m:.3f} m, the reference's {result.reference_path_length_m:.3f} m"
     yield "alignment", _ALIGNMENTS[result.align] + (f", scale {result.scale:.6f}" if result.align == "sim3" else "")
-    for name, errors, unit in (("ATE", result.ate_m, "m"), ("attitude", result.ate_deg, "deg")):
-        rest = f"mean {errors.mean:.4g}, median {errors.median:.4g}, largest {errors.max:.4g}"
-        yield name, f"{errors.rmse:.4g} {unit} (rms), {rest}"
+    small = result.ate_m.rmse < 0.01
+    position = ("ATE", result.ate_m, *((1e3, "mm") if small else (1.0, "m")))
+    for name, errors, factor, unit in (position, ("attitude", result.ate_deg, 1.0, "deg")):
+        mean, middle, largest = (factor * value for value in (errors.mean, errors.median, errors.max))
+        yield (
+            name,
+            f"{factor * errors.rmse:.4g} {unit} (rms), mean {mean:.4g}, median {middle:.4g}, largest {largest:.4g}",
+        )
         if name == "ATE" and result.scale_free is not None:
             off = 100 * (result.scale_free.scale - 1)
-            yield "scale", f"off by {off:+.3f} %; ATE {result.scale_free.ate_m:.4g} m (rms) without it, after Sim(3)"
+            without = f"{1e3 * result.scale_free.ate_m:.4g} mm" if small else f"{result.scale_free.ate_m:.4g} m"
+            yield "scale", f"off by {off:+.3f} %; ATE {without} (rms) without it, after Sim(3)"
     if result.rpe is not None:
-        yield "RPE", f"{result.rpe.trans_rmse_m:.4g} m, {result.rpe.rot_rmse_deg:.4g} deg (rms) from frame to frame"
+        step = result.rpe.trans_rmse_m
+        moved = f"{1e3 * step:.4g} mm" if step < 0.01 else f"{step:.4g} m"
+        yield "RPE", f"{moved}, {result.rpe.rot_rmse_deg:.4g} deg (rms) from frame to frame"
     if result.kitti is None:
         yield "drift", "the path is shorter than the lengths over which it is measured"
         return

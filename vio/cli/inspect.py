@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -55,7 +56,7 @@ def execute(args: argparse.Namespace) -> int:
         )
     facts = {"source": str(recording.path), "kind": recording.kind, **_facts(report)}
     title = ("recording", f"{recording.path} (kind {recording.kind})")
-    print_result(facts, [title, *_rows(report)], as_json=args.json, name_width=20)
+    print_result(facts, [title, *_rows(report, args.source)], as_json=args.json, name_width=20)
     return 1 if report.faults else 0
 
 
@@ -67,8 +68,8 @@ def _facts(report: Inspection) -> dict[str, Any]:
     }
 
 
-def _rows(report: Inspection) -> list[tuple[str, str]]:
+def _rows(report: Inspection, source: str) -> list[tuple[str, str]]:
     rows = [(part.name, part.text) for part in report.parts]
     rows += [("note", note) for note in report.notes]
     rows += [("FAULT", fault) for fault in report.faults]
-    return rows if report.faults else [*rows, ("verdict", "nothing speaks against a run")]
+    return rows if report.faults else [*rows, ("verdict", "can be run"), ("next", f"vio run {shlex.quote(source)}")]

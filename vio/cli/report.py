@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,20 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folders that `vio run` wrote")
     parser.add_argument("--reference", type=Path, metavar="F", help="ground truth in place of that of the runs")
     parser.add_argument("--out", type=Path, metavar="F", help="the page (default report.html in the first RUN)")
+    parser.add_argument("--open", action="store_true", help="show it in the browser")
     parser.set_defaults(execute=execute)
 
 
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
+    print(write(args.runs, args.reference, args.out, shown=args.open))
+    return 0
+
+
+def write(
+    folders: Sequence[Path], reference: Path | None = None, out: Path | None = None, *, shown: bool = False
+) -> Path:
+    """Write the page about runs and return its path; `shown`: also show it in the browser."""
     from vio.errors import DataError
     from vio.files.atomic import check_new_file
     from vio.runs.files import RunFile
@@ -33,9 +43,12 @@ def execute(args: argparse.Namespace) -> int:
         from vio.report.page import write_report
     except ImportError as error:  # pragma: no cover - plotly is installed with this package
         raise DataError(f"the report needs plotly ({error}); install it with: pip install plotly") from error
-    runs = with_distinct_names([read_finished_run(folder, args.reference) for folder in args.runs])
-    out: Path = args.out or args.runs[0] / RunFile.REPORT
+    runs = with_distinct_names([read_finished_run(folder, reference) for folder in folders])
+    out = out or folders[0] / RunFile.REPORT
     check_new_file(out, b'<p class="remark">stereo-vio')
     write_report(out, runs)
-    print(out)
-    return 0
+    if shown:
+        import webbrowser
+
+        webbrowser.open(out.resolve().as_uri())
+    return out

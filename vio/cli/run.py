@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,9 @@ def add_parser(commands: Any) -> None:
         metavar="WHERE",
         help="show the run in rerun: in a window, in a browser (web), or into a file *.rrd (extra view)",
     )
+    parser.add_argument("--no-plot", action="store_true", help="do not draw trajectory.png")
+    parser.add_argument("--report", action="store_true", help="also write report.html, as `vio report` does")
+    parser.add_argument("--open", action="store_true", help="with --report: show it in the browser")
     parser.add_argument("--json", action="store_true", help="print the metrics as one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
     parser.set_defaults(execute=execute)
@@ -58,6 +62,7 @@ _OF_A_NEW_RUN = (
     "save_calibration",
     "map",
     "view",
+    "no_plot",
     "set",
     "config",
     "motion",
@@ -75,12 +80,19 @@ def execute(args: argparse.Namespace) -> int:
     from vio.cli.running import metric_rows, process, resume
     from vio.errors import ConfigError
 
+    if args.open and not args.report:
+        raise ConfigError("--open shows the page of --report; give both")
+
+    def finished(metrics: dict[str, Any]) -> None:
+        print_result(metrics, metric_rows(metrics, plot=not args.no_plot), as_json=args.json)
+        sys.stdout.flush()
+
     if args.resume is not None:
         given = [f"--{name.replace('_', '-')}" for name in _OF_A_NEW_RUN if getattr(args, name)]
         if given:
             raise ConfigError(f"--resume goes on as the run began; leave out {', '.join(given)}")
-        metrics = resume(args.resume, progress=not args.quiet)
-        return print_result(metrics, metric_rows(metrics), as_json=args.json)
+        folder = Path(resume(args.resume, progress=not args.quiet, finished=finished)["out"])
+        return _reported(folder, shown=args.open) if args.report else 0
     metrics = process(
         args.source,
         config_from(args),
@@ -94,5 +106,16 @@ def execute(args: argparse.Namespace) -> int:
         progress=not args.quiet,
         map_file=args.map,
         view=args.view,
+        plot=not args.no_plot,
+        command=args.command_line,
+        finished=finished,
     )
-    return print_result(metrics, metric_rows(metrics), as_json=args.json)
+    return _reported(Path(metrics["out"]), shown=args.open) if args.report else 0
+
+
+def _reported(folder: Path, *, shown: bool) -> int:
+    """Write the page about a run, and show it in a browser."""
+    from vio.cli.report import write
+
+    write([folder], shown=shown)
+    return 0

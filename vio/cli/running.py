@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
-from collections.abc import Sequence
+import shlex
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,12 +18,20 @@ from vio.datasets import open_dataset
 from vio.datasets.frame_rate import used_frames
 from vio.datasets.span import Seconds, frames_between
 from vio.errors import CalibrationError, ConfigError, DataError, StoppedError, VioError
-from vio.evaluation.trajectories import lengths_text, rotation_drift_text
-from vio.files.atomic import atomic_write_text, check_new_file, check_replaceable, check_writable, locked_folder
+from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
+from vio.files.atomic import (
+    atomic_write_bytes,
+    atomic_write_text,
+    check_new_file,
+    check_replaceable,
+    check_writable,
+    locked_folder,
+)
 from vio.files.trajectories import read_trajectory
 from vio.live.build import MapUse, resolve_motion
 from vio.protocols import Dataset, Viewer
 from vio.records import FrameResult, Trajectory
+from vio.report.words import camera_imu_findings
 from vio.runs.files import CHECKPOINT, FILES, RunFile
 from vio.runs.folder import (
     calibration_text,
@@ -31,6 +40,7 @@ from vio.runs.folder import (
     read_request,
 )
 from vio.runs.pipeline import RunControl, RunResult, given_rig, run
+from vio.view.annotated import AnnotatedImage
 
 if TYPE_CHECKING:
     from vio.view.live import RerunViewer
@@ -100,10 +110,14 @@ def process(
     map_file: Path | None = None,
     localise: bool = False,
     view: str | None = None,
+    plot: bool = True,
+    command: str | None = None,
+    finished: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Process a source into a run folder, which grows meanwhile, and return its metrics.
 
     `save_calibration` names the file for the calibration that the run found; `Path()`, one in the run's folder.
+    `command` is kept in the metrics; `finished` gets them before the picture is drawn.
     """
     dataset = _opened(source, config, mapped=map_file is not None)
     for note in dataset.recording.notes:
@@ -121,8 +135,10 @@ def process(
         "save_calibration": None if calibration is None else str(calibration.absolute()),
         "map": None if map_file is None else str(map_file.absolute()),
         "localise": localise,
+        "plot": plot,
+        "command": command,
     }
-    return _process(dataset, config, folder, request, progress=progress, resume=False, view=view)
+    return _process(dataset, config, folder, request, progress=progress, resume=False, view=view, finished=finished)
 
 
 def _opened(source: str, config: Config, *, mapped: bool) -> Dataset:
@@ -130,8 +146,10 @@ def _opened(source: str, config: Config, *, mapped: bool) -> Dataset:
     return open_dataset(source, replace(config.dataset, projection="pinhole") if mapped else config.dataset)
 
 
-def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
-    """Go on with an unfinished run and return its metrics.
+def resume(
+    folder: Path, *, progress: bool = True, finished: Callable[[dict[str, Any]], None] | None = None
+) -> dict[str, Any]:
+    """Go on with an unfinished run and return its metrics; `finished` is that of `process`.
 
     Raises:
         VioError: the folder holds no unfinished run, or one that another program began.
@@ -142,7 +160,7 @@ def resume(folder: Path, *, progress: bool = True) -> dict[str, Any]:
     saved = (folder / RunFile.UNFINISHED / CHECKPOINT).is_file()
     if not saved:
         log.warning("%s: the run ended before its first checkpoint; it begins again", folder)
-    return _process(dataset, config, folder, request, progress=progress, resume=saved)
+    return _process(dataset, config, folder, request, progress=progress, resume=saved, finished=finished)
 
 
 def _process(
@@ -154,16 +172,28 @@ def _process(
     progress: bool,
     resume: bool,
     view: str | None = None,
+    finished: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Run, write the results and return the metrics; an interrupted run reports how to go on."""
     recording, reference = dataset.recording, request["reference"]
     truth = recording.reference if reference is None else read_trajectory(Path(reference))
     start, stop, save_observations = request["start"], request["stop"], request["save_observations"]
     frames = int((used_frames(recording.frame_times_ns[:stop], config.dataset.max_frame_rate) >= start).sum())
+    annotated = AnnotatedImage(frames)
     viewers: list[Viewer] = [ProgressViewer(frames, recording.path.name)] if progress else []
+    viewers.append(annotated)
     shown = None if view is None else _open_view(view, dataset, config, truth)
     if shown is not None:
         viewers.append(shown)
+
+    def complete(metrics: dict[str, Any]) -> None:
+        if isinstance(calibration, str) and file is not None:
+            atomic_write_text(file, calibration)
+        if request.get("plot", True) and (picture := annotated.jpeg()) is not None:
+            atomic_write_bytes(folder / RunFile.FEATURES, picture)
+        if finished is not None and metrics["complete"]:
+            finished(metrics)
+
     with locked_folder(folder), StopRequest() as asked:
         try:
             result = run(
@@ -184,12 +214,12 @@ def _process(
                 truth,
                 lengths_m=request["lengths_m"],
                 save_observations=save_observations,
+                more={"command": request.get("command"), "calibration": file if isinstance(calibration, str) else None},
+                plot=request.get("plot", True),
+                finished=complete,
             )
             if isinstance(calibration, CalibrationError):  # on which the results do not depend
                 raise calibration
-            if calibration is not None and file is not None:
-                atomic_write_text(file, calibration)
-                metrics["calibration"] = file
         except KeyboardInterrupt as error:
             if not (folder / RunFile.UNFINISHED).is_dir():
                 raise
@@ -285,8 +315,8 @@ def free_folder(source: Path, root: Path = Path("runs")) -> Path:
     return folder
 
 
-def metric_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
-    """Return a run's metrics as a few table rows."""
+def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str, str]]:
+    """Return a run's metrics as a few table rows, ended by what to do next; `plot`: whether its picture is drawn."""
     stages = ", ".join(f"{name} {ms:.1f}" for name, ms in metrics["stages_ms"].items())
     frames, span = metrics["frames"], metrics["last_frame"] - metrics["first_frame"] + 1
     median, most = metrics["ms_per_frame_median"], metrics["ms_per_frame_95"]
@@ -306,10 +336,7 @@ def metric_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("scale", "one camera: from the depth images"))
     if metrics["stereo_field"] is not None:
         field = metrics["stereo_field"]
-        off, sigma = field["coefficients_px"][0], field["sigma_px"][0]
-        rows.append(
-            ("stereo", f"rows off by {field['rows_rms_px']:.2f} px (rms), disparities by {-off:+.2f} ± {sigma:.2f} px")
-        )
+        rows.append(("stereo", f"{field['text']}; corrected in this run"))
         found = [] if field["rig"] is None else field["rig"]["lines"]
         rows += [("", line) for line in found[:_LINES]]
     rows += _calibration_rows(metrics)
@@ -317,11 +344,13 @@ def metric_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("ATE", "no reference"))
     else:
         against = metrics["dead_reckoning"]
-        beside = "" if against is None else f"   (dead reckoning {against['ate_m']:.3f} m)"
-        rows.append(("ATE", f"{metrics['ate_m']:.3f} m after SE(3) alignment{beside}"))
+        beside = "" if against is None else f"   (dead reckoning {metres_text(against['ate_m'])})"
+        rows.append(("ATE", f"{metres_text(metrics['ate_m'])} after SE(3) alignment{beside}"))
         free = metrics["evaluation"]["scale_free"]
         if free is not None:
-            rows.append(("", f"{free['ate_m']:.3f} m after Sim(3), scale off by {100 * (free['scale'] - 1):+.2f} %"))
+            rows.append(
+                ("", f"{metres_text(free['ate_m'])} after Sim(3), scale off by {100 * (free['scale'] - 1):+.2f} %")
+            )
     if metrics["t_err_percent"] is not None:
         over = lengths_text(metrics["drift_lengths_m"])
         turned = rotation_drift_text(metrics["r_err_deg_per_100m"], metrics["drift_lengths_m"])
@@ -330,12 +359,15 @@ def metric_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         rows.append(("map", _map_row(metrics["map"])))
     if metrics["landmark_error"] is not None:
         score = metrics["landmark_error"]
-        rows.append(("landmarks", f"{score['rmse_m']:.3f} m ({score['matched']} of {score['surveyed']} surveyed ones)"))
+        rows.append(
+            ("landmarks", f"{metres_text(score['rmse_m'])} ({score['matched']} of {score['surveyed']} surveyed ones)")
+        )
     if metrics.get("calibration") is not None:
         rows.append(("calib.", f"{metrics['calibration']} (next: --calibration FILE)"))
     rows.append(("results", metrics["out"]))
-    plot = Path(metrics["out"]) / RunFile.PICTURE
-    rows.append(("plot", str(plot) if plot.is_file() else "could not be drawn"))
+    if plot:
+        rows.append(("plot", str(Path(metrics["out"]) / RunFile.PICTURE)))
+    rows.append(("next", f"vio report {shlex.quote(metrics['out'])} --open"))
     return rows
 
 
@@ -348,16 +380,7 @@ def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
             for name, x in scale.items()
         ]
         rows.append(("cameras", ", ".join(found)))
-    if found_imu := metrics["camera_imu"]:
-        words = []
-        if "rotation_deg" in found_imu:
-            for key, unit, digits in (("rotation", "deg", 2), ("translation", "mm", 1)):
-                values, sigmas = found_imu[f"{key}_{unit}"], found_imu[f"{key}_sigma_{unit}"]
-                size, sigma = math.hypot(*values), math.hypot(*sigmas)
-                words.append(f"{key} {size:.{digits}f} ± {sigma:.{digits}f} {unit}")
-        if "time_offset_ms" in found_imu:
-            words.append(f"time {found_imu['time_offset_ms']:+.2f} ± {found_imu['time_offset_sigma_ms']:.2f} ms")
-        rows.append(("camera-IMU", "off by " + ", ".join(words)))
+    rows += [("IMU", line) for line in camera_imu_findings(metrics)]
     for sensor, own in (metrics.get("imu") or {}).items():
         words = [
             f"{axis} {value:+.2f} ± {own['scale_percent_sigma'][axis]:.2f}"
@@ -373,7 +396,7 @@ def _calibration_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _map_row(of_map: dict[str, Any]) -> str:
     """Return what a run made of its map as one table row."""
-    ate = "" if of_map["ate_m"] is None else f", ATE {of_map['ate_m']:.3f} m"
+    ate = "" if of_map["ate_m"] is None else f", ATE {metres_text(of_map['ate_m'])}"
     place = "" if of_map["joined"] else "; its place in the map was not found"
     placed = f", {100 * of_map['placed']:.1f} % of the frames placed at the time"
     return f"{of_map['keyframes']} keyframes, {of_map['loops']} loops{ate}{placed}{place}"

@@ -1,7 +1,8 @@
-"""The log of a run's observations and motion samples: a source that replays to the bit.
+"""The log of a run's observations and motion samples: a source that replays to the bit, and the form of other features.
 
 One `.npz` without pickle. The rows of all frames are concatenated; `offsets` separates them. Data that the recording
-lacks (extrinsics, reference, …) are absent from the archive, never coded by a special number.
+lacks (extrinsics, reference, …) are absent from the archive, never coded by a special number. The arrays are described
+in docs/tutorials/features.md; a file of another program needs the first six of them only.
 """
 
 from __future__ import annotations
@@ -12,17 +13,21 @@ from pathlib import Path
 from typing import cast, get_args
 
 import numpy as np
+import numpy.typing as npt
 
-from vio.datasets.common import checked_transform, read_npz
+from vio.cameras.rig import Rig
+from vio.datasets.common import checked_transform, read_npz, shape_text
 from vio.datasets.features import FeatureDataset
 from vio.datasets.samples import MotionSamples, motion_samples
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_bytes
+from vio.files.text import check_increasing
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import CameraKind, Projection, StereoCamera
 from vio.records import (
     BodyFrame,
     FeatureTracks,
+    ImuSample,
     Landmarks,
     MotionSample,
     MotionSource,
@@ -31,21 +36,24 @@ from vio.records import (
     RunMotion,
     Trajectory,
 )
+from vio.records import observations as frame_observations
 
 FORMAT = "stereo-vio observation log"
 VERSION = 2  # 2 adds run_motion
 _REQUIRED: dict[str, tuple[str, int]] = {  # array kinds (numpy's letters) and dimensions
-    "version": ("i", 0),
-    "source": ("U", 0),
-    "notes": ("U", 1),
     "intrinsics": ("f", 1),
-    "image_size": ("i", 1),
     "frame_times_ns": ("i", 1),
-    "frame_indices": ("i", 1),
     "offsets": ("i", 1),
     "ids": ("i", 1),
     "z": ("f", 2),
     "has_right": ("b", 1),
+}
+_DEFAULTED: dict[str, tuple[str, int]] = {  # likewise; `_with_defaults` says what an absent one means
+    "version": ("i", 0),
+    "source": ("U", 0),
+    "notes": ("U", 1),
+    "image_size": ("i", 1),
+    "frame_indices": ("i", 1),
     "stale": ("b", 1),
     "motion_times_ns": ("i", 1),
     "motion_is_imu": ("b", 1),
@@ -123,6 +131,49 @@ def write_observation_log(
     atomic_write_bytes(path, stream.getvalue())
 
 
+def write_observations(
+    path: str | Path,
+    camera: StereoCamera | Rig,
+    frame_times_ns: npt.ArrayLike,
+    frames: Sequence[tuple[npt.ArrayLike, npt.ArrayLike, npt.ArrayLike | None]],
+    *,
+    motion: Sequence[MotionSample] = (),
+    T_cam0_imu: FloatArray | None = None,
+    reference: Trajectory | None = None,
+) -> None:
+    """Write the features of another program as a recording that `vio run` and `open_dataset` read.
+
+    Args:
+        path: the `.npz` to write; its folder must exist.
+        camera: the rectified pair that the pixels belong to, or the rig whose `Rig.camera` that is.
+        frame_times_ns: (F,) exposure times, integer nanoseconds, increasing.
+        frames: for each frame ids (N,), pixels (N, 4) `[ul vl ur vr]`, rectified, and which rows have a right match
+            (N,) (None: all). An id belongs to one point, and occurs once in a frame.
+        motion: samples of an IMU or velocities on the clock of the frames, in time order.
+        T_cam0_imu: (4, 4) extrinsics of the motion sensor; None: those of a `Rig`.
+        reference: ground truth, for the errors of a run.
+
+    Raises:
+        DataError: times or features are malformed, or the file cannot be written.
+        CalibrationError: the extrinsics are no rigid transform.
+    """
+    if isinstance(camera, Rig):
+        T_cam0_imu = camera.T_cam0_imu if T_cam0_imu is None else T_cam0_imu
+        camera = camera.camera
+    times_ns = np.asarray(frame_times_ns)
+    if times_ns.ndim != 1 or times_ns.dtype.kind not in "iu" or len(times_ns) != len(frames):
+        raise DataError(
+            f"frame times are {shape_text(times_ns)} of {times_ns.dtype} for {len(frames)} frames; give one integer, "
+            "in nanoseconds, for each"
+        )
+    times_ns = check_increasing(times_ns.astype(np.int64), lambda k: f"frame times, entry {k}")
+    seen = [frame_observations(k, int(times_ns[k]), *frame) for k, frame in enumerate(frames)]
+    T = None if T_cam0_imu is None else checked_transform(T_cam0_imu, "T_cam0_imu")
+    kinds: set[MotionSource] = {"imu" if isinstance(sample, ImuSample) else "velocity" for sample in motion}
+    recording = Recording("features", Path(path), camera, T, times_ns, False, frozenset(kinds), reference)
+    write_observation_log(Path(path), recording, seen, motion)
+
+
 def _joined(parts: list[np.ndarray], empty: np.ndarray) -> np.ndarray:
     return np.concatenate([empty, *parts])
 
@@ -152,7 +203,7 @@ def _optional_arrays(recording: Recording) -> dict[str, np.ndarray]:
 
 def is_observation_log(names: Sequence[str]) -> bool:
     """Return whether the member names of an `.npz` are those of a log."""
-    return {"format", "version", "offsets"} <= set(names)
+    return {"offsets", "ids", "z"} <= set(names) or "format" in names
 
 
 def read_observation_log(path: Path) -> FeatureDataset:
@@ -161,8 +212,8 @@ def read_observation_log(path: Path) -> FeatureDataset:
     Raises:
         DataError: the file is no log, was written by a newer version, or is inconsistent.
     """
-    arrays = read_npz(path, (*_REQUIRED, *_OPTIONAL))
-    _check_format(arrays, path)
+    arrays = read_npz(path, (*_REQUIRED, *_DEFAULTED, *_OPTIONAL))
+    arrays = _checked(arrays, path)
     frames, offsets, times_ns = arrays["frame_indices"], arrays["offsets"], arrays["frame_times_ns"]
     dense_offsets = offsets[np.searchsorted(frames, np.arange(len(times_ns) + 1))]
     tracks = FeatureTracks(dense_offsets, arrays["ids"], arrays["z"], arrays["has_right"], arrays["stale"])
@@ -185,21 +236,42 @@ def read_observation_log(path: Path) -> FeatureDataset:
     return FeatureDataset(recording, tracks, motion, frames, np.array(stale_share, dtype=np.bool_))
 
 
-def _check_format(arrays: Mapping[str, np.ndarray], path: Path) -> None:
-    if "format" not in arrays or str(arrays["format"]) != FORMAT:
+def _checked(arrays: Mapping[str, np.ndarray], path: Path) -> Mapping[str, np.ndarray]:
+    """Return all arrays but the optional ones, in 64 bits; absent ones have their defaults."""
+    if "format" in arrays and str(arrays["format"]) != FORMAT:
         raise DataError(f"{path}: no observation log; create one with `vio run SOURCE --save-observations`")
     if "version" in arrays and int(arrays["version"]) > VERSION:
         raise DataError(
             f"{path}: an observation log of version {int(arrays['version'])}, this program reads up to {VERSION}; "
             "upgrade stereo-vio"
         )
-    for key, (kind, dimensions) in _REQUIRED.items():
+    for key in _REQUIRED:
         if key not in arrays:
             raise DataError(f"{path}: the observation log lacks {key}; write it again")
-        if arrays[key].dtype.kind != kind or arrays[key].ndim != dimensions:
+    for key, (kind, dimensions) in {**_REQUIRED, **_DEFAULTED}.items():
+        if key in arrays and (arrays[key].dtype.kind != kind or arrays[key].ndim != dimensions):
             raise DataError(f"{path}: {key} of the observation log has type {arrays[key].dtype}, {arrays[key].ndim}-D")
-    if problem := _inconsistency(arrays):
+    whole = _with_defaults(arrays)
+    if problem := _inconsistency(whole):
         raise DataError(f"{path}: the observation log is inconsistent: {problem}; write it again")
+    return whole
+
+
+def _with_defaults(arrays: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+    """Add what is absent: every frame was processed, no row repeats an earlier one, there are no motion samples."""
+    wide = {"i": np.int64, "f": np.float64}
+    given = {key: array.astype(wide.get(array.dtype.kind, array.dtype), copy=False) for key, array in arrays.items()}
+    nothing = np.zeros(0, dtype=np.int64)
+    return {
+        "notes": np.zeros(0, dtype=np.str_),
+        "image_size": nothing,
+        "frame_indices": np.arange(len(given["frame_times_ns"])),
+        "stale": np.zeros(len(given["ids"]), dtype=np.bool_),
+        "motion_times_ns": nothing,
+        "motion_is_imu": nothing.astype(np.bool_),
+        "motion_values": np.zeros((0, 6)),
+        **given,
+    }
 
 
 def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
@@ -210,6 +282,10 @@ def _inconsistency(arrays: Mapping[str, np.ndarray]) -> str | None:
         return f"{rows} ids, but z is {arrays['z'].shape} with {len(arrays['stale'])} stale marks"
     if len(offsets) != len(frames) + 1 or offsets[0] != 0 or offsets[-1] != rows or (np.diff(offsets) < 0).any():
         return f"the offsets do not split {rows} rows into {len(frames)} frames"
+    in_frame = np.stack([arrays["ids"], np.repeat(np.arange(len(frames)), np.diff(offsets))])
+    in_order = in_frame[:, np.lexsort(in_frame)]
+    if (in_order[:, 1:] == in_order[:, :-1]).all(axis=0).any():
+        return "an id occurs twice in a frame"
     if (np.diff(times_ns) <= 0).any() or (np.diff(arrays["motion_times_ns"]) < 0).any():
         return "a clock does not increase"
     if len(frames) and (frames[0] < 0 or frames[-1] >= len(times_ns) or (np.diff(frames) <= 0).any()):

@@ -25,6 +25,7 @@ AssociationMode: TypeAlias = Literal["time", "frame"]
 
 KITTI_LENGTHS_M: tuple[float, ...] = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)
 KITTI_STEP_FRAMES = 10
+_MILLIMETRES_BELOW_M = 0.01  # lengths in words
 _SHORT_M = 10.0  # over shorter lengths a drift for 100 m says nothing that a reader can picture
 RPE_DISTANCE_TOLERANCE = 0.1  # relative tolerance of a pair's path length
 _COLLINEAR = 1e-13  # ratio of squared extents below which points are collinear, to rounding
@@ -476,6 +477,11 @@ def kitti_error(
         return None
     t_err, r_err = np.concatenate(all_trans).mean(), np.concatenate(all_rot).mean()
     return KittiError(float(t_err), float(r_err), segments, tuple(per_length))
+
+
+def metres_text(value_m: float) -> str:
+    """Return a length with its unit: millimetres below a centimetre, else metres with three decimals."""
+    return f"{1e3 * value_m:.3g} mm" if value_m < _MILLIMETRES_BELOW_M else f"{value_m:.3f} m"
 
 
 def lengths_text(lengths_m: Sequence[float]) -> str:

@@ -10,7 +10,7 @@ from vio.geometry.rectify import field_of_view
 from vio.imu.findings import InertialFinding
 from vio.inspection.finding import Inspection, Part
 from vio.inspection.inertial import extrinsics_part, noise_part, rest_part
-from vio.inspection.pictures import depths_part, images_part, rows_part
+from vio.inspection.pictures import depths_part, images_part, rows_parts
 from vio.inspection.times import frames_part, imu_clock_part
 from vio.monitor.inertial import InertialCheck
 from vio.protocols import Dataset, Frontend
@@ -47,7 +47,7 @@ def inspect_recording(
         frames = _spread(dataset, pairs, progress)
         parts.append(images_part(frames))
         if recording.camera.kind != "mono":
-            parts.append(rows_part(frames) if recording.camera.kind == "stereo" else depths_part(frames))
+            parts += rows_parts(frames) if recording.camera.kind == "stereo" else [depths_part(frames)]
     parts += _imu_parts(dataset)
     if recording.has_images and tracked > 1:
         parts += _tracking_parts(dataset, build_frontend, min(tracked, len(recording.frame_times_ns)), progress)
@@ -71,9 +71,9 @@ def camera_part(recording: Recording) -> Part:
     if c.width is not None and c.height is not None and not (0 < c.cu < c.width and 0 < c.cv < c.height):
         faults.append(f"the principal point {c.cu:.0f}, {c.cv:.0f} is outside the image; check its size")
     if stereo:
-        one_px_m = c.fu * c.baseline_m  # the depth of one pixel of disparity
         form = " to a cylinder" if c.is_cylinder else ""
-        text = f"rectified{form}: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, 1 px at {one_px_m:.0f} m"
+        far = f"disparity 1 px at a depth of {c.fu * c.baseline_m:.0f} m"
+        text = f"rectified{form}: focal {c.fu:.1f} px{wide}, baseline {c.baseline_m:.4f} m, {far}"
     else:
         beside = "with depth images" if c.kind == "rgbd" else "alone"
         text = f"one camera {beside}, undistorted: focal {c.fu:.1f} px{wide}"
@@ -184,4 +184,4 @@ def _missing_part(recording: Recording) -> Part:
         missing.append("no T_cam0_imu")
     if recording.reference is None:
         missing.append("no ground truth (no ATE)")
-    return Part("missing", "; ".join(missing) or "nothing", {"missing": missing}, faults)
+    return Part("missing", "; ".join(missing) or "nothing is missing", {"missing": missing}, faults)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vio.calibration.findings import NotObservable
+from vio.calibration.severity import StereoError
 from vio.calibration.stereo import RowResiduals, row_residuals
 from vio.geometry.lie import FloatArray
 from vio.inspection.finding import Part
@@ -18,7 +19,7 @@ _FEATURES = 1500  # per image
 _RANSAC_PX = 1.5
 _LEAST_MATCHES = 20  # a pair with fewer says nothing about the calibration
 _DARK, _BRIGHT, _FLAT = 12.0, 243.0, 3.0  # mean and standard deviation of gray levels of an image without content
-_ROWS_NOTE_PX, _ROWS_FAULT_PX = 0.3, 2.0  # the aim of docs/rectification.md; where matching along rows fails
+_ROWS_FAULT_PX = 2.0  # where matching along rows fails
 _NEAREST_M, _FARTHEST_M = 0.1, 30.0  # medians outside are another unit: structured light ends at 5 m, lidars at 20
 _LEAST_POSITIVE = 0.5  # share of matches with ul > ur; true pairs have nearly all
 
@@ -90,7 +91,7 @@ def depths_part(frames: Sequence[StereoFrame]) -> Part:
     return Part("depth", text, {"known": share, "near_m": near, "median_m": middle, "far_m": far}, faults)
 
 
-def rows_part(frames: Sequence[StereoFrame]) -> Part:
+def rows_parts(frames: Sequence[StereoFrame]) -> list[Part]:
     """Describe how the rows of left and right images agree, by SIFT matches that assume nothing of the calibration."""
     matches = [sift_pairs(f.left, f.right) for f in frames if f.left is not None and f.right is not None]
     counts = [len(z) for z in matches]
@@ -104,29 +105,30 @@ def rows_part(frames: Sequence[StereoFrame]) -> Part:
             "stereo camera, its lenses clean and in focus"
         )
         hopeless = max(counts, default=0) < _LEAST_MATCHES
-        return Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])
-    return Part("stereo", _rows_text(found, counts), _rows_facts(found, z), _rows_faults(found))
+        return [Part("stereo", str(found), {"matches": int(sum(counts))}, [fault] if hopeless else [])]
+    off = StereoError(found.rms_px, found.disparity_px)
+    return [
+        Part("stereo", _rows_text(found, counts), _rows_facts(found), _rows_faults(found)),
+        Part("calibration", str(off), {"grade": off.grade, "rows_rms_px": off.rows_px}),
+    ]
 
 
 def _rows_text(found: RowResiduals, counts: Sequence[int]) -> str:
     field = found.grid_px[np.isfinite(found.grid_px)]
     over = f", {field.min():+.2f} to {field.max():+.2f} over the image" if len(field) else ""
-    worst = max(float(np.abs(field).max(initial=0.0)), abs(found.median_px))
-    hint = "; the stereo calibration is off: `vio calibrate` measures by what" if worst > _ROWS_NOTE_PX else ""
     return (
         f"{np.median(counts):.0f} matches a pair, rows {found.median_px:+.2f} px (median of vl - vr), spread "
-        f"{found.spread_px:.2f}{over}; {100 * found.positive_disparity:.0f} % in front{hint}"
+        f"{found.spread_px:.2f}{over}; {100 * found.positive_disparity:.0f} % in front"
     )
 
 
-def _rows_facts(found: RowResiduals, z: FloatArray) -> dict[str, object]:
-    disparity = z[:, 0] - z[:, 2]
+def _rows_facts(found: RowResiduals) -> dict[str, object]:
     return {
         "matches": found.matches,
         "rows_median_px": found.median_px,
         "rows_spread_px": found.spread_px,
         "positive_disparity": found.positive_disparity,
-        "disparity_median_px": float(np.median(disparity)),
+        "disparity_median_px": found.disparity_px,
     }
 
 

@@ -8,6 +8,7 @@ from vio.errors import DataError, DivergedError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.monitor.run import RunMonitor
+from vio.numerics.robust import median
 from vio.protocols import Backend, Frontend, Selector
 from vio.records import (
     FrameLog,
@@ -132,6 +133,11 @@ class _StageTimer:
         self._last = now
 
 
+def _median_disparity(seen: Observations) -> float | None:
+    z = seen.z[seen.has_right]
+    return median(z[:, 0] - z[:, 2]) if len(z) else None
+
+
 def _frame_log(
     frame: StereoFrame, ms: dict[str, float], output: FrontendOutput, selection: Selection, report: UpdateReport
 ) -> FrameLog:
@@ -153,5 +159,6 @@ def _frame_log(
         landmarks=report.landmarks,
         innovation_median_px=report.innovation_median_px,
         nis_per_dof=report.nis_per_dof,
+        disparity_median_px=_median_disparity(output.observations),
         stages_ms=output.stages_ms,
     )

@@ -6,6 +6,7 @@ from collections import deque
 
 import numpy as np
 
+from vio.calibration.severity import rows_grade
 from vio.geometry.lie import FloatArray
 from vio.numerics.robust import median
 from vio.records import Estimate, UpdateReport
@@ -14,7 +15,6 @@ _NO_FEATURES_S = 1.0  # without a usable feature for longer, the pose is a predi
 _GAP_S, _GAP_STEPS = 0.5, 5.0  # between frames: a gap if longer, and so many times the usual time
 _LEAST_STEPS, _RECENT_STEPS = 5, 50  # between frames, for the usual time to be known; and that it is taken from
 _REJECTING_FRAMES = 20
-_ROWS_OFF_PX = 0.2
 # No rig comes to this by a camera that turns in its mount (docs/notes/design_decisions.md, exchanged cameras).
 _OTHER_PAIR_PX = 10.0
 _SCALE_OFF_PERCENT, _SCALE_SIGMAS = 1.0, 3.0  # of baseline or focal length, both to be exceeded
@@ -92,7 +92,7 @@ class RunHealth:
     def _stereo(self, index: int, estimate: Estimate) -> list[str]:
         """Report once that the filter estimates the stereo calibration, as the rows show that it is off."""
         field = estimate.stereo_field
-        if field is None or field.rows_rms_px < _ROWS_OFF_PX or "stereo" in self._reported:
+        if field is None or "stereo" in self._reported or rows_grade(field.rows_rms_px) == "negligible":
             return []
         self._reported.add("stereo")
         seen = f"frame {index}: the rows of left and right images differ by {field.rows_rms_px:.2f} px (rms)"
@@ -103,8 +103,8 @@ class RunHealth:
                 "may not suffice (msckf.calibrate_stereo)"
             ]
         return [
-            f"{seen} in a smooth pattern: the stereo calibration is off; what it is off by is estimated while running "
-            "(msckf.calibrate_stereo)"
+            f"{seen} in a smooth pattern: the stereo calibration is off, {rows_grade(field.rows_rms_px)}; what it is "
+            "off by is estimated while running (msckf.calibrate_stereo)"
         ]
 
     def _scale(self, index: int, estimate: Estimate) -> list[str]:

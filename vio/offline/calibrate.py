@@ -14,6 +14,7 @@ from vio.calibration.gyro import align_gyro
 from vio.calibration.inertial import ImuAlignment, rates_of
 from vio.calibration.intrinsics import Intrinsics, judge_intrinsics
 from vio.calibration.lever_arm import LeverArm, estimate_lever_arm
+from vio.calibration.severity import StereoError
 from vio.calibration.stereo import (
     RayMatches,
     RowResiduals,
@@ -78,6 +79,17 @@ class CalibrationReport:
     notes: tuple[str, ...]
     intrinsics: Intrinsics | NotObservable = _NOT_TRACKED
     in_motion: SelfCalibration | None = None  # by bundle adjustment; None: from single pairs alone
+
+    @property
+    def stereo_error(self) -> StereoError | None:
+        """What rows and disparities are off by; None: the rows were not measured."""
+        if not isinstance(self.rows, RowResiduals):
+            return None
+        seen_px = self.rows.disparity_px
+        if self.in_motion is None or self.source.dataset is None or seen_px <= 0:
+            return StereoError(self.rows.rms_px, seen_px)
+        off, sigma = self.in_motion.disparity_off(self.source.dataset.recording.camera, seen_px)
+        return StereoError(self.rows.rms_px, seen_px, off, sigma)
 
     @property
     def findings(self) -> tuple[Finding, ...]:

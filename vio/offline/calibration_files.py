@@ -22,6 +22,9 @@ from vio.offline.calibrate import CalibrationReport
 _USUAL_RATE_HZ = 20.0  # where there are no time stamps to derive it from
 
 
+CAMCHAIN = "camchain-imucam.yaml"
+
+
 def write_calibration_report(folder: Path, report: CalibrationReport) -> None:
     """Write the measured calibration in both formats, with the given values where it is not observable.
 
@@ -46,7 +49,7 @@ def write_calibration_report(folder: Path, report: CalibrationReport) -> None:
             camera_yaml(camera, poses[name], comment=f"{name}, by vio calibrate", rate_hz=rate_hz), encoding="utf-8"
         )
     measured = replace(stereo, T_cam0_imu=T_cam0_imu, time_offset_s=offset_s)
-    (folder / "camchain-imucam.yaml").write_text(kalibr_text(measured), encoding="utf-8")
+    (folder / CAMCHAIN).write_text(kalibr_text(measured), encoding="utf-8")
 
 
 def _measured_stereo(report: CalibrationReport, given: StereoRig) -> Rig:

@@ -19,7 +19,7 @@ from vio.calibration.findings import NotObservable
 from vio.calibration.intrinsics import Intrinsics, judged_observable
 from vio.calibration.stereo_field import PARAMETERS
 from vio.errors import EstimationError
-from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, so3_hat, so3_left_jacobian
 from vio.geometry.stereo import StereoCamera
 from vio.numerics.robust import robust_sigma
 from vio.offline.points import MIN_DEPTH_M, PointTracks, keep_rows
@@ -39,6 +39,7 @@ _PRIOR = np.array(
 )
 _OF_RIGHT = {"cu": "right_cu", "cv": "right_cv", "fu": "right_fu", "fv": "right_fv"}  # in `stereo_field.PARAMETERS`
 _FREE = tuple(name for name in PARAMETERS if _OF_RIGHT.get(name, name) in NAMES)  # those estimated here
+_LIKE_BOTH = (("right_cu", "cu"), ("right_cv", "cv"), ("p1", "q1"), ("p2", "q2"))  # of the right camera, as of both
 INTRINSICS = ("focal", "aspect", "cu", "cv")
 # What lens models leave, beside the scatter: this and the sliding window differ by so much on the same drives.
 _LENS_DEG, _LENS_DIRECTION_DEG = 0.01, 0.3
@@ -47,7 +48,6 @@ _STEPS = 30  # of Levenberg-Marquardt, at most
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-4, 1e-10  # over the diagonal of the information
 _SETTLED = 1e-6  # relative decrease of the cost at which the steps end
 _LARGEST_RESIDUAL_PX = 1.5  # robust standard deviation above which the tracks are not of one rigid scene and rig
-_STEP = 1e-6  # of numeric derivatives: by rays and parameters, which have the size of radians
 _CAUCHY = 2.0  # residuals of so many standard deviations count half
 _GATE = 5.0  # rows with larger residuals, in standard deviations, are left out
 _ROUNDING = 1e-12  # of a point's information, against rounding; more of it passes for knowledge of depths
@@ -109,6 +109,19 @@ class SelfCalibration:
             if name in _FREE:
                 values[NAMES.index(_OF_RIGHT.get(name, name))] += value
         return replace(self, values=values)
+
+    def disparity_off(self, camera: StereoCamera, disparity_px: float) -> tuple[float, float]:
+        """Return by which disparities of that size are too large in the middle of the image, with standard deviation.
+
+        The focal length, which scales disparities and everything else, is not counted.
+        """
+        depth_m = camera.fu * camera.baseline_m / disparity_px
+        x = np.where(np.isin(NAMES, INTRINSICS), 0.0, self.values)
+        _, J = _derivatives(camera, x, np.array([[0.0, 0.0, depth_m]]))
+        gradient = np.where(np.isin(NAMES, INTRINSICS), 0.0, J[0, 0] - J[0, 2])
+        z = project_off(camera, x, np.array([[0.0, 0.0, depth_m]]))[0]
+        sigma = np.hypot(np.sqrt(gradient @ self.covariance @ gradient), camera.fu * np.radians(_LENS_DEG))
+        return float(z[0] - z[2] - disparity_px), float(sigma)
 
     def rig_parameters(self) -> FloatArray:
         """Return what the right camera and both lenses are off by (14,), as `stereo_field.PARAMETERS` names it."""
@@ -284,57 +297,92 @@ def _normal_equations(camera: StereoCamera, x: FloatArray, piece: Segment, sigma
     r, J_q, J_x = r * root[:, 0], J_q * root, J_x * root
     R = se3_inverse(piece.T_world_cam0)[tracks.keyframe, :3, :3]
     J_p, J_pose = J_q @ R, np.concatenate([J_q, -J_q @ so3_hat(q)], axis=2)
-    # Dense rows of each point: by its own coordinates (3), and by poses and parameters (C).
+    # Dense rows of each point: by its own coordinates (3), and by poses and parameters (C). A keyframe has it once.
     C = 6 * K + X
-    H_pp, H_pc, g_p, g_c = np.zeros((M, 3, 3)), np.zeros((M, 3, C)), np.zeros((M, 3)), np.zeros((M, C))
+    H_pc, g_c = np.zeros((M, 3, C)), np.zeros((M, C))
     Jt = np.swapaxes(J_p, 1, 2)
-    np.add.at(H_pp, tracks.point, Jt @ J_p)
-    np.add.at(g_p, tracks.point, (Jt @ r[..., None])[..., 0])
+    H_pp, g_p = _sums(Jt @ J_p, tracks.point, M), _sums((Jt @ r[..., None])[..., 0], tracks.point, M)
     blocks = np.zeros((M, K, 3, 6))
-    np.add.at(blocks, (tracks.point, tracks.keyframe), Jt @ J_pose)
+    blocks[tracks.point, tracks.keyframe] = Jt @ J_pose
     H_pc[:, :, : 6 * K] = blocks.transpose(0, 2, 1, 3).reshape(M, 3, 6 * K)
-    by_x = np.zeros((M, 3, X))
-    np.add.at(by_x, tracks.point, Jt @ J_x)
-    H_pc[:, :, 6 * K :] = by_x
+    H_pc[:, :, 6 * K :] = _sums(Jt @ J_x, tracks.point, M)
     H_cc = _reduced_blocks(J_pose, J_x, tracks.keyframe, K)
     gradient = np.zeros((M, K, 6))
-    np.add.at(gradient, (tracks.point, tracks.keyframe), np.einsum("nai,na->ni", J_pose, r))
+    gradient[tracks.point, tracks.keyframe] = (r[:, None] @ J_pose)[:, 0]
     g_c[:, : 6 * K] = gradient.reshape(M, 6 * K)
-    own = np.zeros((M, X))
-    np.add.at(own, tracks.point, np.einsum("nai,na->ni", J_x, r))
-    g_c[:, 6 * K :] = own
+    g_c[:, 6 * K :] = _sums((r[:, None] @ J_x)[:, 0], tracks.point, M)
     H_pp += _ROUNDING * np.trace(H_pp, axis1=1, axis2=2)[:, None, None] * np.eye(3)
     H_pp[:, range(3), range(3)] *= 1 + damping
     H_cc[range(6 * K), range(6 * K)] *= 1 + damping
     return _eliminated(H_pp, H_pc, g_p, g_c, H_cc, _regions(camera, tracks))
 
 
+def _sums(values: FloatArray, group: IntArray, groups: int) -> FloatArray:
+    """Return the sums (G, ...) over each group of values (N, ...)."""
+    order = np.argsort(group, kind="stable")
+    first = np.searchsorted(group[order], np.arange(groups))
+    out = np.zeros((groups, *values.shape[1:]))
+    filled = np.bincount(group, minlength=groups) > 0
+    out[filled] = np.add.reduceat(values[order], first[filled], axis=0)
+    return out
+
+
 def _derivatives(camera: StereoCamera, x: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return central differences of the pixels by points (R, 4, 3), in metres, and by parameters (R, 4, 18)."""
-    J_q, J_x = np.empty((len(q), 4, 3)), np.empty((len(q), 4, len(x)))
-    for k in range(3):
-        step = np.zeros_like(q)
-        step[:, k] = _STEP * q[:, 2]
-        J_q[:, :, k] = (project_off(camera, x, q + step) - project_off(camera, x, q - step)) / (2 * step[:, k : k + 1])
-    for k in range(len(x)):
-        d = np.zeros(len(x))
-        d[k] = _STEP
-        J_x[:, :, k] = (project_off(camera, x + d, q) - project_off(camera, x - d, q)) / (2 * _STEP)
+    """Return derivatives of `project_off` by points (R, 4, 3), in metres, and by parameters (R, 4, 18)."""
+    named = dict(zip(NAMES, x.tolist(), strict=True))
+    R = so3_exp(x[7:10])
+    moved = (q - camera.baseline_m * np.array([1.0, named["ty"], named["tz"]])) @ R.T
+    moved_D_x = np.zeros((len(q), 3, len(x)))
+    moved_D_x[:, :, 7:10] = -so3_hat(moved) @ so3_left_jacobian(x[7:10])
+    moved_D_x[:, :, 10:12] = -camera.baseline_m * R[:, 1:]
+    J_q, J_x = np.empty((len(q), 4, 3)), np.zeros((len(q), 4, len(x)))
+    tangential, focal = (named["q1"], named["q2"]), (named["focal"], named["focal"] + named["aspect"])
+    J_q[:, :2], J_x[:, :2] = _lens_derivatives(camera, named["k"], tangential, focal, q)
+    tangential = tangential[0] + named["p1"], tangential[1] + named["p2"]
+    focal = focal[0] + named["right_fu"], focal[1] + named["right_fv"]
+    by_moved, J_x[:, 2:] = _lens_derivatives(camera, named["k"], tangential, focal, moved)
+    J_q[:, 2:] = by_moved @ R
+    for name, common in (*_LIKE_BOTH, ("right_fu", "focal"), ("right_fv", "focal")):
+        J_x[:, 2:, NAMES.index(name)] = J_x[:, 2:, NAMES.index(common)]
+    J_x[:, 3, NAMES.index("right_fu")] = J_x[:, 2, NAMES.index("right_fv")] = 0
+    J_x[:, 2:] += by_moved @ moved_D_x
     return J_q, J_x
+
+
+def _lens_derivatives(
+    camera: StereoCamera, k: float, tangential: tuple[float, float], focal: tuple[float, float], p: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return derivatives of one camera's pixels by points in it (R, 2, 3), and by parameters of both (R, 2, 18)."""
+    t1, t2 = tangential
+    a, b = p[:, 0] / p[:, 2], p[:, 1] / p[:, 2]
+    ab, r2 = a * b, a * a + b * b
+    of_t1, of_t2 = np.stack([2 * ab, r2 + 2 * b * b]), np.stack([r2 + 2 * a * a, 2 * ab])
+    bent = np.stack([a, b]) * (1 + k * r2) + t1 * of_t1 + t2 * of_t2
+    mixed = 2 * (k * ab + t1 * a + t2 * b)
+    by_a = np.stack([1 + k * (r2 + 2 * a * a) + 2 * t1 * b + 6 * t2 * a, mixed])
+    by_b = np.stack([mixed, 1 + k * (r2 + 2 * b * b) + 6 * t1 * b + 2 * t2 * a])
+    by_p = np.stack([by_a, by_b, -a * by_a - b * by_b], axis=-1) / p[:, 2:]  # (2, R, 3)
+    given = np.array([camera.fu, camera.fv])
+    scale = (given * (1 + np.array(focal)))[:, None]
+    J = np.zeros((len(p), 2, len(NAMES)))
+    for name, columns in (("k", np.stack([a, b]) * r2), ("q1", of_t1), ("q2", of_t2)):
+        J[:, :, NAMES.index(name)] = (scale * columns).T
+    J[:, :, NAMES.index("focal")] = (given[:, None] * bent).T
+    J[:, 1, NAMES.index("aspect")] = given[1] * bent[1]
+    J[:, 0, NAMES.index("cu")], J[:, 1, NAMES.index("cv")] = given
+    return (scale[..., None] * by_p).transpose(1, 0, 2), J
 
 
 def _reduced_blocks(J_pose: FloatArray, J_x: FloatArray, keyframe: IntArray, K: int) -> FloatArray:
     """Return the information (C, C) of poses and parameters for given points."""
     X = J_x.shape[2]
     out = np.zeros((6 * K + X, 6 * K + X))
-    poses, cross = np.zeros((K, 6, 6)), np.zeros((K, 6, X))
-    Jt = np.swapaxes(J_pose, 1, 2)
-    np.add.at(poses, keyframe, Jt @ J_pose)
-    np.add.at(cross, keyframe, Jt @ J_x)
     for k in range(K):
-        out[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = poses[k]
-        out[6 * k : 6 * k + 6, 6 * K :] = cross[k]
-        out[6 * K :, 6 * k : 6 * k + 6] = cross[k].T
+        own, by_x = (J[keyframe == k].reshape(-1, J.shape[2]) for J in (J_pose, J_x))
+        rows = slice(6 * k, 6 * k + 6)
+        out[rows, rows] = own.T @ own
+        out[rows, 6 * K :] = own.T @ by_x
+        out[6 * K :, rows] = out[rows, 6 * K :].T
     flat = J_x.reshape(-1, X)
     out[6 * K :, 6 * K :] = flat.T @ flat
     return out
@@ -360,8 +408,7 @@ def _eliminated(
     own = np.linalg.solve(H_pp, g_p[..., None])[..., 0]
     S = H_cc - H_pc.reshape(-1, C).T @ by_c.reshape(-1, C)
     scores = g_c - np.einsum("mic,mi->mc", H_pc, own)
-    regions = np.zeros((int(region.max()) + 1, C))
-    np.add.at(regions, region, scores)
+    regions = _sums(scores, region, int(region.max()) + 1)
     poses, params = np.arange(6, C - X), np.arange(C - X, C)
     S_pp = S[np.ix_(poses, poses)] + 1e-9 * np.eye(len(poses)) * np.trace(S[np.ix_(poses, poses)]) / max(len(poses), 1)
     gain = np.linalg.solve(S_pp, S[np.ix_(poses, params)])

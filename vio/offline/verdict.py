@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vio.calibration.severity import Grade, length_grade
 from vio.offline.colmap.reconstruction import Mapper, Reconstructed
 from vio.offline.comparison import KeyframeComparison, Segment, motion_differences
 from vio.records import IntArray
 
+_TURN_DEG = 0.2  # a motion that differs by more turns the rest of the path
 _SCALE = 0.01  # by which lengths may differ without a word: matches that are off by 0.1 px make as much at far points
 
 
@@ -48,16 +50,19 @@ def overall_verdict(results: Sequence[MapperResult]) -> str:
     found = {result.mapper: result.found[1] for result in results if result.found is not None}
     if not found:
         return f"none: {results[0].verdict}"
-    agreeing = [name for name, comparison in found.items() if not comparison.segments]
+    agreeing = [name for name, comparison in found.items() if _grade(comparison, comparison.segments) == "negligible"]
     if not agreeing:
         return _disagreement(found)
     comparison = found[agreeing[0]]
-    length = float(np.linalg.norm(np.diff(comparison.aligned[:, :3, 3], axis=0), axis=1).sum())
-    text = f"the run and COLMAP agree: {_metres(comparison.ate_m)} (rms) apart over {length:.3g} m"
+    text = f"the run and COLMAP agree: {_metres(comparison.ate_m)} (rms) apart over {_length(comparison):.3g} m"
+    if comparison.segments:
+        text += f"; the difference of {_size(comparison, comparison.segments)} at frames "
+        text += f"{_ranges(comparison.segments)} is negligible"
     if comparison.scale is None:
         text += f"; lengths could not be compared, {comparison.why_no_scale}"
     elif abs(comparison.scale - 1) > max(_SCALE, 3 * (comparison.scale_sigma or 0.0)):
-        text += f", but COLMAP's path is {_longer(comparison.scale)}: one of both has disparities that are off"
+        grade = length_grade(100 * abs(comparison.scale - 1))
+        text += f", but COLMAP's path is {_longer(comparison.scale)}, {grade}: one of both has disparities that are off"
     missing = results[0].total - len(comparison.frames)
     if missing:
         text += f"; {missing} of {results[0].total} keyframes could not be compared"
@@ -71,16 +76,36 @@ def _disagreement(found: dict[Mapper, KeyframeComparison]) -> str:
     if len(found) == 1:
         ((name, only),) = found.items()
         where = f"the run and COLMAP's {name} model differ at frames {_ranges(only.segments)}"
-        return f"{where}, elsewhere by {_metres(only.ate_m)} (rms); one of both is wrong there"
+        size = _size(only, only.segments)
+        return f"{where} by {size}, elsewhere by {_metres(only.ate_m)} (rms); one of both is wrong there"
     first, second = found.values()
     shared = _shared(first, second)
     if shared:
-        return (
-            f"the run is probably wrong at frames {_ranges(shared)}: both of COLMAP's reconstructions differ from it "
-            f"there by up to {_metres(max(s.difference_m for s in shared))}, and agree with one another"
-        )
+        unusable = ", unusable" if _grade(first, shared) == "unusable" else ""
+        where = f"the run is probably off by {_size(first, shared)} at frames {_ranges(shared)}{unusable}"
+        return f"{where}: both of COLMAP's reconstructions differ from it there, and agree with one another"
     where = " and ".join(f"{_ranges(c.segments)} ({name})" for name, c in found.items())
     return f"undecided at frames {where}: COLMAP's two reconstructions contradict one another there"
+
+
+def _length(comparison: KeyframeComparison) -> float:
+    return float(np.linalg.norm(np.diff(comparison.aligned[:, :3, 3], axis=0), axis=1).sum())
+
+
+def _per_100_m(comparison: KeyframeComparison, segments: Sequence[Segment]) -> float:
+    """Return the largest difference of a motion over the length of the path, m per 100 m."""
+    return 100 * max((s.difference_m for s in segments), default=0.0) / max(_length(comparison), 1e-9)
+
+
+def _grade(comparison: KeyframeComparison, segments: Sequence[Segment]) -> Grade:
+    turned = any(s.difference_deg > _TURN_DEG for s in segments)
+    grade = length_grade(_per_100_m(comparison, segments))
+    return "worth calibrating" if turned and grade == "negligible" else grade
+
+
+def _size(comparison: KeyframeComparison, segments: Sequence[Segment]) -> str:
+    by = max((s.difference_m for s in segments), default=0.0)
+    return f"{_metres(by)} ({_per_100_m(comparison, segments):.2g} m per 100 m)"
 
 
 def _shared(first: KeyframeComparison, second: KeyframeComparison) -> list[Segment]:

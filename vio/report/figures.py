@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 COLOURS = ("#1f5fbf", "#d9822b", "#2e8b57", "#a83279", "#7a5195", "#0f8b8d", "#b5533c", "#6b7280")
 _TRUTH, _POINTS, _LOOPS = "#111111", "#9aa5b1", "#c82828"
 _BULK = (10, 90)  # percentiles of the bands' edges that an axis shows at least
+_LONGEST_SIDE = 1.8  # of the box in three dimensions; seen whole from where plotly puts the eye
 _AXES = ("right", "ahead", "up")
 
 
@@ -33,7 +34,13 @@ class ReportSection:
 
 def sections(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[ReportSection]:
     """Return all figures that these runs have the data for."""
-    found = [_paths(runs, curves), *_mapped(runs, curves), _position(runs, curves), _attitude(runs, curves)]
+    found = [
+        _paths(runs, curves),
+        _path_3d(runs, curves),
+        *_mapped(runs, curves),
+        _position(runs, curves),
+        _attitude(runs, curves),
+    ]
     found += [f(runs, curves) for f in (_velocity, _errors) if _applies(f, curves)]
     found += [_features(runs), _innovations(runs), *_biases(runs), _timing(runs), *_stereo(runs)]
     return found
@@ -65,6 +72,28 @@ def _paths(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSecti
         figure.update_yaxes(scaleanchor=f"x{'' if column == 1 else column}", row=1, col=column)
     figure.update_layout(height=560)
     return ReportSection("Path", figure, "Axes are right, ahead and up at the start.")
+
+
+def _path_3d(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> ReportSection:
+    """Draw the path in three dimensions, with equal scales."""
+    import plotly.graph_objects as go
+
+    figure = _subplots(1, 1, shared=False, kind="scene")
+    paths = [("ground truth", truth.position, _TRUTH, 5) for truth in _truths(curves)]
+    paths += [(run.name, c.position, colour, 3) for run, c, colour in zip(runs, curves, COLOURS, strict=False)]
+    for label, p, colour, width in paths:
+        x, y, z = (_short(p[:, axis]) for axis in range(3))
+        line = {"color": colour, "width": width}
+        figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="lines", line=line, **_named(figure, label)))
+    low, high = _extent([c.position for c in curves], (0, 1, 2), 0.05, 0.02)
+    points = curves[0].points[np.all((curves[0].points >= low) & (curves[0].points <= high), axis=1)]
+    x, y, z = (_short(points[:, axis]) for axis in range(3))
+    marker = {"size": 1, "color": _POINTS, "opacity": 0.6}
+    figure.add_trace(go.Scatter3d(x=x, y=y, z=z, mode="markers", marker=marker, **_named(figure, "landmarks")))
+    axes = {f"{name}axis": {"title": f"{axis} (m)"} for name, axis in zip("xyz", _AXES, strict=True)}
+    ratio = dict(zip("xyz", (_LONGEST_SIDE * (high - low) / (high - low).max()).tolist(), strict=True))
+    figure.update_layout(height=560, scene={**axes, "aspectmode": "manual", "aspectratio": ratio})
+    return ReportSection("Path in three dimensions", figure, "Turn it with the mouse.")
 
 
 def _mapped(runs: Sequence[FinishedRun], curves: Sequence[Curves]) -> list[ReportSection]:
@@ -224,13 +253,16 @@ def _stereo(runs: Sequence[FinishedRun]) -> list[ReportSection]:
 # --- drawing --------------------------------------------------------------------------------------------------------
 
 
-def _subplots(rows: int, columns: int, *, titles: Sequence[str] = (), shared: bool = True) -> go.Figure:
+def _subplots(
+    rows: int, columns: int, *, titles: Sequence[str] = (), shared: bool = True, kind: str = "xy"
+) -> go.Figure:
     from plotly.subplots import make_subplots
 
     figure = make_subplots(
         rows=rows,
         cols=columns,
         subplot_titles=list(titles) or None,
+        specs=[[{"type": kind}] * columns] * rows,
         shared_xaxes="all" if shared else False,
         vertical_spacing=0.25 / rows**1.5 if rows > 1 else None,
         horizontal_spacing=0.09,
@@ -344,11 +376,13 @@ def _frame_curve(
     _xy(figure, run.seconds[rows], run.frames[name][rows], label, colour, row, dash=dash)
 
 
-def _extent(paths: Sequence[FloatArray], axes: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Return the corners of the box around paths with a margin, metres."""
+def _extent(
+    paths: Sequence[FloatArray], axes: tuple[int, ...], share: float = 0.25, least_m: float = 0.05
+) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of the box around paths with a margin (a share of the longest side), metres."""
     every = np.concatenate(paths)[:, axes]
     low, high = every.min(axis=0), every.max(axis=0)
-    margin = max(0.25 * float((high - low).max()), 2.0)
+    margin = max(share * float((high - low).max()), least_m)
     return low - margin, high + margin
 
 

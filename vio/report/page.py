@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
 from vio._version import __version__
 from vio.files.atomic import atomic_write_text
+from vio.files.inputs import read_input
 from vio.files.printable import printable
 from vio.report.figures import COLOURS, ReportSection, sections
-from vio.report.words import run_figures, summary
+from vio.report.words import calibration_findings, run_figures, summary
 from vio.runs.curves import curves_of
+from vio.runs.files import RunFile
 from vio.runs.finished import FinishedRun
 
 _STYLE = """
@@ -25,7 +28,7 @@ table { border-collapse: collapse; } th, td { text-align: left; padding: 3px 18p
 thead th { border-bottom: 1px solid #c4ccd5; font-weight: 600; } tbody th { color: #5b6876; }
 td { font-variant-numeric: tabular-nums; } li { margin: 3px 0; overflow-wrap: anywhere; }
 .swatch { display: inline-block; width: 11px; height: 11px; border-radius: 2px; margin-right: 6px; }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; } img { max-width: 100%; } code { overflow-wrap: anywhere; }
 """
 
 
@@ -47,7 +50,7 @@ def page(runs: Sequence[FinishedRun]) -> str:
     from plotly.offline import get_plotlyjs
 
     title = _text(", ".join(run.name for run in runs))
-    parts = [_words(runs), _table(runs), _warnings(runs), _settings(runs)]
+    parts = [_words(runs), _table(runs), _calibration(runs), _warnings(runs), _images(runs), _settings(runs)]
     parts += [_figure(section, number) for number, section in enumerate(sections(runs, curves_of(runs)))]
     return (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
@@ -61,8 +64,37 @@ def _words(runs: Sequence[FinishedRun]) -> str:
     paragraphs = []
     for run, colour in zip(runs, [*COLOURS, *COLOURS], strict=False):
         head = f'<h2><span class="swatch" style="background:{colour}"></span>{_text(run.name)}</h2>'
-        paragraphs.append((head if len(runs) > 1 else "<h2>Summary</h2>") + f"<p>{_text(' '.join(summary(run)))}</p>")
+        command = run.metrics.get("command")
+        typed = f"<p><code>{_text(str(command))}</code></p>" if command else ""
+        text = f"<p>{_text(' '.join(summary(run)))}</p>"
+        paragraphs.append((head if len(runs) > 1 else "<h2>Summary</h2>") + text + typed)
     return f"<section>{''.join(paragraphs)}</section>"
+
+
+def _images(runs: Sequence[FinishedRun]) -> str:
+    """Show the annotated image that each run kept."""
+    shown = []
+    for run in runs:
+        if (file := run.folder / RunFile.FEATURES).is_file():
+            data = b64encode(read_input(file)).decode("ascii")
+            head = f"<p>{_text(run.name)}</p>" if len(runs) > 1 else ""
+            shown.append(f'{head}<img alt="features" src="data:image/jpeg;base64,{data}">')
+    remark = (
+        '<p class="remark">The left image half-way through the run. Gray circles have no match in the right image.</p>'
+    )
+    return f"<section><h2>Features and disparities</h2>{remark}{''.join(shown)}</section>" if shown else ""
+
+
+def _calibration(runs: Sequence[FinishedRun]) -> str:
+    """List what the runs found the calibration to be off by."""
+    found = [(run, calibration_findings(run.metrics)) for run in runs]
+    lists = [
+        (f"<p>{_text(run.name)}</p>" if len(runs) > 1 else "")
+        + f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in lines)}</ul>"
+        for run, lines in found
+        if lines
+    ]
+    return f"<section><h2>Calibration</h2>{''.join(lists)}</section>" if lists else ""
 
 
 def _table(runs: Sequence[FinishedRun]) -> str:

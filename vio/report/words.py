@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from vio.evaluation.trajectories import lengths_text, rotation_drift_text
+from vio.evaluation.trajectories import lengths_text, metres_text, rotation_drift_text
 from vio.runs.finished import FinishedRun
 from vio.runs.folder import refused_share
 
@@ -36,8 +37,8 @@ def summary(run: FinishedRun) -> list[str]:
     else:
         share = 100 * evaluation.ate_m.rmse / max(evaluation.reference_path_length_m, 1e-9)
         lines.append(
-            f"The position error is {evaluation.ate_m.rmse:.3g} m (root mean square after alignment, {share:.2g} % of "
-            f"the path), at most {evaluation.ate_m.max:.3g} m; the attitude error {evaluation.ate_deg.rmse:.2g} deg."
+            f"The position error is {metres_text(evaluation.ate_m.rmse)} (rms after alignment, {share:.2g} % of the "
+            f"path), at most {metres_text(evaluation.ate_m.max)}; the attitude error {evaluation.ate_deg.rmse:.2g} deg."
         )
         if evaluation.kitti is not None:
             lines.append(
@@ -79,6 +80,31 @@ def _work_ms(run: FinishedRun) -> Any:
 _TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
 
 
+def calibration_findings(metrics: Mapping[str, Any]) -> list[str]:
+    """Return what a run found its calibration to be off by, one line each."""
+    lines = []
+    if field := metrics.get("stereo_field"):
+        text = field.get("text")
+        lines += [f"Stereo pair: {text}; corrected in this run."] if text else []
+        lines += [] if field.get("rig") is None else list(field["rig"]["lines"])
+    for name, x in (metrics.get("stereo_scale") or {}).items():
+        lines.append(f"{name.replace('_', ' ')} off by {x['percent']:+.2f} ± {x['sigma_percent']:.2f} %")
+    return lines + camera_imu_findings(metrics)
+
+
+def camera_imu_findings(metrics: Mapping[str, Any]) -> list[str]:
+    """Return what a run found of the place and the clock of the IMU; they are near zero where these are right."""
+    found, words = metrics.get("camera_imu") or {}, []
+    if "rotation_deg" in found:
+        for key, unit, digits in (("rotation", "deg", 2), ("translation", "mm", 1)):
+            size, sigma = math.hypot(*found[f"{key}_{unit}"]), math.hypot(*found[f"{key}_sigma_{unit}"])
+            words.append(f"{key} off by {size:.{digits}f} ± {sigma:.{digits}f} {unit}")
+    if "time_offset_ms" in found:
+        offset = f"{found['time_offset_ms']:+.2f} ± {found['time_offset_sigma_ms']:.2f} ms"
+        words.append(f"stamps off by {offset}")
+    return [f"against the camera: {', '.join(words)}"] if words else []
+
+
 def run_figures(run: FinishedRun) -> dict[str, str]:
     """Return a run's figures for a table, in a fixed order; a dash where there is none."""
     m, evaluation = run.metrics, run.evaluation
@@ -89,8 +115,8 @@ def run_figures(run: FinishedRun) -> dict[str, str]:
         "frames": str(len(run.estimates)),
         "path (m)": f"{_path_m(run):.2f}",
         "back end": f"{m.get('backend', '–')}, motion {m.get('motion', '–')}",
-        "ATE (m)": "–" if evaluation is None else f"{evaluation.ate_m.rmse:.4f}",
-        "largest error (m)": "–" if evaluation is None else f"{evaluation.ate_m.max:.4f}",
+        "ATE": "–" if evaluation is None else metres_text(evaluation.ate_m.rmse),
+        "largest error": "–" if evaluation is None else metres_text(evaluation.ate_m.max),
         "attitude error (deg)": "–" if evaluation is None else f"{evaluation.ate_deg.rmse:.3f}",
         "drift (%)": "–" if kitti is None else f"{kitti.t_err_percent:.3f}",
         "drift of rotation": "–" if kitti is None else rotation_drift_text(kitti.r_err_deg_per_100m, kitti.lengths_m),

@@ -22,6 +22,7 @@ class RunFile:
     MAP_KEYFRAMES = "map_keyframes.csv"
     LOOPS = "loops.csv"
     LOOP_MATCHES = "loop_matches.npz"
+    FEATURES = "features.jpg"  # one image with its features
     REPORT = "report.html"  # of `vio report`
     UNFINISHED = "unfinished"  # folder, while the run goes on or can go on
 

@@ -8,17 +8,18 @@ import math
 import platform
 import shutil
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, fields, is_dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from vio._version import __version__
 from vio.files.atomic import atomic_folder, check_own
+from vio.calibration.severity import StereoError
 from vio.calibration.stereo_field import PARAMETERS
 from vio.config import Config, describe, to_yaml
 from vio.datasets.common import checked_transform
@@ -38,9 +39,13 @@ from vio.runs.tables import frames_csv
 from vio.files.tables import Records
 from vio.files.trajectories import in_first_cam0, read_trajectory, write_kitti, write_tum
 
+if TYPE_CHECKING:
+    from vio.runs.picture import RunPicture
+
 log = logging.getLogger(__name__)
 
-_OF_THE_OUTPUT = ("source", "reference", "lengths_m", "save_calibration")  # of a request: it may move, or be compared anew
+# Of a request: it may move, or be compared anew.
+_OF_THE_OUTPUT = ("source", "reference", "lengths_m", "save_calibration", "command", "plot")
 _SLOW = 10.0  # times the median; frames that take longer compile, or wait for something else
 _CHUNK, _CHUNK_FRAMES = 100_000, 5_000  # points and frames at a time
 
@@ -67,7 +72,11 @@ def write_run_folder(
     """
     with atomic_folder(folder, replace=True, marker=RunFile.METRICS, own=FILES) as temporary:
         np.save(temporary / RunFile.ESTIMATES, result.estimates.rows)
-        return _write_files(temporary, folder, result, reference, lengths_m, save_observations=save_observations)
+        metrics, picture = _write_files(
+            temporary, folder, result, reference, lengths_m, save_observations=save_observations
+        )
+        picture.write(temporary / RunFile.PICTURE)
+    return metrics
 
 
 def finish_run_folder(
@@ -77,10 +86,24 @@ def finish_run_folder(
     *,
     lengths_m: Sequence[float] | None = None,
     save_observations: bool = False,
+    more: Mapping[str, Any] | None = None,
+    plot: bool = True,
+    finished: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Write the results of a run into the folder in which it grew, and return the metrics.
 
-    What a run that ended early needs to go on stays in `unfinished/`. The arguments are those of `write_run_folder`.
+    What a run that ended early needs to go on stays in `unfinished/`. The first arguments are those of
+    `write_run_folder`.
+
+    Args:
+        folder: of the run.
+        result: the run.
+        reference: ground truth.
+        lengths_m: of the drift.
+        save_observations: also write them.
+        more: added to the metrics.
+        plot: whether to draw `trajectory.png`, which takes 1.4 s of CPU.
+        finished: called with the metrics when everything but the picture is in its place.
 
     Raises:
         VioError: the folder cannot be written.
@@ -93,7 +116,9 @@ def finish_run_folder(
         if final.exists():  # of a process that died
             shutil.rmtree(final)
         final.mkdir()
-        metrics = _write_files(final, folder, result, reference, lengths_m, save_observations=save_observations)
+        metrics, picture = _write_files(
+            final, folder, result, reference, lengths_m, save_observations=save_observations, more=more
+        )
         if result.stopped is None:
             (unfinished / RunFile.ESTIMATES).replace(folder / RunFile.ESTIMATES)
         else:
@@ -104,6 +129,13 @@ def finish_run_folder(
         shutil.rmtree(unfinished if result.stopped is None else final)
     except OSError as error:
         raise DataError(f"cannot write {folder}: {error.strerror or error}; the trajectory so far is there") from error
+    if finished is not None:
+        finished(metrics)
+    if plot:
+        try:
+            picture.write(folder / RunFile.PICTURE)
+        except KeyboardInterrupt:
+            log.warning("%s was not drawn: interrupted; all other results are complete", RunFile.PICTURE)
     return metrics
 
 
@@ -142,7 +174,8 @@ def _inputs(dataset: Dataset, config: Config, request: Mapping[str, Any]) -> dic
     values |= {name: value for name, value in request.items() if name not in _OF_THE_OUTPUT}
     values |= {"number of frames": len(times_ns), "checksum of their times": zlib.crc32(times_ns.tobytes())}
     values |= _flat("camera", recording.camera) | _flat("T_cam0_imu", recording.T_cam0_imu)
-    return values | _flat("calibration", given_rig(dataset))
+    values |= _flat("calibration", given_rig(dataset))
+    return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
 
 
 def _flat(name: str, value: Any) -> dict[str, Any]:
@@ -179,10 +212,13 @@ def _write_files(
     lengths_m: Sequence[float] | None,
     *,
     save_observations: bool,
-) -> dict[str, Any]:
-    """Write all results but `estimates.npy` into `target`, and return the metrics, which name `folder`."""
+    more: Mapping[str, Any] | None = None,
+) -> tuple[dict[str, Any], RunPicture]:
+    """Write all results but `estimates.npy` into `target`; return the metrics, which name `folder`, and the picture."""
+    from vio.runs.picture import RunPicture  # which imports this module by way of finished runs
+
     evaluation, dead_reckoning = score(result, reference, lengths_m=lengths_m)
-    metrics = metrics_of(result, evaluation, dead_reckoning, folder)
+    metrics = {**metrics_of(result, evaluation, dead_reckoning, folder), **(more or {})}
     (target / RunFile.CONFIG).write_text(to_yaml(result.config), encoding="utf-8")
     write_tum(target / RunFile.TRAJECTORY, result.trajectory)
     write_kitti(target / RunFile.TRAJECTORY_KITTI, in_first_cam0(result.trajectory, result.T_cam0_body))
@@ -199,11 +235,8 @@ def _write_files(
     _write_frames(target / RunFile.FRAMES, result.frames)
     if save_observations:
         _write_observations(target / RunFile.OBSERVATIONS, result)
-    from vio.runs.picture import plot_run
-
-    plot_run(target / RunFile.PICTURE, result, evaluation, dead_reckoning)
     (target / RunFile.METRICS).write_text(json_text(metrics, indent=2) + "\n", encoding="utf-8")
-    return metrics
+    return metrics, RunPicture.of(result, evaluation, dead_reckoning)
 
 
 def _write_mapped(target: Path, result: RunResult, mapped: MappedRun, reference: Trajectory | None) -> dict[str, Any]:
@@ -332,6 +365,9 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
         return None
     f = result.recording.camera.fu
     found = None
+    coefficients, sigmas = f * field.coefficients, f * np.sqrt(np.diag(field.covariance))
+    seen = [px for px in result.frames.column("disparity_median_px") if px is not None and px == px]
+    off = StereoError(field.rows_rms_px, float(np.median(seen or [0.0])), -float(coefficients[0]), float(sigmas[0]))
     if not result.recording.camera.is_cylinder:
         try:
             found = result.calibrated_rig()
@@ -339,17 +375,18 @@ def stereo_field(result: RunResult) -> dict[str, Any] | None:
             log.warning("%s", error)
     rig = None
     if found is not None:
-        sigmas = found.sigmas.tolist()
         rig = {
             "off": dict(zip(PARAMETERS, found.parameters.tolist(), strict=True)),
-            "sigma": dict(zip(PARAMETERS, sigmas, strict=True)),
+            "sigma": dict(zip(PARAMETERS, found.sigmas.tolist(), strict=True)),
             "not_expressed_px": found.left_px,
             "lines": list(found.lines()),
         }
     return {
         "rows_rms_px": field.rows_rms_px,
-        "coefficients_px": (f * field.coefficients).tolist(),
-        "sigma_px": (f * np.sqrt(np.diag(field.covariance))).tolist(),
+        "grade": off.grade,
+        "text": str(off),
+        "coefficients_px": coefficients.tolist(),
+        "sigma_px": sigmas.tolist(),
         "rows_px": None if field.rows is None else (f * field.rows).tolist(),
         "rig": rig,
     }

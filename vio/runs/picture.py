@@ -7,12 +7,13 @@ import io
 import logging
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vio.evaluation.trajectories import Evaluation
+from vio.evaluation.trajectories import Evaluation, metres_text
 from vio.records import STAGES
 from vio.geometry.lie import FloatArray
 from vio.runs.curves import SIGMAS, STAGE_COLOURS, Curves, DrawnRun, binned, draw, stereo_curves
@@ -25,24 +26,43 @@ log = logging.getLogger(__name__)
 _ESTIMATE, _REFERENCE, _DEAD_RECKONING, _LANDMARKS = "#1f5fbf", "#111111", "#d9822b", "#9aa5b1"
 _GREEN, _PURPLE = "#3a9d5d", "#8a5fb0"
 _MOVED_SIGMAS = 3.0  # a stereo calibration that ends within so many standard deviations of zero is not drawn
-_STANDS_M = 2.0  # extent of a path below which the landmarks set the limits of the map
+_LEAST_MARGIN_M = 0.02  # about a rig that stands
+_SCALE = 1.3  # of the largest value to the end of an axis
 _BINS = 250  # of the curves that are medians over frames
 # Of the panels, as shares of the figure and of a panel. A layout that matplotlib finds by itself draws all twice.
 _MARGINS = {"left": 0.06, "right": 0.985, "bottom": 0.06, "top": 0.925, "wspace": 0.18, "hspace": 0.26}
 
 
-def plot_run(path: Path, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> None:
-    """Plot the map from above, and height, attitude, errors, feature counts and times over the frames; write a PNG.
+@dataclass(frozen=True, slots=True)
+class RunPicture:
+    """The map from above, and height, attitude, errors, feature counts and times over the frames of a run.
 
-    A picture that cannot be drawn or written gives a warning: it must not cost the results of the run.
-
-    Args:
-        path: the PNG to write.
-        result: the run.
-        evaluation: the trajectory against the reference; None without one.
-        dead_reckoning: dead reckoning against the reference; None without one.
+    It keeps copies, and so can be drawn when the files that the run grew in are gone.
     """
-    write_picture(path, lambda: _figure(result, evaluation, dead_reckoning))
+
+    run: DrawnRun
+    frames: Rows  # (N,) rows of `vio.runs.tables.FRAME`
+    dead_reckoning: Evaluation | None  # against the reference; None without one
+    title: str
+    focal: float | None  # of the panel of the stereo calibration; None: there is none
+
+    @classmethod
+    def of(cls, result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> RunPicture:
+        """Keep what is drawn of a run, its trajectory and dead reckoning compared with a reference (None: without)."""
+        drawn = DrawnRun(
+            np.array(result.estimates.rows),
+            result.T_cam0_body,
+            result.motion,
+            evaluation,
+            result.dead_reckoning,
+            result.landmarks.p_world,
+        )
+        focal = result.recording.camera.fu if has_calibration_panel(result) else None
+        return cls(drawn, np.array(result.frames.rows), dead_reckoning, _title(result, evaluation), focal)
+
+    def write(self, path: Path) -> None:
+        """Write a PNG; a picture that cannot be drawn or written gives a warning: the results do not depend on it."""
+        write_picture(path, lambda: _figure(self))
 
 
 def write_picture(path: Path, draw: Callable[[], Any]) -> None:
@@ -60,36 +80,28 @@ def write_picture(path: Path, draw: Callable[[], Any]) -> None:
             path.unlink(missing_ok=True)
 
 
-def _figure(result: RunResult, evaluation: Evaluation | None, dead_reckoning: Evaluation | None) -> Any:
+def _figure(picture: RunPicture) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 9), dpi=110)
-    run = DrawnRun(
-        result.estimates.rows,
-        result.T_cam0_body,
-        result.motion,
-        evaluation,
-        result.dead_reckoning,
-        result.landmarks.p_world,
-    )
-    curves = draw(run, run.view_of_reference())
-    calibrated = has_calibration_panel(result)
+    curves = draw(picture.run, picture.run.view_of_reference())
+    calibrated = picture.focal is not None
     grid = figure.add_gridspec(6 if calibrated else 5, 2, width_ratios=(1.25, 1), **_MARGINS)
     _draw_map(figure.add_subplot(grid[:, 0]), curves)
     panels = [figure.add_subplot(grid[row, 1]) for row in range(6 if calibrated else 5)]
-    _draw_error(panels[0], curves, dead_reckoning)
+    _draw_error(panels[0], curves, picture.dead_reckoning)
     _draw_height(panels[1], curves)
     _draw_attitude(panels[2], curves)
-    _draw_counts(panels[3], curves.seconds, result.frames.rows)
-    _draw_time(panels[4], curves.seconds, result.frames.rows)
-    if calibrated:
-        _draw_calibration(panels[5], curves.seconds, run.estimates, result.recording.camera.fu)
+    _draw_counts(panels[3], curves.seconds, picture.frames)
+    _draw_time(panels[4], curves.seconds, picture.frames)
+    if picture.focal is not None:
+        _draw_calibration(panels[5], curves.seconds, picture.run.estimates, picture.focal)
     for axes in panels:
         axes.set_xlim(0, max(float(curves.seconds[-1]), 1e-3))
         axes.grid(alpha=0.25)
         axes.tick_params(labelbottom=axes is panels[-1])  # all have the time axis of the last one
     panels[-1].set_xlabel("time in the recording (s)")
-    figure.suptitle(_title(result, evaluation), fontsize=12, parse_math=False)  # a $ in a file name is no formula
+    figure.suptitle(picture.title, fontsize=12, parse_math=False)  # a $ in a file name is no formula
     return figure
 
 
@@ -107,7 +119,8 @@ def _title(result: RunResult, evaluation: Evaluation | None) -> str:
     if evaluation is None:
         return f"{name}, no reference"
     drift = evaluation.as_dict()["t_err_percent"]
-    return f"{name}, ATE {evaluation.ate_m.rmse:.3f} m" + ("" if drift is None else f", drift {drift:.2f} %")
+    ate = metres_text(evaluation.ate_m.rmse)
+    return f"{name}, ATE {ate}" + ("" if drift is None else f", drift {drift:.2f} %")
 
 
 def _draw_map(axes: Any, curves: Curves) -> None:
@@ -118,13 +131,17 @@ def _draw_map(axes: Any, curves: Curves) -> None:
     if curves.truth is not None:
         paths.insert(0, ("ground truth", curves.truth.position, _REFERENCE, "-", 3.0))
     points = curves.points[:, :2]
-    low, high = _view(np.concatenate([path[1][:, :2] for path in paths]), points)
+    box = axes.get_position()
+    shape = box.width * axes.figure.get_figwidth() / (box.height * axes.figure.get_figheight())
+    low, high = _view(np.concatenate([path[1][:, :2] for path in paths if path[0] != "dead reckoning"]), shape)
     inside = np.all((points >= low) & (points <= high), axis=1)
     axes.scatter(*points[inside].T, s=1.2, c=_LANDMARKS, linewidths=0, label="landmarks", rasterized=True)
     for label, positions, colour, style, width in paths:
         axes.plot(*positions[:, :2].T, color=colour, ls=style, lw=width, label=label)
     axes.plot(0, 0, "o", color=_REFERENCE, ms=6, mfc="white", label="start")
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlim(low[0], high[0])
+    axes.set_ylim(low[1], high[1])
+    axes.set_aspect("equal", adjustable="box")
     axes.set_title("from above", fontsize=9, loc="left")
     axes.set_xlabel("right of the start (m)")
     axes.set_ylabel("ahead of the start (m)")
@@ -132,14 +149,12 @@ def _draw_map(axes: Any, curves: Curves) -> None:
     axes.grid(alpha=0.25)
 
 
-def _view(paths: FloatArray, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return plot limits that contain all paths (N, 2) and a margin; of a rig that stands, most landmarks (M, 2)."""
+def _view(paths: FloatArray, shape: float) -> tuple[FloatArray, FloatArray]:
+    """Return limits of a panel whose width is `shape` times its height: all paths (N, 2), a margin, equal scales."""
     low, high = paths.min(axis=0), paths.max(axis=0)
-    if float((high - low).max()) < _STANDS_M and len(points):
-        near = np.percentile(points, (10, 90), axis=0)  # without a few triangulated far off
-        low, high = np.minimum(low, near[0]), np.maximum(high, near[1])
-    margin = max(0.15 * float((high - low).max()), 1.0)
-    return low - margin, high + margin
+    size = high - low + 2 * max(0.1 * float((high - low).max()), _LEAST_MARGIN_M)
+    half = 0.5 * np.array([max(size[0], shape * size[1]), max(size[1], size[0] / shape)])
+    return 0.5 * (low + high) - half, 0.5 * (low + high) + half
 
 
 def _draw_error(axes: Any, curves: Curves, dead_reckoning: Evaluation | None) -> None:
@@ -153,7 +168,7 @@ def _draw_error(axes: Any, curves: Curves, dead_reckoning: Evaluation | None) ->
         seconds = curves.seconds[dead_reckoning.rows]
         axes.plot(seconds, dead_reckoning.errors_m, "--", color=_DEAD_RECKONING, lw=1.1)
     axes.set_ylabel("position error (m)")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, _SCALE * max(float(curves.truth.error_m.max()), 1e-6))  # dead reckoning may leave the panel
 
 
 def _draw_height(axes: Any, curves: Curves) -> None:
@@ -190,7 +205,7 @@ def _draw_time(axes: Any, seconds: FloatArray, frames: Rows) -> None:
     medians = [binned(seconds, frames[f"{stage}_ms"], _BINS)[1] for stage in STAGES]
     axes.stackplot(times, medians, labels=STAGES, colors=STAGE_COLOURS, linewidth=0)
     axes.set_ylabel("time (ms)")
-    axes.set_ylim(0, max(1.2 * float(np.percentile(np.sum(medians, axis=0), 98)), 1.0))
+    axes.set_ylim(0, max(2 * float(np.median(np.sum(medians, axis=0))), 1.0))  # frames that compile leave the panel
     axes.legend(loc="upper right", fontsize=8, ncols=5)
 
 

@@ -47,7 +47,7 @@ ESTIMATE = np.dtype(
 _STAGES = 16  # of the front end, at most
 _COUNTS = ("detected", "tracked", "matched", "selected", "stale", "used", "gated", "landmarks")
 _TIMES = ("read_ms", "frontend_ms", "monitor_ms", "select_ms", "filter_ms")
-_NUMBERS = ("innovation_median_px", "nis_per_dof")
+_NUMBERS = ("innovation_median_px", "nis_per_dof", "disparity_median_px")
 FRAME = np.dtype(
     [
         ("index", "<i8"),
@@ -144,8 +144,8 @@ class FrameRows:
         values: dict[str, Any] = {name: int(row[name]) for name in ("index", "time_ns", *_COUNTS)}
         values |= {name: float(row[name]) for name in _TIMES}
         stages = {name: float(ms) for name, ms in zip(self.stages, row["stages_ms"], strict=False) if ms == ms}
-        innovation, nis = (_number(row[name]) for name in _NUMBERS)
-        return FrameLog(**values, innovation_median_px=innovation, nis_per_dof=nis, stages_ms=stages)
+        values |= {name: _number(row[name]) for name in _NUMBERS}
+        return FrameLog(**values, stages_ms=stages)
 
 
 def observation_rows(seen: Observations) -> Rows:

