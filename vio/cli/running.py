@@ -334,6 +334,10 @@ def metric_rows(metrics: dict[str, Any], *, plot: bool = True) -> list[tuple[str
         rows.append(("scale", f"one camera: from the IMU, standard deviation {sigma} (median of the frames)"))
     elif metrics["camera"].get("kind") == "rgbd":
         rows.append(("scale", "one camera: from the depth images"))
+    elif metrics.get("rig_scale_sigma"):
+        share, path_m = metrics["rig_scale_sigma"], metrics["path_length_m"]
+        of_path = f"{metres_text(share * path_m)} of {path_m:.2f} m"
+        rows.append(("scale", f"known to {100 * share:.2g} % by the calibration: {of_path}"))
     if metrics["stereo_field"] is not None:
         field = metrics["stereo_field"]
         rows.append(("stereo", f"{field['text']}; corrected in this run"))

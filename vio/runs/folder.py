@@ -347,6 +347,7 @@ def metrics_of(
         "stereo_field": stereo_field(result),
         "stereo_scale": stereo_scale(result),
         "scale_sigma": final_scale_sigma(result),
+        "rig_scale_sigma": rig_scale_sigma(result),
         "camera_imu": camera_imu(result),
         "imu": imu_calibration(result),
         "T_cam0_imu": result.T_cam0_body.tolist(),
@@ -404,6 +405,14 @@ def final_scale_sigma(result: RunResult) -> float | None:
     """Return the median standard deviation of the scale over the frames, over it; None: not of one camera."""
     known = [sigma for sigma in result.estimates.column("scale_sigma") if sigma is not None and sigma == sigma]
     return float(np.median(known)) if known else None
+
+
+def rig_scale_sigma(result: RunResult) -> float | None:
+    """Return the standard deviation of the scale by the calibration, over it; None: it is estimated, or not considered."""
+    settings, camera = result.config.msckf, result.recording.camera
+    if result.config.backend != "msckf" or camera.kind == "mono" or result.estimates[-1].stereo_scale is not None:
+        return None
+    return settings.stereo_scale_sigma
 
 
 def camera_imu(result: RunResult) -> dict[str, Any] | None:
