@@ -524,7 +524,7 @@ def test_a_render_that_fails_is_a_failed_row_and_one_that_works_is_made_once(
         (["small", "--seeds", "a"], "--seeds takes whole numbers"),
         (["small", "--only", "rom"], "did you mean 'room'"),
         (["small", "other"], "to compare: vio bench compare"),
-        (["compare", "one"], "takes two output folders, got 1"),
+        (["compare", "one"], "takes two output folders, or one with --between X Y, got 1"),
         (["compare", "one", "two"], "one: no results"),
     ],
 )

@@ -133,6 +133,7 @@ def _write(
         "packages": package_versions(),
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "seeds": list(suite.seeds),
+        "drawn_each_seed": [s.name for s in suite.sequences if s.render_each_seed],
         "outcomes": [outcome.as_dict() for outcome in outcomes],
     }
     rows = summary_rows(outcomes)

@@ -15,10 +15,12 @@ def add_parser(commands: Any) -> None:
         help="run a suite of recordings into one table, or compare two",
         description="Run every sequence of a suite with every configuration and seed, side by side, and write tables "
         "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, kitti, euroc, tumvi. "
-        "'vio bench compare A B' lists what became significantly better or worse from one output folder to another.",
+        "'vio bench compare A B' says what became better or worse from one output folder to another, and "
+        "'vio bench compare A --between X Y' from one configuration or system to another.",
     )
     parser.add_argument("suite", metavar="SUITE", help="YAML file, name of a shipped suite, or 'compare'")
-    parser.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="compare: two output folders, A and B")
+    parser.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="compare: output folders")
+    parser.add_argument("--between", nargs=2, metavar=("X", "Y"), help="compare: these systems, X of A and Y of B")
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings (default: the suite's)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of tables and report (default bench/NAME)")
     parser.add_argument(
@@ -41,7 +43,10 @@ def add_parser(commands: Any) -> None:
         type=float,
         default=2.0,
         metavar="X",
-        help="compare: of one sequence without seeds, a change by more than this counts (default 2)",
+        help="compare: a single sequence that changes by more than this is shown (default 2)",
+    )
+    parser.add_argument(
+        "--margin", type=float, default=1.1, metavar="X", help="compare: a change below this is none (default 1.1)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -53,8 +58,10 @@ def execute(args: argparse.Namespace) -> int:
     from vio.errors import ConfigError
 
     if args.suite == "compare":
-        if len(args.folders) != 2:
-            raise ConfigError(f"vio bench compare takes two output folders, got {len(args.folders)}")
+        if len(args.folders) != 2 and not (args.between and len(args.folders) == 1):
+            raise ConfigError(
+                f"vio bench compare takes two output folders, or one with --between X Y, got {len(args.folders)}"
+            )
         return _compare(args)
     if args.folders:
         raise ConfigError(f"vio bench takes one suite; what is {args.folders[0]}? To compare: vio bench compare A B")
@@ -115,16 +122,18 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    """Print what changed; the status is 1 where something became worse."""
-    from vio.bench.compare import compare, comparison_lines
+    """Print what changed; the status is 1 where something became worse, 3 where that cannot be told."""
+    from vio.bench.compare import EXIT_STATUS, compare, comparison_lines
     from vio.cli.output import print_result
 
-    result = compare(*args.folders, factor=args.factor)
+    a, b = args.folders[0], args.folders[-1]
+    between = None if args.between is None else tuple(args.between)
+    result = compare(a, b, between=between, factor=args.factor, margin=args.margin)
     if args.json:
         print_result(result.as_dict(), (), as_json=True)
     else:
         print("\n".join(comparison_lines(result)))
-    return 1 if result.is_worse else 0
+    return EXIT_STATUS[result.verdict]
 
 
 def _names(text: str) -> list[str]:
