@@ -108,6 +108,10 @@ def _text(row: Row | None) -> str:
     return text if covered > 0.995 else f"{text} ({100 * covered:.0f} % of the frames)"
 
 
+def _cell(row: Row, name: str) -> str:
+    return cell_text(row.cells[name], _BY_NAME[name]) if name in row.cells else "–"
+
+
 def _beside(benches: Benches, lines: Sequence[Line], columns: Sequence[str]) -> Iterator[str]:
     yield f"| ATE m | stereo-vio | {' | '.join(columns)} |"
     yield "|---|" + "---:|" * (len(columns) + 1)
@@ -141,7 +145,7 @@ def _details(benches: Benches) -> Iterator[str]:
     for line in (*REAL, *RENDERED):
         row = benches.row(line.suite, line.sequence, line.ours)
         if row is not None:
-            yield f"| {line.label} | {' | '.join(cell_text(row.cells.get(m.name), m) for m in metrics)} |"
+            yield f"| {line.label} | {' | '.join(_cell(row, m.name) for m in metrics)} |"
 
 
 def _suite(benches: Benches) -> Iterator[str]:
@@ -151,7 +155,7 @@ def _suite(benches: Benches) -> Iterator[str]:
     yield f"| sequence | configuration | {' | '.join(titles)} | failed |"
     yield "|---|---|" + "---:|" * (len(names) + 1)
     for row in benches.rows("rendered"):
-        cells = [cell_text(row.cells.get(name), _BY_NAME[name]) for name in names]
+        cells = [_cell(row, name) for name in names]
         yield f"| {row.sequence} | {row.system} | {' | '.join(cells)} | {number(row.failed, 3)} of {row.runs} |"
 
 

@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import re
+import subprocess
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -83,6 +84,29 @@ def package_versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:  # OpenCV under another of its names
             versions[name] = "unknown"
     return versions
+
+
+def commit_of(root: Path) -> str | None:
+    """Return the commit of a checkout, with a + where files were changed since; None: it is no checkout."""
+    try:
+        found = subprocess.run(
+            ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--exclude=*", "--abbrev=8"],
+            capture_output=True, text=True, check=True, timeout=30,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return found.stdout.strip() or None
+
+
+def machine() -> str:
+    """Return processors and operating system, without the name of the machine."""
+    model = platform.processor() or platform.machine()
+    try:
+        names = re.findall(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+        model = names[0] if names else model
+    except OSError:
+        pass
+    return f"{os.cpu_count()} x {' '.join(model.split())}, {platform.system()}"
 
 
 class InputDigests:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from vio.bench.latex import cells_of
 from vio.bench.suite import Suite
 from vio.bench.tables import METRICS, Outcome, Row, markdown
 from vio.files.atomic import atomic_write_text
@@ -197,7 +198,7 @@ def _as_html(text: str) -> str:
 
 
 def _table(lines: Sequence[str]) -> str:
-    rows = [[cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    rows = [cells_of(line) for line in lines]
     head = "".join(f"<th>{_inline(cell)}</th>" for cell in rows[0])
     body = "".join("<tr>" + "".join(f"<td>{_inline(cell)}</td>" for cell in row) + "</tr>" for row in rows[2:])
     return f"<table><tr>{head}</tr>{body}</table>"

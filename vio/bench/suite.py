@@ -6,7 +6,7 @@ import difflib
 import re
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from vio.files.yaml_text import MOST_BYTES, read_yaml
 SHIPPED = Path(__file__).resolve().parent / "suites"
 _NAME = re.compile(r"[\w.+-]+")  # of a sequence or configuration: it becomes part of a command line and of a CSV file
 _MOST_SEEDS = 1000
+_PUBLISHED_FIGURES = ("ate_m", "drift_percent", "drift_deg_per_100m")
 _RENDER_OWN = ("--out", "--seed", "--workers", "--json")  # of `vio render`: given by the bench itself
 
 
@@ -48,6 +49,16 @@ class Published:
     system: str
     source: str  # paper or page, with its table
     figures: Mapping[str, Mapping[str, float]]  # by name of the figure, by sequence
+    sensors: str  # such as stereo + IMU
+    causal: bool | None  # poses as they were output, or later ones; None: the source does not say
+    alignment: str | None  # SE3, Sim3
+    loops: bool | None
+
+    @property
+    def conditions(self) -> tuple[str, str, str, str]:
+        """Sensors, causal, alignment and loops, for a table."""
+        causal, loops = ("?" if v is None else "yes" if v else "no" for v in (self.causal, self.loops))
+        return self.sensors, causal, self.alignment or "?", loops
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +71,10 @@ class Suite:
     configurations: Mapping[str, Mapping[str, Any]]  # deviations from the defaults
     seeds: tuple[int, ...] = (0,)
     published: tuple[Published, ...] = ()
+    titles: Mapping[str, str] = field(default_factory=dict)  # of sequences and systems, for tables in documents
+    publisher: str | None = None  # where the recordings can be had
+    success_percent: float = 1.0  # a run with an ATE below this share of the way succeeds
+    time_limit_s: float | None = None  # of a task; then it has no result
 
 
 def shipped_suites() -> tuple[str, ...]:
@@ -95,7 +110,7 @@ def suite_from(values: Any, path: Path) -> Suite:
     """
     where = str(path)
     given = _mapping(values, where, "a suite")
-    _only_keys(given, ("name", "sequences", "configurations", "seeds", "published"), where)
+    _only_keys(given, [f.name for f in fields(Suite) if f.name != "folder"], where)
     sequences = _mapping(given.get("sequences"), where, "'sequences'")
     configurations = _mapping(given.get("configurations") or {"default": {}}, where, "'configurations'")
     for name in (*sequences, *configurations):
@@ -110,6 +125,12 @@ def suite_from(values: Any, path: Path) -> Suite:
         configurations={str(name): _mapping(value or {}, where, f"'{name}'") for name, value in configurations.items()},
         seeds=_seeds(given.get("seeds", [0]), where),
         published=tuple(_published(value, where) for value in given.get("published") or ()),
+        titles={str(k): str(v) for k, v in _mapping(given.get("titles") or {}, where, "'titles'").items()},
+        publisher=None if given.get("publisher") is None else str(given["publisher"]),
+        success_percent=_positive(given.get("success_percent", 1.0), "success_percent", where),
+        time_limit_s=None
+        if given.get("time_limit_s") is None
+        else _positive(given["time_limit_s"], "time_limit_s", where),
     )
     for configuration in suite.configurations:
         for sequence in suite.sequences:
@@ -147,13 +168,10 @@ def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> 
                 near = difflib.get_close_matches(name, known, 1)
                 hint = f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
                 raise ConfigError(f"suite {suite.name} has no '{name}'{hint}")
-    return Suite(
-        suite.name,
-        suite.folder,
-        tuple(s for s in suite.sequences if not sequences or s.name in sequences),
-        {name: value for name, value in suite.configurations.items() if not configured or name in configured},
-        suite.seeds,
-        suite.published,
+    return replace(
+        suite,
+        sequences=tuple(s for s in suite.sequences if not sequences or s.name in sequences),
+        configurations={name: v for name, v in suite.configurations.items() if not configured or name in configured},
     )
 
 
@@ -196,13 +214,28 @@ def _published(value: Any, where: str) -> Published:
     system, source = given.pop("system", None), given.pop("source", None)
     if not system or not source:
         raise ConfigError(f"{where}: published figures need a system and a source")
+    conditions = {name: given.pop(name, None) for name in ("sensors", "causal", "alignment", "loops")}
+    if not conditions["sensors"] or conditions["alignment"] not in (None, "SE3", "Sim3"):
+        raise ConfigError(f"{where}: {system} needs sensors, and as alignment SE3, Sim3 or none")
+    if any(conditions[name] not in (None, True, False) for name in ("causal", "loops")):
+        raise ConfigError(
+            f"{where}: causal and loops of {system} take true, false or, where the source is silent, none"
+        )
     figures = {}
     for name, of_sequences in given.items():
+        if name not in _PUBLISHED_FIGURES:
+            raise ConfigError(f"{where}: {system} has unknown '{name}'; figures are {', '.join(_PUBLISHED_FIGURES)}")
         figures[name] = {str(k): v for k, v in _mapping(of_sequences, where, f"'{name}' of {system}").items()}
         for sequence, figure in figures[name].items():
             if isinstance(figure, bool) or not isinstance(figure, (int, float)) or not figure >= 0:
                 raise ConfigError(f"{where}: {name} of {system} on {sequence} is a number, got {figure!r}")
-    return Published(str(system), str(source), figures)
+    return Published(str(system), str(source), figures, **conditions)
+
+
+def _positive(value: Any, name: str, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
+        raise ConfigError(f"{where}: {name} is a number above 0, got {value!r}")
+    return float(value)
 
 
 def _seeds(value: Any, where: str) -> tuple[int, ...]:

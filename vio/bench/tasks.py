@@ -15,7 +15,8 @@ from vio.config import as_dict
 from vio.datasets import READERS
 from vio.errors import ConfigError, DataError
 
-_FORM = 1  # of jobs and records: another one makes other keys
+_NO_FILES = ("handheld", "car", "simulated", "none")  # values of `vio render` in the place of a file
+_FORM = 2  # of jobs and records: another one makes other keys
 # Settings that name files, relative to the folder of the recordings.
 _FILE_SETTINGS = re.compile(
     r"dataset\.calibration|frontend\.features|frontend\.klt\.mask|frontend\.learned\.\w+_weights"
@@ -41,7 +42,21 @@ def tasks_of(suite: Suite, data: Path, digests: InputDigests, peers: Path | None
     Raises:
         ConfigError: the folder of other systems' trajectories does not exist or holds none of a sequence of the suite.
     """
-    return [*_runs(suite, data, digests), *(() if peers is None else _peers(suite, data, digests, peers))]
+    tasks = [*_runs(suite, data, digests), *(() if peers is None else _peers(suite, data, digests, peers))]
+    for task in tasks:
+        task.job["time_limit_s"] = suite.time_limit_s  # no part of the key: a result does not depend on it
+    return tasks
+
+
+def inputs_of(sequence: Sequence, data: Path) -> list[Path]:
+    """Return what a sequence reads: its recording or the files of its render, and its ground truth."""
+    words = sequence.render
+    paths = [] if sequence.source is None else [_source(sequence.source, data)[1]]
+    for k, word in enumerate(words):
+        option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
+        if (equals or not word.startswith("-")) and _takes_a_path(list(words), k, option) and value not in _NO_FILES:
+            paths.append(data / value)
+    return paths + ([] if sequence.reference is None else [data / sequence.reference])
 
 
 def render_of(sequence: Sequence, data: Path, digests: InputDigests, seed: int) -> dict[str, Any]:

@@ -32,6 +32,13 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--only", default="", metavar="NAME,…", help="these sequences alone")
     parser.add_argument("--configurations", default="", metavar="NAME,…", help="these configurations alone")
     parser.add_argument("--seeds", metavar="N,…", help="in the place of the suite's seeds")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="seconds of a task; then it has no result")
+    parser.add_argument("--list", action="store_true", help="say which recordings are there and which not; run nothing")
+    parser.add_argument(
+        "--revision",
+        metavar="REV",
+        help="run this git revision too, in turns, and compare: A is the revision, B this code",
+    )
     parser.add_argument(
         "--identity",
         choices=("content", "stat"),
@@ -69,7 +76,11 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _bench(args: argparse.Namespace) -> int:
+    import sys
+    from dataclasses import replace
+
     from vio.bench.bench import Place, bench
+    from vio.bench.revision import revision_folder, run_in_turns
     from vio.bench.suite import SHIPPED, chosen, read_suite
     from vio.cli.progress import ProgressBar
     from vio.errors import ConfigError, StoppedError
@@ -79,6 +90,10 @@ def _bench(args: argparse.Namespace) -> int:
     suite = chosen(read_suite(args.suite), _names(args.only), _names(args.configurations))
     if args.seeds is not None:
         suite = _with_seeds(suite, args.seeds)
+    if args.time_limit is not None:
+        if not args.time_limit > 0:
+            raise ConfigError(f"--time-limit takes seconds above 0, got {args.time_limit:g}")
+        suite = replace(suite, time_limit_s=args.time_limit)
     default = Path() if suite.folder == SHIPPED else suite.folder
     place = Place(
         data=args.data if args.data is not None else default,
@@ -89,6 +104,12 @@ def _bench(args: argparse.Namespace) -> int:
         identity=args.identity,
         peers=args.peers,
     )
+    if args.list:
+        return _list(suite, place.data, args)
+    if args.revision is not None:
+        run_in_turns(suite, place, args.revision, say=lambda text: None if args.quiet else print(text, file=sys.stderr))
+        args.folders = [revision_folder(place, args.revision), place.out]
+        return _compare(args)
     try:
         with ProgressBar(suite.name, unit="tasks") as bar:
             result = bench(suite, place, (lambda done, total: None) if args.quiet else bar.update)
@@ -96,6 +117,22 @@ def _bench(args: argparse.Namespace) -> int:
         text = f"interrupted; finished tasks are kept in {place.cache}, and the same command goes on with the others"
         raise StoppedError(text, status=128 + getattr(stop, "number", 2)) from stop
     return _report(args, place.out, result)
+
+
+def _list(suite: Any, data: Path, args: argparse.Namespace) -> int:
+    """Print what is there and what is missing; the status is 1 where something is."""
+    from vio.bench.tasks import inputs_of
+    from vio.cli.output import print_result
+
+    missing = {s.name: [str(p) for p in inputs_of(s, data) if not p.exists()] for s in suite.sequences}
+    lines = [(name, "there" if not paths else f"missing: {', '.join(paths)}") for name, paths in missing.items()]
+    runs = len(suite.sequences) * len(suite.configurations) * len(suite.seeds)
+    lines.append(("runs", f"{runs}: {', '.join(suite.configurations)}; seeds {', '.join(map(str, suite.seeds))}"))
+    if any(missing.values()) and suite.publisher is not None:
+        lines.append(("from", suite.publisher))
+    facts = {"suite": suite.name, "missing": {k: v for k, v in missing.items() if v}, "publisher": suite.publisher}
+    print_result({**facts, "runs": runs}, lines, as_json=args.json, name_width=max(len(n) for n, _ in lines))
+    return 1 if any(missing.values()) else 0
 
 
 def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
@@ -112,7 +149,7 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
         shown = [f"{m.title} {number(cells[m.name].median, m.digits)}" for m in METRICS if m.name in cells]
         lines.append((system, f"{done} of {count} sequences; median {', '.join(shown) or 'nothing'}"))
     lines.append(("tasks", f"{len(result.outcomes)}, of which {result.reused} were done before"))
-    lines.append(("report", f"{out / 'report.html'}, tables.md, table.csv, runs.csv"))
+    lines.append(("report", f"{out / 'report.html'}, tables.md, tables.tex, table.csv, runs.csv"))
     facts = {**result.facts, "out": str(out), "reused": result.reused}
     width = max(10, *(len(name) for name, _ in lines))
     print_result(facts, lines, as_json=args.json, name_width=width)
