@@ -42,8 +42,9 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
     """
     try:
         Path(cache).mkdir(parents=True, exist_ok=True)
-        if job["render"] is not None:
-            job = {**job, "source": f"{_rendered(job['render'], Path(cache))}"}
+        job = _with_render(job, Path(cache))
+        if job.get("first") is not None:
+            job["first"] = _with_render(job["first"], Path(cache))
         lost = 0
         while True:
             record, number = _in_process(job, Path(cache))
@@ -95,6 +96,10 @@ def _in_process(job: dict[str, Any], cache: Path) -> tuple[dict[str, Any] | None
         return None, -status
     last = (words.strip() or "no message").splitlines()[-1]
     return failed(f"the program failed, please report it: {last}", keep=False), 0
+
+
+def _with_render(job: dict[str, Any], cache: Path) -> dict[str, Any]:
+    return job if job["render"] is None else {**job, "source": str(_rendered(job["render"], cache))}
 
 
 def _rendered(render: dict[str, Any], cache: Path) -> Path:

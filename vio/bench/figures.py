@@ -114,7 +114,12 @@ def absent_reasons(
         "cpu_ms": "too few frames for a mean",
         "landmarks_m": "there are no surveyed landmarks",
         "innovation_px": "no observation was used",
+        "map_ate_m": "there was no map",
+        **dict.fromkeys(("loops", "loops_false", "loop_error_m", "loop_recall"), "no map was built"),
+        **dict.fromkeys(("placed", "place_s", "map_causal_ate_m", "map_nees"), "no place was found in a map"),
     }
+    if figures.get("loops") is not None:
+        why |= {"loop_error_m": "there is no loop", "loop_recall": "no place was seen again"}
     if peer:
         why |= dict.fromkeys(
             ("nees", "refused_share", "cpu_ms", "memory_mib"), "a trajectory of another system does not say"

@@ -40,6 +40,8 @@ class Sequence:
         None  # far more accurate than the estimate, so that NEES says something; None: if rendered
     )
     settings: Mapping[str, Any] | None = None  # over those of the configuration
+    map: bool = False  # build a map, and score it
+    map_of: str | None = None  # the sequence in whose map this one is localised, built beforehand in the same task
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +134,11 @@ def suite_from(values: Any, path: Path) -> Suite:
         if given.get("time_limit_s") is None
         else _positive(given["time_limit_s"], "time_limit_s", where),
     )
+    for sequence in suite.sequences:
+        if sequence.map_of is not None and (sequence.map or sequence.map_of not in sequences):
+            raise ConfigError(
+                f"{where}: map_of of {sequence.name} names another sequence of the suite, without map: true"
+            )
     for configuration in suite.configurations:
         for sequence in suite.sequences:
             config_of(suite, sequence, configuration, suite.seeds[0])
@@ -199,10 +206,10 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
                 raise ValueError(f"lengths_m {given['lengths_m']}")
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{place}: start and stop are frames or times as 12s, lengths_m metres ({error})") from error
-    for key in ("render_each_seed", "positions_only", "exact_truth"):
+    for key in ("render_each_seed", "positions_only", "exact_truth", "map"):
         if not isinstance(given.get(key, False), bool):
             raise ConfigError(f"{place}: {key} takes true or false, got {given[key]!r}")
-    for key in ("source", "reference"):
+    for key in ("source", "reference", "map_of"):
         if given.get(key) is not None:
             given[key] = str(given[key])
     _mapping(given.get("settings") or {}, where, f"settings of sequence {name}")

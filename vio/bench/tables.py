@@ -50,6 +50,17 @@ MORE_METRICS = (
     Metric("innovation_px", "innovation px", 3),
     Metric("reference_m", "length m", 3),
     Metric("frames", "frames", 6),
+    Metric("map_ate_m", "ATE m in the map", 3),
+    Metric("map_causal_ate_m", "at the time", 3),
+    Metric("placed", "frames with a place", 3, larger_is_better=True),
+    Metric("place_s", "first place s", 3),
+    Metric("loops", "loops", 4),
+    Metric("loops_false", "false", 3),
+    Metric("loop_error_m", "their error m", 3),
+    Metric("loop_recall", "recall", 3, larger_is_better=True),
+    Metric("map_nees", "NEES in the map", 3),
+    Metric("wall_ms", "wall ms", 3, measured=True),
+    Metric("wall_95_ms", "wall ms, 95 %", 3, measured=True),
     Metric("frontend_ms", "front end ms", 3, measured=True),
     Metric("filter_ms", "filter ms", 3, measured=True),
 )
@@ -295,19 +306,32 @@ def full_table(
     metrics: Sequence[Metric] = METRICS,
     titles: Mapping[str, str] | None = None,
     *,
-    success: bool = True,
+    for_documents: bool = False,
 ) -> Iterator[str]:
-    """Yield the table of all figures: a line for each sequence and system."""
+    """Yield the table of all figures: a line for each sequence and system.
+
+    Args:
+        rows: of the suite.
+        metrics: the columns.
+        titles: of sequences and systems, by name.
+        for_documents: leave out runs and success, and sequence or system where there is one alone.
+    """
     named, notes = titles or {}, Notes()
-    last = ["runs", "success"] if success else []
-    yield _line(["sequence", "system", *(metric.title for metric in metrics), *last])
-    yield "|---|---|" + "---:|" * (len(metrics) + len(last))
+    names = ["sequence", "system"]
+    if for_documents:
+        names = [name for name in names if len({getattr(row, name) for row in rows}) > 1] or names[1:]
+    last = [] if for_documents else ["runs", "success"]
+    yield _line([*names, *(metric.title for metric in metrics), *last])
+    yield "|" + "---|" * len(names) + "---:|" * (len(metrics) + len(last))
+    before: list[str] = []
     for row in rows:
         runs = f"{row.runs}" if not row.failed else f"{row.runs - row.failed} of {row.runs}"
         texts = [row_text(row, metric, notes) for metric in metrics]
         share = "–" if row.succeeded is None else f"{100 * row.succeeded / row.runs:.0f} %"
-        ends = [runs, share] if success else []
-        yield _line([named.get(row.sequence, row.sequence), named.get(row.system, row.system), *texts, *ends])
+        labels = [named.get(getattr(row, name), getattr(row, name)) for name in names]
+        shown = ["", *labels[1:]] if for_documents and len(labels) > 1 and labels[:1] == before else labels
+        before = labels[:1]
+        yield _line([*shown, *texts, *([] if for_documents else [runs, share])])
     yield from notes.lines()
 
 

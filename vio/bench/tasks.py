@@ -95,6 +95,9 @@ def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, di
     task = Task(sequence.name, name, seed, "", {})
     try:
         job, identity = _common(sequence, data, digests, seed)
+        if sequence.map_of is not None:
+            (first,) = (s for s in suite.sequences if s.name == sequence.map_of)
+            job["first"], identity["first"] = _common(first, data, digests, seed)
         config = as_dict(config_of(suite, sequence, name, seed))
         files = {}
         for setting, holder, key in _file_settings(config):
@@ -110,13 +113,14 @@ def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, di
 
 def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what a worker needs for a sequence, and the part of it that the result depends on."""
-    job: dict[str, Any] = {"source": None, "render": None, "reference": None, "scratch": None}
+    job: dict[str, Any] = {"source": None, "render": None, "reference": None, "scratch": None, "first": None}
     shared: dict[str, Any] = {
         "start": sequence.start,
         "stop": sequence.stop,
         "lengths_m": None if sequence.lengths_m is None else list(sequence.lengths_m),
         "positions_only": sequence.positions_only,
         "exact_truth": _has_exact_truth(sequence),
+        "map": sequence.map,
         "code": code_digest(),
         "packages": package_versions(),
     }

@@ -37,9 +37,8 @@ if TYPE_CHECKING:
     from vio.records import FrameResult
     from vio.runs.pipeline import RunResult
 
-_WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as in tools/bench.py
+_WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
 _MOST_WARNINGS = 5
-_STAGES = ("frontend", "filter")
 JOB, RESULT = "job.json", "result.json"
 
 
@@ -92,12 +91,7 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
     try:
         _check_place(job)
         config = merge(Config(), job["config"], where="the suite")
-        dataset = open_dataset(job["source"], config.dataset)
-        first, end = frames_between(dataset.recording, parse_bound(job["start"]), _stop(job))
-        total = len(dataset.recording.frame_times_ns)
-        own = dataset.recording.reference
-        reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
-        truth = _Truth(dataset, reference, first, total if end is None else min(end, total))
+        truth = _truth(job, config)
         record |= _peer(job, truth) if job["kind"] == "peer" else _run(job, config, truth, timer)
     except VioError as error:
         record["failure"] = " ".join(str(error).split())
@@ -106,6 +100,20 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
         record |= {"failure": "out of memory", "keep": False}
     record["measured"] = {} if job["kind"] == "peer" else _measured(timer, began)
     return record
+
+
+def _truth(job: dict[str, Any], config: Config) -> _Truth:
+    """Open the recording of a job.
+
+    Raises:
+        VioError: it cannot be used, or its reference cannot be read.
+    """
+    dataset = open_dataset(job["source"], config.dataset)
+    first, end = frames_between(dataset.recording, parse_bound(job["start"]), _stop(job))
+    total = len(dataset.recording.frame_times_ns)
+    own = dataset.recording.reference
+    reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
+    return _Truth(dataset, reference, first, total if end is None else min(end, total))
 
 
 def _measured(timer: _CpuTimer, began: float) -> dict[str, Any]:
@@ -153,6 +161,8 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
     """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
     import cv2
 
+    from vio.bench.maps import map_figures
+    from vio.live.build import MapUse
     from vio.runs.folder import growing_folder, landmark_error, refused_share
     from vio.runs.pipeline import RunControl, run  # loads compiled functions: not for what cannot be opened
 
@@ -160,7 +170,13 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
     with tempfile.TemporaryDirectory(prefix="vio-bench-", dir=job["scratch"]) as folder:
         growing = growing_folder(Path(folder) / "run", truth.dataset, config, {"source": "", "start": truth.first})
         control = RunControl(growing)
-        result = run(truth.dataset, config, start=truth.first, stop=truth.end, viewer=timer, control=control)
+        store = Path(folder) / "map.db"
+        use = MapUse(store) if job["map"] else None
+        if job["first"] is not None:
+            before, use = _truth(job["first"], config), MapUse(store, localise=True)
+            run(before.dataset, config, start=before.first, stop=before.end, map=MapUse(store))
+        first, end = truth.first, truth.end
+        result = run(truth.dataset, config, start=first, stop=end, viewer=timer, map=use, control=control)
         trajectory = result.trajectory
         figures: dict[str, Any] = {
             "frames": len(result.frames),
@@ -171,7 +187,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             "landmarks": len(result.landmarks.ids),
             "innovation_px": _median(f.innovation_median_px for f in result.frames),
         }
-        timer.stages = {f"{name}_ms": _stage_ms(result, f"{name}_ms") for name in _STAGES}
+        timer.stages = _stages(result)
         record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}
         if truth.reference is not None:
             score = _evaluate(job, trajectory, truth.reference, result.T_cam0_body)
@@ -179,6 +195,8 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             figures |= _nees(result, score) if job["exact_truth"] else {"nees": None}
             figures["landmarks_m"] = (landmark_error(result, score) or {}).get("rmse_m")
             record["curve"] = error_curve(score, trajectory.times_ns)
+            if result.mapped is not None and result.stopped is None:
+                figures |= map_figures(result, score, numbered(truth.reference), store if job["map"] else None)
         assert trajectory.times_ns is not None
         text = tum_text(
             trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices
@@ -197,8 +215,18 @@ def _absent(job: dict[str, Any], figures: dict[str, Any], truth: _Truth) -> dict
     )
 
 
-def _stage_ms(result: RunResult, name: str) -> float:
-    return float(np.median(np.asarray(result.frames.column(name), dtype=np.float64)))
+def _stages(result: RunResult) -> dict[str, float]:
+    """Return wall times of a frame in ms, start left out: medians of stages and of all, and what 95 % stay within."""
+    frames = list(result.frames)[_WARM_FRAMES:]
+    if not frames:
+        return {}
+    total = [f.total_ms for f in frames]
+    return {
+        "frontend_ms": float(np.median([f.frontend_ms for f in frames])),
+        "filter_ms": float(np.median([f.filter_ms for f in frames])),
+        "wall_ms": float(np.median(total)),
+        "wall_95_ms": float(np.percentile(total, 95)),
+    }
 
 
 def _median(values: Iterable[float | None]) -> float | None:
