@@ -22,9 +22,9 @@ import pytest
 from tests.dataset_makers import make_drive, make_mat, utias_arrays
 from vio.bench import execute
 from vio.bench.bench import Place, _succeeded, bench, read_bench
-from vio.bench.engines import run_here
+from vio.bench.engines import _check_workers, run_here
 from vio.bench.figures import coverage, figures_of, pose_nees
-from vio.bench.identity import ROOT, InputDigests, commit_of, imported_code
+from vio.bench.identity import ROOT, InputDigests, code_and_packages, commit_of, imported_code
 from vio.bench.latex import latex_of
 from vio.bench.report import _as_html
 from vio.bench.store import Store
@@ -33,7 +33,7 @@ from vio.bench.tables import BY_NAME, METRICS, Outcome, cell_text, markdown, num
 from vio.bench.tasks import tasks_of
 from vio.bench.worker import perform
 from vio.cli import main
-from vio.errors import ConfigError
+from vio.errors import ConfigError, VioError
 from vio.evaluation.trajectories import evaluate
 from vio.files.trajectories import read_trajectory, write_tum
 from vio.geometry.lie import se3_exp, se3_inverse
@@ -74,14 +74,14 @@ def _keys(suite: Suite, data: Path, cache: Path, identity: Any = "content") -> d
 
 
 def test_shipped_suites_are_read_by_name() -> None:
-    assert set(shipped_suites()) == {"euroc", "kitti", "rendered", "small", "tumvi"}
+    assert set(shipped_suites()) == {"euroc", "kitti", "realistic", "rendered", "small", "tumvi"}
     suites = {name: read_suite(name) for name in shipped_suites()}
     assert len(suites["kitti"].sequences) == len(suites["euroc"].sequences) == 11
     for suite in suites.values():
         names = {sequence.name for sequence in suite.sequences}
         for published in suite.published:
             assert "https://" in published.source, "every published figure names where it stands"
-            assert set(published.figures["ate_m"]) <= names
+            assert all(set(of_sequences) <= {*names, "all"} for of_sequences in published.figures.values())
     assert {p.system.partition(",")[0] for p in suites["euroc"].published} >= {"Basalt", "ORB-SLAM3", "VINS-Fusion"}
 
 
@@ -114,6 +114,7 @@ def test_settings_come_from_configuration_then_sequence_then_seed(tmp_path: Path
         ({"published": [{**_OTHER, "sensors": None}]}, "needs sensors"),
         ({"published": [{**_OTHER, "loops": "some"}]}, "causal and loops of Other take true, false"),
         ({"published": [{**_OTHER, "ate_cm": {"first": 1}}]}, "unknown 'ate_cm'; figures are ate_m"),
+        ({"published": [{**_OTHER, "ate_m": {"third": 1}}]}, "names third, which is no sequence of the suite"),
         ({"time_limit_s": -1}, "time_limit_s is a number above 0"),
         ({"sequence": {}}, "did you mean 'sequences'"),
     ],
@@ -539,6 +540,65 @@ def test_a_process_that_is_killed_is_started_again_and_named_at_last(
     record = execute.perform_job(job, str(tmp_path))
     assert record["failure"] == "the program failed, please report it: IndexError: no such row"
     assert record["keep"] is False
+
+
+def test_what_cannot_be_run_is_named_before_the_first_task(
+    data: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "truth.tum").write_text("1 2 3\n")
+    shutil.copy(data / "drive0.mat", tmp_path)
+    sequences = {
+        "gone": "gone.mat",
+        "damaged": {"source": "drive0.mat", "reference": "truth.tum"},
+        "fine": "drive0.mat",
+    }
+    named: list[str] = []
+
+    def run(jobs: Any, cache: str, *, workers: int) -> Any:
+        named.extend(record.getMessage() for record in caplog.records)
+        yield from ()
+
+    monkeypatch.setattr("vio.bench.bench.run_here", run)
+    bench(_suite(tmp_path, sequences=sequences), Place(tmp_path, tmp_path / "out", tmp_path / "cache"))
+    assert [line.partition(" cannot be run: ")[0] for line in named] == ["gone", "damaged"]
+    assert "gone.mat does not exist" in named[0]
+    assert "3 columns fit no known format" in named[1]
+
+
+def test_ground_truth_of_another_body_is_doubted(data: Path, tmp_path: Path) -> None:
+    """A reference that turns as another body does."""
+    runs = [replace(outcome("a", "x", seed, 0.2), notes=("the reference looks wrong",)) for seed in (0, 1)]
+    text = markdown(_suite(tmp_path), summary_rows(runs), runs, {"version": "1", "packages": {}})
+    assert text.count("- a, x: the reference looks wrong") == 1
+    poses = make_drive(14, seed=0, pixel_sigma=0.3).T_world_imu @ se3_exp([0.0, 0.0, 0.0, 1.2, 0.0, 0.0])
+    from vio.datasets import open_dataset
+
+    times_ns = open_dataset(str(data / "drive0.mat")).recording.frame_times_ns
+    write_tum(tmp_path / "turned.tum", Trajectory(poses, times_ns, "imu"))
+    shutil.copy(data / "drive0.mat", tmp_path)
+    suite = _suite(tmp_path, sequences={"a": {"source": "drive0.mat", "reference": "turned.tum"}})
+    (task,) = tasks_of(suite, tmp_path, InputDigests(tmp_path / "i.json"))
+    record = perform({**task.job, "scratch": str(tmp_path)})
+    assert record["notes"], record["figures"]
+
+
+def test_dask_workers_with_other_code_are_named_before_the_first_task() -> None:
+    code, packages = code_and_packages()
+    jobs = {"k": {"code": code, "packages": packages}}
+
+    class Client:
+        def __init__(self, *found: tuple[str, dict[str, str]]) -> None:
+            self.found = {f"tcp://10.0.0.{k}:1": facts for k, facts in enumerate(found)}
+
+        def run(self, function: Any) -> Any:
+            return self.found
+
+    _check_workers(Client(), jobs)
+    _check_workers(Client((code, packages)), jobs)
+    with pytest.raises(VioError, match=r"worker tcp://10\.0\.0\.1:1 has other code than"):
+        _check_workers(Client((code, packages), ("old", packages)), jobs)
+    with pytest.raises(VioError, match=r"other packages \(numpy 1\.0\)"):
+        _check_workers(Client((code, {**packages, "numpy": "1.0"})), jobs)
 
 
 def test_a_task_over_its_time_limit_has_no_result(data: Path, tmp_path: Path) -> None:

@@ -74,6 +74,8 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
     digests = InputDigests(place.cache / "inputs.json", place.identity)
     tasks = tasks_of(suite, place.data, digests, place.peers)
     digests.save()
+    for sequence, why in {task.sequence: task.failure for task in tasks if task.failure is not None}.items():
+        log.warning("%s cannot be run: %s", sequence, why)
     with locked_folder(place.out):
         records: dict[str, Record] = {}
         missing: dict[str, dict[str, Any]] = {}
@@ -175,6 +177,7 @@ def _outcome(task: Task, records: Mapping[str, Record], success_percent: float) 
         failure=record["failure"],
         curve=record["curve"],
         warnings=tuple(record.get("warnings", ())),
+        notes=tuple(record.get("notes", ())),
         absent=record.get("absent", {}),
         succeeded=_succeeded(record, success_percent),
     )

@@ -86,6 +86,11 @@ def package_versions() -> dict[str, str]:
     return versions
 
 
+def code_and_packages() -> tuple[str, dict[str, str]]:
+    """Return what results depend on here beside inputs and settings."""
+    return code_digest(), package_versions()
+
+
 def commit_of(root: Path) -> str | None:
     """Return the commit of a checkout, with a + where files were changed since; None: it is no checkout."""
     try:

@@ -19,6 +19,7 @@ from vio.files.yaml_text import MOST_BYTES, read_yaml
 SHIPPED = Path(__file__).resolve().parent / "suites"
 _NAME = re.compile(r"[\w.+-]+")  # of a sequence or configuration: it becomes part of a command line and of a CSV file
 _MOST_SEEDS = 1000
+PUBLISHED_MEAN = "all"  # in the place of a sequence: the source's own mean
 _PUBLISHED_FIGURES = ("ate_m", "drift_percent", "drift_deg_per_100m")
 _RENDER_OWN = ("--out", "--seed", "--workers", "--json")  # of `vio render`: given by the bench itself
 
@@ -126,7 +127,7 @@ def suite_from(values: Any, path: Path) -> Suite:
         sequences=tuple(_sequence(str(name), value, where) for name, value in sequences.items()),
         configurations={str(name): _mapping(value or {}, where, f"'{name}'") for name, value in configurations.items()},
         seeds=_seeds(given.get("seeds", [0]), where),
-        published=tuple(_published(value, where) for value in given.get("published") or ()),
+        published=tuple(_published(value, where, sequences) for value in given.get("published") or ()),
         titles={str(k): str(v) for k, v in _mapping(given.get("titles") or {}, where, "'titles'").items()},
         publisher=None if given.get("publisher") is None else str(given["publisher"]),
         success_percent=_positive(given.get("success_percent", 1.0), "success_percent", where),
@@ -216,7 +217,7 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
     return Sequence(name=name, **given)
 
 
-def _published(value: Any, where: str) -> Published:
+def _published(value: Any, where: str, sequences: Iterable[str]) -> Published:
     given = dict(_mapping(value, where, "an entry of 'published'"))
     system, source = given.pop("system", None), given.pop("source", None)
     if not system or not source:
@@ -234,6 +235,8 @@ def _published(value: Any, where: str) -> Published:
             raise ConfigError(f"{where}: {system} has unknown '{name}'; figures are {', '.join(_PUBLISHED_FIGURES)}")
         figures[name] = {str(k): v for k, v in _mapping(of_sequences, where, f"'{name}' of {system}").items()}
         for sequence, figure in figures[name].items():
+            if sequence != PUBLISHED_MEAN and sequence not in map(str, sequences):
+                raise ConfigError(f"{where}: {name} of {system} names {sequence}, which is no sequence of the suite")
             if isinstance(figure, bool) or not isinstance(figure, (int, float)) or not figure >= 0:
                 raise ConfigError(f"{where}: {name} of {system} on {sequence} is a number, got {figure!r}")
     return Published(str(system), str(source), figures, **conditions)

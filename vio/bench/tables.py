@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from vio.bench.suite import Suite
+from vio.bench.suite import PUBLISHED_MEAN, Suite
 from vio.files.printable import printable
 
 SUCCESS_COVERAGE = 0.9  # of the frames, which a run must have poses of to succeed
@@ -80,6 +80,7 @@ class Outcome:
     failure: str | None
     curve: Mapping[str, Any] | None
     warnings: Sequence[str] = ()
+    notes: Sequence[str] = ()  # signs of a reference of another recording or body, or in other conventions
     absent: Mapping[str, str] = field(default_factory=dict)  # by name of an undefined figure: why
     succeeded: bool | None = None  # None: undefined, without a reference
 
@@ -93,7 +94,11 @@ class Outcome:
     def as_dict(self) -> dict[str, Any]:
         """Return everything but the curve, for JSON."""
         names = ("sequence", "system", "seed", "key", "figures", "measured", "failure", "absent", "succeeded")
-        return {**{name: getattr(self, name) for name in names}, "warnings": list(self.warnings)}
+        return {
+            **{name: getattr(self, name) for name in names},
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,6 +228,9 @@ def markdown(suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], fac
     ]
     if reasons := list(failure_lines(outcomes)):
         parts.append("## Without a result\n\n" + "\n".join(reasons))
+    if noted := dict.fromkeys((o.sequence, o.system, note) for o in outcomes for note in o.notes):
+        lines = [f"- {sequence}, {system}: {printable(note)}" for sequence, system, note in noted]
+        parts.append("## Doubts about the ground truth\n\n" + "\n".join(lines))
     if suite.published:
         parts.append(
             "## Published figures\n\nTheir sources', under their conditions; ours above are causal, over all frames, "
@@ -295,7 +303,9 @@ def published_table(suite: Suite) -> Iterator[str]:
         for p in entries:
             values = [v for s in sequences if (v := p.figures[name].get(s)) is not None]
             texts = ["–" if (v := p.figures[name].get(s)) is None else f"{v:g}" for s in sequences]
+            stated = p.figures[name].get(PUBLISHED_MEAN)
             mean = f"{number(statistics.fmean(values), 3)} over {len(values)}" if values else "–"
+            mean = mean if stated is None else f"{stated:g} as stated"
             yield _line([p.system, *p.conditions, *texts, mean, p.source])
         yield ""
     yield "– : the source has no figure of this sequence."

@@ -14,6 +14,7 @@ from vio.bench.suite import Sequence, Suite, config_of
 from vio.config import as_dict
 from vio.datasets import READERS
 from vio.errors import ConfigError, DataError
+from vio.files.trajectories import read_trajectory
 
 _NO_FILES = ("handheld", "car", "simulated", "none")  # values of `vio render` in the place of a file
 _FORM = 2  # of jobs and records: another one makes other keys
@@ -137,6 +138,7 @@ def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) ->
     if sequence.reference is not None:
         job["reference"] = str((data / sequence.reference).absolute())
         identity["reference"] = digests.of(Path(job["reference"]))
+        read_trajectory(Path(job["reference"]))  # damaged: named before the first task runs
     return {**job, **shared}, {**identity, **shared}
 
 

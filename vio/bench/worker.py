@@ -195,6 +195,7 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
             figures |= _nees(result, score) if job["exact_truth"] else {"nees": None}
             figures["landmarks_m"] = (landmark_error(result, score) or {}).get("rmse_m")
             record["curve"] = error_curve(score, trajectory.times_ns)
+            record["notes"] = list(score.notes)
             if result.mapped is not None and result.stopped is None:
                 figures |= map_figures(result, score, numbered(truth.reference), store if job["map"] else None)
         assert trajectory.times_ns is not None
@@ -269,7 +270,8 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
         "nees": None,
     }
     curve = error_curve(score, trajectory.times_ns)
-    return {"figures": figures, "curve": curve, "absent": _absent(job, figures, truth)}
+    absent = _absent(job, figures, truth)
+    return {"figures": figures, "curve": curve, "absent": absent, "notes": list(score.notes)}
 
 
 def _evaluate(job: dict[str, Any], trajectory: Trajectory, reference: Trajectory, T_cam0_imu: Any) -> Evaluation:

@@ -14,8 +14,8 @@ def add_parser(commands: Any) -> None:
         "bench",
         help="run a suite of recordings into one table, or compare two",
         description="Run every sequence of a suite with every configuration and seed, side by side, and write tables "
-        "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, kitti, euroc, tumvi. "
-        "'vio bench compare A B' says what became better or worse from one output folder to another, and "
+        "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, realistic, kitti, euroc, "
+        "tumvi. 'vio bench compare A B' says what became better or worse from one output folder to another, and "
         "'vio bench compare A --between X Y' from one configuration or system to another.",
     )
     parser.add_argument("suite", metavar="SUITE", help="YAML file, name of a shipped suite, or 'compare'")
