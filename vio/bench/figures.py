@@ -15,6 +15,7 @@ from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, s
 from vio.records import NS_PER_S, IntArray, Trajectory
 
 _OF_REFERENCE = ("ate_sim3_m", "scale_error_percent", "rpe_m", "drift_percent", "drift_deg_per_100m", "nees")
+_OF_PLACES = ("map_nees", "map_nees_50", "map_nees_95")
 _CURVE = 240  # points of the error over time that are kept; a report shows no more
 _QUANTILES = (0, 5, 25, 50, 75, 95, 100)
 _FRAME_NS = 10_000_000  # a pose within 10 ms of a frame is that frame's, as in `vio eval`
@@ -116,7 +117,7 @@ def absent_reasons(
         "innovation_px": "no observation was used",
         "map_ate_m": "there was no map",
         **dict.fromkeys(("loops", "loops_false", "loop_error_m", "loop_recall"), "no map was built"),
-        **dict.fromkeys(("placed", "place_s", "map_causal_ate_m", "map_nees"), "no place was found in a map"),
+        **dict.fromkeys(("placed", "place_s", "map_causal_ate_m", *_OF_PLACES), "no place was found in a map"),
     }
     if figures.get("loops") is not None:
         why |= {"loop_error_m": "there is no loop", "loop_recall": "no place was seen again"}

@@ -78,7 +78,10 @@ def _causal_figures(result: RunResult, mapped: MappedRun, reference: Trajectory)
     known = np.isfinite(P[score.rows]).all(axis=(1, 2))
     part = replace(score, rows=score.rows[known], reference=_rows(score.reference, known))
     values = pose_nees(part, T, P, result.T_cam0_body, upright=result.motion == "imu") if known.any() else None
-    return figures if values is None else {**figures, "map_nees": float(values.mean())}
+    if values is None:
+        return figures
+    quantiles = {f"map_nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}
+    return {**figures, "map_nees": float(values.mean()), **quantiles}
 
 
 def _rows(trajectory: Trajectory, chosen: Any) -> Trajectory:

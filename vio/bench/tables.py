@@ -59,6 +59,8 @@ MORE_METRICS = (
     Metric("loop_error_m", "their error m", 3),
     Metric("loop_recall", "recall", 3, larger_is_better=True),
     Metric("map_nees", "NEES in the map", 3),
+    Metric("map_nees_50", "its median", 3),
+    Metric("map_nees_95", "its 95 %", 3),
     Metric("wall_ms", "wall ms", 3, measured=True),
     Metric("wall_95_ms", "wall ms, 95 %", 3, measured=True),
     Metric("frontend_ms", "front end ms", 3, measured=True),
