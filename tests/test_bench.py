@@ -26,7 +26,7 @@ from vio.bench.engines import _check_workers, run_here
 from vio.bench.figures import coverage, figures_of, pose_nees
 from vio.bench.identity import ROOT, InputDigests, code_and_packages, commit_of, imported_code
 from vio.bench.latex import latex_of
-from vio.bench.report import _as_html
+from vio.bench.report import _as_html, write_bench_report
 from vio.bench.store import Store
 from vio.bench.suite import Suite, config_of, read_suite, shipped_suites, suite_from
 from vio.bench.tables import BY_NAME, METRICS, Outcome, cell_text, markdown, number, summary_rows
@@ -356,6 +356,17 @@ def test_an_undefined_figure_says_why(data: Path, tmp_path: Path) -> None:
     assert {"drift_percent", "nees", "nees_95"} <= undefined
     assert {name: record["absent"][name] for name in undefined}
     assert record["absent"]["drift_percent"] == "the way is shorter than the drift's lengths"
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_report_of_many_systems_is_drawn(tmp_path: Path) -> None:
+    """Their names fit into the figures, which otherwise collapse with a warning."""
+    curve = {"seconds": [0, 1], "error_m": [0, 0.1], "quantiles_m": [0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]}
+    systems = [f"recommended_seventh_causal_{k}" for k in range(16)]
+    runs = [replace(outcome("first", system, 0, 0.2), curve=curve) for system in systems]
+    facts = {"version": "1", "packages": {}}
+    write_bench_report(tmp_path / "report.html", _suite(tmp_path), summary_rows(runs), runs, facts)
+    assert (tmp_path / "report.html").read_text().count("<svg") == 3
 
 
 def test_success_is_a_small_error_over_most_frames() -> None:

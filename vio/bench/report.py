@@ -76,7 +76,8 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     from matplotlib.figure import Figure
 
     systems = list(dict.fromkeys(o.system for o in outcomes if o.curve))
-    figure = Figure(figsize=(max(6.0, 0.9 + 0.32 * len(sequences) * (len(systems) + 1)), 4.2), layout="constrained")
+    width = max(6.0, 0.9 + 0.32 * len(sequences) * (len(systems) + 1))
+    figure = Figure(figsize=(width, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for k, system in enumerate(systems):
         stats, places = [], []
@@ -98,8 +99,14 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     axes.set_yscale("log")
     axes.set_ylabel("position error (m)")
     axes.grid(alpha=0.25, axis="y")
-    axes.legend(fontsize=9, ncols=min(len(systems), 5), loc="upper left")
+    axes.legend(fontsize=9, ncols=_legend_columns(systems, width - 1.0), loc="upper left")
     return figure
+
+
+def _legend_columns(names: Sequence[str], width: float) -> int:
+    """How many names fit beside one another in so many inches."""
+    longest = max((len(name) for name in names), default=1)
+    return int(np.clip(width / (0.6 + 0.08 * longest), 1, max(len(names), 1)))
 
 
 def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
@@ -109,8 +116,10 @@ def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
 
     columns = min(3, len(sequences))
     lines = -(-len(sequences) // columns)
-    figure = Figure(figsize=(4.0 * columns, 2.3 * lines), layout="constrained")
     systems = list(dict.fromkeys(o.system for o in outcomes if o.curve))
+    wide = _legend_columns(systems, 4.0 * columns)
+    height = 2.3 * lines + 0.2 * -(-len(systems) // wide)
+    figure = Figure(figsize=(4.0 * columns, height), layout="constrained")
     for j, sequence in enumerate(sequences):
         axes = figure.add_subplot(lines, columns, j + 1)
         for k, system in enumerate(systems):
@@ -127,7 +136,7 @@ def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
             axes.set_ylabel("error (m)", fontsize=8)
     colours = {system: _COLOURS[k % len(_COLOURS)] for k, system in enumerate(systems)}
     handles = [Line2D([], [], color=colour, label=system) for system, colour in colours.items()]
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(systems), 6), fontsize=8)
+    figure.legend(handles=handles, loc="outside upper center", ncols=wide, fontsize=8)
     figure.supxlabel("time (s)", fontsize=9)
     return figure
 
