@@ -328,7 +328,8 @@ def test_the_table_is_complete_whatever_failed(tmp_path: Path) -> None:
     text = markdown(suite, summary_rows(runs), runs, {"version": "1", "commit": "abc", "packages": {}})
     assert "| ATE m | x | peer\\|1 |" in text
     assert "| a | 0.2 | **0.1 [80 % of the frames]** |" in text
-    assert "| b | failed 1 of 1 |  |" in text
+    assert "| b | failed 1 of 1 | – [1] |" in text
+    assert "[1] there is no trajectory of this system." in text
     assert "- b, x, seed 0: it is corrupt" in text
     assert "| Other | stereo | yes | Sim3 | ? | 0.5 | 0.5 over 1 | https://example.org/paper |" in text
     assert "[2] the way is too short" in text

@@ -118,7 +118,7 @@ def test_tables_and_figures_change_between_the_markers_only() -> None:
     new = with_figures(text, _results())
     assert new.startswith("a | 1 |\n<!-- suite: paper figure=ate_m -->\n| ATE m | x | peer |\n")
     assert "| drive A | 0.123 (0.123 ± 0.00014) | **0.05 [80 % of the frames]** |" in new
-    assert "| b | failed 1 of 1 |  |" in new
+    assert "| b | failed 1 of 1 | – [1] |" in new
     assert "*Suite `paper`: stereo-vio 1, commit abc, 2030-01-02, 2 x Z80; .*\n<!-- end -->\n| 2 |\n" in new
     assert new.endswith("<!-- figure: paper/a/x/ate_m/2 -->0.12<!-- end figure --> m")
     assert with_figures(new, _results()) == new

@@ -92,15 +92,16 @@ def code_and_packages() -> tuple[str, dict[str, str]]:
 
 
 def commit_of(root: Path) -> str | None:
-    """Return the commit of a checkout, with a + where files were changed since; None: it is no checkout."""
+    """Return the commit of a checkout, with a + where its code was changed since; None: it is no checkout."""
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(root), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()
+
     try:
-        found = subprocess.run(
-            ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--exclude=*", "--abbrev=8"],
-            capture_output=True, text=True, check=True, timeout=30,
-        )  # fmt: skip
+        return git("rev-parse", "--short=8", "HEAD") + ("+" if git("status", "--porcelain", "vio", "frontend") else "")
     except (OSError, subprocess.SubprocessError):
         return None
-    return found.stdout.strip() or None
 
 
 def machine() -> str:

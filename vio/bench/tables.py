@@ -200,7 +200,12 @@ class Notes:
 
     def dash(self, row: Row, metric: Metric) -> str:
         """Return the text of an undefined figure."""
-        why = "the run has no result" if row.failed == row.runs else row.absent.get(metric.name, "not reported")
+        return self.because(
+            "the run has no result" if row.failed == row.runs else row.absent.get(metric.name, "not reported")
+        )
+
+    def because(self, why: str) -> str:
+        """Return a dash with the number of a reason."""
         return f"– [{self._numbers.setdefault(why, len(self._numbers) + 1)}]"
 
     def lines(self) -> Iterator[str]:
@@ -278,7 +283,7 @@ def matrix(
         best = (max if metric.larger_is_better else min)(medians.values()) if len(medians) > 1 else None
         texts = []
         for system in columns:
-            text = ""
+            text = notes.because("there is no trajectory of this system") if system not in own else ""
             if system in own:
                 text = f"failed {own[system].failed} of {own[system].runs}" if own[system].failed else ""
                 text = text or row_text(own[system], metric, notes) + _part(own[system], metric)
