@@ -333,7 +333,7 @@ def test_the_table_is_complete_whatever_failed(tmp_path: Path) -> None:
     assert "- b, x, seed 0: it is corrupt" in text
     assert "| Other | stereo | yes | Sim3 | ? | 0.5 | 0.5 over 1 | https://example.org/paper |" in text
     assert "[2] the way is too short" in text
-    assert "[3] the run has no result" in text
+    assert "[3] no result: it is corrupt" in text
     assert "| 100 % |" in text
     assert "| 50 % of 2 |" in text, "a run without a result is none below the limit"
     dashes = [cell for line in text.splitlines() if line.startswith("| ") for cell in line.split("|") if "– [" in cell]

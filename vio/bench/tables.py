@@ -127,6 +127,7 @@ class Row:
     cells: Mapping[str, Cell]  # by name of the metric; absent where undefined
     absent: Mapping[str, str] = field(default_factory=dict)  # and then why
     succeeded: int | None = None  # of the runs; None: undefined
+    failure: str | None = None  # of the first run without a result
 
 
 def summary_rows(outcomes: Iterable[Outcome]) -> list[Row]:
@@ -143,7 +144,8 @@ def _row(group: Sequence[Outcome]) -> Row:
     failed = sum(o.failure is not None for o in group)
     absent = {name: why for o in reversed(group) for name, why in o.absent.items()}
     succeeded = None if all(o.succeeded is None for o in group) else sum(bool(o.succeeded) for o in group)
-    return Row(first.sequence, first.system, first.seed is None, len(group), failed, cells, absent, succeeded)
+    failure = next((o.failure for o in group if o.failure is not None), None)
+    return Row(first.sequence, first.system, first.seed is None, len(group), failed, cells, absent, succeeded, failure)
 
 
 def cell_of(values: Iterable[float | None], metric: Metric) -> Cell | None:
@@ -200,9 +202,8 @@ class Notes:
 
     def dash(self, row: Row, metric: Metric) -> str:
         """Return the text of an undefined figure."""
-        return self.because(
-            "the run has no result" if row.failed == row.runs else row.absent.get(metric.name, "not reported")
-        )
+        lost = f"no result: {row.failure}" if row.failed == row.runs else None
+        return self.because(lost or row.absent.get(metric.name, "not reported"))
 
     def because(self, why: str) -> str:
         """Return a dash with the number of a reason."""
