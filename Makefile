@@ -51,8 +51,8 @@ mutations: $(TESTED)
 bench: $(VENV)/.base
 	$(BIN)/vio bench small --out bench/small --cache bench/cache
 
-# Measure what docs/results.md tells and write its tables (VIO_DATA=recordings; half an hour and more); RESULTS="--check"
-# only compares, docs/results.md tells what must lie where.
+# Run the suites behind docs/results.md and the README and write their tables (VIO_DATA=recordings; an hour and a half on two
+# cores); RESULTS="--only paper" runs one, RESULTS="--peers DIR" puts other systems beside. docs/results.md says what lies where.
 results: $(VENV)/.base
 	$(BIN)/python -m tools.results --data "$(VIO_DATA)" --work "$(WORK)" $(RESULTS)
 

@@ -1,234 +1,182 @@
-"""The tables of the documents against docs/results.json, and the tool that measures, on a recording of a second."""
+"""The tables and figures of the documents against docs/results.json, and the tool that writes them."""
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
-from subprocess import CompletedProcess
 from typing import Any
 
-import numpy as np
 import pytest
 
-import tools.result_tables as tables
 import tools.results as results
 from tests.dataset_makers import make_drive, make_mat, utias_arrays
-from tools.result_tables import Figure, Figures, differences, figures_of, read_runs, with_tables
-from tools.results import Place, Run, _run, measure, measure_all, write_json
-from vio.datasets import open_dataset
-from vio.datasets.observation_log import write_observation_log
-from vio.records import Observations, Recording, VelocitySample, observations
+from tools.results import DOCUMENTS, PEERS, SUITES, Results, read_results, taken, with_figures, write_json
+from vio.bench.suite import read_suite
 
 ROOT = Path(__file__).resolve().parent.parent
+TEXTS = {name: (ROOT / name).read_text(encoding="utf-8") for name in DOCUMENTS}
 
 
-def test_documents_say_what_was_measured() -> None:
-    """Every number of every marked table, and the sentences that repeat one."""
-    assert list(differences(figures_of(read_runs()))) == []
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_documents_say_what_was_measured(name: str) -> None:
+    """Every marked table and figure; the command writes them from docs/results.json."""
+    assert with_figures(TEXTS[name], read_results()) == TEXTS[name], "python -m tools.results --tables"
 
 
-def test_every_table_stands_in_a_document() -> None:
-    texts = [(ROOT / name).read_text(encoding="utf-8") for name in tables.DOCUMENTS]
-    marked = re.findall(r"<!-- table: (\w+) -->", "".join(texts))
-    assert sorted(marked) == sorted(tables.TABLES)
-    assert sum(text.count("<!-- end -->") for text in texts) == len(marked)
-
-
-def test_every_run_stands_in_the_json_with_its_command() -> None:
-    commands = {name: facts["command"] for name, facts in read_runs().items()}
-    assert commands == {run.name: run.command for run in results.all_runs()}
-
-
-def test_a_changed_number_is_found(tmp_path: Path) -> None:
-    """In a table and in a sentence."""
-    (tmp_path / "docs").mkdir()
-    for name in tables.DOCUMENTS:
-        text = (ROOT / name).read_text(encoding="utf-8")
-        (tmp_path / name).write_text(text, encoding="utf-8")
-    figures = figures_of(read_runs())
-    assert list(differences(figures, tmp_path)) == []
-    document, sentence = next(iter(tables.sentences(figures)))
-    path = tmp_path / document
-    text = path.read_text(encoding="utf-8")
-    cell = figures.tell("paper", "dead reckoning: t_percent")
-    path.write_text(text.replace(sentence, "").replace(f"| {cell} |", "| 0.01 |"), encoding="utf-8")
-    assert [d.partition(":")[2].split()[0] for d in differences(figures, tmp_path)] == ["table", "the"]
-
-
-def test_tables_change_between_the_markers_only() -> None:
-    figures = figures_of(read_runs())
-    text = "a | 1 |\n<!-- table: still -->\n| old |\n<!-- end -->\n| 2 | b\n<!-- end -->"
-    new = with_tables(text, figures)
-    assert new.startswith("a | 1 |\n<!-- table: still -->\n| a minute at rest |")
-    assert new.endswith("<!-- end -->\n| 2 | b\n<!-- end -->")
-    assert "old" not in new
-    assert with_tables(new, figures) == new
-
-
-def test_a_figure_that_was_not_measured_is_named() -> None:
-    with pytest.raises(KeyError, match="no figure ate_m of still/none"):
-        Figures({"still/none": {"ate_mm": Figure(0.2, 2)}}).at("still/none", "ate_m")
-
-
-def test_the_smallest_is_bold() -> None:
-    assert tables._best(["1.20 m", "–", "0.9 (0.8, 1.0)", "0.90"]) == ["1.20 m", "–", "**0.9 (0.8, 1.0)**", "**0.90**"]
-
-
-def test_figures_are_compared_as_printed() -> None:
-    def runs(**figures: list[float]) -> dict[str, Any]:
-        return {"run": {"command": "", "figures": figures}}
-
-    known = runs(a=[1.204, 2], b=[1.204, 2])
-    assert list(results.changes(runs(a=[1.196, 2], b=[1.204, 2]), known, 0.0)) == []
-    assert list(results.changes(runs(a=[1.194, 2], b=[1.2, 2]), known, 0.0)) == [
-        "run: a is 1.19 here and 1.20 in docs/results.json"
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_a_changed_figure_is_found(name: str) -> None:
+    """In a table of any suite, in its line of origin, and in a sentence."""
+    known = read_results()
+    changed = [
+        *(re.sub(r"(\| [^|\n]*?)\d", r"\g<1>x", found[0], count=1) for found in results._TABLE.finditer(TEXTS[name])),
+        *(found[0].replace("Suite", "Suits") for found in results._TABLE.finditer(TEXTS[name])),
+        *(found[1] + "0.0" + found[3] for found in results._FIGURE.finditer(TEXTS[name])),
     ]
-    assert list(results.changes(runs(a=[1.194, 2], b=[1.2, 2]), known, 0.01)) == []
-    assert len(list(results.changes(runs(a=[1.3, 2]), known, 0.01))) == 2, "one has changed, one is missing"
+    assert len(changed) > 4
+    for text in changed:
+        if "has not been run yet" in text and "Suits" not in text:
+            continue
+        assert with_figures(text, known) != text
 
 
-# --- measuring, on recordings of a second ---------------------------------------------------------------------------
+_UTIAS = ("0001", "0005", "0036", "0051", "0020")
+_RECORDINGS = {  # of the two filters from images alone: suite, sequence, and their names there
+    "KITTI raw 0039": ("drives", "kitti_0039", "paper_images", "window_images"),
+    "KITTI odometry 06": ("drives", "kitti_06_head", "paper_images", "window_images"),
+    "ECE276A 0027": ("paper", "0027", "recommended_images", "window_images"),
+    **{f"UTIAS {n}": ("tracks", f"drive_{n}", "paper_images", "window_images") for n in _UTIAS},
+    "UTIAS Starry Night": ("tracks", "starry", "paper_velocity", "window_velocity"),
+}
 
 
-@pytest.fixture
-def place(tmp_path: Path) -> Place:
-    (tmp_path / "data").mkdir()
-    make_mat(tmp_path / "data" / "drive.mat", utias_arrays(make_drive(20)))
-    return Place(tmp_path / "data", tmp_path / "work")
+def test_the_readme_names_where_the_papers_filter_is_better() -> None:
+    """All of these, and no other."""
+    known = read_results()
+    lost = [
+        name
+        for name, (suite, sequence, *systems) in _RECORDINGS.items()
+        if suite in known.suites
+        for paper, window in [[float(known.figure(f"{suite}/{sequence}/{s}/ate_m/3")) for s in systems]]
+        if paper < window
+    ]
+    text = " ".join(TEXTS["README.md"].split())
+    assert f"on {', '.join(lost[:-1])} and {lost[-1]} the paper's filter is better than the sliding window" in text
 
 
-def test_a_run_gives_its_figures(place: Place) -> None:
-    positions = make_drive(20).T_world_imu[:, :3, 3]
-    figures = measure(Run("drive", "vio run drive.mat --lengths 5", _run), place)
-    assert (figures["frames"], figures["length_m"].digits) == (Figure(20, 0), 0)
-    assert figures["length_m"].value == pytest.approx(
-        np.linalg.norm(np.diff(positions, axis=0), axis=1).sum(), rel=1e-4
-    )
-    assert figures["ate_m"].value < figures["dead_reckoning_ate_m"].value < 0.1
-    assert figures["t_percent"].value == figures["t_percent_5m"].value
-    with pytest.raises(SystemExit, match=r"nothing\.mat.* does not exist"):
-        measure(Run("wrong", "vio run nothing.mat", _run), place)
+def test_every_table_of_results_is_written_by_a_suite() -> None:
+    """A table between no markers would be checked by nobody; those of inputs and of studies say where they are from."""
+    loose = results._TABLE.sub("", TEXTS["docs/results.md"])
+    heads = re.findall(r"^(\|.*)\n\|[-:| ]+\|$", loose, re.MULTILINE)
+    assert heads == ["| below VIO_DATA | what it is |", *_STUDIES]
+    assert not re.search(r"^\|[-:| ]+\|$", results._TABLE.sub("", TEXTS["README.md"]), re.MULTILINE)
 
 
-def test_runs_are_kept_and_not_repeated(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    """An interrupted call goes on where it stopped; other code is measured anew."""
-    asked: list[str] = []
-
-    def counted(run: Run, _: Place) -> dict[str, Figure]:
-        asked.append(run.name)
-        if len(asked) == 2:
-            raise KeyboardInterrupt
-        return {"ate_m": Figure(0.125, 2)}
-
-    monkeypatch.setattr(results, "measure", counted)
-    runs = [Run(name, f"vio run {name}", _run) for name in ("one", "two")]
-    with pytest.raises(KeyboardInterrupt):
-        measure_all(runs, place)
-    measured = measure_all(runs, place)
-    assert asked == ["one", "two", "two"]
-    assert measured["one"] == {"command": "vio run one", "figures": {"ate_m": [0.125, 2]}}
-    measure_all([Run("one", "vio run one --motion none", _run)], place)
-    assert asked[3:] == ["one"], "another command is another run"
-    monkeypatch.setattr(results, "_code", lambda: "other")
-    assert measure_all(runs, place) == measured
-    assert asked[4:] == ["one", "two"]
+_STUDIES = (  # measured once, on rigs turned on purpose
+    "| right camera turned by | as given | estimated | angle about y found |",
+    "| recording | rows off by (rms) | as given | estimated | a0 |",
+)
 
 
-def test_a_run_that_diverges_tells_where(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its frame is the figure; a run that was expected to diverge and does not is told, not taken."""
-    with pytest.raises(SystemExit, match="was expected to diverge and did not"):
-        measure(Run("calm", "vio run drive.mat", _run, diverges=True), place)
-    lost = CompletedProcess([], 1, "", "WARNING: no features\nerror: msckf diverged at frame 130: too few features\n")
-    monkeypatch.setattr(Place, "call", lambda self, command: lost)
-    assert measure(Run("lost", "vio run drive.mat", _run, diverges=True), place) == {
-        "diverged_at_frame": Figure(130, 0)
-    }
-    with pytest.raises(SystemExit, match="diverged at frame 130"):
-        measure(Run("lost", "vio run drive.mat", _run), place)
+def test_every_suite_has_a_table_and_is_read() -> None:
+    marked = {found[2] for text in TEXTS.values() for found in results._TABLE.finditer(text)}
+    assert marked == set(SUITES)
+    assert set(PEERS) <= set(SUITES)
+    for name, (path, *_) in SUITES.items():
+        suite = read_suite(path)
+        assert suite.name == name
+        names = {*(s.name for s in suite.sequences), *suite.configurations}
+        assert not names - set(suite.titles) or name == "rendered", name
+
+
+def test_results_hold_what_their_suites_run() -> None:
+    """A sequence or configuration that was added or renamed is to be measured."""
+    for name, facts in read_results().suites.items():
+        suite = read_suite(SUITES[name][0])
+        runs = {(r[0], r[1]) for r in facts["runs"] if r[2] is not None}
+        wanted = {(s.name, c) for s in suite.sequences for c in suite.configurations}
+        assert runs == wanted, name
+
+
+def _results(**more: Any) -> Results:
+    runs = [
+        ["a", "x", 0, {"ate_m": 0.1234, "coverage": 1.0}, {}, None, {"drift_percent": "too short"}],
+        ["a", "x", 1, {"ate_m": 0.1236, "coverage": 1.0}, {}, None, {"drift_percent": "too short"}],
+        ["b", "x", 0, {}, {}, "it is corrupt", {}],
+        ["a", "peer", None, {"ate_m": 0.05, "coverage": 0.8}, {}, None, {}],
+    ]
+    facts = {"suite": "paper", "version": "1", "commit": "abc", "machine": "2 x Z80", "written": "2030-01-02T03:04:05"}
+    return Results({"paper": {**facts, "packages": {}, "titles": {"a": "drive A"}, "runs": runs, **more}})
+
+
+def test_tables_and_figures_change_between_the_markers_only() -> None:
+    text = "a | 1 |\n<!-- suite: paper figure=ate_m -->\nold\n<!-- end -->\n| 2 |\n"
+    text += "it is <!-- figure: paper/a/x/ate_m/2 -->9<!-- end figure --> m"
+    new = with_figures(text, _results())
+    assert new.startswith("a | 1 |\n<!-- suite: paper figure=ate_m -->\n| ATE m | x | peer |\n")
+    assert "| drive A | 0.123 (0.123 ± 0.00014) | **0.05 [80 % of the frames]** |" in new
+    assert "| b | failed 1 of 1 | – [1] |" in new
+    assert "*Suite `paper`: stereo-vio 1, commit abc, 2030-01-02, 2 x Z80; .*\n<!-- end -->\n| 2 |\n" in new
+    assert new.endswith("<!-- figure: paper/a/x/ate_m/2 -->0.12<!-- end figure --> m")
+    assert with_figures(new, _results()) == new
+
+
+def test_a_table_lists_figures_with_the_reason_of_each_dash() -> None:
+    text = "<!-- suite: paper figures=ate_m,drift_percent sequences=a systems=peer,x -->\n<!-- end -->"
+    lines = with_figures(text, _results()).splitlines()
+    assert lines[1] == "| system | ATE m | drift % |"
+    assert [line.split("|")[1].strip() for line in lines[3:5]] == ["peer", "x"], "in the order asked for"
+    assert lines[6] == "[1] not reported; [2] too short."
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["figure=ate_cm", "figures=ate_m figure=ate_m", "figure=ate_m systems=z", "figure=ate_m colour=red", "systems=x"],
+)
+def test_a_table_that_cannot_be_made_is_named(words: str) -> None:
+    with pytest.raises(KeyError, match=r"ate_cm|figure=|no z in suite paper"):
+        with_figures(f"<!-- suite: paper {words} -->\n<!-- end -->", _results())
+    with pytest.raises(KeyError):
+        with_figures("<!-- figure: paper/b/x/ate_m/2 -->0<!-- end figure -->", _results())
 
 
 def test_the_json_is_written_in_order_and_read_back(tmp_path: Path) -> None:
     (tmp_path / "docs").mkdir()
-    runs = read_runs()
-    names = list(runs)
-    write_json({name: runs[name] for name in reversed(names)}, tmp_path)
-    assert list(read_runs(tmp_path)) == names
-    changed = {names[0]: {**runs[names[0]], "command": "other"}}
+    suites = read_results().suites
+    write_json(dict(reversed(suites.items())), tmp_path)
+    assert read_results(tmp_path).suites == suites
+    changed = {"paper": {**suites["paper"], "commit": "other"}}
     write_json(changed, tmp_path)
-    assert read_runs(tmp_path) == {**runs, **changed}, "what was not measured stays"
+    assert read_results(tmp_path).suites == {**suites, **changed}, "what was not measured stays"
+    assert (ROOT / results.FIGURES).read_text(encoding="utf-8").count("\n") > len(suites["paper"]["runs"])
 
 
-def test_flights_are_rendered_once(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
-    def rendered(self: Place, command: str) -> CompletedProcess[str]:
-        asked.append(command)
-        (self.work / "still").mkdir()
-        return CompletedProcess([], 0, "", "")
-
-    monkeypatch.setattr(Place, "call", rendered)
-    place.work.mkdir()
-    results._render(place, "still")
-    results._render(place, "still")
-    assert asked == [results._RENDERS["still"]]
-    assert len((place.work / "still.tum").read_text(encoding="utf-8").splitlines()) == 620
-    monkeypatch.setitem(results._RENDERS, "still", "vio render --seed 1 --out WORK/still")
-    with pytest.raises(SystemExit, match="was not made by 'vio render --seed 1"):
-        results._render(place, "still")
-
-
-def _log(place: Place, name: str, recording: Recording) -> Path:
-    """A log that shows the same three features in every frame of a recording."""
-    seen = [observations(k, int(t), [1, 2, 3], [[10, 5, 8, 5]] * 3) for k, t in enumerate(recording.frame_times_ns)]
-    path = place.work / "runs" / name / "observations.npz"
-    path.parent.mkdir(parents=True)
-    write_observation_log(path, recording, seen, [])
-    return path
-
-
-def test_gaps_are_what_they_are_said_to_be(place: Place) -> None:
-    recording = open_dataset(str(place.data / "drive.mat")).recording
-    times_ns = np.arange(850, dtype=np.int64) * 50_000_000
-    _log(place, "flights_f_imu", replace(recording, frame_times_ns=times_ns, reference=None))
-    for kind in ("blackout", "sparse"):
-        results._gap(place, "f", "imu", kind)
-    logs = {kind: open_dataset(str(place.work / "logs" / f"f_imu_{kind}.npz")) for kind in ("blackout", "sparse")}
-    ids = {kind: [_ids(log.observations(k)) for k in range(850)] for kind, log in logs.items()}
-    dark = [k for k, seen in enumerate(ids["blackout"]) if not seen]
-    assert dark == list(range(800, 840)), "two seconds at 20 Hz"
-    assert not set(ids["blackout"][799]) & set(ids["blackout"][840]), "what is seen later is new"
-    assert ids["blackout"][840] == ids["blackout"][849]
-    assert [k for k, seen in enumerate(ids["sparse"]) if not seen] == list(range(50, 850, 100))
-    assert ids["sparse"][49] == ids["sparse"][51], "tracks go on"
-
-
-def _ids(seen: Observations | None) -> list[int]:
-    assert seen is not None
-    return seen.ids.tolist()
-
-
-def test_noisy_velocities_are_the_papers(place: Place) -> None:
-    """Always the same for one seed, with the paper's standard deviations, and the images' features as they were."""
-    long = make_mat(place.data / "long.mat", utias_arrays(make_drive(100)))
-    log = _log(place, "drives_long.mat_window_none", open_dataset(str(long)).recording)
-    for seed in (0, 1):
-        results._noisy(place, "long.mat", seed)
-    given, zero, one = (
-        np.array([[*s.linear, *s.angular] for s in open_dataset(str(p)).events() if isinstance(s, VelocitySample)])
-        for p in (place.data / "long.mat", *(place.work / "logs" / f"long.mat_noise{seed}.npz" for seed in (0, 1)))
-    )
-    noise = zero - given
-    assert noise[:, :3].std() == pytest.approx(0.5, rel=0.1)
-    assert noise[:, 3:].std() == pytest.approx(0.05, rel=0.1)
-    assert np.abs(zero - one).max() > 0.1
-    results._noisy(place, "long.mat", 0)
-    noisy = open_dataset(str(place.work / "logs" / "long.mat_noise0.npz"))
-    assert np.array_equal([[*s.linear, *s.angular] for s in noisy.events() if isinstance(s, VelocitySample)], zero)
-    assert _ids(noisy.observations(7)) == _ids(open_dataset(str(log)).observations(7))
+def test_a_suite_is_run_and_its_figures_are_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From recordings to documents; what fails is kept with its reason, and other documents stay."""
+    data, root = tmp_path / "data", tmp_path / "root"
+    (root / "docs").mkdir(parents=True)
+    data.mkdir()
+    make_mat(data / "drive.mat", utias_arrays(make_drive(20)))
+    suite = tmp_path / "paper.yaml"
+    configurations = {"window": {"motion": "none"}, "imu": {"motion": "imu"}}
+    suite.write_text(json.dumps({"sequences": {"0027": "drive.mat"}, "configurations": configurations}))
+    monkeypatch.setattr(results, "SUITES", {"paper": (str(suite),)})
+    monkeypatch.setattr(results, "write_json", lambda suites: write_json(suites, root))
+    monkeypatch.setattr(results, "read_results", lambda: read_results(root))
+    argv = ["results", "--data", str(data), "--work", str(tmp_path / "work"), "--workers", "1"]
+    monkeypatch.setattr(sys, "argv", argv)
+    (root / "README.md").write_text("<!-- suite: paper figure=ate_m -->\n<!-- end -->\n")
+    (root / "docs" / "results.md").write_text("nothing")
+    write = results.write_documents
+    monkeypatch.setattr(results, "write_documents", lambda found: write(found, root))
+    assert results.main() == 0
+    facts = read_results(root).suites["paper"]
+    assert {(r[0], r[1], r[5] is None) for r in facts["runs"]} == {("0027", "window", True), ("0027", "imu", False)}
+    assert "| 0027 | 0.0" in (root / "README.md").read_text()
+    assert taken(tmp_path / "work" / "paper") == facts
 
 
 @pytest.mark.parametrize("argv", [[], ["--data", ""], ["--data", "nowhere"]])
@@ -247,7 +195,16 @@ def test_make_results_hands_on_its_variables(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delenv("VIO_DATA", raising=False)
     for given, wanted in (
         ([], '--data "" --work "results"'),
-        (["VIO_DATA=my recordings", "WORK=w", "RESULTS=--check"], '--data "my recordings" --work "w" --check'),
+        (
+            ["VIO_DATA=my recordings", "WORK=w", "RESULTS=--only paper"],
+            '--data "my recordings" --work "w" --only paper',
+        ),
     ):
         done = subprocess.run(["make", "-n", "results", *given], cwd=ROOT, capture_output=True, text=True, check=True)
         assert done.stdout.rstrip().endswith(f"python -m tools.results {wanted}")
+
+
+def test_the_command_of_ci_runs_the_small_suite() -> None:
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert re.search(r"^bench:.*\n\t\$\(BIN\)/vio bench small ", makefile, re.MULTILINE)
+    assert "make bench" in Path(ROOT / ".ci" / "run").read_text(encoding="utf-8")

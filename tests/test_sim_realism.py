@@ -15,7 +15,7 @@ from vio.cli.render import scenario_from
 from vio.config import Config
 from vio.datasets.euroc_files import read_camera_yaml
 from vio.evaluation.trajectories import evaluate
-from vio.geometry.distortion import StereoRig, unproject_pixel
+from vio.geometry.distortion import StereoRig, project_point, unproject_pixel
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.runs.pipeline import run
 from vio.sim.effects import Exposure, SensorEffects, apply_effects, average_exposures
@@ -23,11 +23,11 @@ from vio.sim.errors import SimulationError
 from vio.sim.exposure import _control
 from vio.sim.glare import glare
 from vio.sim.lighting import Light, Lighting, illumination, sun, window
-from vio.sim.miscalibration import CalibrationErrors, miscalibrated
+from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas, drawn_rig, miscalibrated
 from vio.sim.motion import hand_held, motion_at
 from vio.sim.people import _clearance, _place, _step, plan_walks, walking_people
 from vio.sim.render import Radiance, View, camera_rays, render
-from vio.sim.rigs import euroc_like_rig, fisheye_rig, kitti_like_rig, small_rig
+from vio.sim.rigs import euroc_like_rig, euroc_rectified_rig, fisheye_rig, kitti_like_rig, small_rig
 from vio.sim.scenarios import Conditions, ParallelRecording, Scenario, plan, real_conditions
 from vio.sim.sequence import SimulatedRecording
 from vio.sim.world import World, room, street
@@ -298,6 +298,48 @@ def test_the_true_rig_misses_its_calibration_by_what_is_stated(name: str) -> Non
         assert abs(lengths[1] - lengths[0]) == pytest.approx(5e-4)
     assert len(directions) == 4, "each camera and seed another direction"
     assert miscalibrated(rig, CalibrationErrors(), seed=0) is rig
+
+
+def test_drawn_rigs_have_the_stated_standard_deviations() -> None:
+    rig, s = kitti_like_rig(), CalibrationSigmas(scale=1.0)
+    seen = []
+    for seed in range(400):
+        true = drawn_rig(rig, s, seed=seed)
+        off = se3_inverse(rig.T_cam0_cam1) @ true.T_cam0_cam1
+        pitch, yaw, roll = np.rad2deg(so3_log(off[:3, :3]))
+        lengths = [float(np.linalg.norm(r.T_cam0_cam1[:3, 3])) for r in (rig, true)]
+        lenses = [
+            x for c in (true.cam0, true.cam1) for x in (c.cu - rig.cam0.cu, c.cv - rig.cam0.cv, *c.coefficients[:2])
+        ]
+        zoom = [true.cam0.fu / rig.cam0.fu - 1, true.cam1.fu / true.cam0.fu - 1]
+        seen.append([lengths[1] / lengths[0] - 1, *zoom, yaw, pitch, roll, *lenses])
+    lens = [s.cx_px, s.cy_px, s.k1, s.k2]
+    stated = [s.baseline, s.focal_length, s.focal_difference, s.yaw_deg, s.pitch_deg, s.roll_deg, *lens, *lens]
+    np.testing.assert_allclose(np.std(seen, axis=0), stated, rtol=0.12)  # 3.4 sigma of a deviation of 400
+    np.testing.assert_array_less(np.abs(np.mean(seen, axis=0)), 0.2 * np.array(stated))
+    assert np.abs(np.corrcoef(np.transpose(seen)) - np.eye(len(stated))).max() < 0.2
+
+
+@pytest.mark.parametrize("rows", [0.0, 1.0])
+def test_drawn_rigs_with_good_rows_have_disparities_that_are_off(rows: float) -> None:
+    """Pixels of points 3 to 30 m away in the true rig, read by the calibration: rows agree, disparities do not."""
+    rig, off = euroc_rectified_rig(), []
+    for seed in range(20):
+        true = drawn_rig(rig, CalibrationSigmas(scale=1.0, rows=rows), seed=seed)
+        rays = np.stack([*np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 5)), np.ones((5, 5))], axis=-1)
+        points = rays.reshape(-1, 3) * np.linspace(3.0, 30.0, 25)[:, None]
+        pixels = [
+            project_point(camera, points @ T[:3, :3].T + T[:3, 3])[0]
+            - project_point(nominal, points @ N[:3, :3].T + N[:3, 3])[0]
+            for camera, T, nominal, N in (
+                (true.cam0, np.eye(4), rig.cam0, np.eye(4)),
+                (true.cam1, se3_inverse(true.T_cam0_cam1), rig.cam1, se3_inverse(rig.T_cam0_cam1)),
+            )
+        ]
+        off.append(pixels[0] - pixels[1])
+    columns, by_rows = np.sqrt(np.mean(np.square(off), axis=(0, 1)))
+    assert columns > 0.2
+    assert (by_rows < 0.05) if rows == 0 else (by_rows > 0.2)
 
 
 def _true_rig(folder: Path) -> dict[str, object]:

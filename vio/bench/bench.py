@@ -13,11 +13,12 @@ from typing import Any
 from vio._version import __version__
 from vio.bench.engines import run_here, run_on_dask
 from vio.bench.execute import failed
-from vio.bench.identity import Identity, InputDigests, code_digest, package_versions
+from vio.bench.identity import ROOT, Identity, InputDigests, code_digest, commit_of, machine, package_versions
+from vio.bench.latex import latex_of
 from vio.bench.report import write_bench_report
 from vio.bench.store import Record, Store
 from vio.bench.suite import Suite
-from vio.bench.tables import Outcome, csv_of_rows, csv_of_runs, markdown, summary_rows
+from vio.bench.tables import SUCCESS_COVERAGE, Outcome, csv_of_rows, csv_of_runs, markdown, summary_rows
 from vio.bench.tasks import Task, tasks_of
 from vio.errors import DataError
 from vio.files.atomic import atomic_write_text, check_writable, locked_folder
@@ -26,7 +27,7 @@ from vio.files.printable import json_text
 
 log = logging.getLogger(__name__)
 RESULTS = "bench.json"
-FILES = (RESULTS, "tables.md", "table.csv", "runs.csv", "report.html")
+FILES = (RESULTS, "tables.md", "tables.tex", "table.csv", "runs.csv", "report.html")
 Progress = Callable[[int, int], None]
 
 
@@ -73,6 +74,8 @@ def bench(suite: Suite, place: Place, progress: Progress = lambda done, total: N
     digests = InputDigests(place.cache / "inputs.json", place.identity)
     tasks = tasks_of(suite, place.data, digests, place.peers)
     digests.save()
+    for sequence, why in {task.sequence: task.failure for task in tasks if task.failure is not None}.items():
+        log.warning("%s cannot be run: %s", sequence, why)
     with locked_folder(place.out):
         records: dict[str, Record] = {}
         missing: dict[str, dict[str, Any]] = {}
@@ -125,19 +128,25 @@ def _without_poses(record: Record) -> Record:
 def _write(
     suite: Suite, place: Place, tasks: Sequence[Task], records: Mapping[str, Record], store: Store, reused: int
 ) -> Result:
-    outcomes = tuple(_outcome(task, records) for task in tasks)
+    outcomes = tuple(_outcome(task, records, suite.success_percent) for task in tasks)
     facts = {
         "suite": suite.name,
         "version": __version__,
+        "commit": commit_of(ROOT),
+        "machine": machine(),
         "code": code_digest(),
         "packages": package_versions(),
         "written": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         "seeds": list(suite.seeds),
+        "titles": dict(suite.titles),
+        "drawn_each_seed": [s.name for s in suite.sequences if s.render_each_seed],
         "outcomes": [outcome.as_dict() for outcome in outcomes],
     }
     rows = summary_rows(outcomes)
+    tables = markdown(suite, rows, outcomes, facts)
     texts = {
-        "tables.md": markdown(suite, rows, outcomes, facts),
+        "tables.md": tables,
+        "tables.tex": latex_of(tables),
         "table.csv": csv_of_rows(rows),
         "runs.csv": csv_of_runs(outcomes),
         RESULTS: json_text(facts, indent=1) + "\n",
@@ -154,7 +163,7 @@ def _write(
     return Result(outcomes, reused, facts)
 
 
-def _outcome(task: Task, records: Mapping[str, Record]) -> Outcome:
+def _outcome(task: Task, records: Mapping[str, Record], success_percent: float) -> Outcome:
     record = records.get(task.key) if task.failure is None else failed(task.failure, keep=False)
     if record is None:
         record = failed("it was not done", keep=False)
@@ -168,4 +177,17 @@ def _outcome(task: Task, records: Mapping[str, Record]) -> Outcome:
         failure=record["failure"],
         curve=record["curve"],
         warnings=tuple(record.get("warnings", ())),
+        notes=tuple(record.get("notes", ())),
+        absent=record.get("absent", {}),
+        succeeded=_succeeded(record, success_percent),
     )
+
+
+def _succeeded(record: Record, percent: float) -> bool | None:
+    """Whether a run ended with a small error over most frames; None: without a reference, or at rest."""
+    if record["failure"] is not None:
+        return False
+    ate_m, length_m, covered = (record["figures"].get(name) for name in ("ate_m", "reference_m", "coverage"))
+    if ate_m is None or not length_m:
+        return None
+    return bool(ate_m < percent / 100 * length_m and covered is not None and covered >= SUCCESS_COVERAGE)

@@ -1,108 +1,166 @@
-"""What became better or worse from one bench to another, beyond chance: paired by sequence and seed.
+"""What became better or worse from one bench, configuration or system to another: effect sizes, intervals, tests.
 
-Of each figure the logarithm of the ratio B / A is taken for every pair and averaged over the seeds of a sequence. Over
-the sequences, the change is beyond chance where two independent tests of the same numbers agree: the bootstrap's
-interval of the mean excludes no change, and the change is one of the few most extreme among all flips of signs. The
-level is divided by the number of tests (Bonferroni). Single sequences are judged by the spread over their seeds, and
-without seeds by a factor.
+Runs are paired by sequence and seed. Of each figure the logarithm of the ratio B / A is averaged over the seeds of a
+sequence, where pairs of runs that are equal count once. Where each seed has a render of its own, each is a case of its
+own. Over the cases, Student's t gives the interval of the mean and the test: under the hypothesis of no change A and B
+are exchangeable, so the differences are symmetric about zero, and tails that are heavier than normal make the test
+conservative. ATE is the primary figure; the p-values of the others are adjusted together.
 
-Reference: Efron & Tibshirani, An Introduction to the Bootstrap (1993), chapters 13 and 15.
+Reference: Holm, A simple sequentially rejective multiple test procedure, Scand. J. Statist. 6 (1979).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from vio.bench.bench import read_bench
 from vio.bench.tables import METRICS, Metric, Outcome, number
 from vio.errors import EvaluationError
-from vio.geometry.lie import FloatArray
 
-Verdict = Literal["better", "worse", "no change beyond chance", "too few sequences to say", "identical"]
-LEVEL = 0.05  # chance of calling anything better or worse when nothing has changed
-_RESAMPLES = 10_000
-_MANY = 1000  # sequences; beyond, the mean is normal, and its interval needs fewer resamples
-_EXACT_FLIPS = 14  # up to so many sequences all flips of signs are counted, beyond a sample of them
-_COMPARED = ("ate_m", "rpe_m", "drift_percent", "drift_deg_per_100m", "coverage", "cpu_ms", "memory_mib")
-# CPU time and memory depend on the machine: reported, but no regression.
-_NOT_JUDGED = ("cpu_ms", "memory_mib")
+Verdict: TypeAlias = Literal["better", "worse", "not worse", "cannot tell"]
+LEVEL = 0.05  # chance of calling the primary figure changed when nothing has; the same for all others together
+EXIT_STATUS: Mapping[Verdict, int] = {"better": 0, "not worse": 0, "worse": 1, "cannot tell": 3}  # 2 is wrong usage
+_PRIMARY = METRICS[0]
+_JUDGED = ("ate_m", "rpe_m", "drift_percent", "drift_deg_per_100m", "coverage")
+# Reported, but no regression: times depend on the machine, the others say why the judged figures changed.
+_NOT_JUDGED = ("ate_sim3_m", "refused_share", "cpu_ms", "memory_mib")
+_LEAST_CHANGE = 0.01  # a mean change below is none, however certain
 # Below this, in the unit of the figure, two values are the same: ATE of 0.01 mm is that of a recording at rest.
 _FLOOR = 1e-5
+
+_Pair: TypeAlias = tuple[Outcome, Outcome]
+
+
+@dataclass(frozen=True, slots=True)
+class Effect:
+    """The geometric mean of B / A over n independent cases."""
+
+    n: int
+    ratio: float
+    low: float | None  # of the 95 % interval; None: one case has none
+    high: float | None
+    p: float  # two-sided, of no change
 
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One figure of one configuration, over all sequences that both benches have."""
+    """One figure of one configuration, over all sequences that both sides have."""
 
     system: str
     metric: str
-    sequences: int
-    ratio: float  # geometric mean of B / A
-    low: float  # of the bootstrap's interval of it
-    high: float
-    p: float  # share of flips of signs that are as extreme
+    effect: Effect
+    p_adjusted: float  # by Holm: the primary figure over the configurations, the others over all of them
     verdict: Verdict
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether a worse figure is a regression."""
+        return self.metric in _JUDGED
 
 
 @dataclass(frozen=True, slots=True)
 class SequenceChange:
-    """A change of the ATE of one sequence that is beyond its spread."""
+    """One sequence whose ATE changed by more than a factor."""
 
     sequence: str
     system: str
-    before: float  # median over seeds
+    before: float  # median over the seeds
     after: float
-    verdict: Literal["better", "worse"]
-    reason: str
+    effect: Effect  # over the seeds that differ
+    verdict: Verdict  # by a test over the seeds
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """All that differs between two benches."""
+    """All that differs between two sides."""
 
     changes: tuple[Change, ...]
     sequences: tuple[SequenceChange, ...]
     lost: tuple[tuple[str, str, str], ...]  # sequence, system, why: had a result in A, and has none in B
     won: tuple[tuple[str, str], ...]
     only_in_one: int  # runs without a partner
+    margin: float  # "not worse" is a change that is below this factor with 97.5 % confidence
 
     @property
-    def is_worse(self) -> bool:
-        """Whether anything became worse."""
-        judged = [c.verdict for c in self.changes if c.metric not in _NOT_JUDGED]
-        return "worse" in (*judged, *(s.verdict for s in self.sequences)) or bool(self.lost)
+    def verdict(self) -> Verdict:
+        """Worse where anything judged is; else as the ATE says, over all sequences and of single ones."""
+        verdicts = [c.verdict for c in self.changes if c.is_judged] + [s.verdict for s in self.sequences]
+        if self.lost or "worse" in verdicts:
+            return "worse"
+        primary = [c.verdict for c in self.changes if c.metric == _PRIMARY.name]
+        broken = any(s.verdict == "cannot tell" and s.after > s.before for s in self.sequences)
+        if broken or not primary or "cannot tell" in primary:
+            return "cannot tell"
+        return "better" if "better" in primary else "not worse"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the comparison for JSON."""
-        return {**asdict(self), "is_worse": self.is_worse}
+        return {**asdict(self), "verdict": self.verdict}
 
 
-def compare(a: Path, b: Path, *, factor: float = 2.0) -> Comparison:
-    """Compare the results of two output folders.
+def compare(
+    a: Path, b: Path, *, between: tuple[str, str] | None = None, factor: float = 2.0, margin: float = 1.1
+) -> Comparison:
+    """Compare the results of two output folders, or two systems of them.
 
     Args:
         a: before.
-        b: after.
-        factor: by which the ATE of one sequence without other seeds must change to count.
+        b: after; the same folder where two of its systems are compared.
+        between: the system of A and the system of B, each a configuration or another system's name; None: each
+            configuration of A with that of the same name of B.
+        factor: by which the ATE of a single sequence must change to be shown.
+        margin: a change below this factor counts as none where the interval says so.
 
     Raises:
-        VioError: a folder holds no bench, or the two have no run in common.
+        VioError: a folder holds no bench, or the two sides have no run in common.
     """
-    if not factor > 1:
-        raise EvaluationError(f"--factor must be above 1, got {factor:g}")
-    return compare_outcomes(read_bench(a)[0], read_bench(b)[0], factor=factor, what=f"{a} and {b}")
+    for name, value in (("--factor", factor), ("--margin", margin)):
+        if not 1 < value < math.inf:
+            raise EvaluationError(f"{name} must be above 1, got {value:g}")
+    (before, facts), (after, _) = read_bench(a), read_bench(b)
+    what = f"{a} and {b}"
+    if between is not None:
+        before, after = _sides(before, after, between)
+        what = f"{between[0]} of {a} and {between[1]} of {b}"
+    drawn = facts.get("drawn_each_seed", ())
+    return compare_outcomes(before, after, drawn_each_seed=drawn, factor=factor, margin=margin, what=what)
+
+
+def _sides(
+    a: Iterable[Outcome], b: Iterable[Outcome], between: tuple[str, str]
+) -> tuple[tuple[Outcome, ...], tuple[Outcome, ...]]:
+    """Return the runs of two systems under one name; a trajectory of another system stands for all seeds."""
+    sides = []
+    for runs, system in zip((a, b), between, strict=True):
+        known = tuple(runs)
+        own = [replace(o, system=" to ".join(between)) for o in known if o.system == system]
+        if not own:
+            names = ", ".join(dict.fromkeys(o.system for o in known))
+            raise EvaluationError(f"--between {system}: there is no such system; choose of {names}")
+        sides.append(own)
+    seeds = sorted({o.seed for side in sides for o in side if o.seed is not None}) or [0]
+    spread = ([replace(o, seed=s) for o in side for s in (seeds if o.seed is None else [o.seed])] for side in sides)
+    before, after = map(tuple, spread)
+    return before, after
 
 
 def compare_outcomes(
-    a: Iterable[Outcome], b: Iterable[Outcome], *, factor: float = 2.0, what: str = "the two"
+    a: Iterable[Outcome],
+    b: Iterable[Outcome],
+    *,
+    drawn_each_seed: Collection[str] = (),
+    factor: float = 2.0,
+    margin: float = 1.1,
+    what: str = "the two",
 ) -> Comparison:
-    """Compare two lists of runs.
+    """Compare two lists of runs; `drawn_each_seed` are the sequences of which each seed has a render of its own.
 
     Raises:
         EvaluationError: they have no run in common.
@@ -113,146 +171,120 @@ def compare_outcomes(
         raise EvaluationError(f"{what} have no run of the same sequence, configuration and seed; compare one suite")
     pairs = [(before[key], after[key]) for key in common]
     systems = list(dict.fromkeys(old.system for old, _ in pairs))
-    metrics = [metric for metric in METRICS if metric.name in _COMPARED]
-    tables = {(s, m.name): _log_ratios([p for p in pairs if p[0].system == s], m) for s in systems for m in metrics}
-    tests = sum(bool(table) for (_, name), table in tables.items() if name not in _NOT_JUDGED)
-    level = LEVEL / max(tests, 1)
-    changes = [
-        _change(system, metric, [float(np.mean(v)) for v in table.values()], level)
-        for system in systems
-        for metric in metrics
-        if (table := tables[system, metric.name])
-    ]
+    changes: list[Change] = []
+    for metrics in ((_PRIMARY.name,), _JUDGED[1:], _NOT_JUDGED):
+        tested = [
+            (system, metric, effect_of([float(np.mean(v)) for v in cases.values()], metric))
+            for system in systems
+            for metric in METRICS
+            if metric.name in metrics
+            if (cases := _cases([p for p in pairs if p[0].system == system], metric, drawn_each_seed))
+        ]
+        adjusted = holm([effect.p for _, _, effect in tested])
+        changes += [
+            Change(system, metric.name, effect, p, _verdict(effect, p, margin, metric.larger_is_better))
+            for (system, metric, effect), p in zip(tested, adjusted, strict=True)
+        ]
     return Comparison(
-        tuple(changes),
+        tuple(sorted(changes, key=lambda c: systems.index(c.system))),
         tuple(_sequence_changes(pairs, systems, factor)),
         tuple((o.sequence, o.system, n.failure or "") for o, n in pairs if o.failure is None and n.failure is not None),
         tuple((o.sequence, o.system) for o, n in pairs if o.failure is not None and n.failure is None),
         len(before) + len(after) - 2 * len(common),
+        margin,
     )
 
 
-def _log_ratios(pairs: Sequence[tuple[Outcome, Outcome]], metric: Metric) -> dict[str, list[float]]:
-    """Return by sequence the log ratios B / A of all seeds; above 0 is worse, whichever way the figure goes."""
-    out: dict[str, list[float]] = {}
+def _cases(pairs: Sequence[_Pair], metric: Metric, drawn_each_seed: Collection[str] = ()) -> dict[Any, list[float]]:
+    """Return log ratios B / A by case, those of equal pairs of values once; above 0 B is larger."""
+    found: dict[Any, set[tuple[float, float]]] = {}
     for old, new in pairs:
         x, y = old.value(metric), new.value(metric)
         if x is not None and y is not None:
-            ratio = math.log(max(y, _FLOOR) / max(x, _FLOOR))
-            out.setdefault(old.sequence, []).append(-ratio if metric.larger_is_better else ratio)
-    return out
+            case = (old.sequence, old.seed) if old.sequence in drawn_each_seed else old.sequence
+            found.setdefault(case, set()).add((max(x, _FLOOR), max(y, _FLOOR)))
+    return {case: [math.log(y / x) for x, y in sorted(values)] for case, values in found.items()}
 
 
-def _change(system: str, metric: Metric, values: Sequence[float], level: float) -> Change:
-    d = np.array(values)
-    low, high = bootstrap_interval(d, level)
-    p = sign_flip_p(d)
+def effect_of(logs: npt.ArrayLike, metric: Metric = _PRIMARY) -> Effect:
+    """Return the effect of log ratios (N,), one of each independent case."""
+    from scipy import stats
+
+    d = np.asarray(logs, dtype=np.float64)
+    ratio, n = math.exp(float(d.mean())), len(d)
     if not d.any():
-        verdict: Verdict = "identical"
-    elif 2.0 ** (1 - len(d)) > level:  # even if all changed the same way, chance would do that as often
-        verdict = "too few sequences to say"
-    elif p > level or low <= 0 <= high:
-        verdict = "no change beyond chance"
-    else:
-        verdict = "worse" if d.mean() > 0 else "better"
-    sign = -1 if metric.larger_is_better else 1
-    ends = sorted((math.exp(sign * low), math.exp(sign * high)))
-    return Change(system, metric.name, len(d), math.exp(sign * float(d.mean())), ends[0], ends[1], p, verdict)
+        return Effect(n, 1.0, 1.0, 1.0, 1.0)
+    if n == 1:
+        return Effect(n, ratio, None, None, 1.0)
+    if np.ptp(d) < 1e-12:  # the same factor in each
+        return Effect(n, ratio, ratio, ratio, 0.0)
+    test = stats.ttest_1samp(d, 0.0)
+    interval = test.confidence_interval(1 - LEVEL)
+    return Effect(n, ratio, math.exp(float(interval.low)), math.exp(float(interval.high)), float(test.pvalue))
 
 
-def bootstrap_interval(values: FloatArray, level: float) -> tuple[float, float]:
-    """Return the percentile interval of the mean of values (N,) at confidence 1 - level, always the same numbers."""
-    rng = np.random.default_rng(0)
-    n = len(values)
-    means = np.concatenate([values[rng.integers(0, n, (rows, n))].mean(axis=1) for rows in _blocks(n)])
-    low, high = np.quantile(means, [level / 2, 1 - level / 2])
-    return float(low), float(high)
+def holm(p: Sequence[float]) -> list[float]:
+    """Return p-values adjusted for their number: below a level with at most its probability if nothing has changed."""
+    adjusted, largest = [0.0] * len(p), 0.0
+    for rank, k in enumerate(sorted(range(len(p)), key=lambda k: p[k])):
+        largest = max(largest, min(1.0, (len(p) - rank) * p[k]))
+        adjusted[k] = largest
+    return adjusted
 
 
-def sign_flip_p(values: FloatArray) -> float:
-    """Return the share of all flips of signs of values (N,) whose mean is as far from zero: a two-sided p-value.
-
-    Reference: Fisher, The Design of Experiments (1935), section 21.
-    """
-    n = len(values)
-    if n <= _EXACT_FLIPS:
-        signs = 1.0 - 2.0 * ((np.arange(2**n)[:, None] >> np.arange(n)) & 1)
-        sums = np.abs(signs @ values)
-    else:
-        rng = np.random.default_rng(0)
-        parts = [(2.0 * rng.integers(0, 2, (rows, n), dtype=np.int8) - 1.0) @ values for rows in _blocks(n)]
-        sums = np.abs(np.concatenate([[values.sum()], *parts]))
-    return float(np.mean(sums >= abs(values.sum()) * (1 - 1e-12)))
+def _verdict(effect: Effect, p: float, margin: float, larger_is_better: bool = False) -> Verdict:
+    change = math.log(effect.ratio) * (-1 if larger_is_better else 1)
+    if p <= LEVEL and abs(change) >= math.log1p(_LEAST_CHANGE):
+        return "worse" if change > 0 else "better"
+    if effect.low is None or effect.high is None:
+        return "cannot tell"
+    worst = 1 / effect.low if larger_is_better else effect.high
+    return "not worse" if worst <= margin else "cannot tell"
 
 
-def _blocks(n: int) -> Iterator[int]:
-    """Yield how many resamples of n values to draw at a time; of thousands of values fewer in all."""
-    left = max(_RESAMPLES if n <= _MANY else _RESAMPLES // 5, 1)
-    rows = max(_MANY**2 // n, 1)
-    while left > 0:
-        yield min(rows, left)
-        left -= rows
-
-
-def _sequence_changes(
-    pairs: Sequence[tuple[Outcome, Outcome]], systems: Sequence[str], factor: float
-) -> Iterator[SequenceChange]:
-    """Yield sequences whose ATE changed by more than their seeds differ, or, with one seed, by more than a factor."""
-    metric = METRICS[0]
+def _sequence_changes(pairs: Sequence[_Pair], systems: Sequence[str], factor: float) -> Iterator[SequenceChange]:
+    """Yield sequences whose ATE changed by more than the factor, with what a test over their seeds says."""
+    tested = []
     for system in systems:
         own = [p for p in pairs if p[0].system == system]
-        logs = _log_ratios(own, metric)
-        values: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in logs}
-        for pair in own:
-            for side, outcome in enumerate(pair):
-                if (value := outcome.value(metric)) is not None and outcome.sequence in values:
-                    values[outcome.sequence][side].append(value)
-        for name, ratios in logs.items():
-            mean = float(np.mean(ratios))
-            limit, reason = _limit(values[name], len(logs) * len(systems), factor)
-            if abs(mean) > limit:
-                before, after = (float(np.median(v)) if v else 0.0 for v in values[name])
-                yield SequenceChange(name, system, before, after, "worse" if mean > 0 else "better", reason)
-
-
-def _limit(values: Sequence[Sequence[float]], tests: int, factor: float) -> tuple[float, str]:
-    """Return the log ratio beyond which a sequence's change counts, and what that limit is."""
-    counts = [len(v) for v in values]
-    if min(counts) < 2:
-        return math.log(factor), f"one seed: a change by more than a factor of {factor:g}"
-    logs = [np.log(np.maximum(v, _FLOOR)) for v in values]
-    freedom = sum(counts) - 2
-    variance = sum(float(((x - x.mean()) ** 2).sum()) for x in logs) / freedom
-    sigma = math.sqrt(variance * sum(1 / n for n in counts))
-    quantile = _student_quantile(1 - LEVEL / (2 * tests), freedom)
-    return quantile * sigma, f"beyond the spread over {min(counts)} seeds"
-
-
-def _student_quantile(probability: float, freedom: int) -> float:
-    """Return the quantile of Student's t distribution, for probabilities above one half.
-
-    Its square is that of an F distribution, computed here from the incomplete beta function.
-    """
-    from scipy.special import betaincinv
-
-    x = float(betaincinv(freedom / 2, 0.5, 2 * (1 - probability)))
-    return math.sqrt(freedom * (1 - x) / x)
+        tested += [(system, name, effect_of(logs)) for name, logs in _cases(own, _PRIMARY).items()]
+    for (system, name, effect), p in zip(tested, holm([e.p for _, _, e in tested]), strict=True):
+        if abs(math.log(effect.ratio)) > math.log(factor):
+            both = [pair for pair in pairs if (pair[0].sequence, pair[0].system) == (name, system)]
+            values = ([v for o in side if (v := o.value(_PRIMARY)) is not None] for side in zip(*both, strict=True))
+            before, after = (float(np.median(v)) for v in values)
+            verdict: Verdict = "cannot tell" if p > LEVEL else "worse" if effect.ratio > 1 else "better"
+            yield SequenceChange(name, system, before, after, effect, verdict)
 
 
 def comparison_lines(result: Comparison) -> Iterator[str]:
     """Yield a comparison as text: figures over all sequences, then single sequences, then what was lost."""
     titles = {metric.name: metric.title for metric in METRICS}
-    yield f"{'configuration':<16} {'figure':<14} {'B / A':>8}  {'interval':<18} {'p':>7}  n  verdict"
+    width = max(16, *(len(c.system) for c in result.changes)) if result.changes else 16
+    head = f"{'configuration':<{width}} {'figure':<14} {'B / A':>8}  {'95 % interval':<18} "
+    yield f"{head} {'n':>3} {'p (Holm)':>9}  verdict"
     for c in result.changes:
-        interval = f"{number(c.low, 3)} to {number(c.high, 3)}"
-        verdict = f"{c.verdict} (machine, not judged)" if c.metric in _NOT_JUDGED else c.verdict
-        head = f"{c.system:<16} {titles[c.metric]:<14} {number(c.ratio, 4):>8}"
-        yield f"{head}  {interval:<18} {c.p:>7.4f}  {c.sequences}  {verdict}"
+        verdict = c.verdict if c.is_judged else f"({c.verdict}, not judged)"
+        head = f"{c.system:<{width}} {titles[c.metric]:<14} {number(c.effect.ratio, 4):>8}"
+        yield f"{head}  {_interval(c.effect):<18} {c.effect.n:>3} {c.p_adjusted:>9.4f}  {verdict}"
     for s in result.sequences:
         values = f"ATE {number(s.before, 3)} to {number(s.after, 3)} m"
-        yield f"{s.sequence}, {s.system}: {s.verdict}, {values} ({s.reason})"
+        by = f"B / A {number(s.effect.ratio, 3)}, {_interval(s.effect)} over n = {s.effect.n} different seeds"
+        yield f"{s.sequence}, {s.system}: {values} ({by}): {s.verdict}"
     yield from (f"{sequence}, {system}: worse, no result any more: {why}" for sequence, system, why in result.lost)
     yield from (f"{sequence}, {system}: better, has a result now" for sequence, system in result.won)
     if result.only_in_one:
         yield f"{result.only_in_one} runs are in one of the two only and were not compared"
-    yield "something became worse" if result.is_worse else "nothing became worse beyond chance"
+    share = number(100 * (result.margin - 1), 3)
+    yield {
+        "worse": "worse",
+        "better": "better",
+        "not worse": f"not worse by {share} % or more",
+        "cannot tell": f"cannot tell whether it is worse by {share} % or more: more sequences or seeds are needed",
+    }[result.verdict]
+
+
+def _interval(effect: Effect) -> str:
+    if effect.low is None or effect.high is None:
+        return "no interval"
+    return f"{number(effect.low, 3)} to {number(effect.high, 3)}"

@@ -9,6 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from typing import Any
 
 from vio.bench.execute import end_processes, failed, perform_job
+from vio.bench.identity import code_and_packages
 from vio.errors import MissingDependencyError, VioError
 
 log = logging.getLogger(__name__)
@@ -63,6 +64,8 @@ def run_on_dask(
     while pending:
         try:
             with connect(address, timeout=min(wait_s, 10.0), set_as_default=False) as client:
+                if first:
+                    _check_workers(client, pending)
                 first, last_s = False, time.monotonic()
                 for key, record in _session(client, pending, cache, perform):
                     del pending[key]
@@ -76,6 +79,30 @@ def run_on_dask(
         if pending:
             log.warning("the scheduler %s was lost; waiting for it with %d tasks left", address, len(pending))
             time.sleep(_POLL_S)
+
+
+def _check_workers(client: Any, jobs: Mapping[str, Job]) -> None:
+    """Refuse workers whose results would be others, before the first task; one that comes later refuses its tasks.
+
+    Raises:
+        VioError: a worker has other code or packages; the message names it.
+    """
+    wanted = next(((job["code"], job["packages"]) for job in jobs.values() if "code" in job), None)
+    if wanted is None:
+        return
+    try:
+        found: dict[str, tuple[str, dict[str, str]]] = client.run(code_and_packages)
+    except ImportError as error:
+        raise VioError(
+            f"a Dask worker cannot import stereo-vio ({error}); install it there, the same version"
+        ) from error
+    for address, (code, packages) in found.items():
+        differ = [
+            f"{name} {packages.get(name)}" for name, version in wanted[1].items() if packages.get(name) != version
+        ]
+        if code != wanted[0] or differ:
+            what = f"packages ({', '.join(differ)})" if differ else "code"
+            raise VioError(f"the Dask worker {address} has other {what} than this command; install the same versions")
 
 
 def _session(client: Any, jobs: Mapping[str, Job], cache: str, perform: Perform) -> Iterator[tuple[str, Record]]:

@@ -42,8 +42,9 @@ def perform_job(job: dict[str, Any], cache: str, retries: int = RETRIES) -> dict
     """
     try:
         Path(cache).mkdir(parents=True, exist_ok=True)
-        if job["render"] is not None:
-            job = {**job, "source": f"{_rendered(job['render'], Path(cache))}"}
+        job = _with_render(job, Path(cache))
+        if job.get("first") is not None:
+            job["first"] = _with_render(job["first"], Path(cache))
         lost = 0
         while True:
             record, number = _in_process(job, Path(cache))
@@ -83,7 +84,10 @@ def _in_process(job: dict[str, Any], cache: Path) -> tuple[dict[str, Any] | None
     with _task_folder(cache) as folder:
         job = {**job, "scratch": str(folder)}
         (folder / "job.json").write_text(json.dumps(job), encoding="utf-8")
-        status, words = _call([sys.executable, "-m", "vio.bench.worker", str(folder)])
+        try:
+            status, words = _call([sys.executable, "-m", "vio.bench.worker", str(folder)], job.get("time_limit_s"))
+        except subprocess.TimeoutExpired as late:
+            return failed(f"it took longer than the time limit of {late.timeout:g} s", keep=False), 0
         result = folder / "result.json"
         if result.is_file():
             record: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
@@ -92,6 +96,10 @@ def _in_process(job: dict[str, Any], cache: Path) -> tuple[dict[str, Any] | None
         return None, -status
     last = (words.strip() or "no message").splitlines()[-1]
     return failed(f"the program failed, please report it: {last}", keep=False), 0
+
+
+def _with_render(job: dict[str, Any], cache: Path) -> dict[str, Any]:
+    return job if job["render"] is None else {**job, "source": str(_rendered(job["render"], cache))}
 
 
 def _rendered(render: dict[str, Any], cache: Path) -> Path:
@@ -111,8 +119,12 @@ def _rendered(render: dict[str, Any], cache: Path) -> Path:
     return folder
 
 
-def _call(command: list[str]) -> tuple[int, str]:
-    """Run a command that ends with this process; return its status and the end of its stderr."""
+def _call(command: list[str], limit_s: float | None = None) -> tuple[int, str]:
+    """Run a command that ends with this process; return its status and the end of its stderr.
+
+    Raises:
+        TimeoutExpired: it took longer than the limit, and was ended.
+    """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     with tempfile.TemporaryFile(mode="w+", encoding="utf-8", errors="replace") as words:
         process = subprocess.Popen(
@@ -121,7 +133,7 @@ def _call(command: list[str]) -> tuple[int, str]:
         with _lock:
             _running.add(process)
         try:
-            status = process.wait()
+            status = process.wait(limit_s)
         finally:
             with _lock:
                 _running.discard(process)

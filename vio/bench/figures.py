@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +14,8 @@ from vio.evaluation.trajectories import Evaluation, associate_times, nees
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, se3_log, so3_exp
 from vio.records import NS_PER_S, IntArray, Trajectory
 
+_OF_REFERENCE = ("ate_sim3_m", "scale_error_percent", "rpe_m", "drift_percent", "drift_deg_per_100m", "nees")
+_OF_PLACES = ("map_nees", "map_nees_50", "map_nees_95")
 _CURVE = 240  # points of the error over time that are kept; a report shows no more
 _QUANTILES = (0, 5, 25, 50, 75, 95, 100)
 _FRAME_NS = 10_000_000  # a pose within 10 ms of a frame is that frame's, as in `vio eval`
@@ -60,8 +63,8 @@ def pose_nees(
     T_cam0_imu: FloatArray,
     *,
     upright: bool,
-) -> float | None:
-    """Return the mean NEES of the poses, 6 for a consistent filter; None where no covariance can be inverted.
+) -> FloatArray | None:
+    """Return the NEES (M,) of the poses, 6 in the mean for a consistent filter; None: no covariance can be inverted.
 
     The world frames are identified at the first matched pose: all of it where the filter's world is its first frame,
     position and yaw where both worlds are upright, as the filter then estimates the inclination of its first pose.
@@ -81,7 +84,7 @@ def pose_nees(
     if not invertible.any():
         return None
     try:
-        return float(nees(errors[invertible], P[invertible]).mean())
+        return nees(errors[invertible], P[invertible])
     except EvaluationError:
         return None
 
@@ -92,6 +95,38 @@ def _yaw_and_position(T: FloatArray, T_true: FloatArray) -> FloatArray:
     yaw = np.arctan2(C[1, 0] - C[0, 1], C[0, 0] + C[1, 1])
     R = so3_exp(np.array([0.0, 0.0, yaw]))
     return se3_from_parts(R, T[:3, 3] - R @ T_true[:3, 3])
+
+
+def absent_reasons(
+    figures: Mapping[str, Any], *, has_reference: bool, positions_only: bool, peer: bool
+) -> dict[str, str]:
+    """Return why figures are undefined, by name."""
+    why = dict.fromkeys(("ate_m", *_OF_REFERENCE), "the recording has no ground truth")
+    if has_reference:
+        why = {
+            **dict.fromkeys(("ate_sim3_m", "scale_error_percent"), "the positions do not determine a scale"),
+            **dict.fromkeys(("drift_percent", "drift_deg_per_100m"), "the way is shorter than the drift's lengths"),
+            "nees": "the ground truth is no more exact than the estimate",
+        }
+        if positions_only:
+            why |= dict.fromkeys(("rpe_m", *_OF_REFERENCE[-3:]), "the ground truth has no orientations")
+    why |= {
+        "refused_share": "no observation was offered",
+        "cpu_ms": "too few frames for a mean",
+        "landmarks_m": "there are no surveyed landmarks",
+        "innovation_px": "no observation was used",
+        "map_ate_m": "there was no map",
+        **dict.fromkeys(("loops", "loops_false", "loop_error_m", "loop_recall"), "no map was built"),
+        **dict.fromkeys(("placed", "place_s", "map_causal_ate_m", *_OF_PLACES), "no place was found in a map"),
+    }
+    if figures.get("loops") is not None:
+        why |= {"loop_error_m": "there is no loop", "loop_recall": "no place was seen again"}
+    if peer:
+        why |= dict.fromkeys(
+            ("nees", "refused_share", "cpu_ms", "memory_mib"), "a trajectory of another system does not say"
+        )
+    why |= dict.fromkeys(("nees_50", "nees_95"), why["nees"])
+    return {name: text for name, text in why.items() if figures.get(name) is None}
 
 
 def error_curve(evaluation: Evaluation, times_ns: IntArray | None) -> dict[str, list[float]]:

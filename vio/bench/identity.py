@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import re
+import subprocess
 from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
@@ -83,6 +84,35 @@ def package_versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:  # OpenCV under another of its names
             versions[name] = "unknown"
     return versions
+
+
+def code_and_packages() -> tuple[str, dict[str, str]]:
+    """Return what results depend on here beside inputs and settings."""
+    return code_digest(), package_versions()
+
+
+def commit_of(root: Path) -> str | None:
+    """Return the commit of a checkout, with a + where its code was changed since; None: it is no checkout."""
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(root), *words]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.strip()
+
+    try:
+        return git("rev-parse", "--short=8", "HEAD") + ("+" if git("status", "--porcelain", "vio", "frontend") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def machine() -> str:
+    """Return processors and operating system, without the name of the machine."""
+    model = platform.processor() or platform.machine()
+    try:
+        names = re.findall(r"^model name\s*: (.+)$", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+        model = names[0] if names else model
+    except OSError:
+        pass
+    return f"{os.cpu_count()} x {' '.join(model.split())}, {platform.system()}"
 
 
 class InputDigests:

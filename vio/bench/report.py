@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from vio.bench.latex import cells_of
 from vio.bench.suite import Suite
 from vio.bench.tables import METRICS, Outcome, Row, markdown
 from vio.files.atomic import atomic_write_text
@@ -75,7 +76,8 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     from matplotlib.figure import Figure
 
     systems = list(dict.fromkeys(o.system for o in outcomes if o.curve))
-    figure = Figure(figsize=(max(6.0, 0.9 + 0.32 * len(sequences) * (len(systems) + 1)), 4.2), layout="constrained")
+    width = max(6.0, 0.9 + 0.32 * len(sequences) * (len(systems) + 1))
+    figure = Figure(figsize=(width, 4.2), layout="constrained")
     axes = figure.add_subplot()
     for k, system in enumerate(systems):
         stats, places = [], []
@@ -97,8 +99,14 @@ def _boxes(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
     axes.set_yscale("log")
     axes.set_ylabel("position error (m)")
     axes.grid(alpha=0.25, axis="y")
-    axes.legend(fontsize=9, ncols=min(len(systems), 5), loc="upper left")
+    axes.legend(fontsize=9, ncols=_legend_columns(systems, width - 1.0), loc="upper left")
     return figure
+
+
+def _legend_columns(names: Sequence[str], width: float) -> int:
+    """How many names fit beside one another in so many inches."""
+    longest = max((len(name) for name in names), default=1)
+    return int(np.clip(width / (0.6 + 0.08 * longest), 1, max(len(names), 1)))
 
 
 def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
@@ -108,8 +116,10 @@ def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
 
     columns = min(3, len(sequences))
     lines = -(-len(sequences) // columns)
-    figure = Figure(figsize=(4.0 * columns, 2.3 * lines), layout="constrained")
     systems = list(dict.fromkeys(o.system for o in outcomes if o.curve))
+    wide = _legend_columns(systems, 4.0 * columns)
+    height = 2.3 * lines + 0.2 * -(-len(systems) // wide)
+    figure = Figure(figsize=(4.0 * columns, height), layout="constrained")
     for j, sequence in enumerate(sequences):
         axes = figure.add_subplot(lines, columns, j + 1)
         for k, system in enumerate(systems):
@@ -126,7 +136,7 @@ def _curves(sequences: Sequence[str], outcomes: Sequence[Outcome]) -> Any:
             axes.set_ylabel("error (m)", fontsize=8)
     colours = {system: _COLOURS[k % len(_COLOURS)] for k, system in enumerate(systems)}
     handles = [Line2D([], [], color=colour, label=system) for system, colour in colours.items()]
-    figure.legend(handles=handles, loc="outside upper center", ncols=min(len(systems), 6), fontsize=8)
+    figure.legend(handles=handles, loc="outside upper center", ncols=wide, fontsize=8)
     figure.supxlabel("time (s)", fontsize=9)
     return figure
 
@@ -197,7 +207,7 @@ def _as_html(text: str) -> str:
 
 
 def _table(lines: Sequence[str]) -> str:
-    rows = [[cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    rows = [cells_of(line) for line in lines]
     head = "".join(f"<th>{_inline(cell)}</th>" for cell in rows[0])
     body = "".join("<tr>" + "".join(f"<td>{_inline(cell)}</td>" for cell in row) + "</tr>" for row in rows[2:])
     return f"<table><tr>{head}</tr>{body}</table>"

@@ -6,7 +6,7 @@ import difflib
 import re
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,8 @@ from vio.files.yaml_text import MOST_BYTES, read_yaml
 SHIPPED = Path(__file__).resolve().parent / "suites"
 _NAME = re.compile(r"[\w.+-]+")  # of a sequence or configuration: it becomes part of a command line and of a CSV file
 _MOST_SEEDS = 1000
+PUBLISHED_MEAN = "all"  # in the place of a sequence: the source's own mean
+_PUBLISHED_FIGURES = ("ate_m", "drift_percent", "drift_deg_per_100m")
 _RENDER_OWN = ("--out", "--seed", "--workers", "--json")  # of `vio render`: given by the bench itself
 
 
@@ -39,6 +41,8 @@ class Sequence:
         None  # far more accurate than the estimate, so that NEES says something; None: if rendered
     )
     settings: Mapping[str, Any] | None = None  # over those of the configuration
+    map: bool = False  # build a map, and score it
+    map_of: str | None = None  # the sequence in whose map this one is localised, built beforehand in the same task
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +52,16 @@ class Published:
     system: str
     source: str  # paper or page, with its table
     figures: Mapping[str, Mapping[str, float]]  # by name of the figure, by sequence
+    sensors: str  # such as stereo + IMU
+    causal: bool | None  # poses as they were output, or later ones; None: the source does not say
+    alignment: str | None  # SE3, Sim3
+    loops: bool | None
+
+    @property
+    def conditions(self) -> tuple[str, str, str, str]:
+        """Sensors, causal, alignment and loops, for a table."""
+        causal, loops = ("?" if v is None else "yes" if v else "no" for v in (self.causal, self.loops))
+        return self.sensors, causal, self.alignment or "?", loops
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +74,10 @@ class Suite:
     configurations: Mapping[str, Mapping[str, Any]]  # deviations from the defaults
     seeds: tuple[int, ...] = (0,)
     published: tuple[Published, ...] = ()
+    titles: Mapping[str, str] = field(default_factory=dict)  # of sequences and systems, for tables in documents
+    publisher: str | None = None  # where the recordings can be had
+    success_percent: float = 1.0  # a run with an ATE below this share of the way succeeds
+    time_limit_s: float | None = None  # of a task; then it has no result
 
 
 def shipped_suites() -> tuple[str, ...]:
@@ -95,7 +113,7 @@ def suite_from(values: Any, path: Path) -> Suite:
     """
     where = str(path)
     given = _mapping(values, where, "a suite")
-    _only_keys(given, ("name", "sequences", "configurations", "seeds", "published"), where)
+    _only_keys(given, [f.name for f in fields(Suite) if f.name != "folder"], where)
     sequences = _mapping(given.get("sequences"), where, "'sequences'")
     configurations = _mapping(given.get("configurations") or {"default": {}}, where, "'configurations'")
     for name in (*sequences, *configurations):
@@ -109,8 +127,19 @@ def suite_from(values: Any, path: Path) -> Suite:
         sequences=tuple(_sequence(str(name), value, where) for name, value in sequences.items()),
         configurations={str(name): _mapping(value or {}, where, f"'{name}'") for name, value in configurations.items()},
         seeds=_seeds(given.get("seeds", [0]), where),
-        published=tuple(_published(value, where) for value in given.get("published") or ()),
+        published=tuple(_published(value, where, sequences) for value in given.get("published") or ()),
+        titles={str(k): str(v) for k, v in _mapping(given.get("titles") or {}, where, "'titles'").items()},
+        publisher=None if given.get("publisher") is None else str(given["publisher"]),
+        success_percent=_positive(given.get("success_percent", 1.0), "success_percent", where),
+        time_limit_s=None
+        if given.get("time_limit_s") is None
+        else _positive(given["time_limit_s"], "time_limit_s", where),
     )
+    for sequence in suite.sequences:
+        if sequence.map_of is not None and (sequence.map or sequence.map_of not in sequences):
+            raise ConfigError(
+                f"{where}: map_of of {sequence.name} names another sequence of the suite, without map: true"
+            )
     for configuration in suite.configurations:
         for sequence in suite.sequences:
             config_of(suite, sequence, configuration, suite.seeds[0])
@@ -147,13 +176,10 @@ def chosen(suite: Suite, only: Iterable[str], configurations: Iterable[str]) -> 
                 near = difflib.get_close_matches(name, known, 1)
                 hint = f"; did you mean '{near[0]}'?" if near else f"; it holds {', '.join(known[:8])}"
                 raise ConfigError(f"suite {suite.name} has no '{name}'{hint}")
-    return Suite(
-        suite.name,
-        suite.folder,
-        tuple(s for s in suite.sequences if not sequences or s.name in sequences),
-        {name: value for name, value in suite.configurations.items() if not configured or name in configured},
-        suite.seeds,
-        suite.published,
+    return replace(
+        suite,
+        sequences=tuple(s for s in suite.sequences if not sequences or s.name in sequences),
+        configurations={name: v for name, v in suite.configurations.items() if not configured or name in configured},
     )
 
 
@@ -181,28 +207,45 @@ def _sequence(name: str, value: Any, where: str) -> Sequence:
                 raise ValueError(f"lengths_m {given['lengths_m']}")
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{place}: start and stop are frames or times as 12s, lengths_m metres ({error})") from error
-    for key in ("render_each_seed", "positions_only", "exact_truth"):
+    for key in ("render_each_seed", "positions_only", "exact_truth", "map"):
         if not isinstance(given.get(key, False), bool):
             raise ConfigError(f"{place}: {key} takes true or false, got {given[key]!r}")
-    for key in ("source", "reference"):
+    for key in ("source", "reference", "map_of"):
         if given.get(key) is not None:
             given[key] = str(given[key])
     _mapping(given.get("settings") or {}, where, f"settings of sequence {name}")
     return Sequence(name=name, **given)
 
 
-def _published(value: Any, where: str) -> Published:
+def _published(value: Any, where: str, sequences: Iterable[str]) -> Published:
     given = dict(_mapping(value, where, "an entry of 'published'"))
     system, source = given.pop("system", None), given.pop("source", None)
     if not system or not source:
         raise ConfigError(f"{where}: published figures need a system and a source")
+    conditions = {name: given.pop(name, None) for name in ("sensors", "causal", "alignment", "loops")}
+    if not conditions["sensors"] or conditions["alignment"] not in (None, "SE3", "Sim3"):
+        raise ConfigError(f"{where}: {system} needs sensors, and as alignment SE3, Sim3 or none")
+    if any(conditions[name] not in (None, True, False) for name in ("causal", "loops")):
+        raise ConfigError(
+            f"{where}: causal and loops of {system} take true, false or, where the source is silent, none"
+        )
     figures = {}
     for name, of_sequences in given.items():
+        if name not in _PUBLISHED_FIGURES:
+            raise ConfigError(f"{where}: {system} has unknown '{name}'; figures are {', '.join(_PUBLISHED_FIGURES)}")
         figures[name] = {str(k): v for k, v in _mapping(of_sequences, where, f"'{name}' of {system}").items()}
         for sequence, figure in figures[name].items():
+            if sequence != PUBLISHED_MEAN and sequence not in map(str, sequences):
+                raise ConfigError(f"{where}: {name} of {system} names {sequence}, which is no sequence of the suite")
             if isinstance(figure, bool) or not isinstance(figure, (int, float)) or not figure >= 0:
                 raise ConfigError(f"{where}: {name} of {system} on {sequence} is a number, got {figure!r}")
-    return Published(str(system), str(source), figures)
+    return Published(str(system), str(source), figures, **conditions)
+
+
+def _positive(value: Any, name: str, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
+        raise ConfigError(f"{where}: {name} is a number above 0, got {value!r}")
+    return float(value)
 
 
 def _seeds(value: Any, where: str) -> tuple[int, ...]:

@@ -6,11 +6,14 @@ import csv
 import io
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from vio.bench.suite import Suite
+from vio.bench.suite import PUBLISHED_MEAN, Suite
 from vio.files.printable import printable
+
+SUCCESS_COVERAGE = 0.9  # of the frames, which a run must have poses of to succeed
+_ALL_FRAMES = 0.995
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +40,33 @@ METRICS = (
     Metric("cpu_ms", "CPU ms a frame", 3, measured=True),
     Metric("memory_mib", "peak MiB", 3, measured=True),
 )
+# For tables that ask for them, and runs.csv.
+MORE_METRICS = (
+    Metric("nees_50", "NEES median", 3),
+    Metric("nees_95", "NEES 95 %", 3),
+    Metric("landmarks_m", "landmarks m", 3),
+    Metric("used_per_frame", "used a frame", 3),
+    Metric("landmarks", "landmarks", 5),
+    Metric("innovation_px", "innovation px", 3),
+    Metric("reference_m", "length m", 3),
+    Metric("frames", "frames", 6),
+    Metric("map_ate_m", "ATE m in the map", 3),
+    Metric("map_causal_ate_m", "at the time", 3),
+    Metric("placed", "frames with a place", 3, larger_is_better=True),
+    Metric("place_s", "first place s", 3),
+    Metric("loops", "loops", 4),
+    Metric("loops_false", "false", 3),
+    Metric("loop_error_m", "their error m", 3),
+    Metric("loop_recall", "recall", 3, larger_is_better=True),
+    Metric("map_nees", "NEES in the map", 3),
+    Metric("map_nees_50", "its median", 3),
+    Metric("map_nees_95", "its 95 %", 3),
+    Metric("wall_ms", "wall ms", 3, measured=True),
+    Metric("wall_95_ms", "wall ms, 95 %", 3, measured=True),
+    Metric("frontend_ms", "front end ms", 3, measured=True),
+    Metric("filter_ms", "filter ms", 3, measured=True),
+)
+BY_NAME = {metric.name: metric for metric in (*METRICS, *MORE_METRICS)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +82,9 @@ class Outcome:
     failure: str | None
     curve: Mapping[str, Any] | None
     warnings: Sequence[str] = ()
+    notes: Sequence[str] = ()  # signs of a reference of another recording or body, or in other conventions
+    absent: Mapping[str, str] = field(default_factory=dict)  # by name of an undefined figure: why
+    succeeded: bool | None = None  # None: undefined, without a reference
 
     def value(self, metric: Metric) -> float | None:
         """Return a figure; None: undefined, or the run failed."""
@@ -62,8 +95,12 @@ class Outcome:
 
     def as_dict(self) -> dict[str, Any]:
         """Return everything but the curve, for JSON."""
-        names = ("sequence", "system", "seed", "key", "figures", "measured", "failure")
-        return {**{name: getattr(self, name) for name in names}, "warnings": list(self.warnings)}
+        names = ("sequence", "system", "seed", "key", "figures", "measured", "failure", "absent", "succeeded")
+        return {
+            **{name: getattr(self, name) for name in names},
+            "warnings": list(self.warnings),
+            "notes": list(self.notes),
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +111,8 @@ class Cell:
     worst: float
     spread: float  # largest minus smallest
     count: int
+    mean: float
+    sd: float  # of a sample; 0 of one value
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +125,9 @@ class Row:
     runs: int
     failed: int
     cells: Mapping[str, Cell]  # by name of the metric; absent where undefined
+    absent: Mapping[str, str] = field(default_factory=dict)  # and then why
+    succeeded: int | None = None  # of the runs; None: undefined
+    failure: str | None = None  # of the first run without a result
 
 
 def summary_rows(outcomes: Iterable[Outcome]) -> list[Row]:
@@ -97,10 +139,13 @@ def summary_rows(outcomes: Iterable[Outcome]) -> list[Row]:
 
 
 def _row(group: Sequence[Outcome]) -> Row:
-    cells = {metric.name: cell for metric in METRICS if (cell := cell_of((o.value(metric) for o in group), metric))}
+    cells = {m.name: cell for m in BY_NAME.values() if (cell := cell_of((o.value(m) for o in group), m))}
     first = group[0]
     failed = sum(o.failure is not None for o in group)
-    return Row(first.sequence, first.system, first.seed is None, len(group), failed, cells)
+    absent = {name: why for o in reversed(group) for name, why in o.absent.items()}
+    succeeded = None if all(o.succeeded is None for o in group) else sum(bool(o.succeeded) for o in group)
+    failure = next((o.failure for o in group if o.failure is not None), None)
+    return Row(first.sequence, first.system, first.seed is None, len(group), failed, cells, absent, succeeded, failure)
 
 
 def cell_of(values: Iterable[float | None], metric: Metric) -> Cell | None:
@@ -109,7 +154,8 @@ def cell_of(values: Iterable[float | None], metric: Metric) -> Cell | None:
     if not known:
         return None
     worst = min(known) if metric.larger_is_better else max(known)
-    return Cell(statistics.median(known), worst, max(known) - min(known), len(known))
+    sd = statistics.stdev(known) if len(known) > 1 else 0.0
+    return Cell(statistics.median(known), worst, max(known) - min(known), len(known), statistics.fmean(known), sd)
 
 
 def summary_of(rows: Iterable[Row]) -> dict[str, tuple[int, int, dict[str, Cell]]]:
@@ -121,7 +167,7 @@ def summary_of(rows: Iterable[Row]) -> dict[str, tuple[int, int, dict[str, Cell]
     for system, own in by_system.items():
         medians = {
             metric.name: cell
-            for metric in METRICS
+            for metric in BY_NAME.values()
             if (cell := cell_of((r.cells[metric.name].median for r in own if metric.name in r.cells), metric))
         }
         out[system] = (sum(row.failed == 0 for row in own), len(own), medians)
@@ -139,88 +185,189 @@ def number(value: float, digits: int) -> str:
     return f"{value:.{digits + 5}f}".rstrip("0").rstrip(".") if "e-" in text else f"{float(text):.12g}"
 
 
-def cell_text(cell: Cell | None, metric: Metric) -> str:
-    """Return `median` or, over several seeds, `median (smallest to largest)`."""
-    if cell is None:
-        return "–"
-    middle = number(cell.median, metric.digits)
-    if cell.count == 1 or cell.spread == 0:
-        return middle
-    other = cell.worst - cell.spread if not metric.larger_is_better else cell.worst + cell.spread
-    low, high = sorted((cell.worst, other))
-    return f"{middle} ({number(low, metric.digits)} to {number(high, metric.digits)})"
+def cell_text(cell: Cell, metric: Metric, runs: int | None = None) -> str:
+    """Return `median` or, where values differ, `median (mean ± standard deviation)`, with n where it is not `runs`."""
+    text = number(cell.median, metric.digits)
+    if cell.count > 1 and cell.spread > 0:
+        text += f" ({number(cell.mean, metric.digits)} ± {number(cell.sd, 2)})"
+    return text if runs in (None, cell.count) else f"{text}, n = {cell.count}"
+
+
+class Notes:
+    """Why figures are undefined, numbered as they are asked for."""
+
+    def __init__(self) -> None:
+        """Begin without a note."""
+        self._numbers: dict[str, int] = {}
+
+    def dash(self, row: Row, metric: Metric) -> str:
+        """Return the text of an undefined figure."""
+        lost = f"no result: {row.failure}" if row.failed == row.runs else None
+        return self.because(lost or row.absent.get(metric.name, "not reported"))
+
+    def because(self, why: str) -> str:
+        """Return a dash with the number of a reason."""
+        return f"– [{self._numbers.setdefault(why, len(self._numbers) + 1)}]"
+
+    def lines(self) -> Iterator[str]:
+        """Yield the notes below the table."""
+        if self._numbers:
+            yield ""
+            yield "; ".join(f"[{k}] {printable(why)}" for why, k in self._numbers.items()) + "."
+
+
+def row_text(row: Row, metric: Metric, notes: Notes) -> str:
+    """Return one figure of a row, or a dash with the number of its reason."""
+    cell = row.cells.get(metric.name)
+    return notes.dash(row, metric) if cell is None else cell_text(cell, metric, row.runs)
 
 
 def markdown(suite: Suite, rows: Sequence[Row], outcomes: Sequence[Outcome], facts: Mapping[str, Any]) -> str:
     """Return all tables of a bench."""
     seeds = f", seeds {', '.join(map(str, suite.seeds))}" if len(suite.seeds) > 1 else ""
     parts = [
-        f"# {suite.name}\n\nstereo-vio {facts['version']}, code {facts['code'][:12]}, {_versions(facts)}{seeds}.\n",
-        "## ATE in m\n\nMedian over the seeds. Published figures are their sources', under their conditions.\n\n"
-        + "\n".join(ate_matrix(suite, rows)),
-        "## All figures\n\nMedian over the seeds (smallest to largest).\n\n" + "\n".join(full_table(rows)),
-        "## Systems\n\nMedian and worst over the sequences of the medians over seeds.\n\n"
+        f"# {suite.name}\n\n{provenance(facts)}{seeds}.\n",
+        "## ATE in m\n\nMedian over the seeds (mean ± standard deviation).\n\n" + "\n".join(matrix(rows)),
+        "## All figures\n\nMedian over the seeds (mean ± standard deviation), n as in the column of runs where nothing "
+        f"else is said. Success: share of the runs whose ATE is below {suite.success_percent:g} % of the way and that "
+        f"cover {100 * SUCCESS_COVERAGE:g} % of the frames.\n\n" + "\n".join(full_table(rows)),
+        "## Systems\n\nMedian and worst over the sequences of the medians over seeds; n in brackets.\n\n"
         + "\n".join(system_table(rows)),
     ]
     if reasons := list(failure_lines(outcomes)):
         parts.append("## Without a result\n\n" + "\n".join(reasons))
+    if noted := dict.fromkeys((o.sequence, o.system, note) for o in outcomes for note in o.notes):
+        lines = [f"- {sequence}, {system}: {printable(note)}" for sequence, system, note in noted]
+        parts.append("## Doubts about the ground truth\n\n" + "\n".join(lines))
     if suite.published:
-        lines = [f"- {p.system}: {p.source}" for p in suite.published]
-        parts.append("## Sources of published figures\n\n" + "\n".join(lines))
+        parts.append(
+            "## Published figures\n\nTheir sources', under their conditions; ours above are causal, over all frames, "
+            "without loops, after SE(3) alignment.\n\n" + "\n".join(published_table(suite))
+        )
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
-def _versions(facts: Mapping[str, Any]) -> str:
-    return ", ".join(f"{name} {version}" for name, version in facts["packages"].items())
+def provenance(facts: Mapping[str, Any]) -> str:
+    """Return which code made the figures, where and when."""
+    versions = ", ".join(f"{name} {version}" for name, version in facts["packages"].items())
+    known = (facts.get(name) for name in ("commit", "machine", "written"))
+    commit, machine, written = (str(value) if value else "unknown" for value in known)
+    return f"stereo-vio {facts['version']}, commit {commit}, {written[:10]}, {machine}; {versions}"
 
 
-def ate_matrix(suite: Suite, rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the table of ATE: sequences down, systems across; the smallest measured one bold."""
-    metric = METRICS[0]
-    systems = list(dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer)))
-    published = [p for p in suite.published if "ate_m" in p.figures]
-    yield _line(["sequence", *systems, *(f"{p.system} (published)" for p in published)])
-    yield "|---|" + "---:|" * (len(systems) + len(published))
+def matrix(
+    rows: Sequence[Row],
+    metric: Metric = METRICS[0],
+    systems: Sequence[str] = (),
+    titles: Mapping[str, str] | None = None,
+) -> Iterator[str]:
+    """Yield the table of one figure: sequences down, systems across; the smallest of a line in bold.
+
+    Args:
+        rows: of the suite.
+        metric: the figure.
+        systems: the columns; none: all, ours first.
+        titles: of sequences and systems, by name.
+    """
+    named = titles or {}
+    known = list(dict.fromkeys(row.system for row in sorted(rows, key=lambda row: row.is_peer)))
+    columns = [s for s in systems if s in known] if systems else known
+    notes = Notes()
+    yield _line([metric.title, *(named.get(s, s) for s in columns)])
+    yield "|---|" + "---:|" * len(columns)
     by_sequence: dict[str, dict[str, Row]] = {}
     for row in rows:
         by_sequence.setdefault(row.sequence, {})[row.system] = row
     for sequence, cells in by_sequence.items():
-        medians = {s: row.cells["ate_m"].median for s, row in cells.items() if "ate_m" in row.cells and not row.failed}
+        own = {s: cells[s] for s in columns if s in cells}
+        medians = {s: r.cells[metric.name].median for s, r in own.items() if metric.name in r.cells and not r.failed}
+        best = (max if metric.larger_is_better else min)(medians.values()) if len(medians) > 1 else None
         texts = []
-        for system in systems:
-            own = cells.get(system)
-            text = "" if own is None else "failed" if own.failed else cell_text(own.cells.get("ate_m"), metric)
-            best = len(medians) > 1 and medians.get(system) == min(medians.values())
-            texts.append(f"**{text}**" if best else text)
-        texts += [_published_text(p.figures["ate_m"].get(sequence)) for p in published]
-        yield _line([sequence, *texts])
+        for system in columns:
+            text = notes.because("there is no trajectory of this system") if system not in own else ""
+            if system in own:
+                text = f"failed {own[system].failed} of {own[system].runs}" if own[system].failed else ""
+                text = text or row_text(own[system], metric, notes) + _part(own[system], metric)
+            texts.append(f"**{text}**" if best is not None and medians.get(system) == best else text)
+        yield _line([named.get(sequence, sequence), *texts])
+    yield from notes.lines()
 
 
-def _published_text(value: float | None) -> str:
-    return "" if value is None else f"{value:g}"
+def _part(row: Row, metric: Metric) -> str:
+    """Say which share of the frames has a pose, where it is not all of them."""
+    cell = row.cells.get("coverage")
+    if cell is None or metric.name == "coverage" or metric.name not in row.cells or cell.median > _ALL_FRAMES:
+        return ""
+    return f" [{100 * cell.median:.0f} % of the frames]"
 
 
-def full_table(rows: Sequence[Row]) -> Iterator[str]:
-    """Yield the table of all figures."""
-    yield _line(["sequence", "system", *(metric.title for metric in METRICS), "runs"])
-    yield "|---|---|" + "---:|" * (len(METRICS) + 1)
+def published_table(suite: Suite) -> Iterator[str]:
+    """Yield published figures with their conditions: systems down, sequences across, then the mean and the source."""
+    for name in dict.fromkeys(name for p in suite.published for name in p.figures):
+        entries = [p for p in suite.published if name in p.figures]
+        sequences = [s.name for s in suite.sequences if any(s.name in p.figures[name] for p in entries)]
+        yield _line([BY_NAME[name].title, "sensors", "causal", "alignment", "loops", *sequences, "mean", "source"])
+        yield "|---|---|---|---|---|" + "---:|" * (len(sequences) + 1) + "---|"
+        for p in entries:
+            values = [v for s in sequences if (v := p.figures[name].get(s)) is not None]
+            texts = ["–" if (v := p.figures[name].get(s)) is None else f"{v:g}" for s in sequences]
+            stated = p.figures[name].get(PUBLISHED_MEAN)
+            mean = f"{number(statistics.fmean(values), 3)} over {len(values)}" if values else "–"
+            mean = mean if stated is None else f"{stated:g} as stated"
+            yield _line([p.system, *p.conditions, *texts, mean, p.source])
+        yield ""
+    yield "– : the source has no figure of this sequence."
+
+
+def full_table(
+    rows: Sequence[Row],
+    metrics: Sequence[Metric] = METRICS,
+    titles: Mapping[str, str] | None = None,
+    *,
+    for_documents: bool = False,
+) -> Iterator[str]:
+    """Yield the table of all figures: a line for each sequence and system.
+
+    Args:
+        rows: of the suite.
+        metrics: the columns.
+        titles: of sequences and systems, by name.
+        for_documents: leave out runs and success, and sequence or system where there is one alone.
+    """
+    named, notes = titles or {}, Notes()
+    names = ["sequence", "system"]
+    if for_documents:
+        names = [name for name in names if len({getattr(row, name) for row in rows}) > 1] or names[1:]
+    last = [] if for_documents else ["runs", "success"]
+    yield _line([*names, *(metric.title for metric in metrics), *last])
+    yield "|" + "---|" * len(names) + "---:|" * (len(metrics) + len(last))
+    before: list[str] = []
     for row in rows:
         runs = f"{row.runs}" if not row.failed else f"{row.runs - row.failed} of {row.runs}"
-        texts = [cell_text(row.cells.get(metric.name), metric) for metric in METRICS]
-        yield _line([row.sequence, row.system, *texts, "" if row.is_peer else runs])
+        texts = [row_text(row, metric, notes) for metric in metrics]
+        share = "–" if row.succeeded is None else f"{100 * row.succeeded / row.runs:.0f} %"
+        labels = [named.get(getattr(row, name), getattr(row, name)) for name in names]
+        shown = ["", *labels[1:]] if for_documents and len(labels) > 1 and labels[:1] == before else labels
+        before = labels[:1]
+        yield _line([*shown, *texts, *([] if for_documents else [runs, share])])
+    yield from notes.lines()
 
 
 def system_table(rows: Sequence[Row]) -> Iterator[str]:
     """Yield the table of systems over the sequences."""
-    yield _line(["system", "sequences", *(metric.title for metric in METRICS)])
-    yield "|---|---:|" + "---:|" * len(METRICS)
+    yield _line(["system", "sequences", *(metric.title for metric in METRICS), "success"])
+    yield "|---|---:|" + "---:|" * (len(METRICS) + 1)
     for system, (done, count, cells) in summary_of(rows).items():
         texts = []
         for metric in METRICS:
             cell = cells.get(metric.name)
             worst = "" if cell is None or cell.count == 1 else f", worst {number(cell.worst, metric.digits)}"
-            texts.append("–" if cell is None else f"{number(cell.median, metric.digits)}{worst}")
-        yield _line([system, f"{done} of {count}", *texts])
+            texts.append("–" if cell is None else f"{number(cell.median, metric.digits)}{worst} ({cell.count})")
+        own = [row for row in rows if row.system == system and row.succeeded is not None]
+        runs, succeeded = sum(row.runs for row in own), sum(row.succeeded or 0 for row in own)
+        yield _line(
+            [system, f"{done} of {count}", *texts, f"{100 * succeeded / runs:.0f} % of {runs}" if runs else "–"]
+        )
 
 
 def failure_lines(outcomes: Iterable[Outcome]) -> Iterator[str]:
@@ -232,23 +379,25 @@ def failure_lines(outcomes: Iterable[Outcome]) -> Iterator[str]:
 
 
 def csv_of_rows(rows: Iterable[Row]) -> str:
-    """Return one line for each sequence and system: median, worst and spread of each figure over the seeds."""
-    parts = ("median", "worst", "spread")
-    head = ["sequence", "system", "runs", "failed", *(f"{m.name}_{part}" for m in METRICS for part in parts)]
+    """Return one line for each sequence and system: each figure over the seeds."""
+    parts = ("median", "worst", "spread", "mean", "sd", "count")
+    head = ["sequence", "system", "runs", "failed", "succeeded"]
+    head += [f"{m.name}_{part}" for m in METRICS for part in parts]
     lines = []
     for row in rows:
         cells = [row.cells.get(metric.name) for metric in METRICS]
         values = ["" if cell is None else repr(getattr(cell, part)) for cell in cells for part in parts]
-        lines.append([row.sequence, row.system, str(row.runs), str(row.failed), *values])
+        succeeded = "" if row.succeeded is None else str(row.succeeded)
+        lines.append([row.sequence, row.system, str(row.runs), str(row.failed), succeeded, *values])
     return _csv([head, *lines])
 
 
 def csv_of_runs(outcomes: Iterable[Outcome]) -> str:
     """Return one line for each run."""
-    head = ["sequence", "system", "seed", *(metric.name for metric in METRICS), "failure", "key"]
+    head = ["sequence", "system", "seed", *BY_NAME, "failure", "key"]
     lines = []
     for o in outcomes:
-        values = [o.value(metric) for metric in METRICS]
+        values = [o.value(metric) for metric in BY_NAME.values()]
         texts = ["" if value is None else repr(value) for value in values]
         seed = "" if o.seed is None else str(o.seed)
         lines.append([o.sequence, o.system, seed, *texts, printable(o.failure or ""), o.key])

@@ -14,8 +14,10 @@ from vio.bench.suite import Sequence, Suite, config_of
 from vio.config import as_dict
 from vio.datasets import READERS
 from vio.errors import ConfigError, DataError
+from vio.files.trajectories import read_trajectory
 
-_FORM = 1  # of jobs and records: another one makes other keys
+_NO_FILES = ("handheld", "car", "simulated", "none")  # values of `vio render` in the place of a file
+_FORM = 2  # of jobs and records: another one makes other keys
 # Settings that name files, relative to the folder of the recordings.
 _FILE_SETTINGS = re.compile(
     r"dataset\.calibration|frontend\.features|frontend\.klt\.mask|frontend\.learned\.\w+_weights"
@@ -41,7 +43,21 @@ def tasks_of(suite: Suite, data: Path, digests: InputDigests, peers: Path | None
     Raises:
         ConfigError: the folder of other systems' trajectories does not exist or holds none of a sequence of the suite.
     """
-    return [*_runs(suite, data, digests), *(() if peers is None else _peers(suite, data, digests, peers))]
+    tasks = [*_runs(suite, data, digests), *(() if peers is None else _peers(suite, data, digests, peers))]
+    for task in tasks:
+        task.job["time_limit_s"] = suite.time_limit_s  # no part of the key: a result does not depend on it
+    return tasks
+
+
+def inputs_of(sequence: Sequence, data: Path) -> list[Path]:
+    """Return what a sequence reads: its recording or the files of its render, and its ground truth."""
+    words = sequence.render
+    paths = [] if sequence.source is None else [_source(sequence.source, data)[1]]
+    for k, word in enumerate(words):
+        option, equals, value = word.rpartition("=") if word.startswith("--") else ("", "", word)
+        if (equals or not word.startswith("-")) and _takes_a_path(list(words), k, option) and value not in _NO_FILES:
+            paths.append(data / value)
+    return paths + ([] if sequence.reference is None else [data / sequence.reference])
 
 
 def render_of(sequence: Sequence, data: Path, digests: InputDigests, seed: int) -> dict[str, Any]:
@@ -80,6 +96,9 @@ def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, di
     task = Task(sequence.name, name, seed, "", {})
     try:
         job, identity = _common(sequence, data, digests, seed)
+        if sequence.map_of is not None:
+            (first,) = (s for s in suite.sequences if s.name == sequence.map_of)
+            job["first"], identity["first"] = _common(first, data, digests, seed)
         config = as_dict(config_of(suite, sequence, name, seed))
         files = {}
         for setting, holder, key in _file_settings(config):
@@ -95,13 +114,14 @@ def _task(suite: Suite, sequence: Sequence, name: str, seed: int, data: Path, di
 
 def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Return what a worker needs for a sequence, and the part of it that the result depends on."""
-    job: dict[str, Any] = {"source": None, "render": None, "reference": None, "scratch": None}
+    job: dict[str, Any] = {"source": None, "render": None, "reference": None, "scratch": None, "first": None}
     shared: dict[str, Any] = {
         "start": sequence.start,
         "stop": sequence.stop,
         "lengths_m": None if sequence.lengths_m is None else list(sequence.lengths_m),
         "positions_only": sequence.positions_only,
         "exact_truth": _has_exact_truth(sequence),
+        "map": sequence.map,
         "code": code_digest(),
         "packages": package_versions(),
     }
@@ -118,6 +138,7 @@ def _common(sequence: Sequence, data: Path, digests: InputDigests, seed: int) ->
     if sequence.reference is not None:
         job["reference"] = str((data / sequence.reference).absolute())
         identity["reference"] = digests.of(Path(job["reference"]))
+        read_trajectory(Path(job["reference"]))  # damaged: named before the first task runs
     return {**job, **shared}, {**identity, **shared}
 
 

@@ -13,13 +13,14 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vio.bench.figures import between, coverage, error_curve, figures_of, numbered, pose_nees
+from vio.bench.figures import absent_reasons, between, coverage, error_curve, figures_of, numbered, pose_nees
 from vio.bench.identity import code_digest, package_versions
 from vio.config import Config, merge
 from vio.datasets import open_dataset
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from vio.records import FrameResult
     from vio.runs.pipeline import RunResult
 
-_WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as in tools/bench.py
+_WARM_FRAMES = 8  # in which compiled functions are loaded: left out of the CPU time a frame, as its wall times
 _MOST_WARNINGS = 5
 JOB, RESULT = "job.json", "result.json"
 
@@ -46,6 +47,7 @@ class _CpuTimer:
 
     def __init__(self) -> None:
         self.frames = 0
+        self.stages: dict[str, float] = {}  # median wall time of a stage
         self._began_s = self._ended_s = time.process_time()
         self._first = 0
 
@@ -89,12 +91,7 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
     try:
         _check_place(job)
         config = merge(Config(), job["config"], where="the suite")
-        dataset = open_dataset(job["source"], config.dataset)
-        first, end = frames_between(dataset.recording, parse_bound(job["start"]), _stop(job))
-        total = len(dataset.recording.frame_times_ns)
-        own = dataset.recording.reference
-        reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
-        truth = _Truth(dataset, reference, first, total if end is None else min(end, total))
+        truth = _truth(job, config)
         record |= _peer(job, truth) if job["kind"] == "peer" else _run(job, config, truth, timer)
     except VioError as error:
         record["failure"] = " ".join(str(error).split())
@@ -105,10 +102,25 @@ def perform(job: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
+def _truth(job: dict[str, Any], config: Config) -> _Truth:
+    """Open the recording of a job.
+
+    Raises:
+        VioError: it cannot be used, or its reference cannot be read.
+    """
+    dataset = open_dataset(job["source"], config.dataset)
+    first, end = frames_between(dataset.recording, parse_bound(job["start"]), _stop(job))
+    total = len(dataset.recording.frame_times_ns)
+    own = dataset.recording.reference
+    reference = own if job["reference"] is None else read_trajectory(Path(job["reference"]))
+    return _Truth(dataset, reference, first, total if end is None else min(end, total))
+
+
 def _measured(timer: _CpuTimer, began: float) -> dict[str, Any]:
     """What this process took, of which two repetitions differ."""
     return {
         "cpu_ms": timer.ms_per_frame,
+        **timer.stages,
         "cpu_s": time.process_time(),
         "wall_s": time.perf_counter() - began,
         "memory_mib": _peak_memory_mib(),
@@ -149,40 +161,88 @@ def _run(job: dict[str, Any], config: Config, truth: _Truth, timer: _CpuTimer) -
     """Run the odometry as `vio run` does, with one thread of OpenCV, in a folder that is removed."""
     import cv2
 
-    from vio.runs.folder import growing_folder, refused_share
+    from vio.bench.maps import map_figures
+    from vio.live.build import MapUse
+    from vio.runs.folder import growing_folder, landmark_error, refused_share
     from vio.runs.pipeline import RunControl, run  # loads compiled functions: not for what cannot be opened
 
     cv2.setNumThreads(1)  # tasks run side by side; the figures do not depend on it
     with tempfile.TemporaryDirectory(prefix="vio-bench-", dir=job["scratch"]) as folder:
         growing = growing_folder(Path(folder) / "run", truth.dataset, config, {"source": "", "start": truth.first})
         control = RunControl(growing)
-        result = run(truth.dataset, config, start=truth.first, stop=truth.end, viewer=timer, control=control)
+        store = Path(folder) / "map.db"
+        use = MapUse(store) if job["map"] else None
+        if job["first"] is not None:
+            before, use = _truth(job["first"], config), MapUse(store, localise=True)
+            run(before.dataset, config, start=before.first, stop=before.end, map=MapUse(store))
+        first, end = truth.first, truth.end
+        result = run(truth.dataset, config, start=first, stop=end, viewer=timer, map=use, control=control)
         trajectory = result.trajectory
         figures: dict[str, Any] = {
             "frames": len(result.frames),
             "path_m": float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum()),
             "coverage": coverage(_used(truth, config), trajectory),
             "refused_share": refused_share(result.frames.column("used"), result.frames.column("gated")),
+            "used_per_frame": float(np.mean(np.asarray(result.frames.column("used"), dtype=np.float64))),
+            "landmarks": len(result.landmarks.ids),
+            "innovation_px": _median(f.innovation_median_px for f in result.frames),
         }
+        timer.stages = _stages(result)
         record = {"figures": figures, "failure": result.stopped, "warnings": list(result.warnings[:_MOST_WARNINGS])}
         if truth.reference is not None:
             score = _evaluate(job, trajectory, truth.reference, result.T_cam0_body)
             figures |= figures_of(score, positions_only=job["positions_only"])
-            figures["nees"] = _nees(result, score) if job["exact_truth"] else None
+            figures |= _nees(result, score) if job["exact_truth"] else {"nees": None}
+            figures["landmarks_m"] = (landmark_error(result, score) or {}).get("rmse_m")
             record["curve"] = error_curve(score, trajectory.times_ns)
+            record["notes"] = list(score.notes)
+            if result.mapped is not None and result.stopped is None:
+                figures |= map_figures(result, score, numbered(truth.reference), store if job["map"] else None)
         assert trajectory.times_ns is not None
         text = tum_text(
             trajectory.times_ns, trajectory.T_world_body, body=trajectory.body, frames=trajectory.frame_indices
         )
         record["trajectory"] = text.splitlines()  # JSON of ours holds printable text only
+    record["absent"] = _absent(job, figures, truth)
     return record
 
 
-def _nees(result: RunResult, score: Evaluation) -> float | None:
+def _absent(job: dict[str, Any], figures: dict[str, Any], truth: _Truth) -> dict[str, str]:
+    return absent_reasons(
+        figures,
+        has_reference=truth.reference is not None,
+        positions_only=job["positions_only"],
+        peer=job["kind"] == "peer",
+    )
+
+
+def _stages(result: RunResult) -> dict[str, float]:
+    """Return wall times of a frame in ms, start left out: medians of stages and of all, and what 95 % stay within."""
+    frames = list(result.frames)[_WARM_FRAMES:]
+    if not frames:
+        return {}
+    total = [f.total_ms for f in frames]
+    return {
+        "frontend_ms": float(np.median([f.frontend_ms for f in frames])),
+        "filter_ms": float(np.median([f.filter_ms for f in frames])),
+        "wall_ms": float(np.median(total)),
+        "wall_95_ms": float(np.percentile(total, 95)),
+    }
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
+
+
+def _nees(result: RunResult, score: Evaluation) -> dict[str, float | None]:
     rows = result.estimates
     T_world_imu, covariances = (np.array(rows.column(name)) for name in ("T_world_imu", "covariance"))
     upright = result.motion == "imu"
-    return pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
+    values = pose_nees(score, T_world_imu, covariances, result.T_cam0_body, upright=upright)
+    if values is None:
+        return {"nees": None}
+    return {"nees": float(values.mean()), **{f"nees_{q}": float(np.percentile(values, q)) for q in (50, 95)}}
 
 
 def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
@@ -209,7 +269,9 @@ def _peer(job: dict[str, Any], truth: _Truth) -> dict[str, Any]:
         **figures_of(score, positions_only=job["positions_only"]),
         "nees": None,
     }
-    return {"figures": figures, "curve": error_curve(score, trajectory.times_ns)}
+    curve = error_curve(score, trajectory.times_ns)
+    absent = _absent(job, figures, truth)
+    return {"figures": figures, "curve": curve, "absent": absent, "notes": list(score.notes)}
 
 
 def _evaluate(job: dict[str, Any], trajectory: Trajectory, reference: Trajectory, T_cam0_imu: Any) -> Evaluation:

@@ -14,11 +14,13 @@ def add_parser(commands: Any) -> None:
         "bench",
         help="run a suite of recordings into one table, or compare two",
         description="Run every sequence of a suite with every configuration and seed, side by side, and write tables "
-        "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, kitti, euroc, tumvi. "
-        "'vio bench compare A B' lists what became significantly better or worse from one output folder to another.",
+        "and a report. SUITE is a YAML file or the name of a shipped suite: small, rendered, realistic, kitti, euroc, "
+        "tumvi. 'vio bench compare A B' says what became better or worse from one output folder to another, and "
+        "'vio bench compare A --between X Y' from one configuration or system to another.",
     )
     parser.add_argument("suite", metavar="SUITE", help="YAML file, name of a shipped suite, or 'compare'")
-    parser.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="compare: two output folders, A and B")
+    parser.add_argument("folders", metavar="FOLDER", nargs="*", type=Path, help="compare: output folders")
+    parser.add_argument("--between", nargs=2, metavar=("X", "Y"), help="compare: these systems, X of A and Y of B")
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder of the recordings (default: the suite's)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder of tables and report (default bench/NAME)")
     parser.add_argument(
@@ -30,6 +32,13 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--only", default="", metavar="NAME,…", help="these sequences alone")
     parser.add_argument("--configurations", default="", metavar="NAME,…", help="these configurations alone")
     parser.add_argument("--seeds", metavar="N,…", help="in the place of the suite's seeds")
+    parser.add_argument("--time-limit", type=float, metavar="S", help="seconds of a task; then it has no result")
+    parser.add_argument("--list", action="store_true", help="say which recordings are there and which not; run nothing")
+    parser.add_argument(
+        "--revision",
+        metavar="REV",
+        help="run this git revision too, in turns, and compare: A is the revision, B this code",
+    )
     parser.add_argument(
         "--identity",
         choices=("content", "stat"),
@@ -41,7 +50,10 @@ def add_parser(commands: Any) -> None:
         type=float,
         default=2.0,
         metavar="X",
-        help="compare: of one sequence without seeds, a change by more than this counts (default 2)",
+        help="compare: a single sequence that changes by more than this is shown (default 2)",
+    )
+    parser.add_argument(
+        "--margin", type=float, default=1.1, metavar="X", help="compare: a change below this is none (default 1.1)"
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
@@ -53,8 +65,10 @@ def execute(args: argparse.Namespace) -> int:
     from vio.errors import ConfigError
 
     if args.suite == "compare":
-        if len(args.folders) != 2:
-            raise ConfigError(f"vio bench compare takes two output folders, got {len(args.folders)}")
+        if len(args.folders) != 2 and not (args.between and len(args.folders) == 1):
+            raise ConfigError(
+                f"vio bench compare takes two output folders, or one with --between X Y, got {len(args.folders)}"
+            )
         return _compare(args)
     if args.folders:
         raise ConfigError(f"vio bench takes one suite; what is {args.folders[0]}? To compare: vio bench compare A B")
@@ -62,7 +76,11 @@ def execute(args: argparse.Namespace) -> int:
 
 
 def _bench(args: argparse.Namespace) -> int:
+    import sys
+    from dataclasses import replace
+
     from vio.bench.bench import Place, bench
+    from vio.bench.revision import revision_folder, run_in_turns
     from vio.bench.suite import SHIPPED, chosen, read_suite
     from vio.cli.progress import ProgressBar
     from vio.errors import ConfigError, StoppedError
@@ -72,6 +90,10 @@ def _bench(args: argparse.Namespace) -> int:
     suite = chosen(read_suite(args.suite), _names(args.only), _names(args.configurations))
     if args.seeds is not None:
         suite = _with_seeds(suite, args.seeds)
+    if args.time_limit is not None:
+        if not args.time_limit > 0:
+            raise ConfigError(f"--time-limit takes seconds above 0, got {args.time_limit:g}")
+        suite = replace(suite, time_limit_s=args.time_limit)
     default = Path() if suite.folder == SHIPPED else suite.folder
     place = Place(
         data=args.data if args.data is not None else default,
@@ -82,6 +104,12 @@ def _bench(args: argparse.Namespace) -> int:
         identity=args.identity,
         peers=args.peers,
     )
+    if args.list:
+        return _list(suite, place.data, args)
+    if args.revision is not None:
+        run_in_turns(suite, place, args.revision, say=lambda text: None if args.quiet else print(text, file=sys.stderr))
+        args.folders = [revision_folder(place, args.revision), place.out]
+        return _compare(args)
     try:
         with ProgressBar(suite.name, unit="tasks") as bar:
             result = bench(suite, place, (lambda done, total: None) if args.quiet else bar.update)
@@ -89,6 +117,22 @@ def _bench(args: argparse.Namespace) -> int:
         text = f"interrupted; finished tasks are kept in {place.cache}, and the same command goes on with the others"
         raise StoppedError(text, status=128 + getattr(stop, "number", 2)) from stop
     return _report(args, place.out, result)
+
+
+def _list(suite: Any, data: Path, args: argparse.Namespace) -> int:
+    """Print what is there and what is missing; the status is 1 where something is."""
+    from vio.bench.tasks import inputs_of
+    from vio.cli.output import print_result
+
+    missing = {s.name: [str(p) for p in inputs_of(s, data) if not p.exists()] for s in suite.sequences}
+    lines = [(name, "there" if not paths else f"missing: {', '.join(paths)}") for name, paths in missing.items()]
+    runs = len(suite.sequences) * len(suite.configurations) * len(suite.seeds)
+    lines.append(("runs", f"{runs}: {', '.join(suite.configurations)}; seeds {', '.join(map(str, suite.seeds))}"))
+    if any(missing.values()) and suite.publisher is not None:
+        lines.append(("from", suite.publisher))
+    facts = {"suite": suite.name, "missing": {k: v for k, v in missing.items() if v}, "publisher": suite.publisher}
+    print_result({**facts, "runs": runs}, lines, as_json=args.json, name_width=max(len(n) for n, _ in lines))
+    return 1 if any(missing.values()) else 0
 
 
 def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
@@ -105,7 +149,7 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
         shown = [f"{m.title} {number(cells[m.name].median, m.digits)}" for m in METRICS if m.name in cells]
         lines.append((system, f"{done} of {count} sequences; median {', '.join(shown) or 'nothing'}"))
     lines.append(("tasks", f"{len(result.outcomes)}, of which {result.reused} were done before"))
-    lines.append(("report", f"{out / 'report.html'}, tables.md, table.csv, runs.csv"))
+    lines.append(("report", f"{out / 'report.html'}, tables.md, tables.tex, table.csv, runs.csv"))
     facts = {**result.facts, "out": str(out), "reused": result.reused}
     width = max(10, *(len(name) for name, _ in lines))
     print_result(facts, lines, as_json=args.json, name_width=width)
@@ -115,16 +159,18 @@ def _report(args: argparse.Namespace, out: Path, result: Any) -> int:
 
 
 def _compare(args: argparse.Namespace) -> int:
-    """Print what changed; the status is 1 where something became worse."""
-    from vio.bench.compare import compare, comparison_lines
+    """Print what changed; the status is 1 where something became worse, 3 where that cannot be told."""
+    from vio.bench.compare import EXIT_STATUS, compare, comparison_lines
     from vio.cli.output import print_result
 
-    result = compare(*args.folders, factor=args.factor)
+    a, b = args.folders[0], args.folders[-1]
+    between = None if args.between is None else tuple(args.between)
+    result = compare(a, b, between=between, factor=args.factor, margin=args.margin)
     if args.json:
         print_result(result.as_dict(), (), as_json=True)
     else:
         print("\n".join(comparison_lines(result)))
-    return 1 if result.is_worse else 0
+    return EXIT_STATUS[result.verdict]
 
 
 def _names(text: str) -> list[str]:

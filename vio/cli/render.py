@@ -56,11 +56,12 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--duration", type=float, metavar="S", help="length (default 30 s, or the whole flight)")
     parser.add_argument(
         "--realism",
-        choices=("plain", "real"),
+        choices=("plain", "real", "drawn"),
         default="plain",
         help="real: what real cameras do, all at once: exposure control with lag and jumps, motion blur of its shutter "
         "time, noise of its gain, unequal cameras, vignetting, glare, uneven light, blank walls, walking people, and a "
-        "calibration that is slightly off; --set switches single ones off (default plain)",
+        "calibration that is slightly off; --set switches single ones off. drawn: the same, with "
+        "a rig drawn from calibration_sigmas (default plain)",
     )
     parser.add_argument("--effects", metavar="NAME,…", default="", help=f"in addition, of {_EFFECTS}")
     parser.add_argument(
@@ -68,8 +69,8 @@ def add_parser(commands: Any) -> None:
         action="append",
         default=[],
         metavar="a.b=c",
-        help="one value of effects, faults, imu_noise or calibration, or of the scene (bare_wall, moving, people, "
-        "lighting), such as effects.blur_exposure_ms=20 or people=0; may be repeated",
+        help="one value of effects, faults, imu_noise, calibration or calibration_sigmas, or of the scene "
+        "(bare_wall, moving, people, lighting), such as effects.blur_exposure_ms=20 or people=0; may be repeated",
     )
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all random numbers")
     parser.add_argument(
@@ -208,7 +209,8 @@ def _conditions(args: argparse.Namespace) -> Conditions:
     from vio.config import merge_override
     from vio.sim.scenarios import Conditions, conditions_of, real_conditions
 
-    level = real_conditions(args.scene) if args.realism == "real" else Conditions()
+    real = args.realism != "plain"
+    level = real_conditions(args.scene, drawn_rig=args.realism == "drawn") if real else Conditions()
     conditions = conditions_of([name.strip() for name in args.effects.split(",") if name.strip()], level)
     for override in args.set:
         conditions = merge_override(conditions, override, example="effects.gamma=2.2")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
 from vio.geometry.distortion import CameraModel, StereoRig
-from vio.geometry.lie import se3_from_parts, so3_exp
+from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp
 from vio.setting import setting
 from vio.sim.errors import SimulationError
 
@@ -26,6 +26,54 @@ class CalibrationErrors:
         values = (self.scale, self.principal_point_px, self.distortion, self.rotation_deg, self.baseline_mm)
         if not all(np.isfinite(v) and v >= 0 for v in values):
             raise SimulationError("calibration errors are sizes: finite and not negative")
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationSigmas:
+    """Standard deviations of a calibration's errors, from which the seed draws a rig, normally and independently.
+
+    The right camera's terms that move rows of left and right against each other (its pitch and roll, and what its
+    height of the principal point, focal length and lens differ from the left one's) are scaled by `rows`. With 0 the
+    rows agree, as after a rectification that was adjusted by rows, and disparities are off all the same.
+    """
+
+    scale: float = setting(0.0, "factor on all of them: 0 draws nothing, 1 a rig as after a careful calibration")
+    rows: float = setting(1.0, "factor on what moves rows of left and right against each other; 0: rows agree")
+    baseline: float = setting(0.003, "length of the baseline, over it")
+    focal_length: float = setting(0.002, "focal length of both cameras alike, over it")
+    focal_difference: float = setting(0.0005, "focal length of the right camera against the left one, over it")
+    yaw_deg: float = setting(0.02, "right camera about its vertical axis", unit="deg")
+    pitch_deg: float = setting(0.02, "right camera about its horizontal axis", unit="deg")
+    roll_deg: float = setting(0.02, "right camera about its optical axis", unit="deg")
+    cx_px: float = setting(0.2, "column of each camera's principal point", unit="px")
+    cy_px: float = setting(0.2, "row of each camera's principal point", unit="px")
+    k1: float = setting(1e-3, "first radial coefficient of each camera")
+    k2: float = setting(1e-3, "second radial coefficient of each camera")
+
+    def __post_init__(self) -> None:
+        if not all(np.isfinite(v) and v >= 0 for v in astuple(self)):
+            raise SimulationError("calibration sigmas are finite and not negative")
+
+
+def drawn_rig(calibrated: StereoRig, sigmas: CalibrationSigmas, *, seed: int) -> StereoRig:
+    """Return a true rig drawn about `calibrated`; the left camera's pose is exact.
+
+    Raises:
+        SimulationError: the lens is of another model than pinhole, radtan or equidistant.
+    """
+    if sigmas.scale == 0:
+        return calibrated
+    s, rng = sigmas, np.random.default_rng([seed, 72])
+    baseline, focal, difference, *turn_deg = s.scale * rng.standard_normal(6)
+    lens = s.scale * rng.standard_normal((2, 4)) * [s.cx_px, s.cy_px, s.k1, s.k2]  # left, right
+    lens[1, 1:] = lens[0, 1:] + s.rows * (lens[1, 1:] - lens[0, 1:])
+    turn = np.deg2rad(turn_deg) * [s.rows * s.pitch_deg, s.yaw_deg, s.rows * s.roll_deg]
+    zoom = 1 + focal * s.focal_length + np.array([0.0, s.rows * difference * s.focal_difference])
+    T = calibrated.T_cam0_cam1
+    T_true = se3_from_parts(T[:3, :3] @ so3_exp(turn), T[:3, 3] * (1 + baseline * s.baseline))
+    pairs = zip((calibrated.cam0, calibrated.cam1), lens, zoom.tolist(), strict=True)
+    cam0, cam1 = (_changed(camera, off[:2], off[2:], factor) for camera, off, factor in pairs)
+    return replace(calibrated, cam0=cam0, cam1=cam1, T_imu_cam1=calibrated.T_imu_cam0 @ T_true)
 
 
 def miscalibrated(calibrated: StereoRig, errors: CalibrationErrors, *, seed: int) -> StereoRig:
@@ -54,13 +102,19 @@ def miscalibrated(calibrated: StereoRig, errors: CalibrationErrors, *, seed: int
 def _true_camera(camera: CameraModel, errors: CalibrationErrors, rng: np.random.Generator) -> CameraModel:
     angle, sign = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0])
     shift = errors.scale * errors.principal_point_px * np.array([np.cos(angle), np.sin(angle)])
-    first = sign * errors.scale * errors.distortion
+    return _changed(camera, shift, np.array([sign * errors.scale * errors.distortion]))
+
+
+def _changed(camera: CameraModel, shift_px: FloatArray, radial: FloatArray, zoom: float = 1.0) -> CameraModel:
+    """Return the camera with its principal point (2,) and first radial terms moved, and zoomed."""
     model, k = camera.model, camera.coefficients
     if model == "pinhole":
         model, k = "radtan", (0.0, 0.0, 0.0, 0.0)
     elif model not in ("radtan", "equidistant"):
         raise SimulationError(f"a {model} lens cannot be miscalibrated; use a pinhole, radtan or equidistant one")
-    changed = (k[0] + first, *k[1:])
+    moved = [old + add for old, add in zip(k, radial.tolist(), strict=False)]
+    cu, cv = camera.cu + float(shift_px[0]), camera.cv + float(shift_px[1])
+    coefficients = (*moved, *k[len(moved) :])
     return replace(
-        camera, cu=camera.cu + float(shift[0]), cv=camera.cv + float(shift[1]), model=model, coefficients=changed
+        camera, fu=camera.fu * zoom, fv=camera.fv * zoom, cu=cu, cv=cv, model=model, coefficients=coefficients
     )

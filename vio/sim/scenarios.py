@@ -26,7 +26,7 @@ from vio.setting import setting
 from vio.sim.effects import CLEAN, SensorEffects
 from vio.sim.errors import SimulationError
 from vio.sim.imu import ImuNoise, VelocityNoise
-from vio.sim.miscalibration import CalibrationErrors
+from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas
 from vio.sim.motion import (
     MotionSpline,
     car_loop,
@@ -80,6 +80,7 @@ class Conditions:
     faults: FrameFaults = field(default_factory=FrameFaults)
     imu_noise: ImuNoise = field(default_factory=ImuNoise)  # of the simulated IMU
     calibration: CalibrationErrors = field(default_factory=CalibrationErrors)
+    calibration_sigmas: CalibrationSigmas = field(default_factory=CalibrationSigmas)
     bare_wall: bool = setting(False, "two walls without texture; in the street a third of the houses")
     moving: bool = setting(False, "boxes that move on their own")
     people: int = setting(0, "people who walk near the path")
@@ -110,8 +111,8 @@ EFFECTS: dict[str, Callable[[Conditions], Conditions]] = {
 }
 
 
-def real_conditions(scene: SceneName) -> Conditions:
-    """Return the conditions of `--realism real`: what real cameras and places do, all at once."""
+def real_conditions(scene: SceneName, *, drawn_rig: bool = False) -> Conditions:
+    """Return the conditions of `--realism real`, or `drawn`: what real cameras and places do, all at once."""
     outdoors = scene == "street"
     effects = SensorEffects(
         right_gain=0.85,
@@ -126,7 +127,8 @@ def real_conditions(scene: SceneName) -> Conditions:
     )
     return Conditions(
         effects=effects,
-        calibration=CalibrationErrors(scale=1.0),
+        calibration=CalibrationErrors(scale=0.0 if drawn_rig else 1.0),
+        calibration_sigmas=CalibrationSigmas(scale=1.0 if drawn_rig else 0.0),
         bare_wall=True,
         moving=outdoors,
         people=12 if outdoors else 4,
@@ -190,6 +192,7 @@ def plan(scenario: Scenario) -> Simulation:
         effects=scenario.conditions.effects,
         faults=scenario.conditions.faults,
         calibration_errors=scenario.conditions.calibration,
+        calibration_sigmas=scenario.conditions.calibration_sigmas,
         seed=scenario.seed,
     )
 

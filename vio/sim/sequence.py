@@ -36,7 +36,7 @@ from vio.sim.errors import SimulationError
 from vio.sim.exposure import ExposurePlan, plan_exposures
 from vio.sim.glare import glare
 from vio.sim.imu import ImuNoise, VelocityNoise, simulate_imu, simulate_velocity
-from vio.sim.miscalibration import CalibrationErrors, miscalibrated
+from vio.sim.miscalibration import CalibrationErrors, CalibrationSigmas, drawn_rig, miscalibrated
 from vio.sim.motion import FitReport, MotionSpline, motion_at, recorded_motion
 from vio.sim.render import CameraRays, Radiance, View, camera_rays, correspondence, depth_map, render
 from vio.sim.world import World, check_clear, room
@@ -102,6 +102,7 @@ def simulate(
     effects: SensorEffects | None = None,
     faults: FrameFaults | None = None,
     calibration_errors: CalibrationErrors | None = None,
+    calibration_sigmas: CalibrationSigmas | None = None,
     seed: int = 0,
 ) -> Simulation:
     """Plan a recording and check that it can be simulated; nothing is rendered yet.
@@ -119,6 +120,7 @@ def simulate(
         effects: camera effects; None: the defaults of `SensorEffects`.
         faults: dropped and repeated frames, clock offset.
         calibration_errors: how far the true cameras are from `rig`; None: not at all.
+        calibration_sigmas: of what further errors are drawn; None: of none.
         seed: seed of all random numbers.
 
     Raises:
@@ -127,6 +129,7 @@ def simulate(
     faults = FrameFaults() if faults is None else faults
     effects = SensorEffects() if effects is None else effects
     true_rig = rig if calibration_errors is None else miscalibrated(rig, calibration_errors, seed=seed)
+    true_rig = true_rig if calibration_sigmas is None else drawn_rig(true_rig, calibration_sigmas, seed=seed)
     times = _frame_times(motion, rate_hz, frame_times_ns, effects, faults)
     _check_cameras(world, true_rig, motion, times)
     taken, stamps = _apply_faults(times, faults, seed)
