@@ -104,6 +104,11 @@ def _each(change: Callable[[Image], Image]) -> Variant:
     return _pairs(lambda frame, left, right: (change(left), change(right)))
 
 
+def _seeded(variant: Callable[[np.random.Generator], Variant]) -> Variant:
+    """A variant with random numbers, the same ones in every run."""
+    return lambda dataset, period: variant(np.random.default_rng(1))(dataset, period)
+
+
 def _while(change: PairChange) -> Variant:
     """The pairs of the fault's period changed."""
 
@@ -201,7 +206,8 @@ def _reverse(dataset: Dataset, period: Period) -> Changed:
 def _half(dataset: Dataset, period: Period) -> Changed:
     """Images of half the size, with their calibration."""
     camera = dataset.recording.camera
-    assert camera.width is not None and camera.height is not None
+    assert camera.width is not None
+    assert camera.height is not None
     width, height = camera.width // 2, camera.height // 2
 
     def smaller(image: Image) -> Image:
@@ -221,7 +227,7 @@ def _half(dataset: Dataset, period: Period) -> Changed:
 
 
 def _every_second(dataset: Dataset, period: Period) -> Changed:
-    return _with_events(dataset, lambda events: (e for e in events if not isinstance(e, StereoFrame) or not e.index % 2))
+    return _with_events(dataset, lambda events: (e for e in events if not (isinstance(e, StereoFrame) and e.index % 2)))
 
 
 def _night(rng: np.random.Generator) -> Callable[[Image], Image]:
@@ -418,12 +424,10 @@ def _stuck(dataset: Dataset, period: Period) -> Changed:
     return _samples(stuck, during=True)(dataset, period)
 
 
-def _spikes(share: float, gyro: float, accel: float) -> Variant:
-    rng = np.random.default_rng(9)
-
+def _spikes(rng: np.random.Generator, share: float, gyro: float, accel: float) -> Variant:
     def spike(s: ImuSample) -> ImuSample:
-        signs = rng.choice([-1.0, 1.0], (2, 3))
-        return s if rng.random() >= share else ImuSample(s.time_ns, s.gyro + gyro * signs[0], s.accel + accel * signs[1])
+        signs = rng.choice([-1.0, 1.0], (2, 3)) * (rng.random() < share)
+        return ImuSample(s.time_ns, s.gyro + gyro * signs[0], s.accel + accel * signs[1])
 
     return _samples(spike)
 
@@ -446,13 +450,16 @@ def _restamped(shift_s: float, jitter_s: float = 0.0) -> Variant:
     return variant
 
 
-def _noisy_imu(gyro: float, accel: float) -> SampleChange:
-    rng = np.random.default_rng(11)
+def _noisy_imu(rng: np.random.Generator, gyro: float, accel: float) -> SampleChange:
     return _imu(lambda g: g + rng.normal(0.0, gyro, 3), lambda a: a + rng.normal(0.0, accel, 3))
 
 
 def _as_is(values: FloatArray) -> FloatArray:
     return values
+
+
+def _plus(*bias: float) -> Callable[[FloatArray], FloatArray]:
+    return lambda values: values + np.array(bias)
 
 
 _ROT5 = so3_exp(np.radians(5.0) * np.ones(3) / np.sqrt(3.0))
@@ -464,20 +471,20 @@ HEALTHY: dict[str, Variant] = {
     "reverse": _reverse,
     "half": _half,
     "every 2nd": _every_second,
-    "night": _each(_night(np.random.default_rng(2))),
+    "night": _seeded(lambda rng: _each(_night(rng))),
     "contrast 0.5": _each(_gain(0.5, 64.0)),
     "contrast 1.6": _each(_gain(1.6, -76.8)),
     "fog": _each(_gain(0.25, 118.0)),
     "blur": _each(partial(_blurred, sigma_px=2.0)),
     "JPEG 15": _each(_jpeg),
-    "rain": _each(_rain(np.random.default_rng(3))),
-    "snow": _each(_snow(np.random.default_rng(3))),
+    "rain": _seeded(lambda rng: _each(_rain(rng))),
+    "snow": _seeded(lambda rng: _each(_snow(rng))),
     "hood": _each(_hood),
     "dirty right": _pairs(lambda frame, left, right: (left, _dirty(right))),
     "right gain": _pairs(lambda frame, left, right: (left, _gain(0.55, 10.0)(right))),
     "swinging gains": _pairs(_swinging_gains),
     "jumping gains": _pairs(_jumping_gains),
-    "random gains": _pairs(_random_gains(np.random.default_rng(6))),
+    "random gains": _seeded(lambda rng: _pairs(_random_gains(rng))),
 }
 CAMERAS: dict[str, Variant] = {
     "right late": _late(1),
@@ -504,8 +511,8 @@ IMU: dict[str, Variant] = {
     "stuck": _stuck,
     "silent": _gap(ImuSample),
     "dead later": _samples(lambda sample: None, after=True),
-    "spikes": _spikes(0.01, 30.0, 100.0),
-    "small spikes": _spikes(0.02, 1.0, 5.0),
+    "spikes": _seeded(lambda rng: _spikes(rng, 0.01, 30.0, 100.0)),
+    "small spikes": _seeded(lambda rng: _spikes(rng, 0.02, 1.0, 5.0)),
     "jitter 3 ms": _restamped(0.0, 3e-3),
     "50 ms early": _restamped(-0.05),
     "axes exchanged": _samples(_imu(lambda g: g[[1, 0, 2]], lambda a: a[[1, 0, 2]])),
@@ -513,11 +520,11 @@ IMU: dict[str, Variant] = {
     "accelerometer z inverted": _samples(_imu(_as_is, lambda a: a * [1, 1, -1])),
     "accelerometer in g": _samples(_imu(_as_is, lambda a: a / 9.80665)),
     "gyro in deg/s": _samples(_imu(np.degrees, _as_is)),
-    "accelerometer bias": _samples(_imu(_as_is, lambda a: a + [0.7, 0.5, -0.5])),
-    "gyro bias": _samples(_imu(lambda g: g + [0.2, -0.2, 0.1], _as_is)),
-    "bias jump": _samples(_imu(lambda g: g + [0.1, -0.1, 0.05], lambda a: a + [0.5, 0.3, -0.3]), after=True),
+    "accelerometer bias": _samples(_imu(_as_is, _plus(0.7, 0.5, -0.5))),
+    "gyro bias": _samples(_imu(_plus(0.2, -0.2, 0.1), _as_is)),
+    "bias jump": _samples(_imu(_plus(0.1, -0.1, 0.05), _plus(0.5, 0.3, -0.3)), after=True),
     "gyro clipped": _samples(_imu(lambda g: np.clip(g, -0.3, 0.3), _as_is)),
-    "vibration": _samples(_noisy_imu(0.3, 5.0)),
+    "vibration": _seeded(lambda rng: _samples(_noisy_imu(rng, 0.3, 5.0))),
     "turned 5 deg": _samples(_imu(lambda g: _ROT5 @ g, lambda a: _ROT5 @ a)),
     "scale 1.1": _samples(_imu(lambda g: 1.1 * g, lambda a: 1.1 * a)),
 }
