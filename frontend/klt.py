@@ -162,6 +162,7 @@ class KltFrontend:
         They are matched in the right image, if there is one.
         """
         frame, left, right, stereo = images.frame, images.left, images.right, images.stereo
+        stereo.forget_offset()
         previous = self._previous
         if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
             return no_tracks(), None

@@ -115,6 +115,10 @@ class RightCamera(ImageCheck):
         self._last = now
         return False
 
+    def doubts(self, matched: BoolArray) -> bool:
+        """Whether so few of the points (K,) of known depth were found where they should be that a cause is looked for."""
+        return self._cause not in ("frozen", "dark") and len(matched) >= _LEAST_POINTS and matched.mean() < _AGREES
+
     def check_matches(self, index: int, matched: BoolArray, *, moved: bool) -> bool:
         """Judge the matches of a frame near their known depths, and return whether the right image may be used.
 

@@ -377,6 +377,22 @@ def _turned_right(degrees: float, axis: tuple[float, float, float], *, all_along
     return variant
 
 
+def _shaking_right(rng: np.random.Generator, degrees: float) -> Variant:
+    """The right camera turns about its vertical axis by a random angle of its own in each frame."""
+
+    def variant(dataset: Dataset, period: Period) -> Changed:
+        fu = dataset.recording.camera.fu
+
+        def shaken(frame: StereoFrame, left: Image, right: Image) -> Pair:
+            shift = np.array([[1.0, 0.0, fu * np.radians(rng.normal(0.0, degrees))], [0.0, 1.0, 0.0]])
+            border = cv2.BORDER_REPLICATE
+            return left, np.asarray(cv2.warpAffine(right, shift, right.shape[::-1], borderMode=border), dtype=np.uint8)
+
+        return _with_events(dataset, _with_pairs(shaken))
+
+    return variant
+
+
 def _calibration(**factors: float) -> Variant:
     """Entries of the calibration off by factors."""
 
@@ -499,6 +515,7 @@ CAMERAS: dict[str, Variant] = {
     "slow object": _moving_object(1.5),
     "right turned": _turned_right(1.0, (0.3, 1.0, 0.3), all_along=True),
     "right yaw later": _turned_right(1.0, (0.0, 1.0, 0.0), all_along=False),
+    "right shaking": _seeded(lambda rng: _shaking_right(rng, 0.1)),
     "focal +5 %": _calibration(fu=1.05, fv=1.05),
     "baseline +10 %": _calibration(baseline_m=1.1),
     "every 10th repeated": _repeated_tenth,
