@@ -81,9 +81,9 @@ class StereoFit:
         """Match features of known depth anywhere on their rows, as far as a common offset explains their disparities.
 
         A pair that turns a little in its mount, or whose cameras expose a millisecond apart while the rig turns, has
-        disparities that are off by as much at all depths, (R1). That is taken out of all matches of the frame, less a small
-        part, so that an offset that stays becomes that of all points. No match where it is more than a pair may turn
-        by.
+        disparities that are off by as much at all depths, (R1). That is taken out of all matches of the frame, less a
+        small part, so that an offset that stays becomes that of all points. No match where it is more than a pair may
+        turn by.
 
         Args:
             tracks: as for `track_right`, whose matches with it are too few.
@@ -219,7 +219,9 @@ class StereoFit:
     def _with_right_pixels(self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray) -> Tracks:
         """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of the given rows (K,)."""
         if self._offset_px:
-            pixels = pixels + self._offset_px * np.stack([self._offset_growth(tracks.left[rows]), np.zeros(len(rows))], 1)
+            pixels = pixels + self._offset_px * np.stack(
+                [self._offset_growth(tracks.left[rows]), np.zeros(len(rows))], 1
+            )
         right, has_right, skews = tracks.right.copy(), tracks.has_right.copy(), tracks.skew.copy()
         right[rows], has_right[rows], skews[rows] = pixels, True, skew
         point, has_point = tracks.point.copy(), tracks.has_point.copy()

@@ -97,6 +97,17 @@ def test_a_frozen_left_image_is_skipped_and_named_once() -> None:
     assert line.startswith("frame 5: the left camera is frozen: its image does not change since frame 2")
 
 
+def test_an_exposure_of_its_own_that_clips_the_left_image_freezes_no_camera() -> None:
+    """The rig stands still; the left camera's exposure is long in one frame, so that a fifth of its pixels clip."""
+    smooth = cv2.GaussianBlur(TEXTURE, (0, 0), 3.0)
+    frames = [(noisy(smooth[:, :200], k), noisy(smooth[:, 10:210], 20 + k)) for k in range(7)]
+    bright = np.clip(frames[4][0] * 1.8, 0, 255).astype(np.uint8)
+    assert np.mean(bright == 255) > 0.15
+    frames[4] = bright, frames[4][1]
+    usable, frozen, lines = run(frames)
+    assert (all(usable), any(frozen), lines) == (True, False, [])
+
+
 def test_a_dark_right_image_is_named() -> None:
     frames = [pair(k) for k in range(12)]
     for k in FROZEN:
@@ -149,6 +160,18 @@ def frozen_run() -> tuple[list[StereoFrame], list[FrontendOutput]]:
             prior = TrackPrior(seen.ids, truth(SLANTED, poses[k - 1], seen.z[:, :2], poses[k]))
         outputs.append(frontend.process(frame, prior))
     return frames, outputs
+
+
+@pytest.mark.parametrize("camera", ["left", "right"])
+def test_a_frozen_image_is_not_taken_for_the_other_cameras(camera: str) -> None:
+    """The rig moves by more than a baseline, so that a frozen image is one from the other camera's far side."""
+    step = np.array([0.08 if camera == "right" else -0.08, 0.0, 0.0, 0.0, 0.0, 0.0])
+    frames = [stereo_frame(k, se3_exp(k * step)) for k in range(FRAMES)]
+    frames = [replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f for f in frames]
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    lines = [line for frame in frames for line in frontend.process(frame).warnings]
+    assert lines
+    assert not [line for line in lines if "exchanged" in line]
 
 
 def test_front_end_goes_on_with_the_left_images_of_a_frozen_pair(

@@ -5,8 +5,8 @@
 
 A variant changes the events of a recording in memory: the images after rectification, the samples of the IMU, the
 stamps, the calibration. *Healthy* ones are what a good rig may deliver, so no check may act on them. *Faults* begin at
-40 % of the recording and last three seconds, unless their name says otherwise. The error is the ATE after SE(3)
-alignment; `ratio` is its largest value over the largest stated standard deviation of a position.
+40 % of the recording and last three seconds, or to its last fifth, unless their name says otherwise. The error is the
+ATE after SE(3) alignment; `ratio` is its largest value over the largest stated standard deviation of a position.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from vio.protocols import Dataset
 from vio.records import Event, Image, ImuSample, Observations, Recording, StereoFrame, Trajectory
 from vio.runs.pipeline import RunResult, run
 
-_BEGIN, _LENGTH_S = 0.4, 3.0  # of a fault: share of the recording before it, and how long it lasts
+_BEGIN, _END, _LENGTH_S = 0.4, 0.8, 3.0  # of a fault: shares of the recording, and how long it lasts at most
 _MIRROR = np.diag([-1.0, 1.0, 1.0])
 _NS = 1e-9
 
@@ -560,9 +560,9 @@ def run_variant(
     if reference is not None:
         recording = replace(recording, reference=read_trajectory(reference))
     times_ns = recording.frame_times_ns[:stop]
-    begin_ns = int(times_ns[0] + _BEGIN * (times_ns[-1] - times_ns[0]))
+    begin_ns, end_ns = (int(times_ns[0] + share * (times_ns[-1] - times_ns[0])) for share in (_BEGIN, _END))
     cut = Changed(dataset, replace(recording, frame_times_ns=times_ns), _to_frame(stop))
-    changed = GROUPS[group][name](cut, Period(begin_ns, begin_ns + int(_LENGTH_S / _NS)))
+    changed = GROUPS[group][name](cut, Period(begin_ns, min(end_ns, begin_ns + int(_LENGTH_S / _NS))))
     out: dict[str, Any] = {"recording": source.name, "motion": motion, "group": group, "variant": name}
     try:
         result = run(changed, load_config(overrides=[f"motion={motion}", *overrides]))
