@@ -15,7 +15,7 @@ from vio.frontend.flicker import BandRemoval
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
 from vio.frontend.image_check import FrameImages, ImageCheck
-from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains
+from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains, voters
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
@@ -222,12 +222,16 @@ class KltFrontend:
                 after[has_depth],
                 motion,
                 expected_motion,
+                voting=voters(old.age[rows[has_depth]]),
                 in_event=self._objects.active,
             )
             if stereo.rows_are_off and one_motion_explains(problem, chosen, before[has_depth], after[has_depth]):
                 chosen = replace(chosen, object_share=0.0)
             motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
             self._objects.frame(index, chosen)
+            alone = expected_motion is None or not expected_motion.measured
+            if self._objects.hides_scene(index, chosen) and alone:
+                return np.zeros(len(old), dtype=np.bool_), None
         if motion is not None and not has_depth.all():
             near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
             distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)

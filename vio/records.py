@@ -251,6 +251,7 @@ class MotionPrior:
 
     T_curr_prev: FloatArray  # (4, 4) maps the previous cam0 frame into the coming one
     covariance: FloatArray  # (6, 6) of xi in T_curr_prev = exp(xi) T_hat, [rho; phi], m and rad
+    measured: bool = True  # by a motion sensor; False: the rig is expected to go on as before
 
 
 @dataclass(frozen=True, slots=True)
