@@ -421,7 +421,8 @@ class Odometry:
                 )
             for sample in samples:
                 self._last_ns["sample"] = sample.time_ns
-                self._predictor.sample(sample)
+                if (usable := self._processor.usable(sample)) is not None:
+                    self._predictor.sample(usable)
                 self._deliver(self._add(sample))
 
     def _rectified(

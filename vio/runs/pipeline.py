@@ -319,6 +319,7 @@ class _Loop:
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
             self._viewer.frame(result)
+        self._recorder.replace(state.processor.take_revised())
 
 
 def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:
