@@ -68,6 +68,10 @@ class EventProcessor:
         """What the checks have found so far, one line each."""
         return tuple(self._chain.monitor.lines)
 
+    def say(self, line: str) -> None:
+        """Log a line on the events, and add it to the warnings."""
+        self._chain.monitor.say(line)
+
     @property
     def frames_refused(self) -> int:
         """Number of frames that the front end refused."""

@@ -154,6 +154,10 @@ class RunMonitor:
             return None
         return None if check.imu_at_fault and check.rotation_comparison.agree else check.rotation_comparison
 
+    def say(self, line: str) -> None:
+        """Report what was found elsewhere, in one line."""
+        self._report([line])
+
     def refused(self, index: int, reason: str) -> None:
         """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
         if self._refused_last != self._index_before:
