@@ -488,7 +488,7 @@ class Recording:
     motion: frozenset[MotionSource]  # which motion samples the events carry
     reference: Trajectory | None  # ground truth lying in the recording
     landmarks_reference: Landmarks | None = None  # surveyed landmark positions, covariance zero
-    notes: tuple[str, ...] = ()  # what the reader found and corrected; each is logged once as a warning
+    notes: tuple[str, ...] = ()  # what the reader found and corrected; a command logs each once
     run_motion: RunMotion | None = None  # observation logs: what the run behind the log used; None: not known
 
     @property
