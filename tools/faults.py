@@ -31,7 +31,7 @@ from vio.errors import VioError
 from vio.files.trajectories import read_trajectory
 from vio.geometry.lie import FloatArray, se3_from_parts, se3_inverse, so3_exp
 from vio.protocols import Dataset
-from vio.records import Event, Image, ImuSample, Observations, Recording, StereoFrame, Trajectory
+from vio.records import BoolArray, Event, Image, ImuSample, Observations, Recording, StereoFrame, Trajectory
 from vio.runs.pipeline import RunResult, run
 
 _BEGIN, _END, _LENGTH_S = 0.4, 0.8, 3.0  # of a fault: shares of the recording, and how long it lasts at most
@@ -81,6 +81,20 @@ Variant: TypeAlias = Callable[[Dataset, Period], Changed]
 
 def _with_events(dataset: Dataset, change: EventChange, **fields: Any) -> Changed:
     return Changed(dataset, replace(dataset.recording, **fields), change)
+
+
+def _with_frames(dataset: Dataset, kept: BoolArray, change: EventChange = iter) -> Changed:
+    """Only some frames (F,), numbered anew."""
+    number = np.cumsum(kept) - 1
+
+    def changed(events: Iterable[Event]) -> Iterator[Event]:
+        for event in change(events):
+            if not isinstance(event, StereoFrame):
+                yield event
+            elif kept[event.index]:
+                yield replace(event, index=int(number[event.index]))
+
+    return _with_events(dataset, changed, frame_times_ns=dataset.recording.frame_times_ns[kept])
 
 
 def _with_pairs(change: PairChange) -> EventChange:
@@ -227,7 +241,7 @@ def _half(dataset: Dataset, period: Period) -> Changed:
 
 
 def _every_second(dataset: Dataset, period: Period) -> Changed:
-    return _with_events(dataset, lambda events: (e for e in events if not (isinstance(e, StereoFrame) and e.index % 2)))
+    return _with_frames(dataset, np.arange(len(dataset.recording.frame_times_ns)) % 2 == 0)
 
 
 def _night(rng: np.random.Generator) -> Callable[[Image], Image]:
@@ -404,13 +418,17 @@ def _calibration(**factors: float) -> Variant:
     return variant
 
 
-def _gap(*kinds: type) -> Variant:
-    """No event of some kinds during the fault's period."""
+def _gap(*, frames: bool, samples: bool) -> Variant:
+    """No frames or no samples during the fault's period."""
 
     def variant(dataset: Dataset, period: Period) -> Changed:
-        return _with_events(
-            dataset, lambda events: (e for e in events if not (isinstance(e, kinds) and period.holds(e.time_ns)))
-        )
+        times_ns = dataset.recording.frame_times_ns
+        kept = np.array([not (frames and period.holds(time_ns)) for time_ns in times_ns.tolist()])
+
+        def silent(events: Iterable[Event]) -> Iterator[Event]:
+            return (e for e in events if not (samples and isinstance(e, ImuSample) and period.holds(e.time_ns)))
+
+        return _with_frames(dataset, kept, silent)
 
     return variant
 
@@ -519,14 +537,14 @@ CAMERAS: dict[str, Variant] = {
     "focal +5 %": _calibration(fu=1.05, fv=1.05),
     "baseline +10 %": _calibration(baseline_m=1.1),
     "every 10th repeated": _repeated_tenth,
-    "no frames": _gap(StereoFrame),
-    "nothing": _gap(StereoFrame, ImuSample),
+    "no frames": _gap(frames=True, samples=False),
+    "nothing": _gap(frames=True, samples=True),
 }
 IMU: dict[str, Variant] = {
     "zero": _samples(_ZERO, during=True),
     "zero always": _samples(_ZERO),
     "stuck": _stuck,
-    "silent": _gap(ImuSample),
+    "silent": _gap(frames=False, samples=True),
     "dead later": _samples(lambda sample: None, after=True),
     "spikes": _seeded(lambda rng: _spikes(rng, 0.01, 30.0, 100.0)),
     "small spikes": _seeded(lambda rng: _spikes(rng, 0.02, 1.0, 5.0)),
