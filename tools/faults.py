@@ -620,11 +620,34 @@ def _figures(result: RunResult) -> dict[str, Any]:
     return out
 
 
+_PAGE = """# Faults and healthy variants
+
+Real recordings, changed in memory by `tools/faults.py`; ATE in millimetres after SE(3) alignment. This page is made by
+`python tools/faults.py --table RUNS`, with the lines that its runs printed.
+
+## Healthy variants
+
+What a good rig may deliver: no check may act on it. The mirrored pair has exchanged cameras, so the path of the other
+camera is estimated, and compared with its own truth. Numbers in brackets: lines that are said of the variant, but not
+of the recording as it is.
+
+{healthy}
+
+## Faults
+
+From 40 % of the recording on, for three seconds or to its last fifth, unless the name says otherwise. *Ratio*: largest
+error over the largest stated standard deviation of a position; images alone, and short recordings with little motion,
+state too little already without a fault. What was said is cut to its beginning.
+
+{faults}
+"""
+
+
 def table(rows: list[dict[str, Any]]) -> str:
-    """Return the tables of healthy variants and of faults, Markdown."""
+    """Return the page of the docs: the tables of healthy variants and of faults, Markdown."""
     healthy = [row for row in rows if row["group"] == "healthy"]
     faults = [row for row in rows if row["group"] != "healthy"]
-    return "\n".join([*_healthy_table(healthy), "", *_fault_table(faults)])
+    return _PAGE.format(healthy="\n".join(_healthy_table(healthy)), faults="\n".join(_fault_table(faults)))
 
 
 def _healthy_table(rows: list[dict[str, Any]]) -> list[str]:
@@ -652,7 +675,8 @@ def _healthy_table(rows: list[dict[str, Any]]) -> list[str]:
 def _fault_table(rows: list[dict[str, Any]]) -> list[str]:
     lines = ["| recording | fault | ATE mm | ratio | said |", "|---|---|---|---|---|"]
     for row in rows:
-        said = row.get("error") or "; ".join(re.split(r"[:;,] ", line.partition(": ")[2])[0] for line in row["said"])
+        lines_said = [re.sub(r"^(frame \d+|gyro \w+|accelerometer \w+): ", "", line) for line in row.get("said", [])]
+        said = row.get("error") or "; ".join(dict.fromkeys(re.split(r"[:;,] ", line)[0] for line in lines_said))
         ratio = f"{row['ratio']:.1f}" if "ratio" in row else ""
         name = f"{row['group']}: {row['variant']}"
         lines.append(f"| {row['recording']}, {row['motion']} | {name} | {_millimetres(row)} | {ratio} | {said} |")
@@ -681,7 +705,7 @@ def main() -> int:
     parser.add_argument("--table", type=Path, help="print the table of these lines")
     options = parser.parse_args()
     if options.table is not None:
-        print(table([json.loads(line) for line in options.table.read_text().splitlines()]))
+        print(table([json.loads(line) for line in options.table.read_text().splitlines()]), end="")
         return 0
     logging.basicConfig(level=logging.ERROR)
     folder = Path(os.environ.get("VIO_DATA", "."))
