@@ -120,6 +120,8 @@ def _voted(
     T, follows = best_motion(problem, p_prev[voting], pixels[voting], starts)
     if follows.mean() < _CLEAR_VOTE:
         return None
+    inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
+    T, _ = best_motion(problem, p_prev[inliers], pixels[inliers], T[None])  # the oldest points may all be far away
     return Consensus(T, pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px)
 
 

@@ -161,9 +161,9 @@ def test_the_table_shows_errors_ratios_and_what_was_said() -> None:
         row | {"group": "cameras", "variant": "black", "ratio": 0.25, "said": ["frame 5: images are black; left out"]},
         row | {"group": "imu", "variant": "zero", "said": [], "error": "DataError: refused"},
     ]
-    text = table(rows)
+    text = table(rows, [rows[2] | {"ate_m": 0.4}])
     assert "| clean | 4 |" in text
     assert "| night | 5.1 [1] |" in text
     assert "1. r, none, night: frame 7: alarm" in text
-    assert "| r, none | cameras: black | 4 | 0.2 | images are black |" in text
-    assert "| r, none | imu: zero | 4 | 1.0 | DataError: refused |" in text
+    assert "| r, none | cameras: black | 400 | 4 | 0.2 | images are black |" in text
+    assert "| r, none | imu: zero | – | 4 | 1.0 | DataError: refused |" in text

@@ -637,17 +637,19 @@ of the recording as it is.
 
 From 40 % of the recording on, for three seconds or to its last fifth, unless the name says otherwise. *Ratio*: largest
 error over the largest stated standard deviation of a position; images alone, and short recordings with little motion,
-state too little already without a fault. What was said is cut to its beginning.
+state too little already without a fault. *Before*: an earlier revision. What was said is cut to its beginning.
 
 {faults}
 """
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """Return the page of the docs: the tables of healthy variants and of faults, Markdown."""
+def table(rows: list[dict[str, Any]], before: list[dict[str, Any]] | None = None) -> str:
+    """Return the page of the docs, Markdown: healthy variants, and faults with the ATE of an earlier revision."""
     healthy = [row for row in rows if row["group"] == "healthy"]
     faults = [row for row in rows if row["group"] != "healthy"]
-    return _PAGE.format(healthy="\n".join(_healthy_table(healthy)), faults="\n".join(_fault_table(faults)))
+    return _PAGE.format(
+        healthy="\n".join(_healthy_table(healthy)), faults="\n".join(_fault_table(faults, before or []))
+    )
 
 
 def _healthy_table(rows: list[dict[str, Any]]) -> list[str]:
@@ -672,15 +674,22 @@ def _healthy_table(rows: list[dict[str, Any]]) -> list[str]:
     return [*lines, "", *(f"{k}. {note}" for k, note in enumerate(notes, 1))]
 
 
-def _fault_table(rows: list[dict[str, Any]]) -> list[str]:
-    lines = ["| recording | fault | ATE mm | ratio | said |", "|---|---|---|---|---|"]
+def _fault_table(rows: list[dict[str, Any]], before: list[dict[str, Any]]) -> list[str]:
+    lines = ["| recording | fault | ATE mm before | now | ratio | said |", "|---|---|---|---|---|---|"]
+    old = {_key(row): row for row in before}
     for row in rows:
         lines_said = [re.sub(r"^(frame \d+|gyro \w+|accelerometer \w+): ", "", line) for line in row.get("said", [])]
         said = row.get("error") or "; ".join(dict.fromkeys(re.split(r"[:;,] ", line)[0] for line in lines_said))
         ratio = f"{row['ratio']:.1f}" if "ratio" in row else ""
         name = f"{row['group']}: {row['variant']}"
-        lines.append(f"| {row['recording']}, {row['motion']} | {name} | {_millimetres(row)} | {ratio} | {said} |")
+        shown = f"{_millimetres(old.get(_key(row), {}))} | {_millimetres(row)}"
+        lines.append(f"| {row['recording']}, {row['motion']} | {name} | {shown} | {ratio} | {said} |")
     return lines
+
+
+def _key(row: dict[str, Any]) -> tuple[str, ...]:
+    """What names a run."""
+    return tuple(str(row[name]) for name in ("recording", "motion", "group", "variant"))
 
 
 def _unlike(said: list[str], usual: list[str]) -> list[str]:
@@ -693,6 +702,10 @@ def _millimetres(row: dict[str, Any]) -> str:
     return f"{1e3 * row['ate_m']:.3g}" if "ate_m" in row else "–"
 
 
+def _lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
 def main() -> int:
     """Run what the command line names."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n\n")[0])
@@ -702,10 +715,11 @@ def main() -> int:
     parser.add_argument("--stop", type=int, help="frame after the last one")
     parser.add_argument("--reference", type=Path, help="trajectory, where the recording itself holds none")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
-    parser.add_argument("--table", type=Path, help="print the table of these lines")
+    parser.add_argument("--table", type=Path, help="print the tables of these lines")
+    parser.add_argument("--before", type=Path, help="lines of an earlier revision, to compare with in the tables")
     options = parser.parse_args()
     if options.table is not None:
-        print(table([json.loads(line) for line in options.table.read_text().splitlines()]), end="")
+        print(table(_lines(options.table), [] if options.before is None else _lines(options.before)), end="")
         return 0
     logging.basicConfig(level=logging.ERROR)
     folder = Path(os.environ.get("VIO_DATA", "."))
