@@ -699,7 +699,10 @@ def _unlike(said: list[str], usual: list[str]) -> list[str]:
 
 
 def _millimetres(row: dict[str, Any]) -> str:
-    return f"{1e3 * row['ate_m']:.3g}" if "ate_m" in row else "–"
+    if "ate_m" not in row:
+        return "–"
+    error_mm = 1e3 * row["ate_m"]
+    return f"{error_mm:.0f}" if error_mm >= 100 else f"{error_mm:.3g}"
 
 
 def _lines(path: Path) -> list[dict[str, Any]]:
