@@ -293,8 +293,8 @@ class _Loop:
         for event in self._reading.timed(events):
             if resumed and not state.is_new(event):
                 continue
-            if isinstance(event, StereoFrame) and state.frame_ns is not None:
-                state.unread += self._between(state.next_frame + 1, event.index)
+            if isinstance(event, StereoFrame):
+                state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
             self._take(event)
             state.note(event)
             if _LEAST_REFUSED <= processor.frames_refused > len(recorder):
@@ -304,10 +304,12 @@ class _Loop:
                 recorder.save(state, dataset, processor.take_landmarks())
             if stopped:
                 break
-        if stopped is None and state.frame_ns is not None:
-            state.unread += self._between(state.next_frame + 1, self._end)
+        else:
+            if state.frame_ns is not None:
+                state.unread += self._between(state.next_frame + 1, self._end)
         if state.unread:
-            processor.say(_unread_line(state.unread, len(recorder)))
+            last = max(state.next_frame, *state.unread)
+            processor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
         self._record(processor.finish())
         recorder.revise(processor.smoothed)
         if processor.frames_refused > len(recorder):
@@ -359,10 +361,10 @@ def _taken_frames(recording: Recording, config: Config, start: int, stop: int | 
     return {index for index in indices if index >= start and (stop is None or index < stop)}
 
 
-def _unread_line(unread: list[int], taken: int) -> str:
+def _unread_line(unread: list[int], frames: int) -> str:
     """The line on frames that could not be read."""
     named = ", ".join(map(str, unread[:_MOST_NAMED])) + (", …" if len(unread) > _MOST_NAMED else "")
-    return f"{len(unread)} of {len(unread) + taken} frames could not be read and were skipped: {named}"
+    return f"{len(unread)} of {frames} frames could not be read and were skipped: {named}"
 
 
 def _limited(events: Iterable[Event], recording: Recording, config: Config) -> Iterable[Event]:
