@@ -49,6 +49,8 @@ class ExchangeDetector(ImageCheck):
 
     def inspect(self, images: FrameImages) -> FrameImages | None:
         """Return the images in their right order; None: they do not fit each other."""
+        if not images.right_lives:
+            return images
         left, right = images.views
         suspicious = not images.right_trusted
         order = self.order(

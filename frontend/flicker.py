@@ -44,7 +44,7 @@ class BandRemoval(ImageCheck):
         rows_left, rows_right = _row_means(left), _row_means(right)
         contrast = sorted(mean_and_contrast(image, _STRIDE)[1] for image in (left, right))
         if not self._active and contrast[0] > _LEAST_CONTRAST * contrast[1]:
-            self._detect(index, _smoothed(rows_left - rows_right))
+            self._detect(index, _smoothed(_without_gain(rows_left, rows_right)))
         if not self._active:
             return left, right
         return _flattened(left, _smoothed(rows_left)), _flattened(right, _smoothed(rows_right))
@@ -68,6 +68,12 @@ def _row_means(image: Image) -> FloatArray:
     # Sums of integers are vectorised: a twentieth of the time of means, which OpenCV takes as these, times 1 / width.
     sums = np.asarray(cv2.reduce(image, 1, cv2.REDUCE_SUM, dtype=cv2.CV_32S))
     return sums * (1.0 / image.shape[1])
+
+
+def _without_gain(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Difference (H, 1) of row means at one mean gray level: cameras that set their exposure alone make no bands."""
+    a, b = max(float(left.mean()), 1.0), max(float(right.mean()), 1.0)
+    return (left / a - right / b) * ((a + b) / 2)
 
 
 def _smoothed(rows: FloatArray) -> FloatArray:

@@ -22,6 +22,7 @@ class FrameImages:
     previous: PreviousFrame | None  # the last frame that was not skipped
     stereo: StereoFit
     right_trusted: bool  # the right image of the last frame was used
+    right_lives: bool = True  # False: the right image of this frame is known to be frozen, dark or covered
 
     @cached_property
     def views(self) -> tuple[ImageLevels, ...]:

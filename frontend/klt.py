@@ -15,7 +15,7 @@ from vio.frontend.flicker import BandRemoval
 from vio.frontend.flow import track_with_retries
 from vio.frontend.frames import FrameValidator, Stopwatch, make_output
 from vio.frontend.image_check import FrameImages, ImageCheck
-from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains
+from vio.frontend.moving_object import ObjectReport, choose_motion, one_motion_explains, voters
 from vio.frontend.new_features import NewFeatures
 from vio.frontend.one_camera import with_depths, with_prior_depths
 from vio.frontend.outliers import Consensus, RansacProblem, epipolar_distance, predicted_motion, static_tracks
@@ -61,7 +61,8 @@ class KltFrontend:
         contrast = LostContrast()
         self._checks: tuple[ImageCheck, ...] = (contrast, self._objects)  # in this order
         if camera.kind == "stereo":
-            pair = (ExchangeDetector(), self._right, self._delay, self._objects, SwapDetector(_SWAP_FEW))
+            # A frozen image looks as if it were the other camera's, so that is asked first.
+            pair = (self._right, self._delay, ExchangeDetector(), self._objects, SwapDetector(_SWAP_FEW))
             self._checks = (BandRemoval(), contrast, *pair)
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, ANCHOR_RADIUS_PX)
         self._anchor_fit = AnchorFit(camera, self._grid, self._bank)
@@ -162,6 +163,7 @@ class KltFrontend:
         They are matched in the right image, if there is one.
         """
         frame, left, right, stereo = images.frame, images.left, images.right, images.stereo
+        stereo.forget_offset()
         previous = self._previous
         if previous is None or len(previous.tracks) == 0 or (prior is None and self._after_gap(frame)):
             return no_tracks(), None
@@ -220,12 +222,16 @@ class KltFrontend:
                 after[has_depth],
                 motion,
                 expected_motion,
+                voting=voters(old.age[rows[has_depth]]),
                 in_event=self._objects.active,
             )
             if stereo.rows_are_off and one_motion_explains(problem, chosen, before[has_depth], after[has_depth]):
                 chosen = replace(chosen, object_share=0.0)
             motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
             self._objects.frame(index, chosen)
+            alone = expected_motion is None or not expected_motion.measured
+            if self._objects.hides_scene(index, chosen) and alone:
+                return np.zeros(len(old), dtype=np.bool_), None
         if motion is not None and not has_depth.all():
             near_m = camera.fu * camera.baseline_m / stereo.max_disparity_px
             distance = epipolar_distance(camera, motion.T_curr_prev, before[~has_depth], after[~has_depth], near_m)

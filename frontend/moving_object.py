@@ -1,9 +1,10 @@
 """Which of two motions is the camera's, where an object that moves on its own covers much of the image.
 
-The larger consensus wins RANSAC, and that may be the object's. The filter's prediction decides: each motion is tested
-by chi-square against the predicted one, with the covariance of the prediction and that of the fit. With an IMU the
-prediction is known to millimetres and the test decides nearly always; without one the prediction is that of a body
-that goes on as before, and where both motions are possible the larger consensus is used, and it is said.
+The larger consensus wins RANSAC, and that may be the object's. The prediction of a motion sensor decides: each motion
+is tested by chi-square against the predicted one, with the covariance of the prediction and that of the fit. With an
+IMU that is known to millimetres and the test decides nearly always. Otherwise the points vote that have been static
+for longest: what has come into view just now cannot outvote them. Where they are few or at odds, the prediction is that
+of a body that goes on as before, and where both motions are possible the larger consensus is used, and it is said.
 
 A stereo calibration that is off makes two groups of a static scene, too: its depths are wrong by their size. Where the
 rows show such a calibration, an object is reported only if the left images alone, without depths, show it as well.
@@ -21,9 +22,9 @@ from vio.frontend.outliers import Consensus, RansacProblem, bearing_consensus, b
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, z_D_p_cam
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import MotionPrior
+from vio.records import BoolArray, IntArray, MotionPrior
 
-Decision: TypeAlias = Literal["predicted", "undecided"]
+Decision: TypeAlias = Literal["predicted", "voted", "undecided"]
 
 _PROBABILITY = 0.9999  # of a motion that agrees with the prediction to pass the test
 _LEAST_POINTS = 12  # of a second motion
@@ -33,7 +34,11 @@ _SEEN_SHARE = 0.5  # of the smaller group's points that must be off the epipolar
 _PIXEL_SIGMA = 0.5  # of a point's position by its depth and its track
 _INDEPENDENT_POINTS = 50  # errors of neighbours have much in common: a fit is no better than that of so many points
 _SCALE_SIGMA = 0.01  # of the length of a fitted translation: depths of one frame have errors in common
+_VOTERS, _VOTING_FRAMES = 50, 5  # how many points vote, and for how many frames each must have been static
+_CLEAR_VOTE = 0.7  # share of the voting points that must follow a motion
 _FRAMES = 5  # in a row before an object is reported
+_HIDDEN_SHARE = 0.1  # of the points that the scene has, during an event, below which the object hides it …
+_HIDDEN_FRAMES = 3  # … in so many frames in a row
 _CLEAR_FRAMES = 20  # without one before the next is another event
 
 
@@ -53,6 +58,7 @@ def choose_motion(
     found: Consensus,
     predicted: MotionPrior | None,
     *,
+    voting: BoolArray | None = None,
     in_event: bool = False,
 ) -> TwoMotions:
     """Choose between the consensus motion and that of its outliers.
@@ -63,12 +69,19 @@ def choose_motion(
         pixels: left pixels (N, 2) of the same points in the current frame.
         found: the consensus over them.
         predicted: the motion that the filter expects, with its covariance; None: it expects nothing.
+        voting: (N,) which points have been static for long; None: none.
         in_event: whether an object has been seen in the frames before. It may hide all but a few points of the scene,
-            and then the prediction itself is taken in place of a consensus that contradicts it.
+            and then the prediction of a motion sensor is taken in place of a consensus that contradicts it.
     """
+    measured = predicted is not None and predicted.measured
+    if voting is not None and not measured:
+        voted = _voted(problem, p_prev, pixels, found, voting)
+        if voted is not None:
+            share = float((found.inliers & ~voted.inliers).mean())
+            return TwoMotions(voted, share if share >= _LARGE_SHARE else 0.0, "voted")
     others = np.flatnonzero(~found.inliers)
     least = max(_LEAST_POINTS, _LEAST_SUPPORT * found.inliers.sum())
-    if len(others) < least and not (in_event and predicted is not None):
+    if len(others) < least and not (in_event and measured):
         return TwoMotions(found, 0.0, None)
     second, support = np.eye(4), np.zeros(len(others), dtype=np.bool_)
     if len(others) >= least:
@@ -76,18 +89,40 @@ def choose_motion(
         second, support = best_motion(problem, p_prev[others], pixels[others], starts)
     large, share = support.sum() >= least, float(support.sum()) / len(p_prev)
     reported = share if large and share >= _LARGE_SHARE else 0.0
+    if not measured and voting is not None and _votes_for(found, voting):
+        return TwoMotions(found, reported, "voted" if reported else None)
     if predicted is None:
         return TwoMotions(found, reported, "undecided" if reported else None)
     second_agrees = large and _agrees(problem.camera, second, p_prev[others[support]], predicted)
     if not (second_agrees or in_event or reported):
         return TwoMotions(found, 0.0, None)  # whether the first agrees or not
     first_agrees = _agrees(problem.camera, found.T_curr_prev, p_prev[found.inliers], predicted)
-    if first_agrees or not (second_agrees or in_event):
+    if first_agrees or not (second_agrees or (in_event and measured)):
         return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
     T = second if second_agrees else predicted.T_curr_prev
     inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
     share = float(found.inliers.mean())
     return TwoMotions(Consensus(T, inliers), share if share >= _LARGE_SHARE else 0.0, "predicted")
+
+
+def _votes_for(found: Consensus, voting: BoolArray) -> bool:
+    """Whether most of the voting points (N,) follow a motion."""
+    return bool(voting.sum() >= _LEAST_POINTS and found.inliers[voting].mean() >= _CLEAR_VOTE)
+
+
+def _voted(
+    problem: RansacProblem, p_prev: FloatArray, pixels: FloatArray, found: Consensus, voting: BoolArray
+) -> Consensus | None:
+    """Return the motion that most of the voting points (N,) follow, where the consensus is not theirs; else None."""
+    if voting.sum() < _LEAST_POINTS or _votes_for(found, voting):
+        return None
+    starts = np.stack([found.T_curr_prev, np.eye(4)])
+    T, follows = best_motion(problem, p_prev[voting], pixels[voting], starts)
+    if follows.mean() < _CLEAR_VOTE:
+        return None
+    inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
+    T, _ = best_motion(problem, p_prev[inliers], pixels[inliers], T[None])  # the oldest points may all be far away
+    return Consensus(T, pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px)
 
 
 def one_motion_explains(problem: RansacProblem, chosen: TwoMotions, before: FloatArray, after: FloatArray) -> bool:
@@ -121,37 +156,60 @@ def _agrees(camera: StereoCamera, T: FloatArray, p_prev: FloatArray, predicted: 
     return squared <= float(chi_square_quantile(_PROBABILITY, 6))
 
 
+def voters(age: IntArray) -> BoolArray:
+    """Which points (N,), static for some frames (N,), have a vote: the oldest of those that are not new.
+
+    What has come into view, and moves slowly enough to pass for static, is younger than what was there before.
+    """
+    oldest = np.partition(age, len(age) - _VOTERS)[len(age) - _VOTERS] if len(age) > _VOTERS else 0
+    return np.asarray(age >= max(oldest, _VOTING_FRAMES))
+
+
 class ObjectReport(ImageCheck):
     """Reports once per event that an object covers much of the image, and what decided which motion is the camera's."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._frames = self._clear = 0  # in a row
-        self._said = self._active = False
+        self._frames = self._clear = self._hidden = 0  # in a row
+        self._said = self._said_hidden = self._active = False
 
     @property
     def active(self) -> bool:
         """Whether the prediction has distinguished an object from the scene in some of the last frames."""
         return self._active
 
+    def hides_scene(self, index: int, motions: TwoMotions) -> bool:
+        """Return whether a known object has left too few points of the scene for some frames, so that none is used."""
+        hidden = self._active and float(motions.motion.inliers.mean()) < _HIDDEN_SHARE
+        self._hidden = self._hidden + 1 if hidden else 0
+        if self._hidden >= _HIDDEN_FRAMES and not self._said_hidden:
+            self._said_hidden = True
+            self._lines.append(
+                f"frame {index}: fewer than {100 * _HIDDEN_SHARE:.0f} % of the points are left of the scene: the "
+                "object hides it, and no feature is used"
+            )
+        return self._hidden >= _HIDDEN_FRAMES
+
     def frame(self, index: int, motions: TwoMotions) -> None:
         """Take the motions of a frame."""
         if motions.object_share == 0.0:
             self._frames, self._clear = 0, self._clear + 1
             self._said = self._said and self._clear < _CLEAR_FRAMES
+            self._said_hidden = self._said_hidden and self._said
             self._active = self._active and self._clear < _FRAMES
             return
         self._frames, self._clear = self._frames + 1, 0
-        self._active = self._active or (self._frames >= _FRAMES and motions.decision == "predicted")
+        self._active = self._active or (self._frames >= _FRAMES and motions.decision != "undecided")
         if self._frames < _FRAMES or self._said:
             return
         self._said = True
         share = round(100 * motions.object_share)
+        by = "the points seen before" if motions.decision == "voted" else "its predicted motion"
         line = (
-            f"frame {index}: {share} % of the points move together, but not as the camera does by its predicted "
-            "motion: an object that moves on its own covers much of the image; its points are left out"
+            f"frame {index}: {share} % of the points move together, but not as the camera does by {by}: an object that "
+            "moves on its own covers much of the image; its points are left out"
         )
-        if motions.decision != "predicted":
+        if motions.decision == "undecided":
             rest = round(100 * float(motions.motion.inliers.mean()))
             line = (
                 f"frame {index}: two groups of points move differently, {rest} % and {share} % of all: an object that "

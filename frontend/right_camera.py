@@ -2,13 +2,14 @@
 
 Two tests are made. *Images*: a right image that stays the same while the left one changes is frozen; so is a left image
 that stays the same while the right one changes. *Matches*: points of known depth, moved by the motion that the left
-image shows, must appear in the right image where their depth says. Where most do not, right and left contradict each
-other, and the frame is used with its left image alone until they agree again.
+image shows, must appear in the right image where their depth says, but for an offset that all have in common
+(`frontend.stereo_fit`). Where most do not, right and left contradict each other, and the frame is used with its left
+image alone until they agree again.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -25,6 +26,8 @@ _FROZEN_SHARE = 0.3  # change of a frozen camera's image over that of the other'
 _CONTRAST = 50.0  # gray levels that both images are scaled to, so that neither exposure nor gain counts as a change
 _MOST_NOISE = 3.0  # change of a frozen camera's image by noise of the sensor or an encoder, gray levels of these
 _LEAST_CHANGE = 1.0  # the same of the other camera's image: where it changes by less, nothing can be concluded
+_CLIPPED = 250  # gray level from which a pixel of a resampled image may contain clipped ones
+_LEAST_UNCLIPPED = 0.1  # share of the pixels
 _RATIO_GAIN = 0.1  # how fast the usual ratio of the two changes is learned, which depends on gains and scene
 _LEAST_POINTS = 20  # with fewer points of known depth, matches say nothing
 _CONTRADICTS = 0.3  # share of confirmed points below which the images contradict each other; usual is 0.8 to 1
@@ -32,6 +35,8 @@ _AGREES = 0.6  # share above which they agree again
 _FRAMES = 3  # in a row before it is said, or before images that agree are used again
 _BLIND_FRAMES = 40  # after as many without points to test by, the right image is tried again
 _DARK_SHARE = 0.1  # contrast of a dark or covered image over that of the other one
+
+_BY_IMAGE: tuple[Cause, ...] = ("frozen", "dark")  # causes that the image itself shows
 
 _SAID: dict[Cause, str] = {
     "frozen": "the right camera is frozen: its image does not change while the left one does",
@@ -83,9 +88,11 @@ class RightCamera(ImageCheck):
         self._count = self._agreeing = self._untested = 0
 
     def inspect(self, images: FrameImages) -> FrameImages | None:
-        """Skip frames whose left image is frozen."""
+        """Skip frames whose left image is frozen, and mark those whose right image is frozen or dark."""
         left, right = images.views
-        return None if self.left_is_frozen(images.frame.index, left.half, right.half) else images
+        if self.left_is_frozen(images.frame.index, left.half, right.half):
+            return None
+        return replace(images, right_lives=self._cause not in _BY_IMAGE)
 
     def left_is_frozen(self, index: int, left: Image, right: Image) -> bool:
         """Compare the images (H/2, W/2) of a frame with those before; return whether the left one is frozen.
@@ -110,10 +117,14 @@ class RightCamera(ImageCheck):
             return False
         if self._cause is None and change_left > _LEAST_CHANGE:
             self._ratio += _RATIO_GAIN * (change_right / change_left - self._ratio)
-        if self._cause in ("frozen", "dark"):
+        if self._cause in _BY_IMAGE:
             self._cause = "contradicts"  # its image is another one again; whether it fits is for the matches to say
         self._last = now
         return False
+
+    def doubts(self, matched: BoolArray) -> bool:
+        """Whether so few of the points (K,) of known depth are where they should be that a cause is looked for."""
+        return self._cause not in _BY_IMAGE and len(matched) >= _LEAST_POINTS and matched.mean() < _AGREES
 
     def check_matches(self, index: int, matched: BoolArray, *, moved: bool) -> bool:
         """Judge the matches of a frame near their known depths, and return whether the right image may be used.
@@ -123,7 +134,7 @@ class RightCamera(ImageCheck):
             matched: which of the points (K,) of known depth were found in the right image where they should be.
             moved: whether the points were moved by a motion that the left image confirms.
         """
-        if self._cause in ("frozen", "dark"):
+        if self._cause in _BY_IMAGE:
             return False
         tested = moved and len(matched) >= _LEAST_POINTS
         share = float(matched.mean()) if tested else None
@@ -175,7 +186,13 @@ class RightCamera(ImageCheck):
 
 
 def image_change(image: Image, other: Image) -> float:
-    """Mean absolute difference of two images, in gray levels at a common mean and contrast; 0: equal to the bit."""
+    """Mean absolute difference of two images, in gray levels at a common mean and contrast; 0: equal to the bit.
+
+    Pixels at the end of the scale are left out, as far as others are left: an exposure that changes clips others.
+    """
+    kept = (image < _CLIPPED) & (other < _CLIPPED)
+    if not kept.all() and kept.mean() > _LEAST_UNCLIPPED:
+        image, other = image[kept][None], other[kept][None]
     return float(_CONTRAST * _difference(image, other))
 
 

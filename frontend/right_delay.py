@@ -3,6 +3,9 @@
 A right image that is late by `delay` frames shows a feature where it was then: its row differs from the left one by
 `-delay` times the feature's motion along v in the last frame. The differences that a wrong rectification makes are
 constant over time instead, so both are fitted together: six terms over the image, and the delay.
+
+Where the right camera is early by one frame, its last image belongs to the present left one, and takes the place of the
+one that came with it: they were paired wrongly.
 """
 
 from __future__ import annotations
@@ -11,12 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vio.frontend.image_check import ImageCheck
+from vio.frontend.image_check import FrameImages, ImageCheck
 from vio.frontend.tracks import Tracks
 from vio.frontend.weighted_fit import add_equations
 from vio.geometry.lie import FloatArray, se3_exp, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays
 from vio.numerics.compiled import solve_positive
+from vio.records import Image
 
 _MEMORY = 0.97  # per frame, of the normal equations
 _LEAST_MATCHES = 30  # in a frame that is learned from
@@ -56,6 +60,15 @@ class RightDelay(ImageCheck):
         self._solution: FloatArray = np.zeros(_TERMS + 1)
         self._suspected = (0.0, 0)  # delay by the pairings, and in how many frames in a row
         self.frames = 0.0  # the delay in frames to be taken out; 0: none is significant
+        self._early = False  # each right image is used with the next left one
+        self._last_right: Image | None = None  # that came with the last frame, where it is used with this one
+
+    def inspect(self, images: FrameImages) -> FrameImages | None:
+        """Return the left image with the right one of its time; None: that one was not kept."""
+        if not self._early:
+            return images
+        right, self._last_right = self._last_right, images.raw[1].copy()
+        return None if right is None else images.with_raw((images.raw[0], right))
 
     def update(self, index: int, left: FloatArray, flow: FloatArray, rows: FloatArray, frame_s: float) -> bool:
         """Learn from the matches of a frame; return whether a delay has just begun or ended.
@@ -79,9 +92,9 @@ class RightDelay(ImageCheck):
         self._frames += 1
         self._solution = self._moment.copy()
         solve_positive(self._normal + 1e-6 * np.eye(_TERMS + 1), self._solution)
-        before = self.frames
+        before = self.frames == 0.0, self._early
         self._decide(index, frame_s)
-        return (before == 0.0) != (self.frames == 0.0)
+        return before != (self.frames == 0.0, self._early)
 
     def _decide(self, index: int, frame_s: float) -> None:
         """Take a delay out where it is significant, and report it once."""
@@ -120,14 +133,26 @@ class RightDelay(ImageCheck):
         self._suspected = (delay, self._suspected[1] + 1 if self._suspected[0] == delay else 1) if clear else (0.0, 0)
         if self._suspected[1] < _SUSPECT_FRAMES or self.frames != 0.0:
             return False
-        self._normal, self._moment = np.zeros_like(self._normal), np.zeros_like(self._moment)
-        self._square = self._count = 0.0
-        self._frames, self._solution = 0, np.zeros(_TERMS + 1)
+        self._forget()
         self._begin(index, delay, delay, frame_s)
         return True
 
+    def _forget(self) -> None:
+        """Forget what was learned of the rows."""
+        self._normal, self._moment = np.zeros_like(self._normal), np.zeros_like(self._moment)
+        self._square = self._count = 0.0
+        self._frames, self._solution = 0, np.zeros(_TERMS + 1)
+        self._suspected = (0.0, 0)
+
     def _begin(self, index: int, rounded: float, delay: float, frame_s: float) -> None:
-        self.frames = rounded
+        if rounded == (1.0 if self._early else -1.0):
+            self._early, self._last_right = not self._early, None
+            self._forget()
+            if not self._early:
+                self._lines.append(f"frame {index}: the right camera is no longer late or early")
+                return
+        else:
+            self.frames = rounded
         late = "late" if delay > 0 else "early"
         self._lines.append(
             f"frame {index}: the right camera is {late} by {1e3 * abs(delay) * frame_s:.0f} ms ({abs(delay):.2f} "

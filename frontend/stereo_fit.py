@@ -20,6 +20,7 @@ from vio.frontend.tracks import INLIER_PX, AnchorBank, Tracks
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera, depth_of
 from vio.numerics.compiled import compiled
+from vio.numerics.robust import median
 from vio.records import BoolArray, Image, IntArray
 
 _ITERATIONS = 5
@@ -35,6 +36,11 @@ _GOOD_MATCH = 0.9  # correlation of patches whose rows agree
 _LEAST_POINTS = 20
 _ROWS_OFF_PX = 0.2  # root mean square over the matches: from here on the run reports the calibration, too
 _ROW_SEARCH_FRAMES = 10  # between two such searches, while matches are few
+# A pair turns so much in its mount, three times the prior of its calibration, or exposes so far apart.
+_MOST_TURN_RAD = 0.3 * np.pi / 180.0
+_OFFSET_GAIN = 0.2  # part of a frame's common offset that is believed
+_DEPTH_SLACK = 0.1  # standard deviation of a point's depth by motion alone, over it
+_LEAST_SPREAD_PX = 2.0  # between near and far disparities, to tell an offset from a factor
 _MAX_ROWS_HALF = 16  # row difference, pixels at half resolution
 
 
@@ -54,6 +60,7 @@ class StereoFit:
         self._bank = bank
         self._rows = EpipolarRowModel(*size)
         self._unmatched = 0  # frames in a row with hardly any match
+        self._offset_px = 0.0  # that is taken out of all disparities of the present frame
 
     def track_right(self, tracks: Tracks, right: ImageLevels, moved: bool) -> Tracks:
         """Match features of known depth; with a consensus motion (`moved`), check the disparity against the depth.
@@ -63,14 +70,54 @@ class StereoFit:
             right: the right image.
             moved: whether the depths were propagated with a consensus motion.
         """
-        depth = depth_of(self._camera, tracks.point)
-        has_depth = tracks.has_point & (depth > _MIN_DEPTH_M)
-        rows, known = np.flatnonzero(has_depth), take(tracks, has_depth)
-        expected = self._camera.fu * self._camera.baseline_m / depth[rows]
+        rows, expected = self._expected(tracks)
+        known = take(tracks, rows)
         pixels, skew, valid = self._fit(known, right, expected)
         if moved:
             valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= INLIER_PX
         return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
+
+    def track_off_right(self, tracks: Tracks, left: ImageLevels, right: ImageLevels, *, by_motion: bool) -> Tracks:
+        """Match features of known depth anywhere on their rows, as far as a common offset explains their disparities.
+
+        A pair that turns a little in its mount, or whose cameras expose a millisecond apart while the rig turns, has
+        disparities that are off by as much at all depths, (R1). That is taken out of all matches of the frame, less a
+        small part, so that an offset that stays becomes that of all points. No match where it is more than a pair may
+        turn by.
+
+        Args:
+            tracks: as for `track_right`, whose matches with it are too few.
+            left: the left image.
+            right: the right image.
+            by_motion: whether depths come from the camera's motion alone: they have a factor in common, and are known
+                less well.
+        """
+        rows, expected = self._expected(tracks)
+        coarse, unique = self.search(left, right, tracks.left[rows])
+        rows, expected, known = rows[unique], expected[unique], take(tracks, rows[unique])
+        pixels, skew, valid = self._fit(known, right, coarse[unique])
+        rows, expected, pixels, skew = rows[valid], expected[valid], pixels[valid], skew[valid]
+        off, grows = tracks.left[rows, 0] - pixels[:, 0] - expected, self._offset_growth(tracks.left[rows])
+        if len(off) < _LEAST_POINTS:
+            return tracks
+        offset, slope = common_offset(expected / grows, off / grows) if by_motion else (median(off / grows), 0.0)
+        if abs(offset) > self._camera.fu * _MOST_TURN_RAD:
+            return tracks
+        tolerance = INLIER_PX + (_DEPTH_SLACK * expected if by_motion else 0.0)
+        agree = np.abs(off - offset * grows - slope * expected) <= tolerance
+        self._offset_px = (1.0 - _OFFSET_GAIN) * offset
+        return self._with_right_pixels(tracks, rows[agree], pixels[agree], skew[agree])
+
+    def _offset_growth(self, left: FloatArray) -> FloatArray:
+        """By how much more (N,) a turn of the right camera moves pixels at left pixels (N, 2) than in the centre."""
+        x = (left[:, 0] - self._camera.cu) / self._camera.fu
+        return 1.0 + x * x
+
+    def _expected(self, tracks: Tracks) -> tuple[IntArray, FloatArray]:
+        """Rows (K,) of the features of known depth, and the disparities (K,) that follow from it."""
+        depth = depth_of(self._camera, tracks.point)
+        rows = np.flatnonzero(tracks.has_point & (depth > _MIN_DEPTH_M))
+        return rows, self._camera.fu * self._camera.baseline_m / depth[rows]
 
     def match_near(self, tracks: Tracks, right: ImageLevels, rows: IntArray, disparity: FloatArray) -> Tracks:
         """Match the given rows (K,) near their disparities (K,)."""
@@ -112,6 +159,10 @@ class StereoFit:
     def count_on_rows(self, left_half: Image, right_half: Image, points: FloatArray) -> int:
         """Count the left pixels (N, 2) that match well on their row between two images at half resolution."""
         return int(self._search(left_half, right_half, points, _GOOD_MATCH)[1].sum())
+
+    def forget_offset(self) -> None:
+        """Take nothing out of the disparities that follow."""
+        self._offset_px = 0.0
 
     @property
     def has_few_matches(self) -> bool:
@@ -167,12 +218,31 @@ class StereoFit:
 
     def _with_right_pixels(self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray) -> Tracks:
         """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of the given rows (K,)."""
+        if self._offset_px:
+            pixels = pixels + self._offset_px * np.stack(
+                [self._offset_growth(tracks.left[rows]), np.zeros(len(rows))], 1
+            )
         right, has_right, skews = tracks.right.copy(), tracks.has_right.copy(), tracks.skew.copy()
         right[rows], has_right[rows], skews[rows] = pixels, True, skew
         point, has_point = tracks.point.copy(), tracks.has_point.copy()
         f_baseline = self._camera.fu * self._camera.baseline_m
         _triangulate(camera_args(self._camera), f_baseline, tracks.left, rows, pixels, point, has_point)
         return replace(tracks, right=right, has_right=has_right, skew=skews, point=point, has_point=has_point)
+
+
+def common_offset(expected: FloatArray, off: FloatArray) -> tuple[float, float]:
+    """Offset and slope of deviations (N,) over expected disparities (N,): the line through two medians.
+
+    The slope is the factor that is unknown of depths by the motion of one camera; the offset is what is left.
+    Reference: Tukey, Exploratory Data Analysis (1977), resistant lines.
+    """
+    order = np.argsort(expected)
+    near, far = order[len(order) // 2 :], order[: len(order) // 2]
+    d_near, d_far = median(expected[near]), median(expected[far])
+    if d_near - d_far < _LEAST_SPREAD_PX:
+        return median(off), 0.0
+    slope = (median(off[near]) - median(off[far])) / (d_near - d_far)
+    return median(off - slope * expected), slope
 
 
 @compiled

@@ -300,8 +300,13 @@ def test_reports_and_skips_truncated_images_up_to_a_limit(
     image = folder / "image_1" / "000003.png"
     image.write_bytes(image.read_bytes()[:-20])
     run = ("run", str(folder), "--out", str(tmp_path / "out"))
-    assert _json(capsys, *run)["frames"] == 5
+    metrics = _json(capsys, *run)
+    assert metrics["frames"] == 5
+    assert "1 of 6 frames could not be read and were skipped: 3" in metrics["warnings"]
     assert "000003.png" in caplog.text
+    assert main(["report", str(tmp_path / "out")]) == 0
+    assert "5 of 6 frames" in (tmp_path / "out" / "report.html").read_text()
+    capsys.readouterr()
     assert "000003.png" in _error(capsys, *run, "--set", "dataset.max_bad_frames=0")
 
 

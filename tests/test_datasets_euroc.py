@@ -206,6 +206,24 @@ def test_finds_images_with_another_extension(tmp_path: Path) -> None:
     assert len(_frames(dataset)) == 4
 
 
+def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(tmp_path: Path) -> None:
+    """Right images are missing at the end, and the last line of the IMU's record is cut: both are said."""
+    mav = make_euroc(tmp_path, 6) / "mav0"
+    for image in sorted((mav / "cam1" / "data").iterdir())[-2:]:
+        image.unlink()
+    record = mav / "imu0" / "data.csv"
+    lines = record.read_text().splitlines()
+    record.write_text("\n".join([*lines[:-1], ",".join(lines[-1].split(",")[:3])]))
+    dataset = open_dataset(tmp_path)
+    assert len(dataset.recording.frame_times_ns) == 4
+    notes = dataset.recording.notes
+    assert "the last 2 of 6 listed images of cam1 are missing; 4 pairs are used" in notes
+    assert any(f"line {len(lines)}: the last line ends too early (3 of 7 values); left out" in note for note in notes)
+    samples = [event for event in dataset.events() if isinstance(event, ImuSample)]
+    assert samples[-1].time_ns <= int(lines[-2].split(",")[0])
+    assert sum(isinstance(event, StereoFrame) for event in dataset.events()) == 4
+
+
 def test_skips_and_counts_unmatched_images(tmp_path: Path) -> None:
     make_euroc(tmp_path, 6)
     left, right = (tmp_path / "mav0" / name / "data.csv" for name in ("cam0", "cam1"))

@@ -43,6 +43,17 @@ def test_a_late_right_camera_makes_no_bands() -> None:
     assert removal.take_lines() == ()
 
 
+def test_cameras_that_set_their_exposure_alone_make_no_bands() -> None:
+    """Bright sky above dark ground: a gain of one camera alone changes the difference of their row means."""
+    light = np.repeat([190.0, 20.0], 75)[:, None]
+    removal = BandRemoval()
+    for k in range(12):
+        gains = np.random.default_rng(k).uniform(0.4, 1.3, 2)
+        left, right = (np.asarray(gain * light * (0.9 + 0.1 * np.cos(np.arange(200))), np.uint8) for gain in gains)
+        assert removal.flatten(k, left, right)[0] is left
+    assert removal.take_lines() == ()
+
+
 def test_bands_are_named_once_and_taken_out() -> None:
     removal, lines = BandRemoval(), []
     for k in range(12):

@@ -9,7 +9,7 @@ import pytest
 
 from tests.test_frontend_outliers import CAMERA, T_TRUE, make_problem, pixels, scene
 from vio.frontend.klt import KltFrontend
-from vio.frontend.moving_object import ObjectReport, TwoMotions, choose_motion, one_motion_explains
+from vio.frontend.moving_object import ObjectReport, TwoMotions, choose_motion, one_motion_explains, voters
 from vio.frontend.outliers import Consensus, rigid_consensus
 from vio.frontend.prediction import usable_prior
 from vio.frontend.settings import FrontendSettings
@@ -91,6 +91,62 @@ def test_an_object_that_hides_the_scene_does_not_become_the_scene() -> None:
     assert not chosen.motion.inliers[truck].any()
     assert chosen.motion.inliers[~truck].sum() >= 4
     np.testing.assert_allclose(chosen.motion.T_curr_prev, prediction().T_curr_prev)
+
+
+def test_points_seen_before_outvote_what_has_come_into_view() -> None:
+    """No sensor, and a prediction that fits the object: the older points of the scene decide, four of five or one."""
+    for static, moving in ((60, 240), (240, 60)):
+        p, uv, truck = scenery(static, moving)
+        found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
+        assert found is not None
+        age = np.where(truck, 9, 30)
+        age[-5:] = 30  # some wrong ones
+        guess = replace(prediction(T_OBJECT), measured=False)
+        chosen = choose_motion(make_problem(), p, uv, found, guess, voting=voters(age), in_event=True)
+        assert chosen.motion.inliers[~truck].mean() > 0.95
+        assert not chosen.motion.inliers[truck].any()
+        assert (chosen.decision, chosen.object_share > 0) == (("voted", True) if moving > static else (None, False))
+
+
+def test_a_compromise_between_slow_object_and_scene_is_outvoted() -> None:
+    """One motion fits the object and a part of the scene, so that no second group of points is left that agrees."""
+    wall, truck = scene(100, 12, (8.0, 40.0)), scene(260, 13, (6.0, 8.0))
+    slow = pixels(T_TRUE, truck, 15)
+    slow[:, 0] += 5.0
+    uv = np.concatenate([pixels(T_TRUE, wall, 14), slow])
+    p, on_truck = np.concatenate([wall, truck]), np.arange(360) >= 100
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
+    assert found is not None
+    assert 0.3 < found.inliers[~on_truck].mean() < 0.7  # control
+    chosen = choose_motion(make_problem(), p, uv, found, None, voting=voters(np.where(on_truck, 6, 30)))
+    assert chosen.motion.inliers[~on_truck].mean() > 0.95
+    assert np.linalg.norm(se3_log(chosen.motion.T_curr_prev @ se3_inverse(T_TRUE))) < 0.02
+
+
+def test_few_or_divided_votes_decide_nothing() -> None:
+    p, uv, _ = scenery(60, 240)
+    found = rigid_consensus(make_problem(), p, uv, np.eye(4), None, None)
+    assert found is not None
+    without = choose_motion(make_problem(), p, uv, found, None)
+    for age in (np.where(np.arange(300) < 11, 30, 2), np.full(300, 30), np.zeros(300, dtype=np.int64)):
+        voting = voters(age) & ((np.arange(300) < 120) | (age < 30))
+        chosen = choose_motion(make_problem(), p, uv, found, None, voting=voting)
+        assert (chosen.decision, chosen.object_share) == (without.decision, without.object_share)
+
+
+def test_a_scene_that_is_nearly_hidden_is_not_used_and_it_is_said() -> None:
+    report = ObjectReport()
+    half = TwoMotions(Consensus(np.eye(4), np.arange(100) < 40), 0.5, "voted")
+    little = TwoMotions(Consensus(np.eye(4), np.arange(100) < 8), 0.9, "voted")
+    assert not any(report.hides_scene(k, little) for k in range(5))  # no object is known: wrong matches, say
+    for k in range(5, 10):
+        report.frame(k, half)
+    assert report.active
+    assert [report.hides_scene(k, motions) for k, motions in enumerate([half, *[little] * 5, half])] == (
+        [False] * 3 + [True] * 3 + [False]
+    )
+    (line,) = [line for line in report.take_lines() if "hides it" in line]
+    assert line.startswith("frame 3: fewer than 10 % of the points are left of the scene")
 
 
 def test_an_object_is_reported_once_per_event_with_what_decided() -> None:

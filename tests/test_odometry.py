@@ -8,7 +8,7 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -206,6 +206,7 @@ IMAGE = np.zeros((200, 320), dtype=np.uint8)
         (lambda o: o.add_imu(200, np.zeros(4), ONE), r"gyro has shape \(4,\)"),
         (lambda o: o.add_imu([200, 300], ONE, ONE), "gyro has shape"),
         (lambda o: o.add_imu(200, ONE, [0, np.nan, 0]), "accel at 200 ns is not finite"),
+        (lambda o: o.add_imu(200, [0, 1e9, 0], ONE), "gyro at 200 ns is .* beyond any sensor"),
         (lambda o: o.add_imu(200, ["x", 1, 2], ONE), "gyro is not numeric"),
         (lambda o: o.add_velocity(200, ONE, ONE), "set the configuration's motion"),
         (lambda o: o.add_stereo(100, IMAGE, IMAGE), "not after the last one"),
@@ -241,6 +242,7 @@ def test_wrong_calls_are_refused_and_change_nothing(
         ([1, 1], np.ones((2, 4)), "an id occurs twice"),
         ([1], np.ones((2, 4)), "disagree in length"),
         ([1], [[1, 2, np.nan, 2]], "1 pixels are not finite"),
+        ([1], [[1e13, 2, 0, 2]], "1 pixels are .* in no image"),
         (["a"], np.ones((1, 4)), "ids are whole numbers"),
     ],
 )
@@ -249,6 +251,46 @@ def test_wrong_observations_are_refused(ids: Any, z: Any, message: str) -> None:
     with pytest.raises(DataError, match=message):
         odometry.add_observations(5, ids, z)
     assert odometry.add_observations(5, [1], [[1, 2, 0, 2]]) is not None
+
+
+def _live(odometry: Odometry, times_ns: list[int]) -> list[bool]:
+    """Which frames, each with its IMU sample, brought an estimate."""
+    seen = Flight().observe(0, 0.0, np.random.default_rng(0))
+    given = []
+    for time_ns in times_ns:
+        odometry.add_imu(time_ns, ONE, [0.0, 0.0, 9.81])
+        given.append(odometry.add_observations(time_ns, seen.ids, seen.z) is not None)
+    return given
+
+
+def test_one_stamp_far_ahead_costs_one_frame_and_is_named() -> None:
+    odometry = Odometry(CAMERA, T_cam0_imu=T_CAM0_IMU)
+    times = [k * STEP_NS for k in range(12)]
+    times[6] += 60_000_000_000
+    assert _live(odometry, times) == [k != 6 for k in range(12)]
+    named = [line for line in odometry.warnings if "ahead of the last one" in line]
+    assert [line.partition(" at ")[0] for line in named] == ["sample", "frame"]
+    assert "60.1 s ahead" in named[1]
+
+
+def test_a_pause_is_no_wrong_stamp_once_a_second_frame_confirms_it() -> None:
+    odometry = Odometry(CAMERA, T_cam0_imu=T_CAM0_IMU)
+    times = [k * STEP_NS + (10_000_000_000 if k >= 6 else 0) for k in range(12)]
+    assert _live(odometry, times) == [k != 6 for k in range(12)]
+
+
+def test_slow_cameras_have_no_jumps() -> None:
+    odometry = Odometry(CAMERA, IMAGES_ALONE)
+    seen = Flight().observe(0, 0.0, np.random.default_rng(0))
+    for k in range(6):
+        assert odometry.add_observations(k * 3_000_000_000, seen.ids, seen.z) is not None
+    assert not [line for line in odometry.warnings if "ahead" in line]
+
+
+@pytest.mark.parametrize("T", [np.full((4, 4), np.nan), np.diag([1.0, 1.0, -1.0, 1.0]), np.eye(3)])
+def test_wrong_extrinsics_are_refused_with_a_back_end_of_the_callers_own(T: Any) -> None:
+    with pytest.raises(VioError, match="T_cam0_imu"):
+        Odometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T, parts=Parts(frontend=Picky(), backend=cast(Any, object())))
 
 
 def test_a_pixel_that_is_not_seen_may_be_anything() -> None:

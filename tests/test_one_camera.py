@@ -382,8 +382,9 @@ def test_euroc_folder_with_cam0_alone_is_one_camera(tmp_path: Path) -> None:
 
 def test_left_camera_of_a_pair_has_no_right_side(tmp_path: Path) -> None:
     folder = _mono_folder(tmp_path)
-    with pytest.raises(DataError, match="leave it out"):
-        open_dataset(folder, DatasetSettings(camera="left"))
+    alone = open_dataset(folder, DatasetSettings(camera="left"))
+    assert "there is one camera only: --camera left changes nothing" in alone.recording.notes
+    assert len(list(alone.events())) == len(list(open_dataset(folder).events()))
     (folder / "right").mkdir()
     for k in range(4):
         cv2.imwrite(str(folder / "right" / f"{k}.png"), _walls()[k][0])

@@ -9,11 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.test_frontend_scene import CAMERA, SLANTED, flight, stereo_frame, truth
+from tests.test_frontend_scene import CAMERA, SLANTED, eight_bit, flight, right_of, stereo_frame, truth, view
 from vio.frontend.klt import KltFrontend
 from vio.frontend.prediction import prior_depths
 from vio.frontend.right_camera import RightCamera
 from vio.frontend.settings import FrontendSettings, GridSettings
+from vio.frontend.stereo_fit import common_offset
+from vio.geometry.lie import FloatArray, se3_exp
 from vio.records import FrontendOutput, Image, StereoFrame, TrackPrior
 
 SETTINGS = FrontendSettings(grid=GridSettings(target_features=150))
@@ -95,6 +97,17 @@ def test_a_frozen_left_image_is_skipped_and_named_once() -> None:
     assert line.startswith("frame 5: the left camera is frozen: its image does not change since frame 2")
 
 
+def test_an_exposure_of_its_own_that_clips_the_left_image_freezes_no_camera() -> None:
+    """The rig stands still; the left camera's exposure is long in one frame, so that a fifth of its pixels clip."""
+    smooth = cv2.GaussianBlur(TEXTURE, (0, 0), 3.0)
+    frames = [(noisy(smooth[:, :200], k), noisy(smooth[:, 10:210], 20 + k)) for k in range(7)]
+    bright = np.clip(frames[4][0] * 1.8, 0, 255).astype(np.uint8)
+    assert np.mean(bright == 255) > 0.15
+    frames[4] = bright, frames[4][1]
+    usable, frozen, lines = run(frames)
+    assert (all(usable), any(frozen), lines) == (True, False, [])
+
+
 def test_a_dark_right_image_is_named() -> None:
     frames = [pair(k) for k in range(12)]
     for k in FROZEN:
@@ -149,6 +162,18 @@ def frozen_run() -> tuple[list[StereoFrame], list[FrontendOutput]]:
     return frames, outputs
 
 
+@pytest.mark.parametrize("camera", ["left", "right"])
+def test_a_frozen_image_is_not_taken_for_the_other_cameras(camera: str) -> None:
+    """The rig moves by more than a baseline, so that a frozen image is one from the other camera's far side."""
+    step = np.array([0.08 if camera == "right" else -0.08, 0.0, 0.0, 0.0, 0.0, 0.0])
+    frames = [stereo_frame(k, se3_exp(k * step)) for k in range(FRAMES)]
+    frames = [replace(f, **{camera: getattr(frames[2], camera)}) if f.index in FROZEN else f for f in frames]
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    lines = [line for frame in frames for line in frontend.process(frame).warnings]
+    assert lines
+    assert not [line for line in lines if "exchanged" in line]
+
+
 def test_front_end_goes_on_with_the_left_images_of_a_frozen_pair(
     frozen_run: tuple[list[StereoFrame], list[FrontendOutput]],
 ) -> None:
@@ -166,3 +191,49 @@ def test_front_end_goes_on_with_the_left_images_of_a_frozen_pair(
         "frame 5: the right camera is frozen:",
         "frame 10: the right images agree wit",
     ]
+
+
+def turned_frame(index: int, pose: FloatArray, yaw_deg: float) -> StereoFrame:
+    """A frame whose right camera has turned about its vertical axis."""
+    turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, np.radians(yaw_deg), 0.0]))
+    right = eight_bit(view(SLANTED, right_of(pose) @ turn), 2 * index + 1)
+    return replace(stereo_frame(index, pose), right=right)
+
+
+def flight_with_turns(yaw_deg: Callable[[int], float]) -> list[FrontendOutput]:
+    frontend = KltFrontend(CAMERA, SETTINGS)
+    return [frontend.process(turned_frame(k, pose, yaw_deg(k))) for k, pose in enumerate(flight(FRAMES))]
+
+
+@pytest.mark.parametrize("yaw_deg", [0.26, -0.26])
+def test_a_right_camera_that_turns_a_little_is_used_without_the_offset(yaw_deg: float) -> None:
+    """A quarter of a degree moves all disparities by 1.4 px and more, for single frames and for good."""
+    outputs = flight_with_turns(lambda k: yaw_deg if k == 3 or k >= 6 else 0.0)
+    assert [line for output in outputs for line in output.warnings] == []
+    for k, pose in enumerate(flight(FRAMES)):
+        seen = outputs[k].observations
+        assert seen.has_right.mean() > 0.6
+        matched = seen.take(seen.has_right)
+        off = matched.z[:, 2] - truth(SLANTED, pose, matched.z[:, :2], pose)[:, 2]
+        if k in (3, 6):
+            assert abs(np.median(off)) < 0.3 * CAMERA.fu * np.radians(abs(yaw_deg))
+
+
+def test_a_right_camera_that_turns_far_is_not_used() -> None:
+    outputs = flight_with_turns(lambda k: 1.0 if k >= 5 else 0.0)
+    assert [output.observations.has_right.any() for output in outputs] == [k < 5 for k in range(FRAMES)]
+    (line,) = [line for output in outputs for line in output.warnings]
+    assert line.startswith("frame 8: the right image contradicts the left one")
+
+
+def test_offset_and_factor_of_disparities_are_told_apart() -> None:
+    """Depths of one camera's motion have a factor in common; a tenth of wrong matches changes little."""
+    rng = np.random.default_rng(5)
+    expected = rng.uniform(3.0, 60.0, 150)
+    off = 1.2 + 0.15 * expected + rng.normal(0.0, 0.2, 150)
+    off[::10] = rng.uniform(-40.0, 40.0, 15)
+    offset, slope = common_offset(expected, off)
+    assert offset == pytest.approx(1.2, abs=0.3)
+    assert slope == pytest.approx(0.15, abs=0.02)
+    near = np.full(50, 20.0)
+    assert common_offset(near, near * 0.0 + 0.7) == (pytest.approx(0.7), 0.0)  # at one depth nothing tells them apart

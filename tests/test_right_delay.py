@@ -56,7 +56,8 @@ def test_a_small_delay_is_left_alone() -> None:
 
 def test_the_pairing_that_matches_names_a_whole_frame() -> None:
     """Images of another frame contradict the left one too much for their rows to be measured."""
-    for late, early, frames in ((120, 20, 1.0), (20, 120, -1.0)):
+    # An early image is used with the next left one, and then on time.
+    for late, early, frames in ((120, 20, 1.0), (20, 120, 0.0)):
         estimator = RightDelay(CAMERA)
         counts = PairingCounts(points=150, same=30, late=late, early=early)
         assert not estimator.suspect(0, counts, FRAME_S)
@@ -66,6 +67,15 @@ def test_the_pairing_that_matches_names_a_whole_frame() -> None:
     for counts in (PairingCounts(150, 100, 120, 90), PairingCounts(150, 5, 30, 5), PairingCounts(150, 90, 120, 119)):
         estimator = RightDelay(CAMERA)
         assert not any(estimator.suspect(k, counts, FRAME_S) for k in range(5))
+
+
+def test_an_early_camera_that_is_on_time_again_is_late_against_its_repair() -> None:
+    estimator = RightDelay(CAMERA)
+    early, late = PairingCounts(150, 30, 20, 120), PairingCounts(150, 30, 120, 20)
+    assert [estimator.suspect(k, early, FRAME_S) for k in range(2)] == [False, True]
+    assert [estimator.suspect(k, late, FRAME_S) for k in range(2, 4)] == [False, True]
+    assert estimator.frames == 0.0
+    assert estimator.take_lines()[-1] == "frame 3: the right camera is no longer late or early"
 
 
 def test_matches_of_a_late_image_are_brought_to_the_present_exactly() -> None:
@@ -86,16 +96,18 @@ def test_matches_of_a_late_image_are_brought_to_the_present_exactly() -> None:
     assert now.has_right.tolist() == [True] * 20 + [False] * 10
 
 
-def late_flight() -> tuple[list[FloatArray], list[StereoFrame]]:
-    """A flight with vertical motion that comes and goes, whose right images are those of the frame before."""
+def late_flight(frames_late: int) -> tuple[list[FloatArray], list[StereoFrame]]:
+    """A flight with vertical motion that comes and goes, whose right images are those of another frame."""
     heights = 0.06 * np.sin(0.6 * np.arange(FRAMES))
     poses = [se3_exp([0.02 * k, heights[k], 0.02 * k, 0.0, 0.0, 0.0]) for k in range(FRAMES)]
     frames = [stereo_frame(k, pose) for k, pose in enumerate(poses)]
-    return poses, [replace(frame, right=frames[max(k - 1, 0)].right) for k, frame in enumerate(frames)]
+    shown = np.clip(np.arange(FRAMES) - frames_late, 0, FRAMES - 1)
+    return poses, [replace(frame, right=frames[shown[k]].right) for k, frame in enumerate(frames)]
 
 
-def test_front_end_matches_a_late_right_camera_as_if_it_were_on_time() -> None:
-    poses, frames = late_flight()
+@pytest.mark.parametrize(("frames_late", "named"), [(1, "late"), (-1, "early")])
+def test_front_end_matches_a_late_or_early_right_camera_as_if_it_were_on_time(frames_late: int, named: str) -> None:
+    poses, frames = late_flight(frames_late)
     frontend = KltFrontend(CAMERA, FrontendSettings(grid=GridSettings(target_features=150)))
     outputs: list[FrontendOutput] = [frontend.process(frame) for frame in frames]
 
@@ -106,8 +118,10 @@ def test_front_end_matches_a_late_right_camera_as_if_it_were_on_time() -> None:
         return float(np.median(np.abs(seen.z[:, 2] - expected[:, 2])))
 
     line = [line for output in outputs for line in output.warnings][-1]
-    assert "the right camera is late by 50 ms (1.00 frames)" in line
+    assert f"the right camera is {named} by 50 ms (1.00 frames)" in line
     begun = int(line.split()[1].rstrip(":"))
     assert begun < 12
     assert not outputs[begun - 1].observations.has_right.any()  # control: the fault does harm
-    assert max(median_error(k) for k in range(begun + 1, FRAMES)) < 0.1
+    # An early image is kept from the second frame on; the last frame of the flight has no later right image.
+    first, last = (begun + 1, FRAMES) if frames_late > 0 else (begun + 3, FRAMES - 1)
+    assert max(median_error(k) for k in range(first, last)) < 0.1

@@ -251,6 +251,7 @@ class MotionPrior:
 
     T_curr_prev: FloatArray  # (4, 4) maps the previous cam0 frame into the coming one
     covariance: FloatArray  # (6, 6) of xi in T_curr_prev = exp(xi) T_hat, [rho; phi], m and rad
+    measured: bool = True  # by a motion sensor; False: the rig is expected to go on as before
 
 
 @dataclass(frozen=True, slots=True)
@@ -482,7 +483,7 @@ class Recording:
     motion: frozenset[MotionSource]  # which motion samples the events carry
     reference: Trajectory | None  # ground truth lying in the recording
     landmarks_reference: Landmarks | None = None  # surveyed landmark positions, covariance zero
-    notes: tuple[str, ...] = ()  # what the reader found and corrected; each is logged once as a warning
+    notes: tuple[str, ...] = ()  # what the reader found and corrected; a command logs each once
     run_motion: RunMotion | None = None  # observation logs: what the run behind the log used; None: not known
 
     @property

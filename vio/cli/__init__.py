@@ -41,6 +41,7 @@ from vio.cli import (
     run,
     view,
 )
+from vio.cli.output import NOTE
 from vio.errors import StoppedError, VioError
 from vio.files.printable import printable
 
@@ -129,8 +130,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="replace")
     args = _parse(argv)
     gc.set_threshold(_GC_OBJECTS)
+    logging.addLevelName(NOTE, "NOTE")
     logging.basicConfig(
-        level=logging.DEBUG if args.debug else logging.WARNING, format="%(levelname)s: %(message)s", stream=sys.stderr
+        level=logging.DEBUG if args.debug else NOTE, format="%(levelname)s: %(message)s", stream=sys.stderr
     )
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     try:

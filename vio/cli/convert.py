@@ -73,7 +73,7 @@ def _recording(args: argparse.Namespace) -> int:
     import logging
     from dataclasses import replace
 
-    from vio.cli.output import print_result
+    from vio.cli.output import NOTE, print_result
     from vio.cli.progress import ProgressBar
     from vio.datasets import open_dataset
     from vio.datasets.span import frames_between
@@ -87,7 +87,7 @@ def _recording(args: argparse.Namespace) -> int:
     recording = dataset.recording
     need_stereo(recording, "vio convert")
     for note in recording.notes:
-        log.warning("%s", note)
+        log.log(NOTE, "%s", note)
     start, stop = frames_between(recording, args.start, args.stop)
     check_spares(recording.path, args.out)
     with atomic_folder(args.out, replace=True, marker=MARKER, own=_written(args.out)) as folder:

@@ -7,6 +7,8 @@ from typing import Any
 
 from vio.files.printable import json_text, printable
 
+NOTE = 25  # level of a log line that says what was found or assumed, and asks for nothing: between info and warning
+
 
 def print_result(
     facts: Mapping[str, Any], rows: Iterable[tuple[str, str]], *, as_json: bool, name_width: int = 10

@@ -34,7 +34,7 @@ def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     import logging
 
-    from vio.cli.output import print_result
+    from vio.cli.output import NOTE, print_result
     from vio.cli.progress import ProgressBar
     from vio.datasets import DatasetSettings, open_dataset
     from vio.datasets.euroc import write_rectified_euroc
@@ -50,7 +50,7 @@ def execute(args: argparse.Namespace) -> int:
     recording = dataset.recording
     need_stereo(recording, "vio rectify")
     for note in recording.notes:
-        logging.getLogger(__name__).warning("%s", note)
+        logging.getLogger(__name__).log(NOTE, "%s", note)
     writers = {"euroc": write_rectified_euroc, "kitti_raw": write_rectified_kitti}
     if recording.kind in ("plain", "bag", "video"):
         raise DataError(f"{recording.path} is of kind {recording.kind}; rectify it with vio convert --to euroc")

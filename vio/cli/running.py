@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vio.cli.output import NOTE
 from vio.cli.progress import ProgressBar
 from vio.cli.stopping import StopRequest
 from vio.config import Config, load_config
@@ -121,7 +122,7 @@ def process(
     """
     dataset = _opened(source, config, mapped=map_file is not None)
     for note in dataset.recording.notes:
-        log.warning("%s", note)
+        log.log(NOTE, "%s", note)
     folder = check_out(out if out is not None else free_folder(dataset.recording.path))
     calibration = _calibration_file(dataset, folder, save_calibration)
     first, end = frames_between(dataset.recording, start, stop)

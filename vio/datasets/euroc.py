@@ -59,6 +59,7 @@ class _Camera:
     files: ImageFiles  # N
     renamed: int  # number of images whose extension differs from their list
     unlisted: int  # number of images that the list does not name
+    missing: int  # number of images at the end of the list that are not there
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,21 +144,25 @@ def _read_camera(folder: Path) -> _Camera:
     times_ns, rows, lines = stamped_rows(path, 2, "timestamp [ns],filename")
     there = list_images(folder / "data")
     files, renamed = _find_images(there, rows, path, lines)
-    return _Camera(model, T_body_cam, times_ns, files, renamed, len(set(there.names) - set(files.names)))
+    unlisted, missing = len(set(there.names) - set(files.names)), len(times_ns) - len(files.names)
+    return _Camera(model, T_body_cam, times_ns[: len(files.names)], files, renamed, unlisted, missing)
 
 
 def _find_images(there: ImageFiles, names: Sequence[str], path: Path, lines: Sequence[int]) -> tuple[ImageFiles, int]:
-    """Return the listed images, and how many have another extension than listed."""
+    """Return the listed images, and how many have another extension than listed.
+
+    Those missing at the end are left out: the copy of a recording ended early.
+    """
     by_name, by_stem = set(there.names), {stem_of(name): name for name in there.names}
     found = [name if name in by_name else by_stem.get(Path(name).stem) for name in names]
     missing = [k for k, file in enumerate(found) if file is None]
-    if missing:
+    if missing and (missing[0] == 0 or len(missing) < len(names) - missing[0]):
         raise DataError(
             f"{path}, line {lines[missing[0]]}: {there.folder / names[missing[0]]} is missing ({len(missing)} of "
             f"{len(names)} listed images are); copy it again, or remove such lines"
         )
     files = ImageFiles(there.folder, tuple(file for file in found if file is not None))
-    return files, sum(file != name for file, name in zip(files.names, names, strict=True))
+    return files, sum(file != name for file, name in zip(files.names, names, strict=False))
 
 
 def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray, tuple[str, ...]]:
@@ -176,6 +181,12 @@ def _pair(left: _Camera, right: _Camera, mav: Path) -> tuple[IntArray, IntArray,
     notes: list[str] = []
     if renamed := left.renamed + right.renamed:
         notes.append(f"{renamed} images have another extension than listed in their data.csv; matched by their stem")
+    for name, camera in (("cam0", left), ("cam1", right)):
+        if camera.missing:
+            listed = len(camera.times_ns) + camera.missing
+            notes.append(
+                f"the last {camera.missing} of {listed} listed images of {name} are missing; {len(a)} pairs are used"
+            )
     if left.unlisted or right.unlisted:
         notes.append(
             f"{left.unlisted} images of cam0 and {right.unlisted} of cam1 are not listed in their data.csv and are "
@@ -205,7 +216,9 @@ def _read_imu(folder: Path) -> _Imu:
         T_body_imu, noise = read_imu_yaml(path)
     else:
         notes = (f"{path} is missing; the IMU is assumed to be the body frame, its noise is unknown",)
-    return _Imu(T_body_imu, noise, imu_samples(read_imu_csv(folder / "data.csv")), notes)
+    cut: list[str] = []
+    samples = imu_samples(read_imu_csv(folder / "data.csv", cut))
+    return _Imu(T_body_imu, noise, samples, (*notes, *cut))
 
 
 def _reference_file(mav: Path) -> Path | None:

@@ -206,8 +206,12 @@ def image_list_csv(times_ns: IntArray, last_ns: int | None = None) -> str:
     return "\n".join([_IMAGES_HEADER, *(f"{t},{image_name(t, last_ns)}" for t in times_ns.tolist())]) + "\n"
 
 
-def read_imu_csv(path: Path) -> ImuRecord:
+def read_imu_csv(path: Path, cut: list[str] | None = None) -> ImuRecord:
     """Read `timestamp [ns], gyro x y z [rad/s], accel x y z [m/s^2]`.
+
+    Args:
+        path: the file.
+        cut: where to note a last line that ends too early, which is left out then; None: it is an error.
 
     Raises:
         DataError: a line lacks seven finite numbers, or the clock does not increase; the message names the line. Or
@@ -215,7 +219,7 @@ def read_imu_csv(path: Path) -> ImuRecord:
     """
     form = "timestamp [ns], gyro x y z, accel x y z"
     times, lines, numbers_read, bad = array("q"), array("q"), array("d"), []
-    for number, stamp, row in _stamped_lines(path, 7, form):
+    for number, stamp, row in _stamped_lines(path, 7, form, cut):
         fields = row.split(",")
         try:
             values = [float(field) for field in fields]
@@ -279,13 +283,19 @@ def stamped_rows(path: Path, columns: int, form: str) -> tuple[IntArray, list[st
     return check_increasing(times, lambda k: f"{path}, line {lines[k]}"), rows, lines
 
 
-def _stamped_lines(path: Path, columns: int, form: str) -> Iterator[tuple[int, int, str]]:
-    """Yield line number, time and the text behind the time of each line, see `stamped_rows`."""
+def _stamped_lines(path: Path, columns: int, form: str, cut: list[str] | None = None) -> Iterator[tuple[int, int, str]]:
+    """Yield line number, time and the text behind the time of each line, see `stamped_rows` and `read_imu_csv`."""
     empty = True
-    for number, line in lines_of(path):
+    lines = lines_of(path)
+    for number, line in lines:
         if line.startswith("#"):
             continue
         if (count := line.count(",") + 1) != columns:
+            if cut is not None and not empty and count < columns and next(lines, None) is None:
+                cut.append(
+                    f"{path}, line {number}: the last line ends too early ({count} of {columns} values); left out"
+                )
+                return
             raise DataError(f"{path}, line {number}: {count} values instead of {columns} ({form})")
         stamp, _, rest = line.partition(",")
         stamp = stamp.strip()

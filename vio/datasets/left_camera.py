@@ -34,10 +34,15 @@ class LeftCameraDataset:
 def left_camera(dataset: Dataset) -> Dataset:
     """Return the recording of the left camera alone; images stay rectified as those of the pair are.
 
+    One camera alone stays what it is, with a note.
+
     Raises:
-        DataError: the recording has one camera.
+        DataError: the recording has one camera with depth images.
     """
     recording = dataset.recording
+    if recording.camera.kind == "mono":
+        note = "there is one camera only: --camera left changes nothing"
+        return LeftCameraDataset(dataset, replace(recording, notes=(*recording.notes, note)))
     if recording.camera.kind != "stereo":
         raise DataError(f"{recording.path}: --camera left takes one camera of two, but this has one; leave it out")
     return LeftCameraDataset(dataset, replace(recording, camera=left_alone(recording.camera)))

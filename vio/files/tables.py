@@ -87,6 +87,8 @@ class Table:
     def replace(self, index: int, row: Rows) -> None:
         """Put a row (1,) in the place of another."""
         self._is_synced = False
+        if index < self._summed[0]:
+            self._summed = 0, 0
         if self._file is None:
             self._memory[index] = row[0]
             return

@@ -16,7 +16,7 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import ImuSample, MotionSample, Observations
 from vio.setting import Section
 
-_LARGEST = 1e6  # of a pixel, m/s, rad/s or m/s^2: beyond any sensor, and no square overflows below it
+LARGEST = 1e6  # of a pixel, m/s, rad/s or m/s^2: beyond any sensor, and no square overflows below it
 _FARTHEST_M = 1e3  # between IMU and camera
 
 
@@ -66,7 +66,7 @@ class InputOrder:
             (sample.gyro, sample.accel) if isinstance(sample, ImuSample) else (sample.linear, sample.angular)
         )
         kind, now = "IMU" if imu else "velocity", sample.time_ns
-        (a, b, c), (d, e, f), most = first.tolist(), second.tolist(), _LARGEST
+        (a, b, c), (d, e, f), most = first.tolist(), second.tolist(), LARGEST
         # Written out, as it is asked of every sample.
         if not (-most < a < most and -most < b < most and -most < c < most) or not (
             -most < d < most and -most < e < most and -most < f < most
@@ -109,7 +109,7 @@ class InputOrder:
         if (ids[1:] == ids[:-1]).any():
             doubled = int(ids[1:][ids[1:] == ids[:-1]][0])
             raise DataError(f"{where} observes feature {doubled} twice; an id names one feature")
-        finite = np.abs(seen.z) < _LARGEST
+        finite = np.abs(seen.z) < LARGEST
         if not finite.all() and not (finite[:, :2].all() and finite[seen.has_right].all()):
             row = int(np.argmin(finite.all(axis=1)))
             raise DataError(

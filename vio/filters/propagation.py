@@ -151,7 +151,8 @@ class Propagation:
         # T_curr_prev = exp(A (xi_prev - xi_curr)) T_hat with A = Ad(T_cam0_world)
         A = se3_adjoint(T_cam0_world)
         expected = self.expected_error(window, nav, growth, *camera_D_own)
-        motion = MotionPrior(T_curr_prev, A @ expected @ A.T)
+        measured = self.source is not None and not growth.bridged
+        motion = MotionPrior(T_curr_prev, A @ expected @ A.T, measured)
         of_rotation = motion.covariance[3:, 3:]  # no eigenvalue is larger than its trace
         if of_rotation.trace() > _USELESS_RAD**2 and np.linalg.eigvalsh(of_rotation)[-1] > _USELESS_RAD**2:
             return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 InertialFault: TypeAlias = Literal[
@@ -45,6 +45,42 @@ _GROUPS: dict[InertialFault, str] = {
 }
 
 
+# With any of these the readings are of no use to a filter, unless a factor on them is all that is wrong.
+_UNUSABLE: frozenset[InertialFault] = frozenset(
+    {
+        "accelerometer units",
+        "gravity removed",
+        "gyro units",
+        "gyro sign",
+        "gyro axes",
+        "gyro disagrees",
+        "extrinsics inverted",
+        "extrinsics rotation",
+        "accelerometer sign",
+        "accelerometer axes",
+    }
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ImuVerdict:
+    """What is left of an IMU by what was found."""
+
+    usable: bool = True
+    gyro_factor: float = 1.0  # on its readings
+    accel_factor: float = 1.0
+
+    def after(self, finding: InertialFinding) -> ImuVerdict:
+        """Return the verdict with one more finding."""
+        if not finding.certain or finding.fault not in _UNUSABLE:
+            return self
+        if finding.factor is None:
+            return replace(self, usable=False)
+        if finding.fault == "gyro units":
+            return replace(self, gyro_factor=finding.factor)
+        return replace(self, accel_factor=finding.factor)
+
+
 @dataclass(frozen=True, slots=True)
 class InertialFinding:
     """One fault of the IMU, its clock or its extrinsics."""
@@ -53,6 +89,7 @@ class InertialFinding:
     seen: str  # the observation, with figures
     explanation: str  # the likely cause, and what to do
     certain: bool = True  # False: a hint; correct data can look like this
+    factor: float | None = None  # that takes the unit of these readings to rad/s or m/s^2; None: none does
 
     @property
     def message(self) -> str:

@@ -17,6 +17,7 @@ from vio.frontend import build_frontend
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.chain import Chain
+from vio.live.imu_trial import ImuTrial
 from vio.live.processor import EventProcessor
 from vio.protocols import Backend, Dataset, Frontend, Selector
 from vio.records import MotionSource, Observations, Recording, RunMotion, need_stereo
@@ -170,6 +171,10 @@ def build_processor(source: Source, config: Config, parts: Parts, map: MapUse | 
         selector=parts.selector or build_selector(config.selector, whole_record=_record(features), camera=seen),
         backend=backend,
         use_prior=config.frontend.prior,
+        # One camera has no scale without its IMU; a map holds keyframes of the poses that were replaced.
+        trial=ImuTrial(backend)
+        if source.motion == "imu" and camera.kind != "mono" and parts.backend is None and map is None
+        else None,
     )
     session = None if map is None else _open_map(map, source, config, backend)
     return EventProcessor(chain, wait_for_imu=source.motion == "imu", map=session)

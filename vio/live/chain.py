@@ -7,10 +7,12 @@ import time
 from vio.errors import DataError, DivergedError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.live.imu_trial import AS_GIVEN, ImuTrial, corrected
 from vio.monitor.run import RunMonitor
 from vio.numerics.robust import median
 from vio.protocols import Backend, Frontend, Selector
 from vio.records import (
+    Estimate,
     FrameLog,
     FrameResult,
     FrontendOutput,
@@ -37,6 +39,7 @@ class Chain:
         selector: Selector,
         backend: Backend,
         use_prior: bool,
+        trial: ImuTrial | None = None,
     ) -> None:
         """Connect the parts.
 
@@ -48,19 +51,25 @@ class Chain:
             selector: chooses among them.
             backend: estimates.
             use_prior: whether the front end is offered the pixels that the filter expects.
+            trial: begins again where the IMU turns out to be wrong; None: that is only reported.
         """
         self.frontend, self.selector, self.backend = frontend, selector, backend
         self.monitor = RunMonitor(camera, T_cam0_body, imu=motion == "imu")
         self._motion = motion
         self._use_prior = use_prior
         self._propagate_ms = 0.0  # since the last frame
+        self._trial, self._imu = trial, AS_GIVEN
+        self._revised: dict[int, Estimate] = {}
 
     def sample(self, sample: MotionSample) -> None:
         """Take one motion sample."""
         start = time.perf_counter()
         self.monitor.sample(sample)
         if self._motion is not None:
-            self.backend.propagate(sample)
+            if self._trial is not None:
+                self._trial.take(sample)
+            if (usable := self.usable(sample)) is not None:
+                self.backend.propagate(usable)
         self._propagate_ms += 1e3 * (time.perf_counter() - start)
 
     def frame(self, frame: StereoFrame) -> FrameResult | None:
@@ -83,15 +92,19 @@ class Chain:
             return None
         timer.end("frontend")
         self.monitor.observations(output.observations, output.warnings)
+        self.begin_again(frame.index)
         timer.end("monitor")
         seen = output.observations
         if self.backend.stereo_only:
             seen = seen.take(seen.has_right)
         selection = self.selector.select(seen, expected.motion if expected else None)
         timer.end("select")
-        if self._motion == "imu":
+        if self._motion == "imu" and self._imu == AS_GIVEN:
             self.backend.take_rotation_comparison(self.monitor.rotation_comparison)
-        report = self._update(seen.take(selection.chosen))
+        chosen = seen.take(selection.chosen)
+        if self._trial is not None:
+            self._trial.take(chosen)
+        report = self._update(chosen)
         initialisation = self.backend.initialisation
         if not report.started:
             self.monitor.waiting(frame, initialisation.waits_for or "the state is not observable yet")
@@ -105,6 +118,34 @@ class Chain:
         return FrameResult(
             frame, output, selection, report, estimate, _frame_log(frame, timer.ms, output, selection, report)
         )
+
+    def usable(self, sample: MotionSample) -> MotionSample | None:
+        """Return a sample as the back end takes it; None: it does not."""
+        return corrected(sample, self._imu)
+
+    def begin_again(self, index: int) -> None:
+        """Where the monitor has become certain that the IMU is wrong, estimate all frames again; else nothing."""
+        trial, verdict = self._trial, self.monitor.imu_verdict
+        if trial is None or not trial.open:
+            return
+        if verdict == self._imu:
+            if self.monitor.imu_is_judged:
+                trial.close()
+            return
+        again = trial.again(verdict)
+        if again is None:
+            return
+        self.backend, self._revised, self._imu = again.backend, again.estimates, verdict
+        self.monitor.begun_again(index, verdict, len(again.estimates))
+
+    def newest(self, index: int, estimate: Estimate | None) -> Estimate | None:
+        """Return the estimate of a frame, or the one that has replaced it and was not taken yet."""
+        return self._revised.get(index, estimate)
+
+    def take_revised(self) -> dict[int, Estimate]:
+        """Return the estimates, by frame number, that replace earlier ones, and forget them."""
+        revised, self._revised = self._revised, {}
+        return revised
 
     def _update(self, seen: Observations) -> UpdateReport:
         """Update with a frame; a back end that diverges is restarted."""

@@ -9,10 +9,42 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.errors import DataError
+from vio.filters.inputs import LARGEST
 from vio.geometry.lie import FloatArray
 from vio.records import Image, IntArray
 
 _MOST_NS = 2**62  # differences of times stay within 64 bits
+_JUMP_NS, _JUMP_STEPS = 2_000_000_000, 5  # a stamp so far ahead, and so many times the last step, is to be confirmed
+
+
+class JumpGuard:
+    """Leaves out a stamp that jumps ahead until the next one confirms it, lest all later ones be refused for it."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None  # taken
+        self._step_ns = 0
+        self._held_ns: int | None = None  # left out
+
+    def takes(self, time_ns: int) -> bool:
+        """Whether an event may be taken; its time is after the last one that was."""
+        last_ns = self._last_ns
+        step_ns = 0 if last_ns is None else time_ns - last_ns
+        if step_ns > max(_JUMP_NS, _JUMP_STEPS * self._step_ns) and self._step_ns:
+            confirmed = self._held_ns is not None and 0 < time_ns - self._held_ns <= _JUMP_NS
+            if not confirmed:
+                self._held_ns = time_ns
+                return False
+            step_ns = self._step_ns
+        self._last_ns, self._held_ns = time_ns, None
+        self._step_ns = step_ns or self._step_ns
+        return True
+
+    @property
+    def ahead_s(self) -> float:
+        """By how much the stamp that was left out is ahead of the last one."""
+        assert self._held_ns is not None
+        assert self._last_ns is not None
+        return (self._held_ns - self._last_ns) * 1e-9
 
 
 def checked_time(t_ns: Any) -> int:
@@ -47,8 +79,9 @@ def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[i
             raise DataError(f"{name} is not numeric: {error}") from error
         if array.shape != (*times.shape, 3):
             raise DataError(f"{name} has shape {array.shape}, expected {(*times.shape, 3)}")
-        if not np.isfinite(array).all():
-            raise DataError(f"{name} at {np.atleast_1d(times)[0]} ns is not finite: {array}")
+        if not (np.abs(array) < LARGEST).all():  # nor is NaN
+            at = f"{name} at {np.atleast_1d(times)[0]} ns"
+            raise DataError(f"{at} is not finite, or beyond any sensor ({LARGEST:g}): {array}")
         rows.append(array.reshape(-1, 3).copy())
     times = np.atleast_1d(times)
     if np.any((times > _MOST_NS) | (times < -_MOST_NS)):

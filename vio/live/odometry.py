@@ -18,13 +18,14 @@ from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
 from vio.datasets.frame_rate import FrameRateLimit
 from vio.errors import ConfigError, DataError
+from vio.filters.inputs import LARGEST, checked_extrinsics
 from vio.frontend import build_frontend
 from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, live_source
-from vio.live.inputs import check_size, checked_depths, checked_samples, checked_time, gray
+from vio.live.inputs import JumpGuard, check_size, checked_depths, checked_samples, checked_time, gray
 from vio.live.prediction import PosePredictor, PredictedPose
 from vio.numerics.threads import BlasLimit
 from vio.protocols import Frontend
@@ -94,6 +95,7 @@ class Odometry:
         self._offset_ns = 0
         if isinstance(rig, StereoCamera):
             self.camera = rig
+            T_cam0_imu = None if T_cam0_imu is None else checked_extrinsics(T_cam0_imu)
         else:
             self._rig = rig
             # Maps know pinholes only.
@@ -133,6 +135,7 @@ class Odometry:
         self._frames = 0
         self._limit = FrameRateLimit(self._config.dataset.max_frame_rate)
         self._last_ns: dict[str, int] = {}  # newest time of each kind of event
+        self._jumps = {"frame": JumpGuard(), "sample": JumpGuard()}
 
     # What goes in
 
@@ -261,8 +264,9 @@ class Odometry:
             except (ValueError, TypeError) as error:
                 raise DataError(f"observations at {t_ns} ns: {error}") from error
             used = np.concatenate([seen.z[:, :2].ravel(), seen.z[seen.has_right, 2:].ravel()])
-            if not np.isfinite(used).all():
-                raise DataError(f"observations at {t_ns} ns: {int((~np.isfinite(used)).sum())} pixels are not finite")
+            wrong = int((~(np.abs(used) < LARGEST)).sum())
+            if wrong:
+                raise DataError(f"observations at {t_ns} ns: {wrong} pixels are not finite, or in no image")
             time_ns = self._new_time("frame", t_ns, kind="observations")
             if not self._is_used(time_ns):
                 return None
@@ -392,7 +396,7 @@ class Odometry:
             )
 
     def _new_time(self, of: str, t_ns: Any, *, kind: str) -> int:
-        """Check and note a frame's time and kind."""
+        """Check a frame's time and kind, and note the kind."""
         time_ns = checked_time(t_ns)
         last = self._last_ns.get(of)
         if last is not None and time_ns <= last:
@@ -402,14 +406,25 @@ class Odometry:
         if kind == "images" and self._parts.frontend is None:
             self._frontend.open()
         self._kind = kind
-        self._last_ns[of] = time_ns
         return time_ns
 
     def _is_used(self, time_ns: int) -> bool:
-        """Whether the limit on the frame rate lets a frame through; one that it leaves out keeps its number."""
-        used = self._limit.takes(time_ns)
+        """Whether neither its stamp nor the limit on the frame rate leaves a frame out, which then keeps its number."""
+        used = self._is_confirmed("frame", time_ns) and self._limit.takes(time_ns)
         self._frames += not used
         return used
+
+    def _is_confirmed(self, of: str, time_ns: int) -> bool:
+        """Whether a stamp does not jump ahead, or the one before it has jumped as far; else it is said."""
+        jumps = self._jumps[of]
+        if jumps.takes(time_ns):
+            self._last_ns[of] = time_ns
+            return True
+        self._processor.say(
+            f"{of} at {time_ns} ns: its stamp is {jumps.ahead_s:.1f} s ahead of the last one; left out, as are others "
+            "so far ahead until two in a row agree"
+        )
+        return False
 
     def _add_samples(self, samples: list[Any]) -> None:
         with self._lock:
@@ -420,8 +435,10 @@ class Odometry:
                     f"{last + self._offset_ns} ns; give them in order of time, each once"
                 )
             for sample in samples:
-                self._last_ns["sample"] = sample.time_ns
-                self._predictor.sample(sample)
+                if not self._is_confirmed("sample", sample.time_ns):
+                    continue
+                if (usable := self._processor.usable(sample)) is not None:
+                    self._predictor.sample(usable)
                 self._deliver(self._add(sample))
 
     def _rectified(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from vio.live.chain import Chain
 from vio.live.event_order import EventOrder
-from vio.records import Estimate, Event, FrameResult, Landmarks, StereoFrame
+from vio.records import Estimate, Event, FrameResult, Landmarks, MotionSample, StereoFrame
 
 if TYPE_CHECKING:
     from vio.mapping.session import MapSession
@@ -37,6 +37,7 @@ class EventProcessor:
         """
         self._chain, self._order, self.map = chain, EventOrder(wait_for_imu=wait_for_imu), map
         self.estimate: Estimate | None = None  # newest; None before the first
+        self._last_index = 0  # of the frame that it is of
 
     def add(self, event: Event) -> list[FrameResult]:
         """Take an event, whose image is rectified, and return the results of the frames that it completed."""
@@ -50,6 +51,9 @@ class EventProcessor:
         """Process the frames that still wait, and let the checks report what they have not yet reported."""
         results = self._process(self._order.flush())
         self._chain.monitor.close()
+        if self.estimate is not None:
+            self._chain.begin_again(self._last_index)
+        self.estimate = self._chain.newest(self._last_index, self.estimate)
         if self.map is not None:
             self.map.finish()
         return results
@@ -63,6 +67,10 @@ class EventProcessor:
     def warnings(self) -> tuple[str, ...]:
         """What the checks have found so far, one line each."""
         return tuple(self._chain.monitor.lines)
+
+    def say(self, line: str) -> None:
+        """Log a line on the events, and add it to the warnings."""
+        self._chain.monitor.say(line)
 
     @property
     def frames_refused(self) -> int:
@@ -82,6 +90,17 @@ class EventProcessor:
         """Return the points that will not change any more, and forget them; `landmarks` has the others."""
         return self._chain.backend.take_landmarks()
 
+    def usable(self, sample: MotionSample) -> MotionSample | None:
+        """Return a motion sample as the estimator takes it; None: it does not, as the sensor was found to be wrong."""
+        return self._chain.usable(sample)
+
+    def take_revised(self) -> dict[int, Estimate]:
+        """Return the estimates, by frame number, that replace earlier ones, and forget them.
+
+        There are some where the IMU was found to be wrong, once, in the first minute.
+        """
+        return self._chain.take_revised()
+
     def smoothed(self, frame_index: int) -> Estimate | None:
         """Return the estimate at a past frame with all frames since; None where the window does not hold it."""
         return self._chain.backend.smoothed(frame_index)
@@ -96,7 +115,7 @@ class EventProcessor:
             result = self._chain.frame(event)
             if result is not None:
                 results.append(self._in_map(event, result))
-                self.estimate = results[-1].estimate
+                self.estimate, self._last_index = results[-1].estimate, event.index
                 self._order.exposed_after_ns = _wait_ns(self.estimate)
         return results
 

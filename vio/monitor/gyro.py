@@ -51,9 +51,12 @@ def judge_gyro(evidence: Evidence, unit: float) -> list[InertialFinding]:
     seen = _contradiction(gyro_fit, R)
     likely = _explanations(R, gyro_alone=_gyro_alone(evidence, unit))
     uncertain = brief or evidence.clipped
+    # A bias that jumps, or a mount that has turned a little, is explained by some rotation, too.
+    far = gyro_fit.excess(R, max(gyro_fit.scale(R), 0.0)) > _DISAGREES
     for mistake in chain(likely, () if uncertain else _free_explanations(gyro_fit.S_cg)):
         if gyro_fit.fits(mistake.C):
-            finding = InertialFinding(mistake.fault, f"{seen}, and {mistake.seen}", mistake.explanation)
+            seen = f"{seen}, and {mistake.seen}"
+            finding = InertialFinding(mistake.fault, seen, mistake.explanation, certain=far)
             return [finding, *_judge_scale(evidence, mistake.C)]
     if uncertain:
         return []
@@ -117,10 +120,8 @@ def _judge_scale(evidence: Evidence, C: FloatArray) -> list[InertialFinding]:
         1e-3: "the gyro is in mrad/s: divide its readings by 1000",
     }
     odd = "the gyro's scale is wrong, or the camera's focal length is; rad/s are expected"
-    explanation = next(
-        (explanation for factor, explanation in named.items() if abs(np.log(scale / factor)) < 0.15), odd
-    )
-    return [InertialFinding("gyro units", seen, explanation)]
+    factor = next((factor for factor in named if abs(np.log(scale / factor)) < 0.15), None)
+    return [InertialFinding("gyro units", seen, odd if factor is None else named[factor], factor=factor)]
 
 
 def _explanations(R: FloatArray, *, gyro_alone: bool) -> Iterator[_Explanation]:

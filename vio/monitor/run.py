@@ -11,6 +11,7 @@ import numpy as np
 
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
+from vio.imu.findings import ImuVerdict
 from vio.monitor.frozen import DEPTHS, IMAGES, FrozenImages, RepeatReport
 from vio.monitor.health import RunHealth
 from vio.monitor.imu_faults import ImuFaultReport
@@ -69,6 +70,7 @@ class RunMonitor:
         self._waiting_since: int | None = None
         self._waits_for = ""
         self._imu_at_fault = False
+        self.imu_verdict = ImuVerdict()  # by the findings so far
         self.lines: list[str] = []
 
     def sample(self, sample: MotionSample) -> None:
@@ -152,12 +154,30 @@ class RunMonitor:
             return None
         return None if check.imu_at_fault and check.rotation_comparison.agree else check.rotation_comparison
 
+    def say(self, line: str) -> None:
+        """Report what was found elsewhere, in one line."""
+        self._report([line])
+
     def refused(self, index: int, reason: str) -> None:
         """Add a frame that the front end refused, with its reason; a row of such frames is reported once."""
         if self._refused_last != self._index_before:
             self._report([f"frame skipped: {reason}"])
         self._refused_last = index
         self.frames_refused += 1
+
+    @property
+    def imu_is_judged(self) -> bool:
+        """Whether units, axes and signs of the IMU are not compared any more."""
+        return self._inertial is None or self._inertial.done
+
+    def begun_again(self, index: int, verdict: ImuVerdict, frames: int) -> None:
+        """Report that the frames so far were estimated again with what is left of the IMU."""
+        what = "the IMU is not used, and images alone go on"
+        if verdict.usable:
+            parts = (("gyro", verdict.gyro_factor), ("accelerometer", verdict.accel_factor))
+            factors = [f"the {name}'s readings are multiplied by {factor:.6g}" for name, factor in parts if factor != 1]
+            what = " and ".join(factors)
+        self._report([f"frame {index}: {what}; the {frames} frames so far were estimated again"])
 
     def waiting(self, frame: StereoFrame, why: str) -> None:
         """Add a frame without a pose, as the back end's start is not observable yet; `why` is reported at the end."""
@@ -220,6 +240,8 @@ class RunMonitor:
         """Log findings; gaps are reported one by one by `ImuSilence`."""
         findings = tuple(findings)
         self._imu_at_fault |= any(f.certain and f.group in _PREVENTS_START for f in findings)
+        for finding in findings:
+            self.imu_verdict = self.imu_verdict.after(finding)
         self._report(finding.message for finding in findings if finding.fault != "IMU gap")
 
     def _report(self, lines: Iterable[str]) -> None:

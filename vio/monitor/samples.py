@@ -22,7 +22,7 @@ _LEAST_LEVELS = 20  # different readings on the axis
 
 _SMOOTH_S = 0.2  # readings are averaged over this time before their magnitude is judged
 _LEAST_SIZE_S = 1.0
-_GRAVITY = 9.80665
+_GRAVITY, _MILLI_G = 9.80665, 1000.0  # m/s^2, and what readings in mg have
 _NS = 1e-9
 
 
@@ -155,12 +155,13 @@ def _judge_median(median: float, spread: float) -> Size:
     seen = f"the accelerometer's median magnitude is {median:.4g} where gravity alone gives 9.8 m/s^2"
     units = {
         1.0: "in g: multiply by 9.81",
-        1000.0: "in mg (multiply by 0.00981) or in cm/s^2 (divide by 100)",
+        _MILLI_G: "in mg (multiply by 0.00981) or in cm/s^2 (divide by 100)",
         9807.0: "in mm/s^2: divide by 1000",
     }
     for gravity, explanation in units.items():
         if 0.6 < median / gravity < 1.6 and spread < 0.3:
-            finding = InertialFinding("accelerometer units", seen, f"the readings are {explanation}")
+            factor = None if gravity == _MILLI_G else _GRAVITY / gravity  # of which there are two
+            finding = InertialFinding("accelerometer units", seen, f"the readings are {explanation}", factor=factor)
             clear = gravity > 1.0 or (abs(median - 1.0) < 0.1 and spread < 0.06)
             return Size(finding, _GRAVITY / gravity, clear)
     if median < 0.5 * _GRAVITY and (spread >= 0.3 or median < 0.5):

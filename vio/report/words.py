@@ -18,10 +18,11 @@ _MOTION = {"imu": "an IMU", "velocity": "velocities", "none": "images alone"}
 def summary(run: FinishedRun) -> list[str]:
     """Return what happened in a run, one sentence a line."""
     m, span_s = run.metrics, float(run.seconds[-1])
-    frames = len(run.estimates)
+    frames, span = len(run.estimates), m.get("last_frame", 0) - m.get("first_frame", 0) + 1
+    counted = f"{frames} of {span}" if span > frames else str(frames)
     source = str(m.get("source", "")).replace("\\", "/").rstrip("/").rpartition("/")[2]
     lines = [
-        f"{frames} frames of {source or 'a recording'} ({m.get('kind', 'unknown kind')}), {span_s:.1f} s and "
+        f"{counted} frames of {source or 'a recording'} ({m.get('kind', 'unknown kind')}), {span_s:.1f} s and "
         f"{_path_m(run):.1f} m, processed from {_MOTION.get(str(m.get('motion')), 'images alone')} by "
         f"{m.get('backend', 'the filter')}."
     ]

@@ -6,7 +6,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NoReturn
 
 import numpy as np
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
 
 __all__ = ["STAGES", "FrameLog", "NullViewer", "RunControl", "RunResult", "run"]
 
+_MOST_NAMED = 5  # frames that could not be read
 _LEAST_REFUSED = 10  # frames that the front end refused, and more of them than not, before a run gives up
 
 
@@ -170,7 +171,7 @@ def run(
         contextlib.closing(viewer or NullViewer()) as shown,
         contextlib.closing(processor),
     ):
-        loop = _Loop(state, recorder, shown)
+        loop = _Loop(state, recorder, shown, _taken_frames(recording, config, start, stop))
         try:
             with _opencv_threads(dataset, config, parts.frontend):
                 images = _needs_images(dataset, config) or processor.map is not None
@@ -255,6 +256,7 @@ class _RunState:
     dead_reckoning: DeadReckoning | None
     next_frame: int  # where to take up the recording's events: the last frame taken, or the first one
     frame_ns: int | None = None  # newest time of a frame that was taken
+    unread: list[int] = field(default_factory=list)  # numbers of frames that the recording lists and did not give
     sample_ns: int | None = None  # newest time of a motion sample that was taken
 
     def is_new(self, event: Event) -> bool:
@@ -273,8 +275,10 @@ class _RunState:
 class _Loop:
     """Takes a recording's events through the processor into the recorder."""
 
-    def __init__(self, state: _RunState, recorder: RunRecorder, viewer: Viewer) -> None:
-        self._state, self._recorder, self._viewer = state, recorder, viewer
+    def __init__(self, state: _RunState, recorder: RunRecorder, viewer: Viewer, frames: set[int]) -> None:
+        """Prepare; `frames` are the numbers of the recording's frames that the run is to take."""
+        self._state, self._recorder, self._viewer, self._frames = state, recorder, viewer, frames
+        self._end = 1 + max(frames, default=-1)
         self._reading = _ReadTimer()
 
     def run(self, events: Iterable[Event], dataset: Dataset, should_stop: Callable[[], str | None]) -> str | None:
@@ -289,6 +293,8 @@ class _Loop:
         for event in self._reading.timed(events):
             if resumed and not state.is_new(event):
                 continue
+            if isinstance(event, StereoFrame):
+                state.unread += self._between(state.next_frame + (state.frame_ns is not None), event.index)
             self._take(event)
             state.note(event)
             if _LEAST_REFUSED <= processor.frames_refused > len(recorder):
@@ -298,11 +304,21 @@ class _Loop:
                 recorder.save(state, dataset, processor.take_landmarks())
             if stopped:
                 break
+        else:
+            if state.frame_ns is not None:
+                state.unread += self._between(state.next_frame + 1, self._end)
+        if state.unread:
+            last = max(state.next_frame, *state.unread)
+            processor.say(_unread_line(state.unread, sum(index <= last for index in self._frames)))
         self._record(processor.finish())
         recorder.revise(processor.smoothed)
         if processor.frames_refused > len(recorder):
             raise DataError(f"most frames were refused: {processor.warnings[-1]}")
         return stopped
+
+    def _between(self, first: int, end: int) -> list[int]:
+        """Frames `first <= index < end` that the run is to take."""
+        return [index for index in range(first, end) if index in self._frames]
 
     def _take(self, event: Event) -> None:
         state = self._state
@@ -319,6 +335,7 @@ class _Loop:
             if state.dead_reckoning is not None:
                 self._recorder.dead_reckoning(state.dead_reckoning.pose_at(result.log.time_ns))
             self._viewer.frame(result)
+        self._recorder.replace(state.processor.take_revised())
 
 
 def _skipped(viewer: Viewer | None, frames: int) -> Viewer | None:
@@ -335,6 +352,19 @@ def _check_range(recording: Recording, start: int, stop: int | None) -> None:
         raise ConfigError(f"frames {start} to {stop} are no range; give 0 <= start < stop")
     if start >= len(recording.frame_times_ns):
         raise ConfigError(f"--start {start} lies past the last frame, {len(recording.frame_times_ns) - 1}")
+
+
+def _taken_frames(recording: Recording, config: Config, start: int, stop: int | None) -> set[int]:
+    """Numbers of the frames of a recording that a run is to take."""
+    most_hz, times_ns = config.dataset.max_frame_rate, recording.frame_times_ns
+    indices = range(len(times_ns)) if most_hz is None else used_frames(times_ns, most_hz).tolist()
+    return {index for index in indices if index >= start and (stop is None or index < stop)}
+
+
+def _unread_line(unread: list[int], frames: int) -> str:
+    """The line on frames that could not be read."""
+    named = ", ".join(map(str, unread[:_MOST_NAMED])) + (", …" if len(unread) > _MOST_NAMED else "")
+    return f"{len(unread)} of {frames} frames could not be read and were skipped: {named}"
 
 
 def _limited(events: Iterable[Event], recording: Recording, config: Config) -> Iterable[Event]:

@@ -166,6 +166,18 @@ class RunRecorder:
                 )
                 estimates.replace(k, estimate_row(int(row["index"]), now))
 
+    def replace(self, estimates: Mapping[int, Estimate]) -> None:
+        """Replace the estimates of frames by others, by frame number; the text files begin anew."""
+        if not estimates or not self._tables:
+            return
+        table = self._tables["estimates"]
+        with self._writing():
+            for k, index in enumerate(table.rows()["index"].tolist()):
+                if index in estimates:
+                    table.replace(k, estimate_row(index, estimates[index]))
+        self._written = 0
+        self._saved_s = -np.inf  # the last checkpoint is that of other rows
+
     def flush(self) -> None:
         """Bring all that is final to the disk: the tables, trajectory.tum and frames.csv."""
         if self._folder is None or not self._tables:

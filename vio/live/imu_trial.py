@@ -1,0 +1,98 @@
+"""What to do with an IMU that turns out to be wrong: begin again, with its readings in the right unit or without them.
+
+A wrong unit, axis or sign is certain only after seconds of motion, and by then the estimate is lost. So the first
+minute of what the back end was given is kept beside a back end that has not begun. Once the monitor is certain, that
+one takes all of it again, and its estimates replace those before. Features are tracked well without the filter's
+prediction, so they are not extracted again.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+
+from vio.errors import DivergedError, EstimationError
+from vio.imu.findings import ImuVerdict
+from vio.protocols import Backend
+from vio.records import Estimate, ImuSample, MotionSample, Observations
+
+_MOST_FRAMES = 600  # that are kept
+AS_GIVEN = ImuVerdict()
+
+
+@dataclass(frozen=True, slots=True)
+class Replayed:
+    """A back end that has taken everything again, and its estimates by frame number."""
+
+    backend: Backend
+    estimates: dict[int, Estimate]
+
+
+class ImuTrial:
+    """Keeps what a back end is given until its IMU is known to be right, or too much has come."""
+
+    def __init__(self, backend: Backend) -> None:
+        """Begin; `backend` has not taken anything yet."""
+        self._fresh: Backend | None = copy.deepcopy(backend)
+        self._taken: list[MotionSample | Observations] = []
+        self._frames = 0
+
+    @property
+    def open(self) -> bool:
+        """Whether everything can still be taken again."""
+        return self._fresh is not None
+
+    def close(self) -> None:
+        """Forget all."""
+        self._fresh, self._taken = None, []
+
+    def take(self, event: MotionSample | Observations) -> None:
+        """Take a sample as it was recorded, or the observations of a frame, as they are given to the back end."""
+        if self._fresh is None:
+            return
+        self._taken.append(event)
+        self._frames += isinstance(event, Observations)
+        if self._frames > _MOST_FRAMES:
+            self.close()
+
+    def again(self, verdict: ImuVerdict) -> Replayed | None:
+        """Give everything to a new back end, with the IMU that a verdict leaves; nothing can be taken again then.
+
+        None: that one is lost, too.
+        """
+        backend, taken = self._fresh, self._taken
+        assert backend is not None
+        self.close()
+        try:
+            return Replayed(backend, _estimates(backend, taken, verdict))
+        except EstimationError:
+            return None
+
+
+def _estimates(backend: Backend, taken: list[MotionSample | Observations], verdict: ImuVerdict) -> dict[int, Estimate]:
+    """Give everything to a back end; return its estimates by frame number.
+
+    Raises:
+        EstimationError: it is lost.
+    """
+    estimates = {}
+    for event in taken:
+        if isinstance(event, Observations):
+            try:
+                report = backend.update(event)
+            except DivergedError:
+                report = backend.restart(event)
+            if report.started:
+                estimates[event.frame_index] = backend.estimate()
+        elif (sample := corrected(event, verdict)) is not None:
+            backend.propagate(sample)
+    return estimates
+
+
+def corrected(sample: MotionSample, verdict: ImuVerdict) -> MotionSample | None:
+    """Return a sample in the right units; None: it is not to be used."""
+    if verdict == AS_GIVEN or not isinstance(sample, ImuSample):
+        return sample
+    if not verdict.usable:
+        return None
+    return replace(sample, gyro=verdict.gyro_factor * sample.gyro, accel=verdict.accel_factor * sample.accel)
