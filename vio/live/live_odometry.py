@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -31,7 +31,7 @@ from vio.live.shared_prediction import SharedPredictor
 from vio.live.stream import EstimateStream
 from vio.live.warm_up import warm_up
 from vio.live.worker import Worker
-from vio.records import Estimate, FrameResult, ImuSample, Landmarks, MotionSource, VelocitySample
+from vio.records import Estimate, FrameResult, ImuSample, Landmarks, MotionSample, MotionSource, VelocitySample
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class LiveOdometry:
 
     def _warm_up(self) -> None:
         odometry = self._odometry
-        warm_up(odometry.camera, self._T_cam0_imu, odometry.motion, self._config)
+        warm_up(odometry.camera, self._T_cam0_imu, self._config)
         if odometry.camera.width is not None:
             odometry.prepare()
         self._collector.hold()
@@ -134,11 +134,8 @@ class LiveOdometry:
         """
         self._odometry.expect("imu")
         times, (a, b) = checked_samples(t_ns, {"gyro": gyro, "accel": accel})
-        self._check_order("sample", times)
-        self._put(lambda: self._odometry.add_imu(np.array(times), a, b))
         offset = self._odometry.time_offset_ns
-        for t, *row in zip(times, a, b, strict=True):
-            self._predictor.add(ImuSample(t - offset, *row))
+        self._add_samples(times, [ImuSample(t - offset, *row) for t, *row in zip(times, a, b, strict=True)])
 
     def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
         """Take one sample of body velocity, or several in order of time, see `Odometry.add_velocity`.
@@ -148,11 +145,8 @@ class LiveOdometry:
         """
         self._odometry.expect("velocity")
         times, (a, b) = checked_samples(t_ns, {"linear": linear, "angular": angular})
-        self._check_order("sample", times)
-        self._put(lambda: self._odometry.add_velocity(np.array(times), a, b))
         offset = self._odometry.time_offset_ns
-        for t, *row in zip(times, a, b, strict=True):
-            self._predictor.add(VelocitySample(t - offset, *row))
+        self._add_samples(times, [VelocitySample(t - offset, *row) for t, *row in zip(times, a, b, strict=True)])
 
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> None:
         """Take a pair of images, see `Odometry.add_stereo`; they are copied, and processed by the worker.
@@ -322,6 +316,13 @@ class LiveOdometry:
             raise DataError(f"{of} at {times[0]} ns is not after the last one at {last} ns; give them in order of time")
         if times:
             self._last_ns[of] = times[-1]
+
+    def _add_samples(self, times: list[int], samples: Sequence[MotionSample]) -> None:
+        """Queue samples, and let predictions begin with them at once."""
+        self._check_order("sample", times)
+        self._put(lambda: self._odometry.add_samples(samples))
+        for sample in samples:
+            self._predictor.add(sample)
 
     def _add_frame(self, t_ns: Any, add: Callable[[int], object]) -> None:
         """Queue a frame, unless the limit on the frame rate leaves it out."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -44,6 +44,7 @@ from vio.records import (
     ImuSample,
     Landmarks,
     LoopEvent,
+    MotionSample,
     MotionSource,
     Observations,
     StereoFrame,
@@ -159,7 +160,7 @@ class Odometry:
         """
         self.expect("imu")
         times, (a, b) = checked_samples(t_ns, {"gyro": gyro, "accel": accel})
-        self._add_samples([ImuSample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
+        self.add_samples([ImuSample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
 
     def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
         """Take one sample of body velocity, or several in order of time.
@@ -175,7 +176,25 @@ class Odometry:
         """
         self.expect("velocity")
         times, (a, b) = checked_samples(t_ns, {"linear": linear, "angular": angular})
-        self._add_samples([VelocitySample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
+        self.add_samples([VelocitySample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
+
+    def add_samples(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples in order of time, of the kind that `motion` says, on the camera's clock.
+
+        Raises:
+            DataError: a time not after the last sample's.
+        """
+        with self._lock:
+            last = self._last_ns.get("sample")
+            if last is not None and samples and samples[0].time_ns <= last:
+                raise DataError(
+                    f"sample at {samples[0].time_ns + self._offset_ns} ns is not after the last one at "
+                    f"{last + self._offset_ns} ns; give them in order of time, each once"
+                )
+            for sample in samples:
+                self._last_ns["sample"] = sample.time_ns
+                self._predictor.sample(sample)
+                self._deliver(self._add(sample))
 
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> Estimate | None:
         """Take a pair of images and return the newest estimate that it brought; None: it waits for IMU samples.
@@ -314,6 +333,11 @@ class Odometry:
     # What comes out
 
     @property
+    def T_cam0_body(self) -> FloatArray:
+        """Extrinsics (4, 4) of the body whose pose is estimated, in the rectified left camera."""
+        return self._source.T_cam0_body
+
+    @property
     def time_offset_ns(self) -> int:
         """What is subtracted from the IMU's stamps, so that they are on the camera's clock."""
         return self._offset_ns
@@ -447,19 +471,6 @@ class Odometry:
         used = self._limit.takes(time_ns)
         self._frames += not used
         return used
-
-    def _add_samples(self, samples: list[Any]) -> None:
-        with self._lock:
-            last = self._last_ns.get("sample")
-            if last is not None and samples and samples[0].time_ns <= last:
-                raise DataError(
-                    f"sample at {samples[0].time_ns + self._offset_ns} ns is not after the last one at "
-                    f"{last + self._offset_ns} ns; give them in order of time, each once"
-                )
-            for sample in samples:
-                self._last_ns["sample"] = sample.time_ns
-                self._predictor.sample(sample)
-                self._deliver(self._add(sample))
 
     def _rectified(
         self, time_ns: int, left: Image, right: Image | None = None, *, depth_m: FloatArray | None = None

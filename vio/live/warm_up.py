@@ -14,7 +14,7 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.odometry import Odometry
-from vio.records import Image, MotionSource
+from vio.records import Image
 
 _FRAMES, _STEP_NS, _SAMPLES = 40, 50_000_000, 10  # samples a frame
 _FAR_PX, _NEAR_PX = 12.0, 24.0  # disparities of the upper and the lower half of the images
@@ -22,13 +22,12 @@ _SWAY_PX, _SWAY_S = 60.0, 2.0  # of the near half, and its period
 _SMOOTH_PX = 1.5
 
 
-def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, motion: MotionSource | None, config: Config) -> None:
+def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config) -> None:
     """Run an odometry of its own over a camera that sways sideways in front of two walls.
 
     Args:
         camera: rectified, with its image size.
         T_cam0_imu: (4, 4); None: no IMU.
-        motion: which samples the odometry takes.
         config: every setting.
 
     Raises:
@@ -38,22 +37,27 @@ def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, motion: MotionS
         raise DataError("warm_up needs the size of the images; give StereoCamera its width and height")
     with _without_warnings():
         odometry = Odometry(camera, config, T_cam0_imu=T_cam0_imu)
-        walls = _Walls(camera)
-        R_imu_cam = np.eye(3) if T_cam0_imu is None else T_cam0_imu[:3, :3].T
-        for frame in range(_FRAMES):
-            for k in range(1, _SAMPLES + 1):
-                time_ns = _STEP_NS * (frame - 1) + _STEP_NS * k // _SAMPLES
-                _, speed, force = walls.motion(time_ns * 1e-9)
-                if motion == "imu":
-                    # The camera looks at the horizon.
-                    accel = R_imu_cam @ np.array([force, -config.msckf.gravity_mps2, 0.0])
-                    odometry.add_imu(time_ns, np.zeros(3), accel)
-                elif motion == "velocity":
-                    odometry.add_velocity(time_ns, R_imu_cam @ [speed, 0.0, 0.0], np.zeros(3))
-            _add_frame(odometry, walls, frame)
-        odometry.finish()
+        sway(odometry, config)
         if odometry.estimate is not None:
             odometry.landmarks()
+
+
+def sway(odometry: Odometry, config: Config) -> None:
+    """Give an odometry the images and motion samples of two seconds."""
+    walls = _Walls(odometry.camera)
+    R_imu_cam = odometry.T_cam0_body[:3, :3].T
+    for frame in range(_FRAMES):
+        for k in range(1, _SAMPLES + 1):
+            time_ns = _STEP_NS * (frame - 1) + _STEP_NS * k // _SAMPLES
+            _, speed, acceleration = walls.motion(time_ns * 1e-9)
+            if odometry.motion == "imu":
+                # The camera looks at the horizon.
+                force = np.array([acceleration, -config.msckf.gravity_mps2, 0.0])
+                odometry.add_imu(time_ns, np.zeros(3), R_imu_cam @ force)
+            elif odometry.motion == "velocity":
+                odometry.add_velocity(time_ns, R_imu_cam @ [speed, 0.0, 0.0], np.zeros(3))
+        _add_frame(odometry, walls, frame)
+    odometry.finish()
 
 
 def _add_frame(odometry: Odometry, walls: _Walls, frame: int) -> None:
