@@ -41,13 +41,13 @@ def controller(live):
 with vio.LiveOdometry(recording.camera, T_cam0_imu=recording.T_cam0_imu) as live:
     live.warm_up()  # compiles and loads: the first frame then takes no longer than others
     drivers = [camera_driver, imu_driver] if live.motion == "imu" else [camera_driver]
-    threads = [threading.Thread(target=work, args=(live,)) for work in (*drivers, controller)]
+    threads = [threading.Thread(target=work, args=(live,)) for work in (controller, *drivers)]
     start = time.monotonic()
     for thread in threads:
         thread.start()
-    for thread in threads[:-1]:
+    for thread in threads[1:]:
         thread.join()
-threads[-1].join()  # leaving the block has processed what was waiting
+threads[0].join()  # leaving the block has processed what was waiting
 print(live.figures)
 for line in live.warnings:
     print("warning:", line)
