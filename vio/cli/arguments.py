@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from vio.datasets.span import Seconds
 
 
-def add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that change the configuration."""
+def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of any setting."""
     parser.add_argument(
         "--config",
         type=Path,
@@ -22,6 +22,11 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="a.b=c", help="change one setting; may be repeated"
     )
+
+
+def add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that change the configuration."""
+    add_settings_arguments(parser)
     parser.add_argument("--motion", metavar="NAME", help="imu, velocity, none or auto: same as --set motion=NAME")
     parser.add_argument("--backend", metavar="NAME", help="same as --set backend=NAME")
     parser.add_argument("--calibration", metavar="F", help="same as --set dataset.calibration=F")

@@ -227,6 +227,14 @@ class LiveOdometry:
         self._worker.end(discard=False)
         self._worker.raise_failure()
 
+    def check(self) -> None:
+        """Raise what the worker ended with, if it failed; calls that add do the same.
+
+        Raises:
+            Exception: that error.
+        """
+        self._worker.raise_failure()
+
     # What comes out
 
     def latest(self) -> Estimate | None:
