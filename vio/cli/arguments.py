@@ -79,14 +79,16 @@ def config_from(args: argparse.Namespace) -> Config:
 
     overrides = list(args.set)
     named = {
-        "motion": args.motion,
-        "backend": args.backend,
-        "frontend.name": args.frontend,
-        "dataset.calibration": args.calibration,
-        "dataset.camera": args.camera,
-        "dataset.topics": args.topics,
+        "motion": "motion",
+        "backend": "backend",
+        "frontend.name": "frontend",
+        "dataset.calibration": "calibration",
+        "dataset.camera": "camera",
+        "dataset.topics": "topics",
     }
-    for key, value in named.items():
+    # Commands that take any setting alone have none of these, or others by the same name.
+    values = {} if not hasattr(args, "backend") else {key: getattr(args, name) for key, name in named.items()}
+    for key, value in values.items():
         if value is not None:
             # Quoted: to YAML a bare `none` is text but `null`, `on` or `no` would not be.
             overrides.append(f'{key}="{value}"')

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vio.cli.arguments import add_settings_arguments
+from vio.cli.arguments import add_settings_arguments, config_from
 
 
 def add_parser(commands: Any) -> None:
@@ -46,7 +46,6 @@ def execute(args: argparse.Namespace) -> int:
     import sys
 
     from vio.cli.stopping import StopRequest
-    from vio.config import load_config
     from vio.datasets.rigs import load_rig
     from vio.errors import ConfigError
     from vio.live.build import MapUse
@@ -55,7 +54,7 @@ def execute(args: argparse.Namespace) -> int:
     from vio.ros2.sensors import SensorTopics
     from vio.ros2.transport import open_transport
 
-    config = load_config(args.config, args.set)
+    config = config_from(args)
     names = args.frames.split(",")
     if len(names) != 3 or not all(names):
         raise ConfigError(f"--frames {args.frames}: give three names, map,odom,base")
