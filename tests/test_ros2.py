@@ -30,9 +30,9 @@ from vio.datasets.rigs import load_rig
 from vio.errors import DataError, MissingDependencyError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw
 from vio.live.live_odometry import LiveOdometry
+from vio.live.pairing import Pairing
 from vio.records import ImuSample
 from vio.ros2.node import NodeSettings, run_node
-from vio.ros2.pairing import Pairing
 from vio.ros2.play import play
 from vio.ros2.publishing import publisher
 from vio.ros2.sensors import Sensors, SensorTopics, Silence, check_types

@@ -273,6 +273,11 @@ class LiveOdometry:
         return self._odometry.camera
 
     @property
+    def T_cam0_body(self) -> FloatArray:
+        """Extrinsics (4, 4) of the body whose pose is estimated, in the rectified left camera."""
+        return self._odometry.T_cam0_body
+
+    @property
     def motion(self) -> MotionSource | None:
         """What propagates the pose between frames; None: images alone."""
         return self._odometry.motion

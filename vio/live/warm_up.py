@@ -44,52 +44,67 @@ def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config)
 
 def sway(odometry: Odometry, config: Config) -> None:
     """Give an odometry the images and motion samples of two seconds."""
-    walls = _Walls(odometry.camera)
-    R_imu_cam = odometry.T_cam0_body[:3, :3].T
+    source = SwayingCamera(odometry.camera, odometry.T_cam0_body, config.msckf.gravity_mps2)
     for frame in range(_FRAMES):
-        for k in range(1, _SAMPLES + 1):
-            time_ns = _STEP_NS * (frame - 1) + _STEP_NS * k // _SAMPLES
-            _, speed, acceleration = walls.motion(time_ns * 1e-9)
+        time_ns = frame * _STEP_NS
+        for k in range(1 - _SAMPLES, 1):
+            sample_ns = time_ns + k * _STEP_NS // _SAMPLES
             if odometry.motion == "imu":
-                # The camera looks at the horizon.
-                force = np.array([acceleration, -config.msckf.gravity_mps2, 0.0])
-                odometry.add_imu(time_ns, np.zeros(3), R_imu_cam @ force)
+                odometry.add_imu(sample_ns, *source.imu(sample_ns))
             elif odometry.motion == "velocity":
-                odometry.add_velocity(time_ns, R_imu_cam @ [speed, 0.0, 0.0], np.zeros(3))
-        _add_frame(odometry, walls, frame)
+                odometry.add_velocity(sample_ns, *source.velocity(sample_ns))
+        left, right, depth_m = source.images(time_ns)
+        odometry.add_images(time_ns, left, right, depth_m=depth_m)
     odometry.finish()
 
 
-def _add_frame(odometry: Odometry, walls: _Walls, frame: int) -> None:
-    time_ns, camera = _STEP_NS * frame, odometry.camera
-    x, *_ = walls.motion(time_ns * 1e-9)
-    left = walls.image(x)
-    if camera.kind == "stereo":
-        odometry.add_stereo(time_ns, left, walls.image(x + camera.baseline_m))
-    else:
-        odometry.add_images(time_ns, left, depth_m=walls.depth_m if camera.kind == "rgbd" else None)
+class SwayingCamera:
+    """A camera that sways sideways, without an end, in front of two walls of random texture across its optical axis.
 
+    The lower wall is at half of the upper one's distance. Images, IMU and velocities agree.
+    """
 
-class _Walls:
-    """Two walls of random texture across the optical axis, the lower one at half of the distance."""
+    def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, gravity_mps2: float) -> None:
+        """Make the walls.
 
-    def __init__(self, camera: StereoCamera) -> None:
+        Args:
+            camera: rectified, with its image size.
+            T_cam0_body: (4, 4) extrinsics of the IMU.
+            gravity_mps2: the camera looks at the horizon.
+        """
         import cv2
 
         assert camera.width is not None
         assert camera.height is not None
+        self._camera, self._R_body_cam, self._gravity_mps2 = camera, T_cam0_body[:3, :3].T, gravity_mps2
         self._size = camera.width, camera.height
         rows = camera.height // 2
         # A single camera's baseline is 1 m or made up: its walls are at some metres.
         far_m = camera.fu * camera.baseline_m / _FAR_PX if camera.kind == "stereo" else 4.0
         self._px_per_m = np.array([1.0, 2.0]) * camera.fu / far_m
         self._sway_m = _SWAY_PX / self._px_per_m[1]
-        self.depth_m: FloatArray = np.full((camera.height, camera.width), far_m)
-        self.depth_m[rows:] /= 2.0
+        self._depth_m: FloatArray = np.full((camera.height, camera.width), far_m)
+        self._depth_m[rows:] /= 2.0
         noise = np.random.default_rng(0).normal(size=(camera.height, camera.width + 4 * int(_SWAY_PX + _NEAR_PX)))
         smooth = cv2.GaussianBlur(noise, (0, 0), _SMOOTH_PX)
         self._texture = np.clip(128.0 + 40.0 * smooth / smooth.std(), 0, 255).astype(np.uint8)
         self._rows = slice(0, rows), slice(rows, camera.height)
+
+    def imu(self, time_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return angular rate (3,) rad/s and specific force (3,) m/s^2."""
+        *_, acceleration = self.motion(time_ns * 1e-9)
+        return np.zeros(3), self._R_body_cam @ np.array([acceleration, -self._gravity_mps2, 0.0])
+
+    def velocity(self, time_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return linear (3,) m/s and angular velocity (3,) rad/s of the body."""
+        _, speed, _ = self.motion(time_ns * 1e-9)
+        return self._R_body_cam @ np.array([speed, 0.0, 0.0]), np.zeros(3)
+
+    def images(self, time_ns: int) -> tuple[Image, Image | None, FloatArray | None]:
+        """Return the left image (H, W), the right one of a pair, and the depths (H, W) where the camera has them."""
+        x, *_ = self.motion(time_ns * 1e-9)
+        right = self._image(x + self._camera.baseline_m) if self._camera.kind == "stereo" else None
+        return self._image(x), right, self._depth_m if self._camera.kind == "rgbd" else None
 
     def motion(self, time_s: float) -> tuple[float, float, float]:
         """Return position, speed and acceleration along the camera's x axis, m and s; at rest before time 0."""
@@ -99,7 +114,7 @@ class _Walls:
         phase, a = rate * time_s, 0.5 * self._sway_m
         return a * (1 - np.cos(phase)), a * rate * np.sin(phase), a * rate**2 * np.cos(phase)
 
-    def image(self, x_m: float) -> Image:
+    def _image(self, x_m: float) -> Image:
         """Return the image (H, W) of a camera at a position along x."""
         import cv2
 

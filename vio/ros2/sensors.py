@@ -18,8 +18,8 @@ from vio.datasets.images import WHITE_16, UnreadableImageError
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.live.live_odometry import LiveOdometry
+from vio.live.pairing import Pairing
 from vio.records import Image
-from vio.ros2.pairing import Pairing
 from vio.ros2.transport import Quality, Transport
 
 log = logging.getLogger(__name__)
