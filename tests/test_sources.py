@@ -10,7 +10,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -279,3 +281,144 @@ def _record_realsense(path: Path) -> None:
     for sensor in sensors:
         sensor.stop()
         sensor.close()
+
+
+class _OakQueue:
+    def __init__(self, *batches: list[Any]) -> None:
+        self._batches = list(batches)
+
+    def tryGetAll(self) -> list[Any]:
+        return self._batches.pop(0) if self._batches else []
+
+
+class _OakDevice:
+    """Stands in for depthai's module, its device, pipeline and nodes: with the names of depthai 3.12."""
+
+    CameraBoardSocket = SimpleNamespace(CAM_B="left", CAM_C="right")
+    CameraModel = SimpleNamespace(Perspective=0, Fisheye=1)
+    IMUSensor = SimpleNamespace(ACCELEROMETER_RAW=0, GYROSCOPE_RAW=1)
+    ImgFrame = SimpleNamespace(Type=SimpleNamespace(GRAY8="gray"))
+    node = SimpleNamespace(Camera="Camera", IMU="IMU")
+    out = property(lambda self: self)
+
+    def __init__(self) -> None:
+        self.coefficients, self.is_open, self.socket = [0.1, 0.0, 0.0, 0.0, 0.0] + [0.0] * 9, False, ""
+        self.Device = lambda info: self
+        self.Device.getAllAvailableDevices = lambda: [SimpleNamespace(getDeviceId=lambda: "14442C", name="1.1")]  # type: ignore[attr-defined]
+        self.Pipeline = lambda device: self
+
+    def create(self, kind: str) -> Any:
+        return self
+
+    def build(self, socket: str) -> Any:
+        self.socket = socket
+        return self
+
+    def requestOutput(self, size: Any, *, type: Any, fps: float) -> Any:
+        return self
+
+    def enableIMUSensor(self, sensors: list[int], rate: int) -> None:
+        self.socket = "imu"
+
+    def setBatchReportThreshold(self, count: int) -> None: ...
+
+    def setMaxBatchReports(self, count: int) -> None: ...
+
+    def createOutputQueue(self) -> _OakQueue:
+        if self.socket == "imu":
+            return _OakQueue([SimpleNamespace(packets=[_oak_packet(k) for k in range(10)])])
+        value = 1 if self.socket == "left" else 2
+        return _OakQueue(*([_oak_image(k, value + k)] for k in range(2)))
+
+    def readCalibration(self) -> Any:
+        return self
+
+    def getConnectedIMU(self) -> str:
+        return "BMI270"
+
+    def getImuToCameraExtrinsics(self, socket: str) -> Any:
+        T = np.eye(4)
+        T[:3, 3] = [1.0, 2.0, 3.0]  # centimetres
+        return T.tolist()
+
+    def getCameraExtrinsics(self, source: str, target: str) -> Any:
+        T = np.eye(4)
+        T[0, 3] = -7.5
+        return T.tolist()
+
+    def getCameraIntrinsics(self, socket: str, width: int, height: int) -> Any:
+        return [[400.0, 0.0, width / 2], [0.0, 400.0, height / 2], [0.0, 0.0, 1.0]]
+
+    def getDistortionCoefficients(self, socket: str) -> list[float]:
+        return self.coefficients
+
+    def getDistortionModel(self, socket: str) -> int:
+        return self.CameraModel.Perspective
+
+    def start(self) -> None:
+        self.is_open = True
+
+    def stop(self) -> None:
+        self.is_open = False
+
+    def close(self) -> None: ...
+
+
+def _oak_packet(k: int) -> Any:
+    stamp = timedelta(seconds=1, microseconds=5000 * k)
+    read = SimpleNamespace(x=float(k), y=0.0, z=1.0, getTimestampDevice=lambda: stamp)
+    return SimpleNamespace(acceleroMeter=read, gyroscope=read)
+
+
+def _oak_image(k: int, value: int) -> Any:
+    stamp = timedelta(seconds=1, microseconds=50_000 * k)
+    image = np.full((400, 640), value, dtype=np.uint8)
+    return SimpleNamespace(getCvFrame=lambda: image, getTimestampDevice=lambda: stamp)
+
+
+def test_an_oak_gives_pairs_samples_and_calibration_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a stand-in: no device was at hand."""
+    device = _OakDevice()
+    monkeypatch.setitem(sys.modules, "depthai", device)  # type: ignore[arg-type]
+    monkeypatch.setattr("vio.sources.oak._LOST_S", 0.0)
+    source = open_source("oak:14442C")
+    events: list[SourceEvent] = []
+    with pytest.raises(DataError, match="nothing for 0 s"):
+        events.extend(event for event in source.events() if event is not None)
+    frames = [event for event in events if isinstance(event, SourceFrame)]
+    samples = [event for event in events if isinstance(event, SourceSample)]
+    assert [(f.time_ns, f.left[0, 0], f.right[0, 0]) for f in frames if f.right is not None] == [
+        (1_000_000_000, 1, 2),
+        (1_050_000_000, 2, 3),
+    ]
+    assert [s.time_ns for s in samples] == [1_000_000_000 + 5_000_000 * k for k in range(10)]
+    rig = source.rig
+    assert rig is not None
+    assert rig.T_cam1_cam0 is not None
+    assert rig.T_cam0_imu is not None
+    np.testing.assert_allclose(rig.T_cam1_cam0[:3, 3], [-0.075, 0.0, 0.0])
+    np.testing.assert_allclose(rig.T_cam0_imu[:3, 3], [0.01, 0.02, 0.03])
+    assert rig.cam0.model == "radtan"
+    source.close()
+    assert not device.is_open
+    device.coefficients[9] = 0.01
+    with pytest.raises(DataError, match="thin prisms or tilt; give --calibration"):
+        open_source("oak:")
+    with pytest.raises(DataError, match="no such device; connected are: 14442C"):
+        open_source("oak:other")
+
+
+def test_the_stand_in_has_only_names_of_depthai() -> None:
+    dai = pytest.importorskip("depthai", reason="depthai is not installed")
+    for owner, names in (
+        (dai.Device, ("getAllAvailableDevices", "readCalibration", "getConnectedIMU", "close")),
+        (dai.Pipeline, ("create", "start", "stop")),
+        (dai.node.Camera, ("build", "requestOutput")),
+        (dai.node.IMU, ("enableIMUSensor", "setBatchReportThreshold", "setMaxBatchReports")),
+        (dai.CalibrationHandler, [name for name in dir(_OakDevice) if name.startswith("get") and "IMU" not in name]),
+        (dai.MessageQueue, ("tryGetAll",)),
+        (dai.IMUPacket, ("acceleroMeter", "gyroscope")),
+        (dai.ImgFrame, ("getCvFrame", "getTimestampDevice")),
+        (dai.DeviceInfo, ("getDeviceId", "name")),
+    ):
+        assert [name for name in names if not hasattr(owner, name)] == []

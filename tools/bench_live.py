@@ -114,13 +114,23 @@ def soak(args: argparse.Namespace) -> None:
         stages.append(result.log.frontend_ms + result.log.monitor_ms + result.log.filter_ms)
 
     pauses = Pauses()
-    print("| simulated | resident MiB | ms a frame, median | 95 % | worst | longest gc pause, ms | collections |")
-    print("|---|---|---|---|---|---|---|")
+    names = (
+        "simulated",
+        "resident MiB",
+        "CPU ms a frame",
+        "ms a frame, median",
+        "95 %",
+        "worst",
+        "longest gc pause, ms",
+    )
+    print("|", " | ".join((*names, "collections")), "|")
+    print("|", " | ".join(["---"] * (len(names) + 1)), "|")
     with vio.LiveOdometry(pair, on_frame=on_frame, drop="block") as live:
         live.warm_up()
         pauses.ms.clear()
         source = SwayingCamera(live.camera, T_cam0_imu, 9.81)
         for part in range(_PARTS):
+            began_s = time.process_time()
             for frame in range(part * args.frames // _PARTS, (part + 1) * args.frames // _PARTS):
                 time_ns = frame * _STEP_NS
                 for k in range(1 - _SAMPLES, 1):
@@ -132,8 +142,14 @@ def soak(args: argparse.Namespace) -> None:
             live.landmarks()  # once all frames so far are done
             with open("/proc/self/statm") as stream:
                 resident = int(stream.read().split()[1]) * resource.getpagesize() / 2**20
+            used_ms = 1e3 * (time.process_time() - began_s) * _PARTS / args.frames
             shown = np.percentile(stages, [50, 95, 100])
-            cells = [f"{(frame + 1) * _STEP_NS * 1e-9 / 60:.1f} min", f"{resident:.0f}", *(f"{v:.1f}" for v in shown)]
+            cells = [
+                f"{(frame + 1) * _STEP_NS * 1e-9 / 60:.1f} min",
+                f"{resident:.0f}",
+                f"{used_ms:.1f}",
+                *(f"{v:.1f}" for v in shown),
+            ]
             print("|", " | ".join([*cells, f"{max(pauses.ms, default=0):.1f}", f"{len(pauses.ms)}"]), "|", flush=True)
             stages.clear()
             pauses.ms.clear()

@@ -50,6 +50,8 @@ def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[i
         if not np.isfinite(array).all():
             raise DataError(f"{name} at {np.atleast_1d(times)[0]} ns is not finite: {array}")
         rows.append(array.reshape(-1, 3).copy())
+    if times.ndim == 0 and abs(time_ns := int(times)) <= _MOST_NS:  # one sample, as drivers give it
+        return [time_ns], rows
     times = np.atleast_1d(times)
     if np.any((times > _MOST_NS) | (times < -_MOST_NS)):
         raise DataError(f"{times[0]} to {times[-1]} ns are no times of a clock; give nanoseconds")
