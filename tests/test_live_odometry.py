@@ -387,6 +387,8 @@ def test_a_map_that_is_behind_holds_up_no_frame(flight: Path, tmp_path: Path, mo
         return extract(*images)
 
     monkeypatch.setattr(session, "extract", waits)
+    warmed: list[int] = []
+    monkeypatch.setattr("vio.mapping.features.extract", lambda *images: warmed.append(len(images)))
     dataset = vio.open_dataset(flight)
     recording = dataset.recording
     results: list[FrameResult] = []
@@ -398,6 +400,8 @@ def test_a_map_that_is_behind_holds_up_no_frame(flight: Path, tmp_path: Path, mo
         map=MapUse(tmp_path / "a.map"),
         drop="block",
     ) as live:
+        live.warm_up()
+        assert warmed == [2]
         for event in dataset.events():
             if isinstance(event, StereoFrame):
                 live.add_stereo(event.time_ns, event.left, event.right)

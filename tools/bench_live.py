@@ -71,14 +71,16 @@ def play(flight: Path, every: int, config: str | None, map_file: Path | None) ->
                 calls[kind].append(1e3 * (time.perf_counter() - start))
 
         threads = [threading.Thread(target=feed, args=(k, s)) for k, s in (("frame", frames), ("sample", samples))]
+        before_s = time.process_time(), time.perf_counter()
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
+        cores = (time.process_time() - before_s[0]) / (time.perf_counter() - before_s[1])
     found, rate = live.figures, 1e9 / float(np.median(np.diff([f.time_ns for f in frames])))
     size = f"{recording.camera.width}x{recording.camera.height}"
     cells = [size, f"{rate:.0f}", config or "default", "yes" if map_file else "no", f"{len(frames)}"]
-    cells += [f"{found.dropped}"]
+    cells += [f"{found.dropped}", f"{cores:.2f}"]
     for value in (found.latency_median_ms, found.latency_95_ms, found.latency_worst_ms):
         cells.append("-" if value is None else f"{value:.0f}")
     for kind in ("sample", "frame"):
@@ -88,7 +90,7 @@ def play(flight: Path, every: int, config: str | None, map_file: Path | None) ->
 
 def latency(args: argparse.Namespace) -> None:
     """Print a table in Markdown."""
-    names = ("images", "Hz", "config", "map", "frames", "left out", "median", "95 %", "worst")
+    names = ("images", "Hz", "config", "map", "frames", "left out", "cores", "median", "95 %", "worst")
     print("|", " | ".join((*names, "add_imu 95 % / worst", "add_stereo 95 % / worst")), "|")
     print("|", " | ".join(["---"] * (len(names) + 2)), "|")
     for flight in args.flights:

@@ -93,7 +93,7 @@ class LiveOdometry:
             on_frame=self._take_result,
             map=None if use is None else replace(use, wait=False),
         )
-        self._on_frame = on_frame
+        self._on_frame, self._with_map = on_frame, use is not None
         if isinstance(rig, Rig):
             self._T_cam0_imu = rig.T_rect0_imu
         self._predictor = SharedPredictor(self._config.msckf.gravity_mps2)
@@ -119,7 +119,7 @@ class LiveOdometry:
 
     def _warm_up(self) -> None:
         odometry = self._odometry
-        warm_up(odometry.camera, self._T_cam0_imu, self._config)
+        warm_up(odometry.camera, self._T_cam0_imu, self._config, with_map=self._with_map)
         if odometry.camera.width is not None:
             odometry.prepare()
         self._collector.hold()

@@ -22,13 +22,14 @@ _SWAY_PX, _SWAY_S = 60.0, 2.0  # of the near half, and its period
 _SMOOTH_PX = 1.5
 
 
-def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config) -> None:
+def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config, *, with_map: bool) -> None:
     """Run an odometry of its own over a camera that sways sideways in front of two walls.
 
     Args:
         camera: rectified, with its image size.
         T_cam0_imu: (4, 4); None: no IMU.
         config: every setting.
+        with_map: whether features of keyframes are extracted, too.
 
     Raises:
         DataError: the camera has no image size.
@@ -40,6 +41,12 @@ def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config)
         sway(odometry, config)
         if odometry.estimate is not None:
             odometry.landmarks()
+    if with_map:
+        from vio.mapping.features import extract
+
+        left, right, _ = SwayingCamera(camera, odometry.T_cam0_body, config.msckf.gravity_mps2).images(0)
+        assert right is not None  # of other cameras there is no map
+        extract(left, right)
 
 
 def sway(odometry: Odometry, config: Config) -> None:
