@@ -28,6 +28,7 @@ IMAGES_ALONE = replace(Config(), motion="none")
 IMAGES = np.random.default_rng(0).integers(0, 255, (6, 480, 752), dtype=np.uint8)  # equal ones would be left out
 IMAGE = IMAGES[0]
 FRAMES = 12
+_PATIENCE_S = 60  # so that what blocks where it must not fails, and does not hang
 
 
 class Held:
@@ -39,7 +40,7 @@ class Held:
 
     def process(self, frame: StereoFrame, prior: Any = None) -> FrontendOutput:
         self.entered.release()
-        self.go_on.acquire()
+        self.go_on.acquire(timeout=_PATIENCE_S)
         self.times.append(frame.time_ns)
         seen = Flight().observe(frame.index, 0.3, np.random.default_rng(frame.index))
         return FrontendOutput(replace(seen, time_ns=frame.time_ns), 0, 0, 0)
@@ -383,7 +384,7 @@ def test_a_map_that_is_behind_holds_up_no_frame(flight: Path, tmp_path: Path, mo
     monkeypatch.setattr(session, "_SHARED", 1.0)  # nearly every frame is a keyframe
 
     def waits(*images: Any) -> Any:
-        go_on.wait()
+        go_on.wait(timeout=_PATIENCE_S)
         return extract(*images)
 
     monkeypatch.setattr(session, "extract", waits)

@@ -145,9 +145,15 @@ def test_the_node_gives_the_poses_of_the_file_run(
     assert played.frames == len(times)
     while len(taken["/vio/odometry"]) < len(times) and not failures:
         receiver.spin(0.1)
+    publisher(Member(graph), {}).empty("/vio/save")
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "out" / "trajectory.tum").is_file() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    saved = (tmp_path / "out" / "trajectory.tum").is_file()
     done.set()
     thread.join()
     receiver.spin(0.0)
+    assert saved  # before the end
     assert failures == []
     received = [_pose(data) for data in taken["/vio/odometry"]]
     assert [t for t, _ in received] == times
@@ -458,6 +464,7 @@ def test_messages_pass_over_dds_and_late_ones_get_the_last(domain: int) -> None:
     assert [(f.name, f.kind, f.many) for f in fields_of(IMAGE)][-1] == ("data", "uint8", "sequence")
 
 
+@pytest.mark.slow
 @needs_dds
 @needs_loopback
 def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: int, tmp_path: Path) -> None:
