@@ -1,38 +1,53 @@
-"""Odometry one sample at a time, as a robot has them, with poses between frames for a controller.
+"""Odometry beside the threads of a robot: an IMU driver, a camera driver and a controller that wants poses in between.
 
-python examples/live_loop.py RECORDING          # stands in for the cameras and the IMU
+python examples/live_loop.py RECORDING          # stands in for the drivers, in real time
 """
 
 import sys
-
-import numpy as np
+import threading
+import time
 
 import vio
-from vio.errors import DataError
 
 source = vio.open_dataset(sys.argv[1])
 recording = source.recording
-use_imu = "imu" in recording.motion
-config = vio.load_config(overrides=[f"motion={'imu' if use_imu else 'none'}"])
-T_cam0_imu = recording.T_cam0_imu if recording.T_cam0_imu is not None else np.eye(4)
-odometry = vio.Odometry(recording.camera, config, T_cam0_imu=T_cam0_imu)
+images = [event for event in source.events(stop=100) if hasattr(event, "left")]
+samples = [event for event in source.events(stop=100, images=False) if hasattr(event, "gyro")]
 
-for event in source.events():
-    try:
-        if hasattr(event, "left"):  # a pair of images; a live camera gives the time and two arrays
-            odometry.add_stereo(event.time_ns, event.left, event.right)
-        elif use_imu:  # a sample of the IMU: rad/s and m/s^2
-            odometry.add_imu(event.time_ns, event.gyro, event.accel)
-    except DataError as error:  # a bad sample or image changes nothing
-        print("refused:", error)
-        continue
-    if odometry.estimate is not None and hasattr(event, "left"):
-        x, y, z = odometry.estimate.T_world_imu[:3, 3]
-        sigma = np.sqrt(np.trace(odometry.estimate.covariance[:3, :3]))
-        print(f"{odometry.estimate.time_ns * 1e-9:.3f} s  {x:8.3f} {y:8.3f} {z:8.3f} m  +- {sigma:.3f} m")
 
-odometry.finish()
-ahead = odometry.predict(odometry.estimate.time_ns + 20_000_000)  # 20 ms after the newest frame
-print("20 ms later:", ahead.T_world_imu[:3, 3].round(3))
-for line in odometry.warnings:
+def in_real_time(events):  # replace both loops over it by your drivers' callbacks
+    for event in events:
+        time.sleep(max(0.0, start + (event.time_ns - images[0].time_ns) * 1e-9 - time.monotonic()))
+        yield event
+
+
+def imu_driver(live):
+    for sample in in_real_time(samples):
+        live.add_imu(sample.time_ns, sample.gyro, sample.accel)  # rad/s and m/s^2; returns at once
+
+
+def camera_driver(live):
+    for pair in in_real_time(images):
+        live.add_stereo(pair.time_ns, pair.left, pair.right)  # copied, and processed by the odometry's own thread
+
+
+def controller(live):
+    for estimate in live:  # ends when the odometry is closed
+        ahead = live.predict(estimate.time_ns + 20_000_000)  # from the samples that have come since
+        x, y, z = ahead.T_world_imu[:3, 3]
+        print(f"{ahead.time_ns * 1e-9:.3f} s  {x:8.3f} {y:8.3f} {z:8.3f} m")
+
+
+with vio.LiveOdometry(recording.camera, T_cam0_imu=recording.T_cam0_imu) as live:
+    live.warm_up()  # compiles and loads: the first frame then takes no longer than others
+    drivers = [camera_driver, imu_driver] if live.motion == "imu" else [camera_driver]
+    threads = [threading.Thread(target=work, args=(live,)) for work in (controller, *drivers)]
+    start = time.monotonic()
+    for thread in threads:
+        thread.start()
+    for thread in threads[1:]:
+        thread.join()
+threads[0].join()  # leaving the block has processed what was waiting
+print(live.figures)
+for line in live.warnings:
     print("warning:", line)

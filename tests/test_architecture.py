@@ -118,6 +118,16 @@ def test_dask_stays_in_its_module() -> None:
     assert not {"distributed", "dask"} & _heads(ROOT / "vio" / "bench" / "engines.py", top_level_only=True)
 
 
+def test_dds_ros_and_cameras_stay_in_their_modules() -> None:
+    for package, module in (
+        ("cyclonedds", "vio.ros2.dds"),
+        ("rclpy", "vio.ros2.rclpy_transport"),
+        ("pyrealsense2", "vio.sources.realsense"),
+        ("depthai", "vio.sources.oak"),
+    ):
+        assert [_name(f) for f in FILES if package in _heads(f, top_level_only=False)] == [module]
+
+
 def test_matplotlib_stays_out_of_import_time() -> None:
     assert not [_name(f) for f in FILES if "matplotlib" in _heads(f, top_level_only=True)]
 
@@ -130,7 +140,7 @@ def _loaded(code: str, suspects: set[str]) -> set[str]:
 
 
 HEAVY = {"numpy", "scipy", "numba", "cv2", "torch", "kornia", "matplotlib", "pycolmap", "yaml", "threadpoolctl", "tqdm"}
-HEAVY |= {"rosbags", "distributed", "dask"}
+HEAVY |= {"rosbags", "distributed", "dask", "cyclonedds", "pyrealsense2", "depthai"}
 HELP = """
 import contextlib, vio.cli
 with contextlib.suppress(SystemExit):

@@ -7,7 +7,14 @@ import subprocess
 import sys
 
 INSTALLERS = {"pip", "wheel"}  # not the project's business
-EXTRAS = ("pytest", "torch", "kornia", "distributed")  # one package, at least, of each extra
+EXTRAS = (
+    "pytest",
+    "torch",
+    "kornia",
+    "distributed",
+    "cyclonedds",
+    "pyrealsense2",
+)  # one package, at least, of each extra
 
 
 def main() -> int:

@@ -18,10 +18,12 @@ if TYPE_CHECKING:
     from vio.datasets.rigs import load_rig
     from vio.evaluation.trajectories import evaluate
     from vio.live.build import MapUse, Parts
+    from vio.live.live_odometry import LiveOdometry
     from vio.live.odometry import Odometry
     from vio.runs.pipeline import RunControl, run
 
 __all__ = [
+    "LiveOdometry",
     "MapUse",
     "Odometry",
     "Parts",
@@ -37,6 +39,7 @@ __all__ = [
 ]
 
 _MODULES = {  # loaded when the name is first used
+    "LiveOdometry": "vio.live.live_odometry",
     "MapUse": "vio.live.build",
     "Odometry": "vio.live.odometry",
     "Parts": "vio.live.build",

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from vio.datasets.span import Seconds
 
 
-def add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that change the configuration."""
+def add_settings_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of any setting."""
     parser.add_argument(
         "--config",
         type=Path,
@@ -22,6 +22,11 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="a.b=c", help="change one setting; may be repeated"
     )
+
+
+def add_config_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments that change the configuration."""
+    add_settings_arguments(parser)
     parser.add_argument("--motion", metavar="NAME", help="imu, velocity, none or auto: same as --set motion=NAME")
     parser.add_argument("--backend", metavar="NAME", help="same as --set backend=NAME")
     parser.add_argument("--calibration", metavar="F", help="same as --set dataset.calibration=F")
@@ -74,14 +79,16 @@ def config_from(args: argparse.Namespace) -> Config:
 
     overrides = list(args.set)
     named = {
-        "motion": args.motion,
-        "backend": args.backend,
-        "frontend.name": args.frontend,
-        "dataset.calibration": args.calibration,
-        "dataset.camera": args.camera,
-        "dataset.topics": args.topics,
+        "motion": "motion",
+        "backend": "backend",
+        "frontend.name": "frontend",
+        "dataset.calibration": "calibration",
+        "dataset.camera": "camera",
+        "dataset.topics": "topics",
     }
-    for key, value in named.items():
+    # Commands that take any setting alone have none of these, or others by the same name.
+    values = {} if not hasattr(args, "backend") else {key: getattr(args, name) for key, name in named.items()}
+    for key, value in values.items():
         if value is not None:
             # Quoted: to YAML a bare `none` is text but `null`, `on` or `no` would not be.
             overrides.append(f'{key}="{value}"')

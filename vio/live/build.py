@@ -47,6 +47,8 @@ class MapUse:
 
     path: Path
     localise: bool = False  # find poses in the map, and leave it as it is
+    # Wait for the map's thread, so that results repeat to the bit; False: keyframes and results come when it is ready.
+    wait: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,5 +221,6 @@ def _open_map(use: MapUse, source: Source, config: Config, backend: Backend) -> 
         source="live" if recording is None else str(recording.path.absolute()),
         imu=source.motion == "imu",
         localise=use.localise,
+        wait=use.wait,
         alone=source.motion is None,
     )

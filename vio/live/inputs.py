@@ -11,7 +11,7 @@ import numpy.typing as npt
 from vio.errors import DataError
 from vio.filters.inputs import LARGEST
 from vio.geometry.lie import FloatArray
-from vio.records import Image, IntArray
+from vio.records import Image, IntArray, Observations, observations
 
 _MOST_NS = 2**62  # differences of times stay within 64 bits
 _JUMP_NS, _JUMP_STEPS = 2_000_000_000, 5  # a stamp so far ahead, and so many times the last step, is to be confirmed
@@ -83,6 +83,8 @@ def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[i
             at = f"{name} at {np.atleast_1d(times)[0]} ns"
             raise DataError(f"{at} is not finite, or beyond any sensor ({LARGEST:g}): {array}")
         rows.append(array.reshape(-1, 3).copy())
+    if times.ndim == 0 and abs(time_ns := int(times)) <= _MOST_NS:  # one sample, as drivers give it
+        return [time_ns], rows
     times = np.atleast_1d(times)
     if np.any((times > _MOST_NS) | (times < -_MOST_NS)):
         raise DataError(f"{times[0]} to {times[-1]} ns are no times of a clock; give nanoseconds")
@@ -91,8 +93,27 @@ def checked_samples(t_ns: Any, values: dict[str, npt.ArrayLike]) -> tuple[list[i
     return times.tolist(), rows
 
 
-def gray(image: npt.ArrayLike, name: str) -> Image:
-    """Return an image as (H, W) uint8.
+def checked_observations(
+    index: int, time_ns: Any, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None
+) -> Observations:
+    """Return what a front end saw in a frame.
+
+    Raises:
+        DataError: shapes disagree, an id occurs twice, or a pixel that is seen is not finite or in no image.
+    """
+    try:
+        seen = observations(index, 0, ids, z, has_right)
+    except (ValueError, TypeError) as error:
+        raise DataError(f"observations at {time_ns} ns: {error}") from error
+    used = np.concatenate([seen.z[:, :2].ravel(), seen.z[seen.has_right, 2:].ravel()])
+    wrong = int((~(np.abs(used) < LARGEST)).sum())
+    if wrong:
+        raise DataError(f"observations at {time_ns} ns: {wrong} pixels are not finite, or in no image")
+    return seen
+
+
+def check_image(image: npt.ArrayLike, name: str) -> npt.NDArray[np.uint8]:
+    """Return an image as it is, (H, W) gray or (H, W, 3) BGR.
 
     Raises:
         DataError: it is neither 8-bit gray nor BGR.
@@ -102,10 +123,20 @@ def gray(image: npt.ArrayLike, name: str) -> Image:
         raise DataError(
             f"the {name} image has shape {array.shape} and type {array.dtype}; give uint8, (H, W) gray or (H, W, 3) BGR"
         )
+    return array
+
+
+def gray(image: npt.ArrayLike, name: str) -> Image:
+    """Return an image as (H, W) uint8.
+
+    Raises:
+        DataError: it is neither 8-bit gray nor BGR.
+    """
+    array = check_image(image, name)
     if array.ndim == 3:
         import cv2
 
-        array = cv2.cvtColor(array, cv2.COLOR_BGR2GRAY)
+        array = np.asarray(cv2.cvtColor(array, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     return np.array(array, dtype=np.uint8, order="C")  # a copy: the caller may fill its buffer again
 
 
@@ -121,9 +152,9 @@ def checked_depths(depth_m: npt.ArrayLike, shape: tuple[int, ...]) -> FloatArray
     return array
 
 
-def check_size(image: Image, expected: tuple[int, int], name: str) -> None:
+def check_size(image: npt.NDArray[np.uint8], expected: tuple[int, int], name: str) -> None:
     """Raise DataError unless an image has the height and width that the calibration states."""
-    if image.shape != expected:
+    if image.shape[:2] != expected:
         raise DataError(
             f"the {name} image is {image.shape[1]}x{image.shape[0]}, but the calibration is for "
             f"{expected[1]}x{expected[0]}; check that calibration and camera belong together"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -18,14 +18,22 @@ from vio.cameras.rig import Rig, rig_of_rectified
 from vio.config import Config
 from vio.datasets.frame_rate import FrameRateLimit
 from vio.errors import ConfigError, DataError
-from vio.filters.inputs import LARGEST, checked_extrinsics
+from vio.filters.inputs import checked_extrinsics
 from vio.frontend import build_frontend
 from vio.frontend.precomputed import PrecomputedFrontend
 from vio.frontend.settings import FrontendSettings
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.live.build import CONFIGURED, MapUse, Parts, build_processor, live_source
-from vio.live.inputs import JumpGuard, check_size, checked_depths, checked_samples, checked_time, gray
+from vio.live.inputs import (
+    JumpGuard,
+    check_size,
+    checked_depths,
+    checked_observations,
+    checked_samples,
+    checked_time,
+    gray,
+)
 from vio.live.prediction import PosePredictor, PredictedPose
 from vio.numerics.threads import BlasLimit
 from vio.protocols import Frontend
@@ -38,6 +46,7 @@ from vio.records import (
     ImuSample,
     Landmarks,
     LoopEvent,
+    MotionSample,
     MotionSource,
     Observations,
     StereoFrame,
@@ -69,7 +78,7 @@ class Odometry:
         T_cam0_imu: FloatArray | None = None,
         parts: Parts = CONFIGURED,
         on_frame: Callable[[FrameResult], None] | None = None,
-        map: Path | str | None = None,
+        map: Path | str | MapUse | None = None,
         localise: bool = False,
     ) -> None:
         """Prepare; the first frame begins the trajectory.
@@ -81,8 +90,9 @@ class Odometry:
             T_cam0_imu: (4, 4) extrinsics, only beside a rectified pair; a `Rig` has its own.
             parts: front end, selector or back end in place of the configured ones.
             on_frame: called with the result of each frame, by the call that processed it.
-            map: file of a map to begin or to continue (docs/maps.md): estimates have `T_map_body`, and `close` ends it.
-            localise: find poses in the map, and leave it as it is.
+            map: file of a map to begin or to continue (docs/maps.md): estimates have `T_map_body`, and `close` ends it;
+                or its use in full.
+            localise: find poses in the map, and leave it as it is; with the file of a map.
 
         Raises:
             CalibrationError: the rig cannot be rectified.
@@ -107,7 +117,8 @@ class Odometry:
             T_cam0_imu = rig.T_rect0_imu
             self._offset_ns = round(1e9 * rig.time_offset_s)
         self._source = live_source(self.camera, T_cam0_imu, self._config)
-        self._parts, self._map = parts, None if map is None else MapUse(Path(map), localise)
+        self._parts = parts
+        self._map = MapUse(Path(map), localise) if isinstance(map, (str, Path)) else map
         self._on_frame = on_frame
         self._lock = threading.RLock()
         self._blas = BlasLimit()
@@ -151,9 +162,9 @@ class Odometry:
             DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
             ConfigError: this odometry does not use an IMU.
         """
-        self._expect("imu")
+        self.expect("imu")
         times, (a, b) = checked_samples(t_ns, {"gyro": gyro, "accel": accel})
-        self._add_samples([ImuSample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
+        self.add_samples([ImuSample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
 
     def add_velocity(self, t_ns: int | npt.ArrayLike, linear: npt.ArrayLike, angular: npt.ArrayLike) -> None:
         """Take one sample of body velocity, or several in order of time.
@@ -167,9 +178,29 @@ class Odometry:
             DataError: a wrong shape, a value that is not finite, or a time not after the last sample's.
             ConfigError: this odometry does not use velocities; set `motion` to velocity.
         """
-        self._expect("velocity")
+        self.expect("velocity")
         times, (a, b) = checked_samples(t_ns, {"linear": linear, "angular": angular})
-        self._add_samples([VelocitySample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
+        self.add_samples([VelocitySample(t - self._offset_ns, *row) for t, *row in zip(times, a, b, strict=True)])
+
+    def add_samples(self, samples: Sequence[MotionSample]) -> None:
+        """Take motion samples in order of time, of the kind that `motion` says, on the camera's clock.
+
+        Raises:
+            DataError: a time not after the last sample's.
+        """
+        with self._lock:
+            last = self._last_ns.get("sample")
+            if last is not None and samples and samples[0].time_ns <= last:
+                raise DataError(
+                    f"sample at {samples[0].time_ns + self._offset_ns} ns is not after the last one at "
+                    f"{last + self._offset_ns} ns; give them in order of time, each once"
+                )
+            for sample in samples:
+                if not self._is_confirmed("sample", sample.time_ns):
+                    continue
+                if (usable := self._processor.usable(sample)) is not None:
+                    self._predictor.sample(usable)
+                self._deliver(self._add(sample))
 
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> Estimate | None:
         """Take a pair of images and return the newest estimate that it brought; None: it waits for IMU samples.
@@ -259,14 +290,7 @@ class Odometry:
             DataError: shapes disagree, an id occurs twice, a pixel is not finite, or a time not after the last one.
         """
         with self._lock:
-            try:
-                seen = observations(self._frames, 0, ids, z, has_right)
-            except (ValueError, TypeError) as error:
-                raise DataError(f"observations at {t_ns} ns: {error}") from error
-            used = np.concatenate([seen.z[:, :2].ravel(), seen.z[seen.has_right, 2:].ravel()])
-            wrong = int((~(np.abs(used) < LARGEST)).sum())
-            if wrong:
-                raise DataError(f"observations at {t_ns} ns: {wrong} pixels are not finite, or in no image")
+            seen = checked_observations(self._frames, t_ns, ids, z, has_right)
             time_ns = self._new_time("frame", t_ns, kind="observations")
             if not self._is_used(time_ns):
                 return None
@@ -286,7 +310,53 @@ class Odometry:
         with self._lock:
             self._processor.close()
 
+    def expect(self, source: MotionSource) -> None:
+        """Check that this odometry uses samples of a sensor.
+
+        Raises:
+            ConfigError: it does not.
+        """
+        if self.motion != source:
+            raise ConfigError(
+                f"{source} samples came, but this odometry runs on motion {self.motion or 'none'}; set the "
+                "configuration's motion, and for an IMU give the rig its T_cam0_imu"
+            )
+
+    def prepare(self) -> None:
+        """Build what the first images would build: the front end, and the maps of the rectification.
+
+        Raises:
+            VioError: the settings contradict the camera, or name a file that cannot be read.
+        """
+        with self._lock:
+            if self._parts.frontend is None:
+                self._frontend.open()
+            if self._rectifier is not None:
+                black = [np.zeros(shape or (1, 1), dtype=np.uint8) for shape in self.image_shapes]
+                depth = np.zeros(black[0].shape) if self.camera.kind == "rgbd" else None
+                self._rectifier.frame(0, 0, *black, depth_m=depth)
+
     # What comes out
+
+    @property
+    def T_cam0_body(self) -> FloatArray:
+        """Extrinsics (4, 4) of the body whose pose is estimated, in the rectified left camera."""
+        return self._source.T_cam0_body
+
+    @property
+    def time_offset_ns(self) -> int:
+        """What is subtracted from the IMU's stamps, so that they are on the camera's clock."""
+        return self._offset_ns
+
+    @property
+    def image_shapes(self) -> tuple[tuple[int, int] | None, ...]:
+        """Height and width of the images of each camera, as they are to be given; None: any."""
+        if self._rectifier is not None and self.camera.kind == "stereo":
+            rig = self._rectifier.rig
+            return (rig.cam0.height, rig.cam0.width), (rig.cam1.height, rig.cam1.width)
+        width, height = self.camera.width, self.camera.height
+        shape = None if width is None or height is None else (height, width)
+        return (shape, shape) if self.camera.kind == "stereo" else (shape,)
 
     @property
     def estimate(self) -> Estimate | None:
@@ -388,13 +458,6 @@ class Odometry:
 
     # How
 
-    def _expect(self, source: MotionSource) -> None:
-        if self.motion != source:
-            raise ConfigError(
-                f"{source} samples came, but this odometry runs on motion {self.motion or 'none'}; set the "
-                "configuration's motion, and for an IMU give the rig its T_cam0_imu"
-            )
-
     def _new_time(self, of: str, t_ns: Any, *, kind: str) -> int:
         """Check a frame's time and kind, and note the kind."""
         time_ns = checked_time(t_ns)
@@ -425,21 +488,6 @@ class Odometry:
             "so far ahead until two in a row agree"
         )
         return False
-
-    def _add_samples(self, samples: list[Any]) -> None:
-        with self._lock:
-            last = self._last_ns.get("sample")
-            if last is not None and samples and samples[0].time_ns <= last:
-                raise DataError(
-                    f"sample at {samples[0].time_ns + self._offset_ns} ns is not after the last one at "
-                    f"{last + self._offset_ns} ns; give them in order of time, each once"
-                )
-            for sample in samples:
-                if not self._is_confirmed("sample", sample.time_ns):
-                    continue
-                if (usable := self._processor.usable(sample)) is not None:
-                    self._predictor.sample(usable)
-                self._deliver(self._add(sample))
 
     def _rectified(
         self, time_ns: int, left: Image, right: Image | None = None, *, depth_m: FloatArray | None = None

@@ -1,7 +1,8 @@
 """Between odometry and map: chooses keyframes, hands them to the map's thread, and takes back what it finds.
 
 What a keyframe brings is taken over a fixed number of frames after it, by waiting if need be. So the result does not
-depend on how fast the thread was, and repeats to the bit.
+depend on how fast the thread was, and repeats to the bit. In live use no frame waits: a map that is behind gets its
+next keyframe later.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ _LEAST_TRACKED = 6  # likewise, by which the odometry can still follow
 _LOCALISE_STEP = 5  # frames between keyframes of a session that is localised, where nothing is stored
 _LOST_STEP = 3  # likewise while it has no place
 _LOST_M = 1.0  # standard deviation of the position, likewise
+_MOST_WAITING = 3  # keyframes without a result, where the odometry waits for none: beyond, the next one comes later
 HANDOVER_FRAMES = 10  # from a keyframe to the frame at which its result is taken over
 # On the standard deviations of a motion: errors of a track last longer than a frame, which the window does not count.
 # Measured over a keyframe's step: 1.6 to 3.1 times the standard deviation (street), 1.2 to 3.1 (room).
@@ -56,6 +58,7 @@ class MapSession:
         source: str,
         imu: bool,
         localise: bool,
+        wait: bool = True,
         alone: bool = False,
     ) -> None:
         """Open the map.
@@ -67,6 +70,8 @@ class MapSession:
             source: names the recording.
             imu: whether the vertical is known.
             localise: leave the map as it is.
+            wait: for the map's thread where it is behind; False: a result is taken over once it is there, and no frame
+                becomes a keyframe while several wait.
             alone: whether the odometry has images alone, so that it is lost where they show nothing.
 
         Raises:
@@ -74,7 +79,7 @@ class MapSession:
             DataError: the map cannot be used.
         """
         check_camera(path, camera)
-        self._localise, self._imu, self._alone = localise, imu, alone
+        self._localise, self._imu, self._alone, self._wait = localise, imu, alone, wait
         self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
         store = MapStore(path, create=not localise, read_only=localise)
         self._builder = MapBuilder(store, source, camera, upright=imu, localise=localise)
@@ -115,7 +120,7 @@ class MapSession:
         """
         self._frames += 1
         self._T_odom_body = estimate.T_world_imu
-        events = self._take(lambda due: due <= self._frames)
+        events = self._take(lambda due, done: due <= self._frames and (done or self._wait))
         fresh = seen.take(seen.has_right & ~seen.stale)
         seen_now = len(fresh) >= _LEAST_TRACKED
         lost = seen_now and self._is_lost(frame.time_ns)
@@ -131,13 +136,14 @@ class MapSession:
         self._since += 1
         if motion is None and self._newest is not None:
             return events
-        if self._is_due(fresh.ids, motion):
+        busy = not self._wait and len(self._waiting) >= _MOST_WAITING
+        if not busy and self._is_due(fresh.ids, motion):
             self._submit(frame, fresh.ids, estimate, motion)
         return events
 
     def finish(self) -> tuple[LoopEvent, ...]:
         """Wait for everything, and write the map."""
-        events = self._take(lambda due: True)
+        events = self._take(lambda due, done: True)
         if self._frames:
             self._T_map_odom, self._T_map_cam = self._executor.submit(self._builder.finish).result().T_map_odom, None
         return events
@@ -292,10 +298,10 @@ class MapSession:
 
     # Results
 
-    def _take(self, is_due: Callable[[int], bool]) -> tuple[LoopEvent, ...]:
-        """Take over what is due, waiting for it; errors of the map's thread are raised here."""
+    def _take(self, is_due: Callable[[int, bool], bool]) -> tuple[LoopEvent, ...]:
+        """Take over what is due, by frame and whether it is done, waiting for it; the map's errors are raised here."""
         events: list[LoopEvent] = []
-        while self._waiting and is_due(self._waiting[0][0]):
+        while self._waiting and is_due(self._waiting[0][0], self._waiting[0][2].done()):
             _, frame, result = self._waiting.pop(0)
             update = result.result()
             self._T_map_odom, self._known, self._T_map_cam = update.T_map_odom, update.covariance, update.T_map_cam

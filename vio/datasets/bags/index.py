@@ -22,7 +22,7 @@ from vio.errors import DataError
 from vio.geometry.lie import FloatArray, rotation_from_quat_xyzw, se3_from_parts, se3_inverse
 from vio.records import NS_PER_S, ImuRecord, IntArray, Trajectory, VelocitySample
 
-__all__ = ["BagIndex", "Stamps", "index_bag", "info_topic", "stamp_of"]
+__all__ = ["BagIndex", "Stamps", "camera_info_of", "index_bag", "info_topic", "stamp_of"]
 
 _WHITE_SAMPLES = 8  # images looked at for the level of white, spread over the recording
 _WHITE_SHARE = 0.999  # of their pixels are no brighter than that level
@@ -100,6 +100,14 @@ class BagIndex:
         key = max(carriers, key=lambda name: len(self.moving[name]))
         found = _trajectory(self.moving[key], imu=imu)
         return None if found is None else replace(found, T_world_body=found.T_world_body @ carriers[key])
+
+    def add_frames(self, fields: Any) -> None:
+        """Take the transforms of a tf2_msgs/TFMessage as static ones."""
+        for item in fields.transforms:
+            t, q = item.transform.translation, item.transform.rotation
+            R = rotation_from_quat_xyzw(np.array([q.x, q.y, q.z, q.w]))
+            parent, child = (str(name).lstrip("/") for name in (item.header.frame_id, item.child_frame_id))
+            self.frames[(parent, child)] = se3_from_parts(R, [t.x, t.y, t.z])
 
     def transform(self, target: str, source: str) -> FloatArray | None:
         """`T_target_source` (4, 4) through the static frames; None: they are not connected."""
@@ -243,19 +251,16 @@ def _pose(index: BagIndex, fields: Any, message: Message) -> None:
 
 
 def _frames(index: BagIndex, fields: Any, message: Message) -> None:
-    for item in fields.transforms:
-        t, q = item.transform.translation, item.transform.rotation
-        R = rotation_from_quat_xyzw(np.array([q.x, q.y, q.z, q.w]))
-        parent, child = (str(name).lstrip("/") for name in (item.header.frame_id, item.child_frame_id))
-        index.frames[(parent, child)] = se3_from_parts(R, [t.x, t.y, t.z])
+    index.add_frames(fields)
 
 
 def _info(index: BagIndex, fields: Any, message: Message) -> None:
     if message.topic not in index.infos:
-        index.infos[message.topic] = _camera_info(fields, message.topic)
+        index.infos[message.topic] = camera_info_of(fields, message.topic)
 
 
-def _camera_info(fields: Any, topic: str) -> CameraInfo:
+def camera_info_of(fields: Any, topic: str) -> CameraInfo:
+    """Return a sensor_msgs/CameraInfo; ROS 1 and ROS 2 write its matrices in capitals and in small letters."""
     D, K, R, P = (np.array(getattr(fields, n, getattr(fields, n.upper(), None)), dtype=np.float64) for n in "dkrp")
     return CameraInfo(
         topic,

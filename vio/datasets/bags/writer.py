@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from vio.geometry.stereo import StereoCamera
 from vio.records import NS_PER_S, Image, ImuSample, Trajectory, VelocitySample
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Writer
 
 Storage: TypeAlias = Literal["rosbag2", "mcap"]
@@ -29,15 +28,28 @@ _UNKNOWN = np.array([-1.0, *np.zeros(8)])  # sensor_msgs/Imu: the covariance of 
 _LATCHED = ("/tf_static",)  # a subscriber gets the last message however late it comes
 
 
-class BagWriter:
-    """An opened bag. Every message is logged at its own stamp; T maps coordinates of the child to the parent's."""
+class MessageSink(Protocol):
+    """What takes messages in the place of a bag."""
 
-    def __init__(self, writer: Writer, latched: Sequence[str]) -> None:
+    def add_connection(self, topic: str, msgtype: str, **options: Any) -> Any:
+        """Return what `write` takes for a topic."""
+
+    def write(self, connection: Any, timestamp: int, data: bytes | memoryview) -> None:
+        """Take a message as CDR, with its time in ns."""
+
+
+class BagWriter:
+    """Makes ROS 2 messages, for an opened bag or for publishing; each is logged at its own stamp.
+
+    T maps coordinates of the child to the parent's.
+    """
+
+    def __init__(self, writer: Writer | MessageSink, latched: Sequence[str] = ()) -> None:
         from rosbags.typesys import Stores, get_typestore
 
         self._writer = writer
         self._store = get_typestore(Stores.ROS2_HUMBLE)
-        self._connections: dict[str, Connection] = {}
+        self._connections: dict[str, Any] = {}
         self._latched = (*_LATCHED, *latched)
 
     def image(self, topic: str, frame: str, time_ns: int, image: Image) -> None:
@@ -98,6 +110,41 @@ class BagWriter:
         raw = np.frombuffer(data.tobytes(), dtype=np.uint8)
         row = 16 * len(data)
         self._put(topic, time_ns, "sensor_msgs/msg/PointCloud2", frame, 1, len(data), fields, False, 16, row, raw, True)
+
+    def odometry(
+        self,
+        topic: str,
+        frames: tuple[str, str],
+        time_ns: int,
+        T: FloatArray,
+        covariance: FloatArray,
+        twist: tuple[FloatArray, FloatArray, FloatArray],
+    ) -> None:
+        """Write a pose (4, 4) of the child in the parent's frame, and its motion in its own axes.
+
+        Args:
+            topic: its name.
+            frames: parent and child.
+            time_ns: stamp.
+            T: (4, 4).
+            covariance: (6, 6) of position and of rotation about the parent's axes.
+            twist: linear (3,) m/s and angular velocity (3,) rad/s, and their covariance (6, 6).
+        """
+        linear, angular, spread = twist
+        pose = self._make("geometry_msgs/msg/PoseWithCovariance", self._pose(T), covariance.ravel())
+        motion = self._make("geometry_msgs/msg/Twist", self._vector(linear), self._vector(angular))
+        motion = self._make("geometry_msgs/msg/TwistWithCovariance", motion, spread.ravel())
+        self._put(topic, time_ns, "nav_msgs/msg/Odometry", frames[0], frames[1], pose, motion)
+
+    def diagnostics(self, name: str, time_ns: int, level: int, text: str, values: Mapping[str, str]) -> None:
+        """Write the state of a part on /diagnostics: level 0 is fine, 1 a warning, 2 an error."""
+        pairs = [self._make("diagnostic_msgs/msg/KeyValue", key, value) for key, value in values.items()]
+        status = self._make("diagnostic_msgs/msg/DiagnosticStatus", level, name, text, "", pairs)
+        self._put("/diagnostics", time_ns, "diagnostic_msgs/msg/DiagnosticArray", "", [status])
+
+    def empty(self, topic: str) -> None:
+        """Write a message without content."""
+        self._write(topic, 0, self._make("std_msgs/msg/Empty"))
 
     def _transforms(self, topic: str, time_ns: int, transforms: Sequence[tuple[str, str, FloatArray]]) -> None:
         items = []

@@ -1,0 +1,427 @@
+"""Live sources: videos by OpenCV, a RealSense made by its library, and recordings that repeat the run to the bit."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import importlib.util
+import itertools
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from datetime import timedelta
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+import vio
+from vio.cli import main
+from vio.config import Config
+from vio.datasets.rigs import load_rig
+from vio.errors import ConfigError, DataError, MissingDependencyError
+from vio.files.trajectories import read_trajectory
+from vio.records import ImuSample, StereoFrame
+from vio.sources.interpolated import ImuInterpolation
+from vio.sources.run import run_source
+from vio.sources.source import SourceEvent, SourceFrame, SourceSample, open_source
+
+
+@pytest.fixture(scope="module")
+def pairs(flight: Path) -> list[StereoFrame]:
+    return [event for event in vio.open_dataset(flight).events() if isinstance(event, StereoFrame)]
+
+
+@pytest.fixture(scope="module")
+def video(pairs: list[StereoFrame], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The images of a flight side by side, without loss."""
+    path = tmp_path_factory.mktemp("video") / "pair.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 20.0, (320, 90))
+    for pair in pairs:
+        assert pair.left is not None
+        assert pair.right is not None
+        writer.write(np.dstack([np.hstack([pair.left, pair.right])] * 3))
+    writer.release()
+    return path
+
+
+def test_a_video_gives_the_images_side_by_side(video: Path, pairs: list[StereoFrame]) -> None:
+    source = open_source(f"video:{video}")
+    frames = [event for event in source.events() if isinstance(event, SourceFrame)]
+    source.close()
+    assert (source.rig, source.has_imu) == (None, False)
+    assert len(frames) == len(pairs)
+    assert {b.time_ns - a.time_ns for a, b in itertools.pairwise(frames)} == {50_000_000}
+    for frame, pair in zip(frames, pairs, strict=True):
+        for image, expected in ((frame.left, pair.left), (frame.right, pair.right)):
+            assert expected is not None
+            assert np.abs(image.astype(int) - expected).max() <= 1  # of the way through colour
+    (single, *_) = open_source(f"video:{video}", "single").events()
+    assert isinstance(single, SourceFrame)
+    assert (single.left.shape, single.right) == ((90, 320), None)
+    (halved, *_) = open_source(f"video:{video}", "top-bottom").events()
+    assert isinstance(halved, SourceFrame)
+    assert halved.left.shape == (45, 320)
+
+
+def test_a_live_run_is_repeated_from_its_recording(
+    video: Path, flight: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    options = ["--calibration", str(flight), "--drop", "none", "--record", str(tmp_path / "kept")]
+    options += ["--view", str(tmp_path / "run.rrd")]
+    assert main(["live", f"video:{video}", *options, "--out", str(tmp_path / "out")]) == 0
+    assert "16 frames with a pose, 0 left out" in capsys.readouterr().out
+    live = read_trajectory(tmp_path / "out" / "trajectory.tum")
+    again = vio.run(vio.open_dataset(tmp_path / "kept"), Config()).trajectory
+    assert len(live) == len(again)
+    np.testing.assert_array_equal(live.T_world_body[:, :3, 3], again.T_world_body[:, :3, 3])
+    assert (tmp_path / "out" / "calibration.yaml").is_file()
+    assert (tmp_path / "run.rrd").stat().st_size > 10_000
+    assert main(["live", f"video:{video}", *options]) == 1
+    assert "kept: is not empty; give --record a new folder" in capsys.readouterr().err
+
+
+class Replayed:
+    """A camera with an IMU, made of a recording's events."""
+
+    has_imu = True
+
+    def __init__(self, flight: Path, stop_after: int | None = None) -> None:
+        self._dataset, self.rig = vio.open_dataset(flight), load_rig(flight)
+        self.given, self.closed, self._stop_after = 0, False, stop_after
+
+    def events(self) -> Iterator[SourceEvent | None]:
+        yield None
+        for event in self._dataset.events():
+            if isinstance(event, StereoFrame):
+                assert event.left is not None
+                yield SourceFrame(event.time_ns, event.left, event.right)
+                self.given += 1
+            elif isinstance(event, ImuSample):
+                yield SourceSample(event.time_ns, event.gyro, event.accel)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_samples_are_recorded_with_all_digits_and_ending_early_keeps_everything(flight: Path, tmp_path: Path) -> None:
+    source = Replayed(flight)
+    kept, out = tmp_path / "kept", tmp_path / "out"
+    run = run_source(
+        source,
+        Config(),
+        None,
+        should_stop=lambda: source.given >= 12,
+        say=lambda _: None,
+        record=kept,
+        out=out,
+        drop="none",
+    )
+    assert source.closed
+    assert run.figures.dropped == 0
+    assert run.samples > 100
+    again = vio.run(vio.open_dataset(kept), Config()).trajectory
+    live = read_trajectory(out / "trajectory.tum")
+    assert len(live) == len(again) == 12
+    np.testing.assert_array_equal(live.T_world_body[:, :3, 3], again.T_world_body[:, :3, 3])
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, *_: Any) -> None: ...
+
+
+def test_a_stream_over_the_network_has_times_of_arrival_and_its_end_is_named(
+    video: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vio.sources.video._PAUSE_S", 0.0)
+    handler = functools.partial(_Quiet, directory=str(video.parent))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            began = time.monotonic_ns()
+            source = open_source(f"http://127.0.0.1:{server.server_address[1]}/{video.name}")
+            frames: list[SourceFrame] = []
+            with pytest.raises(DataError, match="check the cable or the network"):
+                frames.extend(event for event in source.events() if event is not None)  # type: ignore[misc]
+            source.close()
+        finally:
+            server.shutdown()
+            thread.join()
+    times = [began, *(frame.time_ns for frame in frames), time.monotonic_ns()]
+    assert times == sorted(times)
+
+
+@pytest.mark.parametrize(
+    ("name", "error", "message"),
+    [
+        ("nonsense", ConfigError, "is no live source; give one of v4l2:, video:"),
+        ("v4l2:/dev/video_none", DataError, "there is no such device; video devices are"),
+        ("video:nowhere.mp4", DataError, "OpenCV cannot open it"),
+    ],
+)
+def test_absent_sources_are_named(name: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        open_source(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "extra"), [("realsense:", "pyrealsense2", "realsense"), ("oak:", "depthai", "oak")]
+)
+def test_without_the_extra_it_is_named(name: str, package: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingDependencyError, match=rf"pip install 'stereo-vio\[{extra}\]'"):
+        open_source(name)
+
+
+def test_what_a_run_needs_is_named(video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["live", f"video:{video}"]) == 1
+    assert "no calibration of its own; give --calibration FILE" in capsys.readouterr().err
+    assert main(["live", f"video:{video}", "--localise"]) == 1
+    assert "--localise needs --map FILE" in capsys.readouterr().err
+
+
+def test_the_accelerometer_is_interpolated_at_the_times_of_the_gyro() -> None:
+    imu = ImuInterpolation()
+    out: list[SourceSample] = []
+    for k in range(40):  # gyro each 5 ns, accelerometer each 8 ns from 6 on
+        if k % 5 == 0:
+            out.extend(imu.gyro(k, np.full(3, float(k))))
+        if k >= 6 and (k - 6) % 8 == 0:
+            out.extend(imu.accel(k, np.array([2.0 * k, 0.0, 1.0])))
+    out.extend(imu.accel(38, np.full(3, 99.0)))  # again: left out
+    assert [sample.time_ns for sample in out] == [10, 15, 20, 25, 30, 35]
+    for sample in out:
+        np.testing.assert_allclose(sample.accel, [2.0 * sample.time_ns, 0.0, 1.0])
+        np.testing.assert_array_equal(sample.gyro, float(sample.time_ns))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("pyrealsense2") is None, reason="pyrealsense2 is not installed")
+def test_a_realsense_made_by_its_library_gives_pairs_samples_and_calibration(tmp_path: Path) -> None:
+    path = tmp_path / "camera.db3"
+    _record_realsense(path)
+    source = open_source(f"realsense:{path}")
+    events = [event for event in source.events() if event is not None]
+    source.close()
+    frames = [event for event in events if isinstance(event, SourceFrame)]
+    samples = [event for event in events if isinstance(event, SourceSample)]
+    assert [f.time_ns for f in frames] == [1_000_000_000 + 50_000_000 * k for k in range(5)]
+    for k, frame in enumerate(frames):
+        assert frame.right is not None
+        assert (frame.left[0, 0], frame.right[0, 0]) == (20 * k + 1, 20 * k + 2)
+    assert source.has_imu
+    assert len(samples) == 50
+    np.testing.assert_allclose(samples[3].accel, [0.0, 3.0, 1.0])
+    rig = source.rig
+    assert rig is not None
+    assert rig.cam0.fu == 100.0
+    assert rig.T_cam1_cam0 is not None
+    np.testing.assert_allclose(rig.T_cam1_cam0[:3, 3], [-0.05, 0.0, 0.0], atol=1e-7)
+    with pytest.raises(DataError, match="no such camera; connected are"):
+        open_source("realsense:12345")
+    with pytest.raises(DataError, match="there is no such file"):
+        open_source("realsense:nowhere.bag")
+
+
+def _record_realsense(path: Path) -> None:
+    """Record a software device of librealsense: two infrared imagers, gyro and accelerometer."""
+    import pyrealsense2 as rs
+
+    width, height = 160, 90
+    device = rs.software_device()
+    stereo, motion = device.add_sensor("Stereo Module"), device.add_sensor("Motion Module")
+    videos = []
+    for index in (1, 2):
+        stream, lens = rs.video_stream(), rs.intrinsics()
+        lens.width, lens.height, lens.fx, lens.fy, lens.ppx, lens.ppy = width, height, 100.0, 100.0, 79.5, 44.5
+        lens.model, lens.coeffs = rs.distortion.brown_conrady, [0.0] * 5
+        stream.type, stream.index, stream.uid, stream.fmt = rs.stream.infrared, index, index, rs.format.y8
+        stream.width, stream.height, stream.fps, stream.bpp, stream.intrinsics = width, height, 20, 1, lens
+        videos.append(stereo.add_video_stream(stream))
+    moved = rs.extrinsics()
+    moved.rotation, moved.translation = [1, 0, 0, 0, 1, 0, 0, 0, 1], [-0.05, 0, 0]
+    videos[0].register_extrinsics_to(videos[1], moved)
+    inertial = []
+    for uid, kind in ((3, rs.stream.gyro), (4, rs.stream.accel)):
+        stream = rs.motion_stream()
+        stream.type, stream.index, stream.uid, stream.fps, stream.fmt = kind, 0, uid, 200, rs.format.motion_xyz32f
+        stream.intrinsics = rs.motion_device_intrinsic()
+        inertial.append(motion.add_motion_stream(stream))
+    recorder, kept = rs.recorder(str(path), device), rs.frame_queue(1000)
+    sensors = recorder.query_sensors()
+    for sensor, profiles in zip(sensors, (videos, inertial), strict=True):
+        sensor.open(profiles)
+        sensor.start(kept)
+    for k in range(5):
+        for j in range(10):
+            for profile in inertial:
+                sample, value = rs.software_motion_frame(), rs.vector()
+                value.x, value.y, value.z = float(k), float(j), 1.0
+                sample.data, sample.timestamp, sample.profile = (
+                    value,
+                    1000.0 + 50 * k + 5 * j,
+                    profile.as_motion_stream_profile(),
+                )
+                sample.domain, sample.frame_number = rs.timestamp_domain.hardware_clock, 10 * k + j
+                motion.on_motion_frame(sample)
+        for profile in videos:
+            image = rs.software_video_frame()
+            image.pixels = np.full(width * height, 20 * k + profile.stream_index(), dtype=np.uint8)
+            image.stride, image.bpp, image.timestamp, image.profile = (
+                width,
+                1,
+                1000.0 + 50 * k,
+                profile.as_video_stream_profile(),
+            )
+            image.domain, image.frame_number = rs.timestamp_domain.hardware_clock, k
+            stereo.on_video_frame(image)
+        time.sleep(0.02)  # the recorder writes in a thread of its own
+    for sensor in sensors:
+        sensor.stop()
+        sensor.close()
+
+
+class _OakQueue:
+    def __init__(self, *batches: list[Any]) -> None:
+        self._batches = list(batches)
+
+    def tryGetAll(self) -> list[Any]:
+        return self._batches.pop(0) if self._batches else []
+
+
+class _OakDevice:
+    """Stands in for depthai's module, its device, pipeline and nodes: with the names of depthai 3.12."""
+
+    CameraBoardSocket = SimpleNamespace(CAM_B="left", CAM_C="right")
+    CameraModel = SimpleNamespace(Perspective=0, Fisheye=1)
+    IMUSensor = SimpleNamespace(ACCELEROMETER_RAW=0, GYROSCOPE_RAW=1)
+    ImgFrame = SimpleNamespace(Type=SimpleNamespace(GRAY8="gray"))
+    node = SimpleNamespace(Camera="Camera", IMU="IMU")
+    out = property(lambda self: self)
+
+    def __init__(self) -> None:
+        self.coefficients, self.is_open, self.socket = [0.1, 0.0, 0.0, 0.0, 0.0] + [0.0] * 9, False, ""
+        self.Device = lambda info: self
+        self.Device.getAllAvailableDevices = lambda: [SimpleNamespace(getDeviceId=lambda: "14442C", name="1.1")]  # type: ignore[attr-defined]
+        self.Pipeline = lambda device: self
+
+    def create(self, kind: str) -> Any:
+        return self
+
+    def build(self, socket: str) -> Any:
+        self.socket = socket
+        return self
+
+    def requestOutput(self, size: Any, *, type: Any, fps: float) -> Any:
+        return self
+
+    def enableIMUSensor(self, sensors: list[int], rate: int) -> None:
+        self.socket = "imu"
+
+    def setBatchReportThreshold(self, count: int) -> None: ...
+
+    def setMaxBatchReports(self, count: int) -> None: ...
+
+    def createOutputQueue(self) -> _OakQueue:
+        if self.socket == "imu":
+            return _OakQueue([SimpleNamespace(packets=[_oak_packet(k) for k in range(10)])])
+        value = 1 if self.socket == "left" else 2
+        return _OakQueue(*([_oak_image(k, value + k)] for k in range(2)))
+
+    def readCalibration(self) -> Any:
+        return self
+
+    def getConnectedIMU(self) -> str:
+        return "BMI270"
+
+    def getImuToCameraExtrinsics(self, socket: str) -> Any:
+        T = np.eye(4)
+        T[:3, 3] = [1.0, 2.0, 3.0]  # centimetres
+        return T.tolist()
+
+    def getCameraExtrinsics(self, source: str, target: str) -> Any:
+        T = np.eye(4)
+        T[0, 3] = -7.5
+        return T.tolist()
+
+    def getCameraIntrinsics(self, socket: str, width: int, height: int) -> Any:
+        return [[400.0, 0.0, width / 2], [0.0, 400.0, height / 2], [0.0, 0.0, 1.0]]
+
+    def getDistortionCoefficients(self, socket: str) -> list[float]:
+        return self.coefficients
+
+    def getDistortionModel(self, socket: str) -> int:
+        return self.CameraModel.Perspective
+
+    def start(self) -> None:
+        self.is_open = True
+
+    def stop(self) -> None:
+        self.is_open = False
+
+    def close(self) -> None: ...
+
+
+def _oak_packet(k: int) -> Any:
+    stamp = timedelta(seconds=1, microseconds=5000 * k)
+    read = SimpleNamespace(x=float(k), y=0.0, z=1.0, getTimestampDevice=lambda: stamp)
+    return SimpleNamespace(acceleroMeter=read, gyroscope=read)
+
+
+def _oak_image(k: int, value: int) -> Any:
+    stamp = timedelta(seconds=1, microseconds=50_000 * k)
+    image = np.full((400, 640), value, dtype=np.uint8)
+    return SimpleNamespace(getCvFrame=lambda: image, getTimestampDevice=lambda: stamp)
+
+
+def test_an_oak_gives_pairs_samples_and_calibration_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a stand-in: no device was at hand."""
+    device = _OakDevice()
+    monkeypatch.setitem(sys.modules, "depthai", device)  # type: ignore[arg-type]
+    monkeypatch.setattr("vio.sources.oak._LOST_S", 0.0)
+    source = open_source("oak:14442C")
+    events: list[SourceEvent] = []
+    with pytest.raises(DataError, match="nothing for 0 s"):
+        events.extend(event for event in source.events() if event is not None)
+    frames = [event for event in events if isinstance(event, SourceFrame)]
+    samples = [event for event in events if isinstance(event, SourceSample)]
+    assert [(f.time_ns, f.left[0, 0], f.right[0, 0]) for f in frames if f.right is not None] == [
+        (1_000_000_000, 1, 2),
+        (1_050_000_000, 2, 3),
+    ]
+    assert [s.time_ns for s in samples] == [1_000_000_000 + 5_000_000 * k for k in range(10)]
+    rig = source.rig
+    assert rig is not None
+    assert rig.T_cam1_cam0 is not None
+    assert rig.T_cam0_imu is not None
+    np.testing.assert_allclose(rig.T_cam1_cam0[:3, 3], [-0.075, 0.0, 0.0])
+    np.testing.assert_allclose(rig.T_cam0_imu[:3, 3], [0.01, 0.02, 0.03])
+    assert rig.cam0.model == "radtan"
+    source.close()
+    assert not device.is_open
+    device.coefficients[9] = 0.01
+    with pytest.raises(DataError, match="thin prisms or tilt; give --calibration"):
+        open_source("oak:")
+    with pytest.raises(DataError, match="no such device; connected are: 14442C"):
+        open_source("oak:other")
+
+
+def test_the_stand_in_has_only_names_of_depthai() -> None:
+    dai = pytest.importorskip("depthai", reason="depthai is not installed")
+    for owner, names in (
+        (dai.Device, ("getAllAvailableDevices", "readCalibration", "getConnectedIMU", "close")),
+        (dai.Pipeline, ("create", "start", "stop")),
+        (dai.node.Camera, ("build", "requestOutput")),
+        (dai.node.IMU, ("enableIMUSensor", "setBatchReportThreshold", "setMaxBatchReports")),
+        (dai.CalibrationHandler, [name for name in dir(_OakDevice) if name.startswith("get") and "IMU" not in name]),
+        (dai.MessageQueue, ("tryGetAll",)),
+        (dai.IMUPacket, ("acceleroMeter", "gyroscope")),
+        (dai.ImgFrame, ("getCvFrame", "getTimestampDevice")),
+        (dai.DeviceInfo, ("getDeviceId", "name")),
+    ):
+        assert [name for name in names if not hasattr(owner, name)] == []

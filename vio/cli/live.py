@@ -1,0 +1,89 @@
+"""`vio live`: odometry from a camera."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from vio.cli.arguments import add_settings_arguments, config_from
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser(
+        "live",
+        help="odometry from a camera",
+        description="Run on a camera until Ctrl-C. SOURCE is v4l2:/dev/video0, a URL as rtsp://…, video:FILE, "
+        "realsense:[SERIAL] (extra realsense) or oak:[ID] (extra oak).",
+    )
+    parser.add_argument("source", metavar="SOURCE", help="the camera")
+    parser.add_argument("--calibration", type=Path, metavar="FILE", help="in place of the device's own")
+    parser.add_argument(
+        "--layout",
+        choices=("side-by-side", "top-bottom", "single"),
+        default="side-by-side",
+        help="how the images lie in a video (default side-by-side)",
+    )
+    add_settings_arguments(parser)
+    parser.add_argument("--record", type=Path, metavar="DIR", help="keep images and samples, for vio run DIR")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write trajectory and calibration there at the end")
+    parser.add_argument("--map", type=Path, metavar="FILE", help="begin or continue a map")
+    parser.add_argument("--localise", action="store_true", help="find poses in --map, and leave it as it is")
+    parser.add_argument("--view", nargs="?", const="spawn", metavar="WHERE", help="show it in rerun (extra view)")
+    parser.add_argument("--drop", choices=("oldest", "none", "block"), default="oldest", help="of frames that wait")
+    parser.set_defaults(execute=execute)
+
+
+def execute(args: argparse.Namespace) -> int:
+    """Run the subcommand."""
+    import sys
+
+    from vio.cli.stopping import StopRequest
+    from vio.datasets.rigs import load_rig
+    from vio.errors import ConfigError
+    from vio.live.build import MapUse
+    from vio.sources.run import run_source
+    from vio.sources.source import open_source
+
+    config = config_from(args)
+    if args.localise and args.map is None:
+        raise ConfigError("--localise needs --map FILE")
+    rig = None
+    if args.calibration is not None:
+        rig = load_rig(args.calibration, cameras=1 if args.layout == "single" else 2)
+    viewers: list[Any] = []
+
+    def show(odometry: Any, rig: Any) -> Any:
+        if args.view is None:
+            return None
+        from vio.view.live import RerunViewer, ViewedRig
+        from vio.view.stream import open_stream
+
+        stream, address = open_stream(args.view, args.source)
+        if address is not None:
+            print(f"shown at {address}", file=sys.stderr)
+        T_cam0_body = odometry.T_cam0_body
+        viewers.append(RerunViewer(stream, ViewedRig(odometry.camera, T_cam0_body, odometry.motion, None)))
+        return viewers[0].frame
+
+    with StopRequest() as asked:
+        run = run_source(
+            open_source(args.source, args.layout),
+            config,
+            rig,
+            should_stop=asked.reason,
+            say=lambda line: print(line, file=sys.stderr, flush=True),
+            out=args.out,
+            record=args.record,
+            map=None if args.map is None else MapUse(args.map, args.localise),
+            drop=args.drop,
+            on_start=show,
+        )
+    for viewer in viewers:
+        viewer.close()
+    found = run.figures
+    print(f"{found.results} frames with a pose, {found.dropped} left out, {run.samples} IMU samples")
+    if found.latency_median_ms is not None:
+        print(f"latency {found.latency_median_ms:.0f} ms (median), {found.latency_95_ms:.0f} (95 %)")
+    return 0

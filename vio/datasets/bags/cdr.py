@@ -1,0 +1,64 @@
+"""ROS 2 messages as bytes (CDR) and back, and the fields of their types, by the library rosbags."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from vio.datasets.bags.store import MISSING, named_damage
+from vio.errors import MissingDependencyError
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One field of a message type."""
+
+    name: str
+    kind: str  # a built-in type such as uint32 or string, or another message's
+    many: Literal["one", "array", "sequence"] = "one"
+    length: int = 0  # of an array; of a sequence the most elements, 0: any number
+
+
+@functools.cache
+def _store() -> Any:
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise MissingDependencyError(MISSING.format("reading")) from error
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def decoded(data: bytes, kind: str, where: str) -> Any:
+    """Return the fields of a message.
+
+    Args:
+        data: CDR with its header of four bytes.
+        kind: such as sensor_msgs/msg/Image.
+        where: topic, for messages.
+
+    Raises:
+        DataError: the message does not fit its type.
+    """
+    with named_damage(where):
+        return _store().deserialize_cdr(data, kind)
+
+
+def is_message(kind: str) -> bool:
+    """Return whether a message type is known."""
+    return kind in _store().fielddefs
+
+
+def fields_of(kind: str) -> tuple[Field, ...]:
+    """Return the fields of a message type."""
+    from rosbags.interfaces import Nodetype
+
+    found = []
+    for name, (node, value) in _store().fielddefs[kind][1]:
+        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            (inner, of), length = value
+            many: Literal["array", "sequence"] = "array" if node == Nodetype.ARRAY else "sequence"
+            found.append(Field(name, of[0] if inner == Nodetype.BASE else of, many, length))
+        else:
+            found.append(Field(name, value[0] if node == Nodetype.BASE else value))
+    return tuple(found)

@@ -1,0 +1,82 @@
+"""Figures of live use: how old results are when they come, how many frames are left out, and whether that is normal."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+_KEPT = 1000  # results that the median and the bound of 95 % are taken of
+_LATE_S = 0.5  # results older than that, one after another, mean that the computer is too slow
+_LATE_RESULTS = 10
+_MOST_LEFT_OUT = 10  # of the newest hundred frames
+
+
+@dataclass(frozen=True, slots=True)
+class LiveFigures:
+    """How a live odometry keeps up. Latency is the time from the call that brings a frame to its result."""
+
+    results: int  # frames with a result
+    dropped: int  # frames left out because too many waited
+    refused: int  # calls that the odometry refused after they had been taken
+    waiting: int  # frames in the queue
+    latency_median_ms: float | None  # of the newest thousand results; None: there are none
+    latency_95_ms: float | None
+    latency_worst_ms: float | None  # of all results
+
+
+class LiveMonitor:
+    """Measures latency and counts frames that are left out. Frames are noted by one thread, results by another."""
+
+    def __init__(self, *, judges_latency: bool) -> None:
+        """Begin.
+
+        Args:
+            judges_latency: whether frames come at a camera's rate, so that late results mean a slow computer.
+        """
+        self._judges = judges_latency
+        self._arrived: deque[tuple[int, float]] = deque()  # time of the frame, ns, and of its arrival, s
+        self._latencies_s: deque[float] = deque(maxlen=_KEPT)
+        self._left_out: deque[bool] = deque(maxlen=100)
+        self._late = 0  # results in a row
+        self._worst_s = 0.0
+        self._warned = False
+        self.results = self.dropped = self.refused = 0
+
+    def arrived(self, time_ns: int) -> None:
+        """Note a frame before it is put into the queue."""
+        self._arrived.append((time_ns, time.perf_counter()))
+
+    def queued(self, *, fits: bool) -> None:
+        """Note whether there was room for a frame; else, one that had waited longer was left out."""
+        self.dropped += not fits
+        self._left_out.append(not fits)
+
+    def result(self, time_ns: int) -> str | None:
+        """Note the result of a frame; return what is to be said once of a computer that falls behind."""
+        now, arrived = time.perf_counter(), None
+        while self._arrived and self._arrived[0][0] <= time_ns:
+            arrived = self._arrived.popleft()[1]
+        if arrived is None:
+            return None
+        latency = now - arrived
+        self.results += 1
+        self._latencies_s.append(latency)
+        self._worst_s = max(self._worst_s, latency)
+        self._late = self._late + 1 if latency > _LATE_S else 0
+        left_out = sum(self._left_out)
+        if self._warned or not self._judges or (self._late < _LATE_RESULTS and left_out < _MOST_LEFT_OUT):
+            return None
+        self._warned = True
+        lost = f", {left_out} of the last {len(self._left_out)} frames left out" if left_out else ""
+        return f"falling behind by {latency:.1f} s{lost}: use --config fast, or set dataset.max_frame_rate"
+
+    def figures(self, waiting: int) -> LiveFigures:
+        """Return the figures so far, with the number of frames in the queue."""
+        if not self._latencies_s:
+            return LiveFigures(0, self.dropped, self.refused, waiting, None, None, None)
+        median, most = 1e3 * np.percentile(list(self._latencies_s), [50, 95])
+        found = float(median), float(most), 1e3 * self._worst_s
+        return LiveFigures(self.results, self.dropped, self.refused, waiting, *found)

@@ -1,0 +1,151 @@
+"""Two seconds of images made up, so that everything is compiled, loaded and allocated before the first real frame."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+
+from vio.config import Config
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.live.odometry import Odometry
+from vio.records import Image
+
+_FRAMES, _STEP_NS, _SAMPLES = 40, 50_000_000, 10  # samples a frame
+_FAR_PX, _NEAR_PX = 12.0, 24.0  # disparities of the upper and the lower half of the images
+_SWAY_PX, _SWAY_S = 60.0, 2.0  # of the near half, and its period
+_SMOOTH_PX = 1.5
+
+
+def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config, *, with_map: bool) -> None:
+    """Run an odometry of its own over a camera that sways sideways in front of two walls.
+
+    Args:
+        camera: rectified, with its image size.
+        T_cam0_imu: (4, 4); None: no IMU.
+        config: every setting.
+        with_map: whether features of keyframes are extracted, too.
+
+    Raises:
+        DataError: the camera has no image size.
+    """
+    if camera.width is None or camera.height is None:
+        raise DataError("warm_up needs the size of the images; give StereoCamera its width and height")
+    with _without_warnings():
+        odometry = Odometry(camera, config, T_cam0_imu=T_cam0_imu)
+        sway(odometry, config)
+        if odometry.estimate is not None:
+            odometry.landmarks()
+    if with_map:
+        from vio.mapping.features import extract
+
+        left, right, _ = SwayingCamera(camera, odometry.T_cam0_body, config.msckf.gravity_mps2).images(0)
+        assert right is not None  # of other cameras there is no map
+        extract(left, right)
+
+
+def sway(odometry: Odometry, config: Config) -> None:
+    """Give an odometry the images and motion samples of two seconds."""
+    source = SwayingCamera(odometry.camera, odometry.T_cam0_body, config.msckf.gravity_mps2)
+    for frame in range(_FRAMES):
+        time_ns = frame * _STEP_NS
+        for k in range(1 - _SAMPLES, 1):
+            sample_ns = time_ns + k * _STEP_NS // _SAMPLES
+            if odometry.motion == "imu":
+                odometry.add_imu(sample_ns, *source.imu(sample_ns))
+            elif odometry.motion == "velocity":
+                odometry.add_velocity(sample_ns, *source.velocity(sample_ns))
+        left, right, depth_m = source.images(time_ns)
+        odometry.add_images(time_ns, left, right, depth_m=depth_m)
+    odometry.finish()
+
+
+class SwayingCamera:
+    """A camera that sways sideways, without an end, in front of two walls of random texture across its optical axis.
+
+    The lower wall is at half of the upper one's distance. Images, IMU and velocities agree.
+    """
+
+    def __init__(self, camera: StereoCamera, T_cam0_body: FloatArray, gravity_mps2: float) -> None:
+        """Make the walls.
+
+        Args:
+            camera: rectified, with its image size.
+            T_cam0_body: (4, 4) extrinsics of the IMU.
+            gravity_mps2: the camera looks at the horizon.
+        """
+        import cv2
+
+        assert camera.width is not None
+        assert camera.height is not None
+        self._camera, self._R_body_cam, self._gravity_mps2 = camera, T_cam0_body[:3, :3].T, gravity_mps2
+        self._size = camera.width, camera.height
+        rows = camera.height // 2
+        # A single camera's baseline is 1 m or made up: its walls are at some metres.
+        far_m = camera.fu * camera.baseline_m / _FAR_PX if camera.kind == "stereo" else 4.0
+        self._px_per_m = np.array([1.0, 2.0]) * camera.fu / far_m
+        self._sway_m = _SWAY_PX / self._px_per_m[1]
+        self._depth_m: FloatArray = np.full((camera.height, camera.width), far_m)
+        self._depth_m[rows:] /= 2.0
+        noise = np.random.default_rng(0).normal(size=(camera.height, camera.width + 4 * int(_SWAY_PX + _NEAR_PX)))
+        smooth = cv2.GaussianBlur(noise, (0, 0), _SMOOTH_PX)
+        self._texture = np.clip(128.0 + 40.0 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+        self._rows = slice(0, rows), slice(rows, camera.height)
+
+    def imu(self, time_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return angular rate (3,) rad/s and specific force (3,) m/s^2."""
+        *_, acceleration = self.motion(time_ns * 1e-9)
+        return np.zeros(3), self._R_body_cam @ np.array([acceleration, -self._gravity_mps2, 0.0])
+
+    def velocity(self, time_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return linear (3,) m/s and angular velocity (3,) rad/s of the body."""
+        _, speed, _ = self.motion(time_ns * 1e-9)
+        return self._R_body_cam @ np.array([speed, 0.0, 0.0]), np.zeros(3)
+
+    def images(self, time_ns: int) -> tuple[Image, Image | None, FloatArray | None]:
+        """Return the left image (H, W), the right one of a pair, and the depths (H, W) where the camera has them."""
+        x, *_ = self.motion(time_ns * 1e-9)
+        right = self._image(x + self._camera.baseline_m) if self._camera.kind == "stereo" else None
+        return self._image(x), right, self._depth_m if self._camera.kind == "rgbd" else None
+
+    def motion(self, time_s: float) -> tuple[float, float, float]:
+        """Return position, speed and acceleration along the camera's x axis, m and s; at rest before time 0."""
+        if time_s < 0:
+            return 0.0, 0.0, 0.0
+        rate = 2.0 * np.pi / _SWAY_S
+        phase, a = rate * time_s, 0.5 * self._sway_m
+        return a * (1 - np.cos(phase)), a * rate * np.sin(phase), a * rate**2 * np.cos(phase)
+
+    def _image(self, x_m: float) -> Image:
+        """Return the image (H, W) of a camera at a position along x."""
+        import cv2
+
+        out = np.empty(self._size[::-1], dtype=np.uint8)
+        for rows, px_per_m in zip(self._rows, self._px_per_m.tolist(), strict=True):
+            shift = np.array([[1.0, 0.0, -(px_per_m * x_m + _NEAR_PX)], [0.0, 1.0, 0.0]])
+            size = self._size[0], rows.stop - rows.start
+            out[rows] = cv2.warpAffine(self._texture[rows], shift, size, flags=cv2.INTER_LINEAR)
+        return out
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Keep what the checks find in made-up images of this thread out of the log."""
+    thread = threading.get_ident()
+
+    def passes(record: logging.LogRecord) -> bool:
+        return record.thread != thread
+
+    loggers = [logging.getLogger(name) for name in ("vio.monitor.run", "vio.live.odometry")]
+    for logger in loggers:
+        logger.addFilter(passes)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeFilter(passes)

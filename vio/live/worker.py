@@ -1,0 +1,106 @@
+"""The thread that does the processing of live use: one call after the other, in the order in which they came."""
+
+from __future__ import annotations
+
+import atexit
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
+
+from vio.live.event_queue import Drop, EventQueue, QueuedCall
+
+Answer = TypeVar("Answer")
+
+
+class Worker:
+    """Makes calls in a thread of its own. An error that a call raises ends it, and is raised by all later calls."""
+
+    def __init__(
+        self, most_frames: int, drop: Drop, *, finish: Callable[[], object], close: Callable[[], object]
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            most_frames: that wait, see `EventQueue`.
+            drop: likewise.
+            finish: called after the last call, unless the worker failed or was told to forget what waits.
+            close: called last, in any case.
+        """
+        self._queue = EventQueue(most_frames, drop)
+        self._finish, self._close = finish, close
+        self._failure: Exception | None = None
+        self._forgets = False
+        self._thread = threading.Thread(target=self._run, name="vio", daemon=True)
+        self._thread.start()
+        atexit.register(self._at_exit)
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that wait."""
+        return self._queue.frames
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether calls are still made."""
+        return self._thread.is_alive()
+
+    def put(self, make: Callable[[], object], *, frame: bool = False) -> bool:
+        """Add a call; False: a frame that waited was left out for it.
+
+        Raises:
+            Exception: what the worker failed with; VioError: it was closed.
+        """
+        self.raise_failure()
+        return self._queue.put(QueuedCall(make, frame))
+
+    def ask(self, function: Callable[[], Answer]) -> Answer:
+        """Call a function in the thread, after all calls so far, and return or raise what it does."""
+        if threading.current_thread() is self._thread:
+            return function()
+        self.raise_failure()
+        answer: Future[Answer] = Future()
+
+        def make() -> None:
+            try:
+                answer.set_result(function())
+            except Exception as error:  # noqa: BLE001 # raised in the caller's thread
+                answer.set_exception(error)
+
+        self._queue.put(QueuedCall(make, answer=answer))
+        return answer.result()
+
+    def fail(self, error: Exception) -> None:
+        """End the worker with an error; what waits is forgotten."""
+        self._failure = self._failure or error
+        self._queue.close(discard=True)
+
+    def raise_failure(self) -> None:
+        """Raise what the worker failed with, if it did."""
+        if self._failure is not None:
+            raise self._failure
+
+    def end(self, *, discard: bool) -> None:
+        """Make the calls that wait, or forget them, and end the thread."""
+        self._forgets = self._forgets or discard
+        self._queue.close(discard=discard)
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+        atexit.unregister(self._at_exit)
+
+    def _at_exit(self) -> None:
+        """Without a call of `end`, the program's end must not find the thread at work."""
+        self.end(discard=True)
+
+    def _run(self) -> None:
+        try:
+            while (make := self._queue.take()) is not None:
+                make()
+            if self._failure is None and not self._forgets:
+                self._finish()
+        except Exception as error:  # noqa: BLE001 # raised by the next call
+            self.fail(error)
+        try:
+            self._close()
+        except Exception as error:  # noqa: BLE001 # likewise
+            self.fail(error)

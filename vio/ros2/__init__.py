@@ -1,0 +1,1 @@
+"""A ROS 2 node, and recordings played to a ROS 2 graph, over DDS directly or with rclpy."""

@@ -1,0 +1,121 @@
+"""The node: waits for the calibration, then feeds an odometry from the graph and publishes what it finds."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from vio.cameras.rig import Rig
+from vio.config import Config
+from vio.errors import CalibrationError
+from vio.live.build import MapUse
+from vio.live.event_queue import Drop
+from vio.live.live_odometry import LiveOdometry
+from vio.ros2.calibration import CameraInfos
+from vio.ros2.outputs import RESET, SAVE, FrameNames, Outputs
+from vio.ros2.sensors import SILENT_S, Sensors, SensorTopics, Silence, check_types
+from vio.ros2.transport import Quality, Transport
+
+log = logging.getLogger(__name__)
+
+_SPIN_S = 0.1
+_EMPTY = "std_msgs/msg/Empty"
+
+
+@dataclass(frozen=True, slots=True)
+class NodeSettings:
+    """What a node subscribes to, and how it publishes."""
+
+    topics: SensorTopics
+    frames: FrameNames = field(default_factory=FrameNames)
+    prefix: str = "/vio"  # of the names of what it publishes, and of reset and save
+    quality: Quality = "sensor"  # of the subscriptions: "reliable" loses nothing, and needs reliable publishers
+    drop: Drop = "oldest"  # see `LiveOdometry`
+    with_tf: bool = True
+    out: Path | None = None  # folder for the trajectory and the calibration, at the end and on request
+    map: MapUse | None = None
+
+
+def run_node(
+    transport: Transport,
+    settings: NodeSettings,
+    config: Config,
+    rig: Rig | None,
+    *,
+    should_stop: Callable[[], object],
+    say: Callable[[str], None],
+) -> None:
+    """Run until it is asked to stop; then write the map and what was asked for.
+
+    Args:
+        transport: of the graph.
+        settings: topics and names.
+        config: every setting.
+        rig: the calibration; None: that of the CameraInfo topics.
+        should_stop: asked a few times a second.
+        say: reports what the node waits for, and that it is ready.
+
+    Raises:
+        VioError: a topic has another type, images do not fit the calibration, or the estimation has failed.
+    """
+    topics = settings.topics
+    check_types(topics.kinds, transport)
+    found = rig or _awaited(transport, topics, should_stop, say)
+    if found is None:
+        return
+    if topics.imu is None:
+        config = replace(config, motion="none")
+    elif found.T_cam0_imu is None:
+        raise CalibrationError(
+            f"the calibration has no T_cam_imu, so that {topics.imu} cannot be used; leave --imu out"
+        )
+    with LiveOdometry(found, config, drop=settings.drop, map=settings.map) as odometry:
+        say("warming up")
+        odometry.warm_up()
+        sensors = Sensors(transport, topics, odometry, settings.quality)
+        outputs = Outputs(
+            transport,
+            odometry,
+            sensors,
+            frames=settings.frames,
+            prefix=settings.prefix,
+            with_tf=settings.with_tf,
+        )
+        transport.subscribe(f"{settings.prefix}/{RESET}", _EMPTY, lambda _: odometry.reset(), "reliable")
+        transport.subscribe(f"{settings.prefix}/{SAVE}", _EMPTY, lambda _: _save(outputs, settings), "reliable")
+        say(f"ready: {', '.join(topics.kinds)} to {settings.prefix}")
+        silence = Silence(topics.kinds)
+        while not should_stop():
+            transport.spin(_SPIN_S)
+            for line in silence.check(sensors.received, transport):
+                log.warning("%s", line)
+            odometry.check()
+    outputs.join()
+    if settings.out is not None:
+        outputs.save(settings.out)
+
+
+def _save(outputs: Outputs, settings: NodeSettings) -> None:
+    if settings.out is None:
+        log.warning("save was asked for, but the node has no folder; start it with --out FOLDER")
+    else:
+        outputs.save(settings.out)
+
+
+def _awaited(
+    transport: Transport, topics: SensorTopics, should_stop: Callable[[], object], say: Callable[[str], None]
+) -> Rig | None:
+    """Wait for the calibration from the graph; None: it was asked to stop."""
+    infos, silence, since = CameraInfos(transport, topics), None, time.monotonic()
+    while not should_stop():
+        rig = infos.rig()
+        if rig is not None:
+            return rig
+        transport.spin(_SPIN_S)
+        if silence is None and time.monotonic() - since > SILENT_S:
+            silence = True
+            say(infos.waits_for())
+    return None

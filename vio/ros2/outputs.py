@@ -1,0 +1,159 @@
+"""What the node publishes: odometry, frames, path, landmarks, diagnostics; and the files that it writes."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from concurrent.futures import CancelledError
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.errors import VioError
+from vio.files.atomic import atomic_write_text
+from vio.files.trajectories import write_tum
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.live.live_odometry import LiveOdometry
+from vio.offline.export_bag import ros_covariance
+from vio.records import NS_PER_S, BodyFrame, Estimate, Trajectory
+from vio.ros2.publishing import publisher
+from vio.ros2.sensors import Sensors
+from vio.ros2.transport import Transport
+
+log = logging.getLogger(__name__)
+
+ODOMETRY, PATH, POINTS, RESET, SAVE = "odometry", "path", "landmarks", "reset", "save"
+KINDS = {ODOMETRY: "nav_msgs/msg/Odometry", PATH: "nav_msgs/msg/Path", POINTS: "sensor_msgs/msg/PointCloud2"}
+_SLOW_NS = NS_PER_S  # between paths, landmarks and diagnostics
+_PATH_POSES = 2000  # the newest ones
+_POINTS = 20_000  # likewise
+_UNKNOWN = 1e6  # variance of what is not measured
+_GYRO_VARIANCE = 1e-4  # (rad/s)^2 of a single sample: 0.01 rad/s, of cheap gyros at some hundred hertz
+
+
+@dataclass(frozen=True, slots=True)
+class FrameNames:
+    """Names of the frames of /tf: the map, the odometry's world, and the body (IMU, or left camera without one)."""
+
+    map: str = "map"
+    odom: str = "odom"
+    base: str = "base_link"
+
+
+class Outputs:
+    """Publishes each estimate, in a thread of its own that ends with the odometry."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        odometry: LiveOdometry,
+        sensors: Sensors,
+        *,
+        frames: FrameNames,
+        prefix: str,
+        with_tf: bool,
+    ) -> None:
+        """Advertise, and begin to publish.
+
+        Args:
+            transport: of the graph.
+            odometry: whose estimates are published.
+            sensors: gives the newest rate of the gyro, and counts.
+            frames: names of the frames.
+            prefix: of the topics' names.
+            with_tf: whether /tf is published.
+        """
+        self._odometry, self._sensors, self._frames, self._with_tf = odometry, sensors, frames, with_tf
+        self._names = {name: f"{prefix}/{name}" for name in KINDS}
+        topics = {self._names[name]: kind for name, kind in KINDS.items()}
+        if with_tf:
+            topics["/tf"] = "tf2_msgs/msg/TFMessage"
+        late = (self._names[PATH], self._names[POINTS])
+        self._out = publisher(transport, topics, latched=late)
+        self._poses: list[tuple[int, FloatArray]] = []
+        self._slow_ns: int | None = None  # newest time of path, landmarks and diagnostics
+        self._thread = threading.Thread(target=self._run, args=(iter(odometry),), name="ros2", daemon=True)
+        self._thread.start()
+
+    def join(self) -> None:
+        """Wait for the last estimate, after the odometry was closed."""
+        self._thread.join()
+
+    def save(self, folder: Path) -> None:
+        """Write the trajectory so far and, once it is estimated, the calibration."""
+        poses = list(self._poses)
+        if not poses:
+            log.warning("%s: there is no pose yet, nothing was written", folder)
+            return
+        folder.mkdir(parents=True, exist_ok=True)
+        write_tum(folder / "trajectory.tum", self._trajectory(poses))
+        with contextlib.suppress(VioError):  # of a rig that no calibration file holds
+            atomic_write_text(folder / "camchain-imucam.yaml", kalibr_text(self._odometry.calibrated_rig().rig))
+
+    def _run(self, estimates: object) -> None:
+        for estimate in estimates:  # type: ignore[attr-defined]
+            self._publish(estimate)
+
+    def _publish(self, estimate: Estimate) -> None:
+        time_ns, T = estimate.time_ns, estimate.T_world_imu
+        if self._poses and time_ns <= self._poses[-1][0]:  # a new trajectory
+            self._poses, self._slow_ns = [], None
+        self._poses.append((time_ns, T))
+        names = self._frames
+        covariance = ros_covariance(T, estimate.covariance)
+        self._out.odometry(
+            self._names[ODOMETRY], (names.odom, names.base), time_ns, T, covariance, self._twist(estimate)
+        )
+        if self._with_tf:
+            self._out.transform(names.odom, names.base, time_ns, T)
+            if estimate.T_map_body is not None:
+                self._out.transform(names.map, names.odom, time_ns, estimate.T_map_body @ se3_inverse(T))
+        if self._slow_ns is None or time_ns - self._slow_ns >= _SLOW_NS:
+            self._slow_ns = time_ns
+            self._publish_slowly(time_ns)
+
+    def _publish_slowly(self, time_ns: int) -> None:
+        recent = self._poses[-_PATH_POSES:]
+        self._out.path(self._names[PATH], self._frames.odom, self._trajectory(recent), time_ns)
+        figures = self._odometry.figures
+        with contextlib.suppress(VioError, CancelledError):  # the odometry is being closed
+            points = self._odometry.landmarks()
+            sigmas = np.sqrt(np.trace(points.covariance[-_POINTS:], axis1=1, axis2=2) / 3.0)
+            self._out.points(self._names[POINTS], self._frames.odom, time_ns, points.p_world[-_POINTS:], sigmas)
+        warnings = self._odometry.warnings
+        values = {
+            "results": str(figures.results),
+            "dropped": str(figures.dropped),
+            "refused messages": str(self._sensors.refused + figures.refused),
+            "latency median, ms": _number(figures.latency_median_ms),
+            "latency 95 %, ms": _number(figures.latency_95_ms),
+            "latency worst, ms": _number(figures.latency_worst_ms),
+            "warnings": str(len(warnings)),
+        }
+        text = warnings[-1] if warnings else "running"
+        self._out.diagnostics("vio", time_ns, 1 if warnings else 0, text, values)
+
+    def _twist(self, estimate: Estimate) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return linear and angular velocity (3,) of the body in its own axes, and their covariance (6, 6)."""
+        linear, angular, spread = np.zeros(3), np.zeros(3), np.eye(6) * _UNKNOWN
+        R_body_world = estimate.T_world_imu[:3, :3].T
+        if estimate.velocity_world is not None:
+            linear = R_body_world @ estimate.velocity_world
+            if estimate.velocity_covariance is not None:
+                spread[:3, :3] = R_body_world @ estimate.velocity_covariance @ R_body_world.T
+        if self._sensors.gyro is not None and estimate.gyro_bias is not None:
+            angular = self._sensors.gyro - estimate.gyro_bias
+            spread[3:, 3:] = np.eye(3) * _GYRO_VARIANCE
+        return linear, angular, spread
+
+    def _trajectory(self, poses: list[tuple[int, FloatArray]]) -> Trajectory:
+        body: BodyFrame = "imu" if self._odometry.motion == "imu" else "cam0"
+        times = np.array([time_ns for time_ns, _ in poses], dtype=np.int64)
+        return Trajectory(np.array([T for _, T in poses]), times, body)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"

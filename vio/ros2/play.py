@@ -1,0 +1,125 @@
+"""A recording, published as a robot's drivers would."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from vio.datasets.bags.topics import CAMERA_INFO, IMAGE, IMU
+from vio.datasets.bags.writer import BagWriter
+from vio.geometry.lie import se3_inverse
+from vio.protocols import Dataset
+from vio.records import Event, ImuSample, Recording, StereoFrame
+from vio.ros2.calibration import info_topic
+from vio.ros2.publishing import publisher
+from vio.ros2.sensors import SensorTopics
+from vio.ros2.transport import Quality, Transport
+
+CAMERA_FRAMES, IMU_FRAME = ("cam0", "cam1"), "imu"
+_WAIT_S = 0.05
+_OTHERS_S = 1.0  # after the first subscriber, for those to other topics
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """Counts of what was published."""
+
+    frames: int
+    samples: int
+
+
+def play(
+    transport: Transport,
+    dataset: Dataset,
+    topics: SensorTopics,
+    *,
+    rate: float | None,
+    quality: Quality,
+    should_stop: Callable[[], object],
+    wait: bool = True,
+    stop: int | None = None,
+) -> Played:
+    """Publish the rectified images of a recording with their CameraInfo, its IMU samples, and the IMU's pose.
+
+    Args:
+        transport: of the graph.
+        dataset: the recording.
+        topics: names; the right camera and the IMU are left out where the recording has none.
+        rate: times real time; None: as fast as it goes.
+        quality: "reliable" waits for slow subscribers.
+        should_stop: asked before each message.
+        wait: for a subscriber to the left images, before the first one.
+        stop: frame after the last one; None: to the end.
+    """
+    recording = dataset.recording
+    imu = topics.imu if recording.T_cam0_imu is not None and "imu" in recording.motion else None
+    cameras = topics.cameras if recording.camera.kind == "stereo" else topics.cameras[:1]
+    kinds = dict.fromkeys(cameras, IMAGE) | {info_topic(name): CAMERA_INFO for name in cameras}
+    out = publisher(transport, kinds if imu is None else {**kinds, imu: IMU}, default=quality)
+    if imu is not None and recording.T_cam0_imu is not None:
+        first_ns = int(recording.frame_times_ns[0])
+        out.static_transforms(first_ns, [(IMU_FRAME, CAMERA_FRAMES[0], se3_inverse(recording.T_cam0_imu))])
+    if wait:
+        sensors = [*cameras] if imu is None else [*cameras, imu]
+        _wait_for_subscribers(transport, sensors, lambda: _publish_infos(out, cameras, recording), should_stop)
+    frames = samples = 0
+    clock = _Clock(rate)
+    for event in dataset.events(0, stop):
+        clock.wait_for(event)
+        if should_stop():
+            break
+        if isinstance(event, StereoFrame):
+            frames += 1
+            _publish_frame(out, cameras, recording, event)
+        elif isinstance(event, ImuSample) and imu is not None:
+            samples += 1
+            out.imu(imu, IMU_FRAME, event)
+    return Played(frames, samples)
+
+
+def _wait_for_subscribers(
+    transport: Transport, topics: list[str], announce: Callable[[], None], should_stop: Callable[[], object]
+) -> None:
+    """Wait for a subscriber to the left images, and a little longer for those to the others.
+
+    Meanwhile the calibration is announced: a node may need it before it subscribes to images.
+    """
+    others_until: float | None = None
+    while not should_stop():
+        if transport.subscribers(topics[0]):
+            others_until = others_until or time.monotonic() + _OTHERS_S
+            if all(map(transport.subscribers, topics)) or time.monotonic() > others_until:
+                return
+        announce()
+        transport.spin(_WAIT_S)
+
+
+def _publish_infos(out: BagWriter, cameras: tuple[str, ...], recording: Recording) -> None:
+    for name, body in zip(cameras, CAMERA_FRAMES, strict=False):
+        time_ns = int(recording.frame_times_ns[0])
+        out.camera_info(info_topic(name), body, time_ns, recording.camera, right=body == CAMERA_FRAMES[1])
+
+
+def _publish_frame(out: BagWriter, cameras: tuple[str, ...], recording: Recording, frame: StereoFrame) -> None:
+    for name, body, image in zip(cameras, CAMERA_FRAMES, (frame.left, frame.right), strict=False):
+        if image is not None:
+            right = body == CAMERA_FRAMES[1]
+            out.camera_info(info_topic(name), body, frame.time_ns, recording.camera, right=right)
+            out.image(name, body, frame.time_ns, image)
+
+
+class _Clock:
+    """Holds events back until their time has come."""
+
+    def __init__(self, rate: float | None) -> None:
+        self._rate = rate
+        self._start: tuple[int, float] | None = None  # of the recording, ns, and of this computer, s
+
+    def wait_for(self, event: Event) -> None:
+        if self._rate is None:
+            return
+        if self._start is None:
+            self._start = event.time_ns, time.monotonic()
+        due = self._start[1] + (event.time_ns - self._start[0]) * 1e-9 / self._rate
+        time.sleep(max(0.0, due - time.monotonic()))

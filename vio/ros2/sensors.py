@@ -1,0 +1,192 @@
+"""Image and IMU messages into the odometry: decoding, pairing, stamps that go back, and what is silent."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vio.datasets.bags.cdr import decoded
+from vio.datasets.bags.index import stamp_of
+from vio.datasets.bags.pictures import compressed_pixels, gray_of, raw_gray, white_of
+from vio.datasets.bags.topics import COMPRESSED, IMAGE, IMU
+from vio.datasets.images import WHITE_16, UnreadableImageError
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray
+from vio.live.live_odometry import LiveOdometry
+from vio.live.pairing import Pairing
+from vio.records import Image
+from vio.ros2.transport import Quality, Transport
+
+log = logging.getLogger(__name__)
+
+SILENT_S = 5.0  # without a message, before it is said
+_BACK_NS = 500_000_000  # a stamp that is so much older than the last one begins anew: a bag in a loop, a new driver
+_WHITE_IMAGES = 8  # of 16 bits, looked at for the level of white
+_WHITE_SHARE = 0.999  # of their pixels are no brighter
+
+
+@dataclass(frozen=True, slots=True)
+class SensorTopics:
+    """The topics that an odometry is fed from."""
+
+    left: str
+    right: str | None = None  # None: one camera
+    imu: str | None = None  # None: images alone
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The image topics."""
+        return (self.left,) if self.right is None else (self.left, self.right)
+
+    @property
+    def kinds(self) -> dict[str, str]:
+        """All topics with their types: those of image_transport end in /compressed."""
+        kinds = {name: COMPRESSED if name.endswith("/compressed") else IMAGE for name in self.cameras}
+        return kinds if self.imu is None else {**kinds, self.imu: IMU}
+
+
+class Sensors:
+    """Subscribes, and adds what comes to an odometry. All of it happens in the thread that spins the transport."""
+
+    def __init__(self, transport: Transport, topics: SensorTopics, odometry: LiveOdometry, quality: Quality) -> None:
+        self._topics, self._odometry = topics, odometry
+        self._pairing: Pairing[Image] = Pairing()
+        self._last_ns: dict[str, int] = {}
+        self._levels: list[float] = []  # brightest ones of 16-bit images
+        self.gyro: FloatArray | None = None  # (3,) rad/s, of the newest sample
+        self.received = dict.fromkeys(topics.kinds, 0)  # messages
+        self.refused = 0
+        for side, name in enumerate(topics.cameras):
+            transport.subscribe(name, topics.kinds[name], self._image_taker(name, side), quality)
+        if topics.imu is not None:
+            transport.subscribe(topics.imu, IMU, self._imu, quality)
+
+    def _image_taker(self, topic: str, side: int) -> Any:
+        return lambda data: self._image(topic, side, data)
+
+    def _image(self, topic: str, side: int, data: bytes) -> None:
+        kind = self._topics.kinds[topic]
+        fields = decoded(data, kind, topic)
+        time_ns = self._stamped(topic, fields)
+        if time_ns is None:
+            return
+        where = f"{topic} at {time_ns} ns"
+        try:
+            image = gray_of(fields, where, compressed=kind == COMPRESSED, white=self._white(fields, kind, where))
+        except UnreadableImageError as error:
+            self._refuse(str(error))
+            return
+        if self._topics.right is None:
+            self._odometry.add_images(time_ns, image)
+            return
+        pair = self._pairing.add(side, time_ns, image)
+        if pair is not None:
+            self._odometry.add_stereo(*pair)
+
+    def _imu(self, data: bytes) -> None:
+        assert self._topics.imu is not None
+        fields = decoded(data, IMU, self._topics.imu)
+        time_ns = self._stamped(self._topics.imu, fields)
+        if time_ns is None:
+            return
+        w, a = fields.angular_velocity, fields.linear_acceleration
+        try:
+            self._odometry.add_imu(time_ns, [w.x, w.y, w.z], [a.x, a.y, a.z])
+        except DataError as error:  # as of a sample that is not finite
+            self._refuse(str(error))
+            return
+        self.gyro = np.array([w.x, w.y, w.z])
+
+    def _stamped(self, topic: str, fields: Any) -> int | None:
+        """Return a message's stamp; None: it is not after the last one of its topic.
+
+        Where it lies far before that one, all begins anew.
+        """
+        self.received[topic] += 1
+        time_ns = stamp_of(fields)
+        last = self._last_ns.get(topic)
+        if last is not None and time_ns < last - _BACK_NS:
+            log.warning(
+                "%s: the stamps went back by %.1f s, as of a publisher that was restarted: a new trajectory begins",
+                topic,
+                (last - time_ns) * 1e-9,
+            )
+            self._odometry.reset()
+            self._last_ns.clear()
+            self._pairing = Pairing()
+        elif last is not None and time_ns <= last:
+            self._refuse(f"{topic}: the stamp {time_ns} ns is not after the last one, {last} ns")
+            return None
+        self._last_ns[topic] = time_ns
+        return time_ns
+
+    def _white(self, fields: Any, kind: str, where: str) -> int:
+        """Return the level of white of 16-bit images, from the first ones."""
+        encoding = getattr(fields, "encoding", "16")
+        if len(self._levels) < _WHITE_IMAGES and "16" in encoding:
+            pixels = compressed_pixels(fields, where) if kind == COMPRESSED else raw_gray(fields, where)
+            if pixels.dtype != np.uint16:
+                return WHITE_16
+            self._levels.append(float(np.quantile(pixels, _WHITE_SHARE)))
+        return white_of(max(self._levels)) if self._levels else WHITE_16
+
+    def _refuse(self, why: str) -> None:
+        self.refused += 1
+        if self.refused == 1:
+            log.warning("%s; such messages are left out, and counted in /diagnostics", why)
+
+
+class Silence:
+    """Notices topics from which nothing comes, and says once what the graph has in their place."""
+
+    def __init__(self, kinds: Mapping[str, str]) -> None:
+        self._kinds = kinds
+        self._heard = {topic: (0, time.monotonic()) for topic in kinds}  # messages so far, and when that changed
+        self._said: set[str] = set()
+
+    def check(self, received: Mapping[str, int], transport: Transport) -> list[str]:
+        """Return what is to be said now.
+
+        Raises:
+            DataError: a topic has messages of another type.
+        """
+        now, lines = time.monotonic(), []
+        for topic, kind in self._kinds.items():
+            count, since = self._heard[topic]
+            if received.get(topic, 0) != count:
+                self._heard[topic] = received[topic], now
+                self._said.discard(topic)
+            elif now - since > SILENT_S and topic not in self._said:
+                self._said.add(topic)
+                lines.append(_why_silent(topic, kind, transport.topics(), began=count > 0))
+        return lines
+
+
+def check_types(kinds: Mapping[str, str], transport: Transport) -> None:
+    """Compare the types of topics with those of the graph.
+
+    Raises:
+        DataError: a topic has messages of another type.
+    """
+    there = transport.topics()
+    for topic, kind in kinds.items():
+        others = there.get(topic, frozenset())
+        if others and kind not in others:
+            raise DataError(f"{topic} has {', '.join(sorted(others))}, not {kind}; name another topic")
+
+
+def _why_silent(topic: str, kind: str, there: Mapping[str, frozenset[str]], *, began: bool) -> str:
+    """Return why nothing may come from a topic, and what to do."""
+    if topic in there:
+        reason = "its publisher is silent" if began else "its publisher sends nothing, or cannot be reached"
+        return f"no message on {topic} for {SILENT_S:g} s: {reason}; check the driver"
+    fitting = sorted(name for name, kinds in there.items() if kind in kinds)
+    have = (
+        f"topics of its type are {', '.join(fitting[:8])}" if fitting else "and none of its type; check ROS_DOMAIN_ID"
+    )
+    return f"no message on {topic} for {SILENT_S:g} s: nobody publishes it; {have}"

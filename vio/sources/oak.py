@@ -1,0 +1,149 @@
+"""Luxonis OAK with two mono cameras and an IMU, calibration of the device, by the package depthai 3.
+
+Not tried on a device: written against the types and docstrings of depthai 3.12.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from vio.cameras.rig import Rig, camera_from_matrix
+from vio.errors import DataError, MissingDependencyError
+from vio.geometry.distortion import CameraModel
+from vio.live.pairing import Pairing
+from vio.records import Image
+from vio.sources.interpolated import ImuInterpolation
+from vio.sources.source import SourceEvent, SourceFrame
+
+_WIDTH, _HEIGHT, _RATE_HZ = 640, 400, 20.0
+_IMU_HZ = 200
+_COEFFICIENTS = 8  # of OpenCV's rational polynomial; the device stores thin prisms and tilt behind them
+_PAUSE_S = 0.002
+_LOST_S = 5.0
+
+
+class OakSource:
+    """A device, by its ID or the first one; see `LiveSource`. Stamps are those of the device's exposures."""
+
+    def __init__(self, name: str) -> None:
+        """Open the device and start it.
+
+        Args:
+            name: ID or IP address; empty: the first device.
+
+        Raises:
+            MissingDependencyError: depthai is not installed.
+            DataError: there is no such device, or it has no calibration of a pair.
+        """
+        try:
+            import depthai as dai
+        except ImportError as error:
+            raise MissingDependencyError(
+                "oak: needs the package depthai; install it with: pip install 'stereo-vio[oak]'"
+            ) from error
+        self._dai, self._name = dai, f"oak:{name}"
+        devices = dai.Device.getAllAvailableDevices()
+        found = [info for info in devices if not name or name in (info.getDeviceId(), info.name)]
+        if not found:
+            have = ", ".join(info.getDeviceId() for info in devices) or "none"
+            raise DataError(f"{self._name}: no such device; connected are: {have}; check the cable")
+        try:
+            self._open(found[0])
+        except RuntimeError as error:  # what depthai raises of a device and of a calibration that lacks an entry
+            raise DataError(f"{self._name}: {error}; check the cable and its calibration") from error
+
+    def _open(self, info: Any) -> None:
+        dai = self._dai
+        self._device = dai.Device(info)
+        self._pipeline = dai.Pipeline(self._device)
+        sockets = dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C  # left and right
+        self._images = [
+            self._pipeline.create(dai.node.Camera)
+            .build(socket)
+            .requestOutput((_WIDTH, _HEIGHT), type=dai.ImgFrame.Type.GRAY8, fps=_RATE_HZ)
+            .createOutputQueue()
+            for socket in sockets
+        ]
+        stored = self._device.readCalibration()
+        self._imu: Any = None
+        T_cam0_imu = None
+        if self._device.getConnectedIMU() not in ("", "NONE"):
+            node = self._pipeline.create(dai.node.IMU)
+            node.enableIMUSensor([dai.IMUSensor.ACCELEROMETER_RAW, dai.IMUSensor.GYROSCOPE_RAW], _IMU_HZ)
+            node.setBatchReportThreshold(1)
+            node.setMaxBatchReports(10)
+            self._imu = node.out.createOutputQueue()
+            T_cam0_imu = _metres(stored.getImuToCameraExtrinsics(sockets[0]))
+        lenses = [self._lens(stored, socket) for socket in sockets]
+        self._rig = Rig(lenses[0], lenses[1], _metres(stored.getCameraExtrinsics(*sockets)), T_cam0_imu)
+        self._pipeline.start()
+
+    def _lens(self, stored: Any, socket: Any) -> CameraModel:
+        K = np.array(stored.getCameraIntrinsics(socket, _WIDTH, _HEIGHT), dtype=np.float64)
+        values = stored.getDistortionCoefficients(socket)
+        if stored.getDistortionModel(socket) == self._dai.CameraModel.Fisheye:
+            return camera_from_matrix(K, _WIDTH, _HEIGHT, "equidistant", values[:4], self._name)
+        if any(values[_COEFFICIENTS:]):
+            raise DataError(f"{self._name}: its lens model has thin prisms or tilt; give --calibration FILE")
+        return camera_from_matrix(K, _WIDTH, _HEIGHT, "radtan", values[:_COEFFICIENTS], self._name)
+
+    @property
+    def rig(self) -> Rig | None:
+        """The calibration of the device."""
+        return self._rig
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether the device has one."""
+        return self._imu is not None
+
+    def events(self) -> Iterator[SourceEvent | None]:
+        """Yield pairs and samples.
+
+        Raises:
+            DataError: nothing has come for seconds.
+        """
+        imu, last_s = ImuInterpolation(), time.monotonic()
+        pairing: Pairing[Image] = Pairing()
+        while True:
+            came = False
+            for packets in [] if self._imu is None else self._imu.tryGetAll():
+                for packet in packets.packets:
+                    for take, read in ((imu.accel, packet.acceleroMeter), (imu.gyro, packet.gyroscope)):
+                        yield from take(_ns(read.getTimestampDevice()), np.array([read.x, read.y, read.z]))
+                came = True
+            for side, images in enumerate(self._images):
+                for message in images.tryGetAll():
+                    came = True
+                    image = np.asarray(message.getCvFrame(), dtype=np.uint8)
+                    pair = pairing.add(side, _ns(message.getTimestampDevice()), image)
+                    if pair is not None:
+                        yield SourceFrame(*pair)
+            if came:
+                last_s = time.monotonic()
+                continue
+            if time.monotonic() - last_s > _LOST_S:
+                raise DataError(f"{self._name}: nothing for {_LOST_S:.0f} s; check the cable")
+            time.sleep(_PAUSE_S)
+            yield None
+
+    def close(self) -> None:
+        """Stop the device."""
+        self._pipeline.stop()
+        self._device.close()
+
+
+def _metres(T_cm: Any) -> Any:
+    """Return extrinsics (4, 4) of the device, which are in centimetres, in metres."""
+    T = np.array(T_cm, dtype=np.float64)
+    T[:3, 3] *= 0.01
+    return T
+
+
+def _ns(stamp: Any) -> int:
+    """Return a time of depthai, a timedelta, in nanoseconds; it has microseconds."""
+    return (stamp.days * 86_400 + stamp.seconds) * 1_000_000_000 + stamp.microseconds * 1000

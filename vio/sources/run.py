@@ -1,0 +1,118 @@
+"""A live source through the odometry, with recording and results, until it ends or is asked to stop."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from vio.cameras.rig import Rig
+from vio.config import Config
+from vio.datasets.rigs.kalibr import kalibr_text
+from vio.errors import CalibrationError, DataError, VioError
+from vio.files.atomic import atomic_write_text
+from vio.files.trajectories import write_tum
+from vio.geometry.lie import FloatArray
+from vio.live.build import MapUse
+from vio.live.event_queue import Drop
+from vio.live.figures import LiveFigures
+from vio.live.live_odometry import LiveOdometry
+from vio.records import BodyFrame, FrameResult, Trajectory
+from vio.sources.recorder import Recorder
+from vio.sources.source import LiveSource, SourceFrame
+
+
+@dataclass(frozen=True, slots=True)
+class LiveRun:
+    """What a live run leaves behind."""
+
+    figures: LiveFigures
+    warnings: tuple[str, ...]
+    samples: int  # of the IMU
+
+
+def run_source(
+    source: LiveSource,
+    config: Config,
+    rig: Rig | None,
+    *,
+    should_stop: Callable[[], object],
+    say: Callable[[str], None],
+    out: Path | None = None,
+    record: Path | None = None,
+    map: MapUse | None = None,
+    drop: Drop = "oldest",
+    on_start: Callable[[LiveOdometry, Rig], Callable[[FrameResult], None] | None] = lambda odometry, rig: None,
+) -> LiveRun:
+    """Run until the source ends or is asked to stop; then write what was asked for.
+
+    Args:
+        source: opened; it is closed at the end.
+        config: every setting.
+        rig: calibration in place of the device's.
+        should_stop: asked with each event, and about each second.
+        say: reports that it is ready.
+        out: folder for `trajectory.tum` and the calibration that was found.
+        record: new folder for what the source gave, which `vio run` repeats.
+        map: a map to begin or to continue.
+        drop: see `LiveOdometry`.
+        on_start: may return what is called with each result, a viewer's.
+
+    Raises:
+        VioError: there is no calibration, images do not fit it, or source, disk or estimation have failed.
+    """
+    with contextlib.closing(source):
+        rig = rig or source.rig
+        if rig is None:
+            raise CalibrationError("this source has no calibration of its own; give --calibration FILE")
+        if source.has_imu and rig.T_cam0_imu is None:
+            raise CalibrationError("the calibration has no T_cam_imu for this camera's IMU; give one that has")
+        if not source.has_imu:
+            config = replace(config, motion="none")
+            rig = replace(rig, T_cam0_imu=None)
+        poses: list[tuple[int, FloatArray]] = []
+        watcher: Callable[[FrameResult], None] | None = None
+
+        def on_frame(result: FrameResult) -> None:
+            poses.append((result.estimate.time_ns, result.estimate.T_world_imu))
+            if watcher is not None:
+                watcher(result)
+
+        samples = 0
+        with LiveOdometry(rig, config, on_frame=on_frame, map=map, drop=drop) as odometry:
+            say("warming up")
+            odometry.warm_up()
+            watcher = on_start(odometry, rig)
+            with contextlib.ExitStack() as stack:
+                recorder = None if record is None else stack.enter_context(contextlib.closing(Recorder(record, rig)))
+                say("ready")
+                for event in source.events():
+                    if should_stop():
+                        break
+                    odometry.check()
+                    if event is None:
+                        continue
+                    if recorder is not None:
+                        recorder.add(event)
+                    if isinstance(event, SourceFrame):
+                        odometry.add_images(event.time_ns, event.left, event.right)
+                    else:
+                        samples += 1
+                        odometry.add_imu(event.time_ns, event.gyro, event.accel)
+        if out is not None:
+            _write(out, odometry, poses)
+        return LiveRun(odometry.figures, odometry.warnings, samples)
+
+
+def _write(folder: Path, odometry: LiveOdometry, poses: list[tuple[int, FloatArray]]) -> None:
+    if not poses:
+        raise DataError(f"{folder}: no frame has a pose; nothing was written")
+    folder.mkdir(parents=True, exist_ok=True)
+    body: BodyFrame = "imu" if odometry.motion == "imu" else "cam0"
+    times = np.array([time_ns for time_ns, _ in poses], dtype=np.int64)
+    write_tum(folder / "trajectory.tum", Trajectory(np.array([T for _, T in poses]), times, body))
+    with contextlib.suppress(VioError):  # of a rig that no calibration file holds
+        atomic_write_text(folder / "calibration.yaml", kalibr_text(odometry.calibrated_rig().rig))

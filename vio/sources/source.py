@@ -1,0 +1,109 @@
+"""What a live source is, and which there are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal, Protocol, TypeAlias
+
+from vio.cameras.rig import Rig
+from vio.errors import ConfigError
+from vio.geometry.lie import FloatArray
+from vio.records import Image
+
+Layout: TypeAlias = Literal["side-by-side", "top-bottom", "single"]
+
+
+@dataclass(frozen=True, slots=True)
+class SourceFrame:
+    """Images of one exposure, raw as the camera gives them."""
+
+    time_ns: int
+    left: Image  # (H, W) uint8
+    right: Image | None  # None: one camera
+
+
+@dataclass(frozen=True, slots=True)
+class SourceSample:
+    """One sample of the IMU, on its own clock as the rig states it."""
+
+    time_ns: int
+    gyro: FloatArray  # (3,) rad/s
+    accel: FloatArray  # (3,) m/s^2
+
+
+SourceEvent: TypeAlias = "SourceFrame | SourceSample"
+
+
+class LiveSource(Protocol):
+    """A camera, with or without an IMU."""
+
+    @property
+    def rig(self) -> Rig | None:
+        """The calibration that the device has stored; None: it has none, and the user gives one."""
+
+    @property
+    def has_imu(self) -> bool:
+        """Whether samples come."""
+
+    def events(self) -> Iterator[SourceEvent | None]:
+        """Yield frames and samples as they come, each kind in order of time; None at least each second without any.
+
+        It ends where the source ends.
+
+        Raises:
+            DataError: the device does not deliver any more.
+        """
+
+    def close(self) -> None:
+        """Let the device go."""
+
+
+def _video(rest: str, layout: Layout) -> LiveSource:
+    from vio.sources.video import VideoSource
+
+    return VideoSource(rest, layout)
+
+
+def _network(scheme: str) -> Callable[[str, Layout], LiveSource]:
+    return lambda rest, layout: _video(f"{scheme}:{rest}", layout)
+
+
+def _realsense(rest: str, layout: Layout) -> LiveSource:
+    from vio.sources.realsense import RealSenseSource
+
+    return RealSenseSource(rest)
+
+
+def _oak(rest: str, layout: Layout) -> LiveSource:
+    from vio.sources.oak import OakSource
+
+    return OakSource(rest)
+
+
+SOURCES: dict[str, Callable[[str, Layout], LiveSource]] = {
+    "v4l2": _video,
+    "video": _video,
+    **{scheme: _network(scheme) for scheme in ("rtsp", "http", "https", "udp", "tcp")},
+    "realsense": _realsense,
+    "oak": _oak,
+}
+
+
+def open_source(name: str, layout: Layout = "side-by-side") -> LiveSource:
+    """Open a source by its name.
+
+    Args:
+        name: `v4l2:/dev/video0`, `video:FILE`, a URL that OpenCV opens (`rtsp://…`), `realsense:[SERIAL or FILE.bag]`,
+            `oak:[ID]`.
+        layout: how the two images of a pair lie in one video.
+
+    Raises:
+        ConfigError: there is no such kind of source.
+        DataError: the device is absent or cannot be opened.
+        MissingDependencyError: its package is not installed.
+    """
+    scheme, colon, rest = name.partition(":")
+    if not colon or scheme not in SOURCES:
+        raise ConfigError(f"{name!r} is no live source; give one of {', '.join(f'{known}:' for known in SOURCES)}")
+    return SOURCES[scheme](rest, layout)
