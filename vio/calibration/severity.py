@@ -16,6 +16,7 @@ Grade: TypeAlias = Literal["negligible", "worth calibrating", "unusable"]
 _NEGLIGIBLE_ROWS_PX, _UNUSABLE_ROWS_PX = 0.15, 2.0
 # Lengths, m per 100 m. Less than the first is below the drift of images alone on a road; a tenth is no measurement.
 _NEGLIGIBLE_LENGTH, _UNUSABLE_LENGTH = 0.2, 10.0
+_SIGMAS = 3.0  # standard deviations of doubt
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,10 +37,14 @@ class StereoError:
 
     @property
     def grade(self) -> Grade:
-        """What to do about it."""
+        """What to do about it; of the disparities, by what they are off beyond doubt."""
         if self.seen_px < 0:
             return "unusable"
-        return max(rows_grade(self.rows_px), length_grade(self.per_100_m or 0.0), key=get_args(Grade).index)
+        certain = 0.0
+        if self.disparity_px is not None and self.seen_px > 0:
+            doubt = _SIGMAS * (self.disparity_sigma_px or 0.0)
+            certain = 100 * max(abs(self.disparity_px) - doubt, 0.0) / self.seen_px
+        return max(rows_grade(self.rows_px), length_grade(certain), key=get_args(Grade).index)
 
     def __str__(self) -> str:
         """Return grade and sizes."""
