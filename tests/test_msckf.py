@@ -42,6 +42,7 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import ImuSample, IntArray, Observations, UpdateReport, VelocitySample, observations
 
+EXACT_RIG = MsckfSettings(calibrate_stereo="off", stereo_scale_sigma=0.0)
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
 STEP_NS = 50_000_000
@@ -213,7 +214,7 @@ def test_unobservable_directions_gain_nothing_whatever_the_estimate(seed: int) -
 
 
 def _imu_settings() -> MsckfSettings:
-    return MsckfSettings()
+    return EXACT_RIG
 
 
 def _spin(n: int = 11, seed: int = 3) -> list[ImuSample]:
@@ -285,7 +286,7 @@ def test_imu_at_rest_stays_at_rest() -> None:
 
 
 def test_twist_transition_equals_central_differences() -> None:
-    motion = TwistMotion(MsckfSettings())
+    motion = TwistMotion(EXACT_RIG)
     nav = NavState(
         se3_exp([3.0, -2.0, 1.0, 0.4, -0.8, 1.1]),
         np.array([8.0, 0.2, -0.1]),
@@ -302,7 +303,7 @@ def test_twist_transition_equals_central_differences() -> None:
 
 
 def test_velocity_measurement_moves_the_twist_and_its_bias() -> None:
-    motion = TwistMotion(MsckfSettings())
+    motion = TwistMotion(EXACT_RIG)
     nav, _ = motion.start(0)
     motion.take(VelocitySample(0, np.array([5.0, 0, 0]), np.array([0, 0, 0.3])))
     measurement = motion.measurement(nav)
@@ -317,7 +318,7 @@ def test_velocity_measurement_moves_the_twist_and_its_bias() -> None:
 def _window(seed: int = 0) -> Window:
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(DIM, DIM)) * 0.05
-    window = Window(TwistMotion(MsckfSettings()), NavState(np.eye(4), *np.zeros((4, 3))), root @ root.T)
+    window = Window(TwistMotion(EXACT_RIG), NavState(np.eye(4), *np.zeros((4, 3))), root @ root.T)
     for k in range(4):
         window.add_clone(k, k * STEP_NS)
         window.propagate(window.motion.advance(window.nav, k * STEP_NS, (k + 1) * STEP_NS))
@@ -511,7 +512,7 @@ class Flight:
 @pytest.mark.parametrize("motion", [None, "imu"])
 def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion: str | None) -> None:
     """What is told then is the last covariance carried by each step's transition, and each step's noise on top."""
-    flight, settings = Flight(frames=6), MsckfSettings(calibrate_camera_imu="none")
+    flight, settings = Flight(frames=6), replace(EXACT_RIG, calibrate_camera_imu="none")
     _, _, filt = flight.run(settings, motion)
     window, noise = filt._window, np.random.default_rng(1)
     assert window is not None
@@ -538,7 +539,7 @@ def test_frames_without_features_grow_the_covariance_by_the_motion_model(motion:
 
 
 def test_tracks_have_their_say_when_the_oldest_clone_leaves_and_not_before() -> None:
-    settings = MsckfSettings(clones=4, max_landmarks=0)
+    settings = replace(EXACT_RIG, clones=4, max_landmarks=0)
 
     def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
         return seen.take(seen.ids % 2 == 0) if k == 0 else seen  # odd ones begin in the second frame
@@ -566,17 +567,16 @@ def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch
         p_world: FloatArray,
         A: FloatArray,
         covariance: FloatArray,
-        point_D_focal: FloatArray | None,
     ) -> None:
         table = filt._frame.tracks.table
         rows = table.rows()
         views = table.views(rows[np.isin(table.ids(rows), ids[:1])], len(window.clones))
         T = np.array([c.T_world_imu for c in window.clones])
         made.append((T, p_world[:1], A[:3, window.state.clones.start : window.state.landmarks.start], views))
-        add(window, ids, p_world, A, covariance, point_D_focal)
+        add(window, ids, p_world, A, covariance)
 
     monkeypatch.setattr(Window, "add_landmarks", spy)
-    settings, flight, noise = MsckfSettings(clones=5), Flight(frames=6), np.random.default_rng(0)
+    settings, flight, noise = replace(EXACT_RIG, clones=5), Flight(frames=6), np.random.default_rng(0)
     filt = Msckf(CAMERA, T_CAM0_IMU, settings, motion=None)
     for k in range(6):
         filt.update(flight.observe(k, 0.01, noise))
@@ -594,7 +594,7 @@ def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch
 
 @pytest.mark.parametrize("motion", [None, "velocity", "imu"])
 def test_flight_that_starts_in_motion_is_followed(motion: str | None) -> None:
-    errors, _, _ = Flight().run(MsckfSettings(), motion)
+    errors, _, _ = Flight().run(EXACT_RIG, motion)
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.05
     assert np.linalg.norm(errors[5:, 3:], axis=1).max() < 0.03
 
@@ -608,7 +608,7 @@ def test_covariance_can_be_believed(motion: str | None, monkeypatch: pytest.Monk
     """
     runs, frames = 20, 20
     monkeypatch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
-    settings = MsckfSettings()
+    settings = EXACT_RIG
     values = []
     for seed in range(runs):
         bias = np.random.default_rng(1000 + seed).normal(0, [0.02] * 3 + [0.05] * 3)
@@ -622,7 +622,7 @@ def test_covariance_can_be_believed(motion: str | None, monkeypatch: pytest.Monk
 
 def test_biases_are_found() -> None:
     bias = np.array([0.02, -0.05, 0.08, 0.1, -0.05, 0.08])
-    errors, _, filt = Flight(frames=160).run(MsckfSettings(), "imu", bias=bias)
+    errors, _, filt = Flight(frames=160).run(EXACT_RIG, "imu", bias=bias)
     np.testing.assert_allclose(filt.estimate().gyro_bias, bias[:3], atol=3e-3)
     np.testing.assert_allclose(filt.estimate().accel_bias, bias[3:], atol=0.06)
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.08
@@ -635,8 +635,8 @@ def test_a_frame_that_shows_nothing_ends_no_track(motion: str | None) -> None:
     def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
         return seen.take(np.zeros(len(seen), dtype=np.bool_)) if k % 10 == 9 else seen
 
-    errors, covariances, filt = Flight().run(MsckfSettings(), motion, spoil=spoil)
-    whole, _, filt_whole = Flight().run(MsckfSettings(), motion)
+    errors, covariances, filt = Flight().run(EXACT_RIG, motion, spoil=spoil)
+    whole, _, filt_whole = Flight().run(EXACT_RIG, motion)
     seeing = np.arange(len(errors)) % 10 != 9
     assert np.isin(filt_whole.landmarks().ids, filt.landmarks().ids).mean() > 0.9
     rms, rms_whole = (np.sqrt(np.mean(e[seeing, :3] ** 2)) for e in (errors, whole))
@@ -653,7 +653,7 @@ def test_wrong_matches_do_not_capture_it() -> None:
         z = seen.z + np.where(wrong[:, None], noise.uniform(-40, 40, (len(seen), 1)) * [1, 0.3, 1, 0.3], 0)
         return replace(seen, z=z)
 
-    errors, _, _ = Flight().run(MsckfSettings(), "imu", spoil=spoil, limit=120)
+    errors, _, _ = Flight().run(EXACT_RIG, "imu", spoil=spoil, limit=120)
     distances = np.linalg.norm(errors[:, :3], axis=1)
     assert distances.max() < 0.4  # without the rejection of views: 5.2
     # The harm is done in the first frames, where tracks have two views and nothing identifies the wrong one.
@@ -664,7 +664,7 @@ def test_blackout_grows_the_covariance_and_is_survived() -> None:
     def spoil(k: int, seen: Observations, noise: np.random.Generator) -> Observations:
         return seen.take(np.zeros(len(seen), dtype=np.bool_)) if 30 <= k < 50 else seen
 
-    errors, covariances, _ = Flight(frames=80).run(MsckfSettings(), "imu", spoil=spoil)
+    errors, covariances, _ = Flight(frames=80).run(EXACT_RIG, "imu", spoil=spoil)
     trace = np.trace(covariances[:, :3, :3], axis1=1, axis2=2)
     assert trace[49] > 3 * trace[29]
     assert np.all(np.diff(trace[31:50]) > 0)
@@ -672,17 +672,17 @@ def test_blackout_grows_the_covariance_and_is_survived() -> None:
 
 
 def test_standing_still_does_not_drift() -> None:
-    errors, _, _ = Flight(frames=200, still=True).run(MsckfSettings(), "imu", sigma=0.2)
+    errors, _, _ = Flight(frames=200, still=True).run(EXACT_RIG, "imu", sigma=0.2)
     assert np.linalg.norm(errors[100:, :3], axis=1).max() < 0.004
 
 
 def test_two_runs_give_the_same_bits() -> None:
-    a, b = (Flight(frames=25).run(MsckfSettings(), "imu")[0] for _ in range(2))
+    a, b = (Flight(frames=25).run(EXACT_RIG, "imu")[0] for _ in range(2))
     np.testing.assert_array_equal(a, b)
 
 
 def test_window_and_map_stay_bounded() -> None:
-    settings = MsckfSettings(clones=6, max_landmarks=8)
+    settings = replace(EXACT_RIG, clones=6, max_landmarks=8)
     _, _, filt = Flight(frames=60).run(settings, "imu")
     assert len(filt.landmarks().ids) > 100  # the map that is told remembers every track
     window = filt._window
@@ -694,7 +694,7 @@ def test_window_and_map_stay_bounded() -> None:
 
 def test_the_map_is_the_same_however_often_it_is_merged(monkeypatch: pytest.MonkeyPatch) -> None:
     """Standing still, all features are told again every few frames; the map holds each of them once, or twice."""
-    settings, maps, held = MsckfSettings(clones=4), [], []
+    settings, maps, held = replace(EXACT_RIG, clones=4), [], []
     for least in (0, 10**9):
         monkeypatch.setattr("vio.filters.point_map._LEAST_MERGE", least)
         _, _, filt = Flight(frames=60, still=True).run(settings, "imu", sigma=0.2)
@@ -719,7 +719,7 @@ def test_people_before_the_camera_do_not_move_it_against_its_imu() -> None:
         z[(seen.ids % 5 >= 2) & (seen.ids % 5 < 4)] += shift * np.array([0.3, 0.8, 0.6, 0.8])
         return replace(seen, z=z)
 
-    settings = MsckfSettings()
+    settings = EXACT_RIG
     plain, _, _ = Flight(frames=50).run(settings, "imu")
     spoiled, _, _ = Flight(frames=50).run(settings, "imu", spoil=spoil)
     apart = np.linalg.norm(spoiled[30:, :3] - plain[30:, :3], axis=1)
@@ -734,7 +734,7 @@ def test_left_only_views_count() -> None:
         has_right = seen.ids % 2 == 0 if k else np.ones(len(seen), dtype=np.bool_)
         return replace(seen, has_right=has_right, z=np.where(has_right[:, None], seen.z, [1, 1, 0, 0] * seen.z))
 
-    with_left, _, _ = Flight(frames=40).run(MsckfSettings(), None, spoil=spoil)
+    with_left, _, _ = Flight(frames=40).run(EXACT_RIG, None, spoil=spoil)
     assert np.linalg.norm(with_left[:, :3], axis=1).max() < 0.05
 
 
@@ -789,7 +789,7 @@ def test_covariance_can_be_believed_where_depth_is_hard_to_tell(world: str, monk
             _start_in_flight(patch, flight, seed)
             bias = np.random.default_rng(1000 + seed).normal(0, [0.02] * 3 + [0.05] * 3)
             patch.setattr(imu_start, "START_TILT_SIGMA_DEG", 1.0)
-            errors, covariances, _ = flight.run(MsckfSettings(), "imu", seed, bias=bias, limit=40, spoil=spoil)
+            errors, covariances, _ = flight.run(EXACT_RIG, "imu", seed, bias=bias, limit=40, spoil=spoil)
         values.append(nees(errors[1:], covariances[1:]))
     mean = np.mean(values, axis=0)
     low, high = nees_bounds(6, runs)
@@ -815,7 +815,7 @@ def test_tracks_without_disparity_are_used(world: str, monkeypatch: pytest.Monke
         return _without_right(seen, np.full(len(seen), left))
 
     monkeypatch.setattr(Msckf, "update", spy)
-    flight.run(MsckfSettings(), "imu", spoil=spoil)
+    flight.run(EXACT_RIG, "imu", spoil=spoil)
     assert np.median(used[5:]) > (20 if left else 50)
 
 
@@ -830,7 +830,7 @@ def test_left_only_tracks_improve_what_few_stereo_tracks_tell() -> None:
                 left_only = seen.ids % 100 < 80
                 return _without_right(seen, left_only) if keep else seen.take(~left_only)
 
-            errors, _, _ = Flight(30).run(MsckfSettings(), None, seed, limit=40, spoil=spoil)
+            errors, _, _ = Flight(30).run(EXACT_RIG, None, seed, limit=40, spoil=spoil)
             squares.append(np.sum(errors[:, :3] ** 2, axis=1))
         rms.append(np.sqrt(np.mean(squares)))
     assert rms[0] < 0.75 * rms[1]
@@ -840,10 +840,10 @@ def test_no_landmark_without_a_well_determined_depth(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("tests.test_msckf.CAMERA", replace(CAMERA, baseline_m=0.05))
     flight = FarFlight(30)
     _start_in_flight(monkeypatch, flight, 0)
-    _, _, filt = flight.run(MsckfSettings(), "imu", sigma=0.5)
+    _, _, filt = flight.run(EXACT_RIG, "imu", sigma=0.5)
     assert filt._window is not None
     assert len(filt._window.landmarks) == 0
-    _, _, near = Flight(30).run(MsckfSettings(), "imu", sigma=0.1)
+    _, _, near = Flight(30).run(EXACT_RIG, "imu", sigma=0.1)
     assert near._window is not None
     assert len(near._window.landmarks) > 10
 
@@ -851,7 +851,7 @@ def test_no_landmark_without_a_well_determined_depth(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("change", [{"clones": 2}, {"max_features": 0}, {"max_landmarks": -1}])
 def test_settings_out_of_range(change: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="msckf"):
-        Msckf(CAMERA, T_CAM0_IMU, replace(MsckfSettings(), **change), motion=None)
+        Msckf(CAMERA, T_CAM0_IMU, replace(EXACT_RIG, **change), motion=None)
 
 
 @pytest.mark.parametrize("motion", [None, "imu"])
@@ -874,7 +874,7 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
                 events.append(str(error))
                 return self.restart(observations)
 
-    errors, covariances, filt = flight.run(MsckfSettings(), motion, filter_class=Fragile)
+    errors, covariances, filt = flight.run(EXACT_RIG, motion, filter_class=Fragile)
     assert [event[:27] for event in events] == ["msckf diverged at frame 12:"]
     assert np.linalg.norm(errors[:, :3], axis=1).max() < 0.15
     assert np.sqrt(covariances[12, 0, 0]) > 3 * np.sqrt(covariances[11, 0, 0])
@@ -885,12 +885,12 @@ def test_restarts_from_the_last_good_pose_after_a_divergence(
 
 
 def test_a_restart_carries_the_pose_on_and_grows_its_covariance_with_the_time_in_between() -> None:
-    filt = Flight(frames=12).run(MsckfSettings(), None)[2]
+    filt = Flight(frames=12).run(EXACT_RIG, None)[2]
     good = filt._good
     assert good is not None
     sigmas = []
     for elapsed_s in (0.05, 0.2):
-        nav, P = restarted(good, good.time_ns + round(1e9 * elapsed_s), TwistMotion(MsckfSettings()), MsckfSettings())
+        nav, P = restarted(good, good.time_ns + round(1e9 * elapsed_s), TwistMotion(EXACT_RIG), EXACT_RIG)
         moved = nav.T_world_imu[:3, 3] - good.nav.T_world_imu[:3, 3]
         expected = elapsed_s * (good.nav.T_world_imu[:3, :3] @ good.nav.velocity)
         np.testing.assert_allclose(moved, expected, rtol=0.1, atol=1e-3)
@@ -906,19 +906,19 @@ def test_a_restart_carries_the_pose_on_and_grows_its_covariance_with_the_time_in
 
 
 def test_without_a_good_update_there_is_nothing_to_restart_from() -> None:
-    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion=None)
+    filt = Msckf(CAMERA, T_CAM0_IMU, EXACT_RIG, motion=None)
     with pytest.raises(EstimationError, match="no good state"):
         filt.restart(Flight(frames=1).observe(0, 0.1, np.random.default_rng(0)))
 
 
 def test_samples_of_another_kind_are_refused() -> None:
-    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion="imu")
+    filt = Msckf(CAMERA, T_CAM0_IMU, EXACT_RIG, motion="imu")
     with pytest.raises(ConfigError, match="VelocitySample"):
         filt.propagate(VelocitySample(0, np.zeros(3), np.zeros(3)))
 
 
 def test_before_the_first_frame_there_is_no_map() -> None:
-    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(), motion=None)
+    filt = Msckf(CAMERA, T_CAM0_IMU, EXACT_RIG, motion=None)
     assert filt.predict(0) is None
     assert filt.smoothed(0) is None
     with pytest.raises(EstimationError, match="has not seen a frame yet"):
@@ -930,7 +930,7 @@ def test_before_the_first_frame_there_is_no_map() -> None:
 def test_garbage_ends_in_an_error_of_ours_or_in_numbers(seed: int, gap: int) -> None:
     """Features that jump about at random, with gaps: never a NaN passed on, never a foreign exception."""
     rng = np.random.default_rng(seed)
-    filt = Msckf(CAMERA, T_CAM0_IMU, MsckfSettings(clones=5), motion=None)
+    filt = Msckf(CAMERA, T_CAM0_IMU, replace(EXACT_RIG, clones=5), motion=None)
     for k in range(40):
         n = int(rng.integers(0, 25))
         z = np.column_stack([rng.uniform(60, 740, n), rng.uniform(0, 470, n), np.zeros((n, 2))])

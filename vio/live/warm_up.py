@@ -6,6 +6,7 @@ import contextlib
 import logging
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -37,16 +38,23 @@ def warm_up(camera: StereoCamera, T_cam0_imu: FloatArray | None, config: Config,
     if camera.width is None or camera.height is None:
         raise DataError("warm_up needs the size of the images; give StereoCamera its width and height")
     with _without_warnings():
-        odometry = Odometry(camera, config, T_cam0_imu=T_cam0_imu)
-        sway(odometry, config)
-        if odometry.estimate is not None:
-            odometry.landmarks()
+        for made in _configs(config):
+            odometry = Odometry(camera, made, T_cam0_imu=T_cam0_imu)
+            sway(odometry, made)
+            if odometry.estimate is not None:
+                odometry.landmarks()
     if with_map:
         from vio.mapping.features import extract
 
         left, right, _ = SwayingCamera(camera, odometry.T_cam0_body, config.msckf.gravity_mps2).images(0)
         assert right is not None  # of other cameras there is no map
         extract(left, right)
+
+
+def _configs(config: Config) -> list[Config]:
+    """Return the configuration, and one with which landmarks begin at once, not when the stereo field is known."""
+    at_once = replace(config, msckf=replace(config.msckf, calibrate_stereo="off"))
+    return [config] if at_once == config else [config, at_once]
 
 
 def sway(odometry: Odometry, config: Config) -> None:
