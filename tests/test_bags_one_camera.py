@@ -19,7 +19,7 @@ from vio.config import Config  # noqa: E402
 from vio.datasets import DatasetSettings, open_dataset  # noqa: E402
 from vio.datasets.bags.reader import BagDataset  # noqa: E402
 from vio.datasets.rigs.kalibr import kalibr_text  # noqa: E402
-from vio.errors import CalibrationError, ConfigError, DataError  # noqa: E402
+from vio.errors import CalibrationError, ConfigError  # noqa: E402
 from vio.geometry.distortion import CameraModel  # noqa: E402
 from vio.geometry.lie import se3_exp, se3_inverse  # noqa: E402
 from vio.geometry.stereo import one_camera  # noqa: E402
@@ -224,9 +224,9 @@ def test_without_an_imu_a_run_says_what_it_says_of_a_folder(folder_of_one: Path,
             run(dataset, Config())
 
 
-def test_the_left_camera_of_one_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="but this has one; leave it out"):
-        open_dataset(script_of().write(tmp_path / "f"), DatasetSettings(camera="left"))
+def test_the_left_camera_of_one_is_that_camera(tmp_path: Path) -> None:
+    alone = open_dataset(script_of().write(tmp_path / "f"), DatasetSettings(camera="left"))
+    assert "there is one camera only: --camera left changes nothing" in alone.recording.notes
 
 
 # --- stamps ---------------------------------------------------------------------------------------------------------

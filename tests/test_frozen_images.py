@@ -36,7 +36,7 @@ from vio.sim.sequence import SimulatedRecording, simulate
 from vio.sim.world import room
 
 STEP_NS = 50_000_000
-FRAMES, FIRST, LAST = 32, 14, 23  # frames of the flight, of which 10 are repeated: 0.5 s
+FRAMES, FIRST, LAST = 52, 34, 43  # frames of the flight, of which 10 are repeated: 0.5 s
 
 
 # One pair after another

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.test_msckf import CAMERA, STEP_NS, T_CAM0_IMU, Flight
+from tests.test_msckf import CAMERA, EXACT_RIG, STEP_NS, T_CAM0_IMU, Flight
 from vio.evaluation.trajectories import nees, nees_bounds
 from vio.filters.late_imu import LateImuMsckf
-from vio.filters.settings import MsckfSettings
 from vio.geometry.lie import se3_inverse, se3_log, transform_points
 
 
 def test_images_carry_the_frames_before_an_imu_that_begins_late() -> None:
     """The world stays that of the first frame: no jump at the handover, and gravity is known in that world."""
-    flight, settings, rng = Flight(64), MsckfSettings(), np.random.default_rng(3)
+    flight, settings, rng = Flight(64), EXACT_RIG, np.random.default_rng(3)
     filt = LateImuMsckf(CAMERA, T_CAM0_IMU, settings)
     samples = [x for x in flight.imu(rng, settings, np.zeros(6)) if x.time_ns > 1_480_000_000]
     errors, covariances = [], []

@@ -72,7 +72,8 @@ def test_every_table_of_results_is_written_by_a_suite() -> None:
     loose = results._TABLE.sub("", TEXTS["docs/results.md"])
     heads = re.findall(r"^(\|.*)\n\|[-:| ]+\|$", loose, re.MULTILINE)
     assert heads == ["| below VIO_DATA | what it is |", *_STUDIES]
-    assert not re.search(r"^\|[-:| ]+\|$", results._TABLE.sub("", TEXTS["README.md"]), re.MULTILINE)
+    heads = re.findall(r"^(\|.*)\n\|[-:| ]+\|$", results._TABLE.sub("", TEXTS["README.md"]), re.MULTILINE)
+    assert heads == ["| extra | for | |"]
 
 
 _STUDIES = (  # measured once, on rigs turned on purpose

@@ -221,7 +221,7 @@ class MonoStarter:
             self.why = f"features and IMU disagree by more than {self._settings.pixel_sigma_max_px:g} px"
             return None
         P = fitted.covariance()
-        sigma = scale_sigma(WindowPosterior.of(window, P, P))
+        sigma = scale_sigma(WindowPosterior.of(window, P))
         return *_at_origin(window.nav, P[:DIM, :DIM]), float("inf") if sigma is None else sigma
 
     def _window(self, motion: ImuMotion, views: list[Observations], begin: NavState) -> Window:

@@ -29,8 +29,9 @@ class WindowPosterior:
     has_imu: bool  # whether the clones' velocities are smoothed, too
 
     @classmethod
-    def of(cls, window: Window, P: FloatArray, reported: FloatArray) -> WindowPosterior:
+    def of(cls, window: Window, P: FloatArray, reported: FloatArray | None = None) -> WindowPosterior:
         """Take over the body's poses at the window's exposures, with the covariances (k, k) up to theirs."""
+        reported = P if reported is None else reported
         rows = window.state.clones
         own = P[rows, rows], reported[rows, rows]
         if "extrinsics" in window.state:

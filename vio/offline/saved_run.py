@@ -195,7 +195,7 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
         rtol=1e-9,
     ):
         raise DataError(f"{recording.path} has another calibration than the run {run.tracked.where}; repeat the run")
-    correct = _image_correction(run)
+    correct = _image_correction(run, theirs)
     for row in rows.tolist():
         index = int(run.tracked.frames[row])
         found = [e for e in dataset.events(index, index + 1) if isinstance(e, StereoFrame)]
@@ -208,13 +208,14 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
             yield replace(found[0], left=left, right=right)
 
 
-def _image_correction(run: SavedRun) -> Rectifier | None:
-    """Return the map of the front end's image pairs to those of the tracks; None: they are the same."""
+def _image_correction(run: SavedRun, shown: StereoCamera) -> Rectifier | None:
+    """Return the map of image pairs, of the camera that is `shown`, to those of the tracks; None: they are the same."""
     seen, camera = run.dataset.recording.camera, run.tracked.camera
     if seen.is_cylinder:
         maps = (pinhole_maps(seen, camera),) * 2
     elif run.field is not None:
-        maps = run.field.maps()
+        sized = replace(run.field.camera, width=shown.width, height=shown.height)  # features may state no size
+        maps = replace(run.field, camera=sized).maps()
     else:
         return None
     return Rectifier(rig_from_rectified(camera, np.eye(4)), camera, np.eye(4), maps, "linear")
