@@ -482,7 +482,7 @@ def test_three_processes_give_the_poses_of_the_file_run(flight: Path, domain: in
         source = subprocess.run([*command, "play", str(flight), "--ros2", "--reliable", "--rate", "max"], check=True)
         assert source.returncode == 0
         printed, _ = receiver.communicate(timeout=240)
-        node.send_signal(signal.SIGINT)
+        node.send_signal(signal.SIGTERM)  # SIGINT is ignored where a shell started the tests behind it
         assert node.wait(timeout=60) == 0
     finally:
         receiver.kill()

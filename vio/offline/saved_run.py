@@ -210,12 +210,12 @@ def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator
 
 def _image_correction(run: SavedRun, shown: StereoCamera) -> Rectifier | None:
     """Return the map of image pairs, of the camera that is `shown`, to those of the tracks; None: they are the same."""
-    seen, camera = run.dataset.recording.camera, run.tracked.camera
+    # Features may state no size.
+    seen, camera = run.dataset.recording.camera, replace(run.tracked.camera, width=shown.width, height=shown.height)
     if seen.is_cylinder:
         maps = (pinhole_maps(seen, camera),) * 2
     elif run.field is not None:
-        sized = replace(run.field.camera, width=shown.width, height=shown.height)  # features may state no size
-        maps = replace(run.field, camera=sized).maps()
+        maps = replace(run.field, camera=camera).maps()
     else:
         return None
     return Rectifier(rig_from_rectified(camera, np.eye(4)), camera, np.eye(4), maps, "linear")
