@@ -297,7 +297,7 @@ class FrameUpdate:
         ended = np.flatnonzero(ending & good)
         if len(ended):
             self._overdispersion.add(table.ids(tracks.rows[ended]), *self.tracks.field_scores(tracks, ended))
-        # Errors that neighbours share are not in the factor, and the field is told of them in every frame.
+        # Errors that neighbours share are not in the factor, and the field takes them in with every frame.
         repeated = self._overdispersion.factor
         window.absorb(*self._information(window, tracks, ending & good, pixels), repeated=repeated)
         depth_sigma = np.sqrt(self.tracks.variance) * tracks.information.relative_depth_sigma()
