@@ -42,7 +42,7 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import ImuSample, IntArray, Observations, UpdateReport, VelocitySample, observations
 
-EXACT_RIG = MsckfSettings(calibrate_stereo="off", stereo_scale_sigma=0.0)
+EXACT_RIG = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
 STEP_NS = 50_000_000
