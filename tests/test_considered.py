@@ -54,6 +54,22 @@ def test_the_covariance_says_how_the_pose_follows_the_rig(motion: MotionSource |
         np.testing.assert_allclose(added / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.1)
 
 
+def test_the_covariances_of_points_say_how_they_follow_the_rig() -> None:
+    """Against runs on images in which one constant is off at a time: points of tracks and landmarks of the state."""
+    known = replace(ON, stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
+    run, exact = (fly(ROUND, None, settings).filter.landmarks() for settings in (ON, known))
+    np.testing.assert_array_equal(run.ids, exact.ids)
+    added = np.trace(run.covariance - exact.covariance, axis1=1, axis2=2)
+    expected = np.zeros(len(run.ids))
+    for constant, sigma in SIGMAS.items():
+        of_rig = fly(ROUND, None, known, spoil=lambda k, seen, c=constant: _seen_by(c, OFF, seen)).filter.landmarks()  # type: ignore[misc]
+        np.testing.assert_array_equal(run.ids, of_rig.ids)
+        expected += np.sum((of_rig.p_world - exact.p_world) ** 2, axis=1) * (sigma / OFF) ** 2
+    ratio = np.sqrt(added / expected)
+    assert len(ratio) > 100
+    np.testing.assert_allclose(np.quantile(ratio, [0.05, 0.5, 0.95]), 1, atol=0.2)
+
+
 @pytest.mark.parametrize("scaled", [False, True])
 def test_a_prior_follows_its_constants(scaled: bool) -> None:
     """Against the same equations with one constant known and taken out of prior and measurement."""

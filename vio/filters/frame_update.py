@@ -164,10 +164,8 @@ class FrameUpdate:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
         if kept.all():
             return
-        first, gone, P = window.state.landmarks.start, ~kept, window.prior.P
-        rows = [slice(first + 3 * k, first + 3 * k + 3) for k in np.flatnonzero(gone).tolist()]
-        blocks = np.array([P[r, r] for r in rows]).reshape(-1, 3, 3)
-        self._points.store(window.landmark_ids[gone], window.landmarks[gone], blocks)
+        gone, covariances = ~kept, self._rig.landmark_covariances(window)
+        self._points.store(window.landmark_ids[gone], window.landmarks[gone], covariances[gone])
         window.keep_landmarks(kept)
 
     def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
@@ -357,14 +355,18 @@ class FrameUpdate:
         size = window.state.clones.stop
         P = self._move_to_optimum(window, tracks, A, b, size).covariance()  # without landmarks
         V = window.prior.error_D_constants[:size, 1:]
-        V = (V - P @ (A[:size, :size] @ V + C[:size])) * self._rig.considered_sigmas(window)
-        reported = P + V @ V.T
+        V = V - P @ (A[:size, :size] @ V + C[:size])
+        reported = P + self._rig.uncertainty(window, V)
         self._propagation.posterior = FramePosterior.of(window, P)
         self._propagation.reported = FramePosterior.of(window, reported)
         self.smoothed = WindowPosterior.of(window, P, reported)
 
         done = np.flatnonzero(ending & good & (depth_sigma < _MAP_DEPTH_SIGMA))
         covariance = self._variance * tracks.information.point_covariance(done)
+        if joint is not None:
+            of_points = tracks.information.point_D_clones(done) @ V[window.state.clones]
+            of_points += joint.point_D_stereo(tracks.information)[done, :, -CONSIDERED:]
+            covariance = covariance + self._rig.uncertainty(window, of_points)
         self._points.store(table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
         spent = leaving & ~lost
         spent[promoted] = False

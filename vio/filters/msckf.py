@@ -315,7 +315,8 @@ class Msckf(Backend):
 
         A point that came back under its id appears once, as it was seen last.
         """
-        return self._points.with_landmarks(self._started())
+        window = self._started()
+        return self._points.with_landmarks(window, self._rig.landmark_covariances(window))
 
     def take_landmarks(self) -> Landmarks:
         """Return the points that have left the state since the last call, and forget them; `landmarks` has the others.

@@ -88,6 +88,19 @@ class RigCalibration:
             sigmas[:2] = 0.0
         return sigmas
 
+    def uncertainty(self, window: Window, V: FloatArray) -> FloatArray:
+        """What the constants considered add to a covariance (..., k, k), by how its errors follow them (..., k, 4)."""
+        V = V * self.considered_sigmas(window)
+        out: FloatArray = V @ np.swapaxes(V, -1, -2)
+        return out
+
+    def landmark_covariances(self, window: Window) -> FloatArray:
+        """Covariances (M, 3, 3) of the landmarks in the state, with what is considered."""
+        first, prior = window.state.landmarks.start, window.prior
+        rows = first + np.arange(3 * len(window.landmarks)).reshape(-1, 3)
+        out: FloatArray = prior.P[rows[:, :, None], rows[:, None, :]]
+        return out + self.uncertainty(window, prior.error_D_constants[rows, 1:])
+
     def field(self, window: Window) -> StereoCorrection | None:
         """The stereo calibration's faults at the window's present means; None where they are not estimated."""
         estimated, stereo = window.calibration.stereo_terms, window.calibration.stereo
