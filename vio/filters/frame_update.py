@@ -178,7 +178,7 @@ class FrameUpdate:
         """Gauss-Newton over the window; returns the tracks linearised at the estimate, and the last fit."""
         for _ in range(_MOST_STEPS):
             everything = np.ones(len(tracks.rows), dtype=np.bool_)
-            A, b = self._information(window, tracks, everything, pixels)
+            A, b, _ = self._information(window, tracks, everything, pixels)
             fitted = self._move_to_optimum(window, tracks, A, b, len(A))
             tracks = self._linearise(window, tracks.rows, _LATER_STEPS)
             residual = tracks.newest_innovation()
@@ -235,65 +235,68 @@ class FrameUpdate:
         return StepErrors(correction, A @ expected @ A.T, process, A @ remaining @ A.T)
 
     def _information(
-        self, window: Window, tracks: LinearTracks, chosen: BoolArray, pixels: Views | None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Information matrix (D, D) and vector (D,) of chosen tracks and of this frame's landmarks."""
-        poses, variance, field = 6 * len(window.clones), self._variance, self._rig.field(window)
-        A, b, stereo = np.zeros((poses, poses)), np.zeros(poses), None
-        if field is not None:
-            stereo = StereoInformation.none(len(field.terms), poses + 3 * len(window.landmarks))
+        self,
+        window: Window,
+        tracks: LinearTracks,
+        chosen: BoolArray,
+        pixels: Views | None,
+        joint: StereoColumns | None = None,
+    ) -> tuple[FloatArray, FloatArray, FloatArray | None]:
+        """Information of chosen tracks and of this frame's landmarks.
+
+        Args:
+            window: with its means.
+            tracks: linearised there.
+            chosen: mask (F,).
+            pixels: of the landmarks; None: without them.
+            joint: the tracks' columns of the coefficients estimated and of those considered; None: without the latter.
+
+        Returns:
+            Its matrix (D, D) and vector (D,), and that of all errors with what is considered (D, 4).
+        """
+        variance, field, state = self._variance, self._rig.field(window), window.state
+        b = np.zeros(6 * len(window.clones))
+        A = np.zeros((len(b), len(b)))
+        columns, S = tracks.stereo if joint is None else joint, state.stereo.stop - state.stereo.start
+        stereo = None
+        if columns is not None:
+            stereo = StereoInformation.none(columns.b.shape[1], state.size - state.clones.start)
         if chosen.any():
             A, b = eliminate_points(tracks.information, chosen)
-            if stereo is not None and tracks.stereo is not None:
-                stereo = stereo + eliminate_points_from_columns(tracks.stereo, tracks.information, chosen)
+            if stereo is not None and columns is not None:
+                stereo = stereo + eliminate_points_from_columns(columns, tracks.information, chosen)
         at = self._landmark_residuals(window, pixels) if pixels is not None and len(pixels.z) else None
-        if at is not None and pixels is not None and field is not None and stereo is not None:
-            H = field.jacobian(pixels.z - at.r)  # at the predicted pixels
+        if at is not None and pixels is not None and stereo is not None:
+            z = pixels.z - at.r  # as predicted
+            H = self._joint_jacobian(field, z, considered=joint is not None)
             stereo = stereo + landmark_columns(at, H, len(window.clones))
         scaled = None if stereo is None else stereo.scaled(1 / variance)
-        A, b = window.state.information(A / variance, b / variance, scaled)
+        of_estimated = None if scaled is None else scaled.of_first(S)
+        A, b = state.information(A / variance, b / variance, of_estimated)
         if at is not None:
             # In their anchor, the newest clone: dp = xi_f - xi_rho.
-            rows = window.state.clone(-1).start, window.state.landmarks.start
+            rows = state.clone(-1).start, state.landmarks.start
             track_loops.add_landmarks(at.r, at.J, at.weight / variance, *rows, A, b)
-        return A, b
+        if joint is None or scaled is None:
+            return A, b, None
+        by_considered = np.zeros((state.size, CONSIDERED))
+        by_considered[state.stereo] = scaled.A[:S, S:]
+        by_considered[state.clones.start :] = scaled.cross[S:].T
+        return A, b, by_considered
 
     def _joint_columns(self, window: Window, tracks: LinearTracks) -> StereoColumns | None:
         """The tracks' columns of the coefficients estimated and of those considered; None: none is considered."""
         if not self._rig.considered_sigmas(window).any():
             return None
-        H = self._joint_jacobian(tracks.field, tracks.z)
+        H = self._joint_jacobian(tracks.field, tracks.z, considered=True)
         return stereo_columns(tracks.at, H, tracks.information.q.p_D_q, tracks.weight)
 
-    def _joint_jacobian(self, field: StereoCorrection | None, z: FloatArray) -> FloatArray:
-        """Derivatives (..., 4, S + 4) of predicted pixels by the coefficients estimated and by those considered."""
-        by_considered = error_jacobian(self._rig.camera, z, FIELD_TERMS, CONSIDERED)
-        return by_considered if field is None else np.concatenate([field.jacobian(z), by_considered], axis=-1)
-
-    def _by_considered(
-        self, window: Window, tracks: LinearTracks, joint: StereoColumns | None, chosen: BoolArray, pixels: Views | None
-    ) -> FloatArray:
-        """Information (D, 4) that chosen tracks and this frame's landmarks have of all errors with what is considered.
-
-        Args:
-            window: with its means.
-            tracks: linearised there.
-            joint: their columns.
-            chosen: mask (F,).
-            pixels: of the landmarks; None: without them.
-        """
-        state = window.state
-        out = np.zeros((state.size, CONSIDERED))
-        if joint is None:
-            return out
-        field, S = self._rig.field(window), state.stereo.stop - state.stereo.start
-        of_all = StereoInformation.none(S + CONSIDERED, state.size - state.clones.start)
-        of_all = of_all + eliminate_points_from_columns(joint, tracks.information, chosen)
-        at = self._landmark_residuals(window, pixels) if pixels is not None and len(pixels.z) else None
-        if at is not None and pixels is not None:
-            of_all = of_all + landmark_columns(at, self._joint_jacobian(field, pixels.z - at.r), len(window.clones))
-        out[state.stereo], out[state.clones.start :] = of_all.A[:S, S:], of_all.cross[S:].T
-        return out / self._variance
+    def _joint_jacobian(self, field: StereoCorrection | None, z: FloatArray, *, considered: bool) -> FloatArray:
+        """Derivatives (..., 4, S + 4) of predicted pixels by the coefficients estimated, and by those considered."""
+        parts = [] if field is None else [field.jacobian(z)]
+        if considered:
+            parts.append(error_jacobian(self._rig.camera, z, FIELD_TERMS, CONSIDERED))
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
 
     def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
         """Residuals of the landmarks' pixels in the newest exposure."""
@@ -343,19 +346,17 @@ class FrameUpdate:
         # Errors that neighbours share are not in the factor, and the field takes them in with every frame.
         repeated = self._overdispersion.factor
         joint = self._joint_columns(window, tracks)
-        considered = self._by_considered(window, tracks, joint, ending & good, pixels)
-        window.absorb(
-            *self._information(window, tracks, ending & good, pixels), repeated=repeated, considered=considered
-        )
+        A, b, considered = self._information(window, tracks, ending & good, pixels, joint)
+        window.absorb(A, b, repeated=repeated, considered=considered)
         depth_sigma = np.sqrt(self.tracks.variance) * tracks.information.relative_depth_sigma()
         promoted = self._promote(window, tracks, joint, leaving & good & seen[:, newest], depth_sigma)
 
-        A, b = self._information(window, tracks, good & ~ending, None)
-        C = self._by_considered(window, tracks, joint, good & ~ending, None)
+        A, b, considered = self._information(window, tracks, good & ~ending, None, joint)
         size = window.state.clones.stop
         P = self._move_to_optimum(window, tracks, A, b, size).covariance()  # without landmarks
         V = window.prior.error_D_constants[:size, 1:]
-        V = V - P @ (A[:size, :size] @ V + C[:size])
+        if considered is not None:
+            V = V - P @ (A[:size, :size] @ V + considered[:size])
         reported = P + self._rig.uncertainty(window, V)
         self._propagation.posterior = FramePosterior.of(window, P)
         self._propagation.reported = FramePosterior.of(window, reported)

@@ -214,6 +214,10 @@ class StereoInformation:
         """Return the information times a factor."""
         return StereoInformation(self.A * factor, self.cross * factor, self.b * factor)
 
+    def of_first(self, terms: int) -> StereoInformation | None:
+        """Return the information about the first coefficients; None: about none."""
+        return StereoInformation(self.A[:terms, :terms], self.cross[:terms], self.b[:terms]) if terms else None
+
 
 def eliminate_points_from_columns(
     columns: StereoColumns, info: TrackInformation, chosen: BoolArray
