@@ -66,6 +66,7 @@ class RunMonitor:
         self._index, self._index_before = -1, -1  # of the present frame, and of the one before it
         self._refused_last = -2
         self.frames_refused = 0
+        self.refusal = ""  # of the last of them
         self.frames_waiting = 0  # that have no pose, as the back end had not begun
         self._waiting_since: int | None = None
         self._waits_for = ""
@@ -164,7 +165,7 @@ class RunMonitor:
         if self._refused_last != self._index_before:
             self._report([f"frame skipped: {reason}"])
         self._refused_last = index
-        self.frames_refused += 1
+        self.frames_refused, self.refusal = self.frames_refused + 1, reason
 
     @property
     def imu_is_judged(self) -> bool:
