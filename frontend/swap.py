@@ -18,8 +18,8 @@ _MANY = 0.4  # share of features matched in the mirrored images that indicates a
 class SwapDetector(ImageCheck):
     """Detects a recording with swapped left and right images: few matches, but many in the mirrored images.
 
-    Several frames must show it; all after them are refused until one is in order. Once a few frames were in order, so is the recording: `ExchangeDetector` judges later
-    ones.
+    Several frames must show it; all after them are refused until one is in order. Once a few frames were in order, so
+    is the recording: `ExchangeDetector` judges later ones.
     """
 
     def __init__(self, few: float) -> None:
