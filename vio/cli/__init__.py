@@ -143,8 +143,8 @@ def _check_address_space(command: str) -> None:
     if 0 <= limit < _LEAST_ADDRESS_SPACE:  # RLIM_INFINITY is -1
         raise VioError(
             f"the address space is limited to {limit / 1e6:.0f} MB (ulimit -v), and vio {command} loads "
-            f"{_LEAST_ADDRESS_SPACE / 1e6:.0f} MB of libraries; raise the limit, or limit the resident memory instead (a container, "
-            "systemd-run -p MemoryMax)"
+            f"{_LEAST_ADDRESS_SPACE / 1e6:.0f} MB of libraries; raise the limit, or limit the resident memory "
+            "instead (a container, systemd-run -p MemoryMax)"
         )
 
 
