@@ -49,7 +49,7 @@ class ExchangeDetector(ImageCheck):
 
     def inspect(self, images: FrameImages) -> FrameImages | None:
         """Return the images in their right order; None: they do not fit each other."""
-        if not images.right_lives:
+        if not images.right_lives or images.swapped:
             return images
         left, right = images.views
         suspicious = not images.right_trusted

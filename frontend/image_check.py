@@ -23,6 +23,7 @@ class FrameImages:
     stereo: StereoFit
     right_trusted: bool  # the right image of the last frame was used
     right_lives: bool = True  # False: the right image of this frame is known to be frozen, dark or covered
+    swapped: bool = False  # all frames so far were exchanged: a fault of the recording, which is not put back
 
     @cached_property
     def views(self) -> tuple[ImageLevels, ...]:

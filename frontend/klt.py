@@ -62,7 +62,7 @@ class KltFrontend:
         self._checks: tuple[ImageCheck, ...] = (contrast, self._objects)  # in this order
         if camera.kind == "stereo":
             # A frozen image looks as if it were the other camera's, so that is asked first.
-            pair = (self._right, self._delay, ExchangeDetector(), self._objects, SwapDetector(_SWAP_FEW))
+            pair = (self._right, self._delay, SwapDetector(_SWAP_FEW), ExchangeDetector(), self._objects)
             self._checks = (BandRemoval(), contrast, *pair)
         self._bank = AnchorBank(_BANK_SPARE * self._grid.target_features, ANCHOR_RADIUS_PX)
         self._anchor_fit = AnchorFit(camera, self._grid, self._bank)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from vio.errors import DataError
 from vio.frontend.image_check import FrameImages, ImageCheck
@@ -17,8 +18,8 @@ _MANY = 0.4  # share of features matched in the mirrored images that indicates a
 class SwapDetector(ImageCheck):
     """Detects a recording with swapped left and right images: few matches, but many in the mirrored images.
 
-    Several frames must show it. Once a few frames were in order, so is the recording: `ExchangeDetector` judges later
-    ones.
+    Several frames must show it; all after them are refused until one is in order. Once a few frames were in order, so
+    is the recording: `ExchangeDetector` judges later ones.
     """
 
     def __init__(self, few: float) -> None:
@@ -26,6 +27,14 @@ class SwapDetector(ImageCheck):
         super().__init__()
         self._few = few
         self._suspicious = self._in_order = 0  # frames
+
+    @property
+    def _certain(self) -> bool:
+        return self._suspicious >= _FRAMES
+
+    def inspect(self, images: FrameImages) -> FrameImages:
+        """Return the images as given, marked where the recording was found to be swapped."""
+        return replace(images, swapped=True) if self._certain else images
 
     def conclude(self, images: FrameImages, tracks: Tracks) -> None:
         """Check the features of a frame.
@@ -50,8 +59,11 @@ class SwapDetector(ImageCheck):
         if self._in_order >= _FRAMES:
             return
         mirrored = count_mirrored()
-        self._suspicious = self._suspicious + 1 if mirrored >= max(_MANY * features, 2 * matched) else 0
-        if self._suspicious >= _FRAMES:
+        if mirrored >= max(_MANY * features, 2 * matched):
+            self._suspicious += 1
+        elif not self._certain:
+            self._suspicious = 0
+        if self._certain:
             raise DataError(
                 f"frame {frame.index}: left and right images look swapped ({mirrored} of {features} features match "
                 f"with a negative disparity, {matched} with a positive one, in {_FRAMES} frames); exchange the "

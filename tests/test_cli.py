@@ -231,6 +231,15 @@ def test_output_on_a_terminal_without_unicode() -> None:
         assert done.stderr == b""
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of the address space")
+@pytest.mark.parametrize("kib", [400_000, 800_000])
+def test_a_limit_of_the_address_space_ends_in_one_line(kib: int, tmp_path: Path) -> None:
+    words = f"ulimit -v {kib}; exec '{sys.executable}' -m vio run '{tmp_path}'"
+    done = subprocess.run(["bash", "-c", words], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert re.fullmatch(r"error: the address space is limited to \d+ MB .*\n", done.stderr)
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is always full")
 def test_reports_unwritable_output_in_one_line() -> None:
     with Path("/dev/full").open("w") as full:

@@ -30,6 +30,9 @@ from tests.euroc_maker import (
 )
 from tests.sift import match_sift
 from vio.cameras.rig import rectifier_of
+from vio.cli.output import NOTE
+from vio.cli.running import process
+from vio.config import load_config
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.euroc import pair_stamps, read_euroc
 from vio.datasets.euroc_files import camera_yaml, read_camera_yaml, rig_read_as
@@ -206,7 +209,7 @@ def test_finds_images_with_another_extension(tmp_path: Path) -> None:
     assert len(_frames(dataset)) == 4
 
 
-def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(tmp_path: Path) -> None:
+def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Right images are missing at the end, and the last line of the IMU's record is cut: both are said."""
     mav = make_euroc(tmp_path, 6) / "mav0"
     for image in sorted((mav / "cam1" / "data").iterdir())[-2:]:
@@ -219,6 +222,11 @@ def test_a_copy_that_ended_early_is_used_as_far_as_it_goes(tmp_path: Path) -> No
     notes = dataset.recording.notes
     assert "the last 2 of 6 listed images of cam1 are missing; 4 pairs are used" in notes
     assert any(f"line {len(lines)}: the last line ends too early (3 of 7 values); left out" in note for note in notes)
+    for motion, said in (("imu", 1), ("none", 0)):
+        caplog.clear()
+        with caplog.at_level(NOTE):
+            process(str(tmp_path), load_config(overrides=[f"motion={motion}"]), out=tmp_path / motion, plot=False)
+        assert sum("ends too early" in record.getMessage() for record in caplog.records) == said
     samples = [event for event in dataset.events() if isinstance(event, ImuSample)]
     assert samples[-1].time_ns <= int(lines[-2].split(",")[0])
     assert sum(isinstance(event, StereoFrame) for event in dataset.events()) == 4

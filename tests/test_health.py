@@ -45,7 +45,7 @@ def test_reports_once_a_focal_length_that_differs_beyond_doubt_and_beyond_harm(
 ) -> None:
     scale = StereoScaleEstimate(np.array([0.0, np.log1p(percent / 100)]), np.diag([0.0, (sigma / 100) ** 2]))
     health = RunHealth()
-    lines = [line for k in range(5) for line in health.frame(k, GOOD, _estimate(k, stereo_scale=scale))]
+    lines = [line for k in range(5) for line in health.scale(k, _estimate(k, stereo_scale=scale))]
     assert [f"frame 0: the focal length is 5.0 % {word} than calibrated" in line for line in lines] == [True] * (
         word is not None
     )
@@ -53,7 +53,7 @@ def test_reports_once_a_focal_length_that_differs_beyond_doubt_and_beyond_harm(
 
 def test_a_scale_that_is_off_is_laid_on_baseline_or_focal_length_where_nothing_tells_them_apart() -> None:
     scale = StereoScaleEstimate(np.array([np.log(1.1), 0.0]), np.diag([0.01**2, 0.0]))
-    (line,) = RunHealth().frame(0, GOOD, _estimate(0, stereo_scale=scale))
+    (line,) = RunHealth().scale(0, _estimate(0, stereo_scale=scale))
     assert "the baseline, or the focal length, is 10.0 % longer than calibrated" in line
     assert "check the sensor (unit, axes, clock)" in line
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -129,3 +129,12 @@ def test_verdict_follows_from_what_is_certain(
 ) -> None:
     finding = InertialFinding(fault, "", "", certain=certain, factor=factor)  # type: ignore[arg-type]
     assert ImuVerdict().after(finding) == expected
+
+
+def test_images_carry_on_by_the_depths_of_before_when_the_right_camera_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.test_imu_trial.FRAMES", 80)
+    it = _recording("slow", 2)
+    frames = [replace(seen, has_right=seen.has_right & (seen.frame_index < 40)) for seen in it.frames]
+    recording = replace(_flight().recording, frame_times_ns=np.array([seen.time_ns for seen in frames[:80]]))
+    used = np.array(_run(_Features(replace(it, frames=frames), [], recording), "none").frames.column("used"))
+    assert used[40:].min() > 10

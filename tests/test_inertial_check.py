@@ -22,7 +22,7 @@ from vio.imu.clocks import judge_clocks
 from vio.imu.findings import InertialFinding
 from vio.monitor.inertial import InertialCheck
 from vio.monitor.run import RunMonitor
-from vio.records import ImuSample, Observations, observations
+from vio.records import Estimate, ImuSample, Observations, StereoScaleEstimate, UpdateReport, observations
 from vio.sim.imu import ImuNoise, simulate_imu
 from vio.sim.motion import MotionSpline, car_loop, fit_spline, hand_held, motion_at, rotate_body_axes
 from vio.sim.rigs import R_FLU_EUROC_IMU, euroc_rectified_rig, small_rig
@@ -178,7 +178,7 @@ def test_correct_recording_gives_no_finding(name: str, seed: int, mount: str) ->
     assert _watch(_recording(name, seed, mount)) == []
 
 
-@pytest.mark.parametrize("count", [10, 25, 40, 80])
+@pytest.mark.parametrize("count", [10, 25, 40, 90])
 @pytest.mark.parametrize("first", [0, 120, 240])
 def test_short_recording_gives_no_finding(first: int, count: int) -> None:
     it = _recording("room", 1)
@@ -266,6 +266,32 @@ def test_slow_motion_is_enough(name: str) -> None:
 def test_reports_degrees_when_the_run_ends_after_two_seconds() -> None:
     it = _recording("room")
     assert _faults(_watch(it, samples=_gyro(it, np.degrees), frames=it.frames[:40])) == ["gyro units"]
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_names_an_inverted_axis_of_the_accelerometer_when_the_run_ends_after_four_seconds(axis: int) -> None:
+    it, signs = _recording("room"), 1.0 - 2.0 * np.eye(3)[axis]
+    assert _faults(_watch(it, samples=_accel(it, lambda a: signs * a), frames=it.frames[:90])) == ["accelerometer axes"]
+
+
+@pytest.mark.parametrize(("name", "said"), [("", True), ("cycled accelerometer", False)])
+def test_a_run_blames_the_baseline_only_once_the_accelerometers_axes_are_right(name: str, said: bool) -> None:
+    it = _recording("room")
+    monitor = RunMonitor(it.camera, it.T_cam0_imu, imu=True)
+    off = StereoScaleEstimate(np.array([np.log(1.3), 0.0]), np.diag([1e-4, 0.0]))
+    lines_at = []
+    for event in sorted([*(_CORRUPTED[name][0](it) if name else it.samples), *it.frames], key=lambda e: e.time_ns):
+        if isinstance(event, ImuSample):
+            monitor.sample(event)
+            continue
+        monitor.observations(event)
+        used = UpdateReport(50, 2, 1, 30, 0.3, 1.0)
+        monitor.update(event.frame_index, used, Estimate(event.time_ns, np.eye(4), 1e-4 * np.eye(6), stereo_scale=off))
+        lines_at.append(sum("the baseline" in line for line in monitor.lines))
+    monitor.close()
+    assert lines_at[60] == 0
+    assert [line for line in monitor.lines if "the baseline" in line] == monitor.lines * said
+    assert lines_at[-1] == said
 
 
 @pytest.mark.parametrize(

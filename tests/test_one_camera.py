@@ -378,6 +378,10 @@ def test_euroc_folder_with_cam0_alone_is_one_camera(tmp_path: Path) -> None:
     assert dataset.recording.camera.kind == "mono"
     assert len(list(dataset.events())) == 3
     assert not any("data.csv" in note for note in dataset.recording.notes), "the names of the images say the same"
+    (cam / "data.csv").write_text("#timestamp [ns],filename\n" + "1,a.png\n" * 5)
+    assert any(
+        "data.csv lists 5 images; the 3 that are there are used" in n for n in open_dataset(tmp_path).recording.notes
+    )
 
 
 def test_left_camera_of_a_pair_has_no_right_side(tmp_path: Path) -> None:

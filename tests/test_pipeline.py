@@ -418,3 +418,17 @@ def test_a_recording_that_shows_nothing_is_said_so() -> None:
     result = run(Dark(frames=4, velocity=False), Config())
     assert result.warnings[-1] == "no feature in any of 4 frames: the trajectory contains no information on the motion"
     assert not any("no feature in any" in line for line in run(FakeDrive(frames=4), Config()).warnings)
+
+
+def test_an_error_of_refused_frames_gives_their_reason_and_not_the_last_warning() -> None:
+    class Hollow(FakeDrive):
+        """Most frames have no features, and the last ones do not come."""
+
+        def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
+            yield from super().events(start, 20, images=images)
+
+        def observations(self, index: int) -> Observations | None:
+            return super().observations(index) if index < 5 else None
+
+    with pytest.raises(DataError, match=r"^most frames were refused: frame \d+ has no precomputed observations"):
+        run(Hollow(), Config())

@@ -484,6 +484,7 @@ class Recording:
     reference: Trajectory | None  # ground truth lying in the recording
     landmarks_reference: Landmarks | None = None  # surveyed landmark positions, covariance zero
     notes: tuple[str, ...] = ()  # what the reader found and corrected; a command logs each once
+    motion_notes: tuple[str, ...] = ()  # those of them that are on motion samples only
     run_motion: RunMotion | None = None  # observation logs: what the run behind the log used; None: not known
 
     @property

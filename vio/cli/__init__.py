@@ -64,6 +64,8 @@ _COMMANDS = tuple(module for modules in BY_PURPOSE.values() for module in module
 # Objects made before Python looks for cycles among the young ones: a tenth of a command's start went into that search,
 # over modules and samples that stay.
 _GC_OBJECTS = 100_000
+_LEAST_ADDRESS_SPACE = 1_000_000_000  # bytes; a short run of MH_01 takes 976 MB, and OpenCV fails to load in 820
+_LIGHT = ("config", "completion")  # commands that load no library
 _MOST_SHOWN = 200  # characters of a path in a message
 _ENDING = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
@@ -127,6 +129,25 @@ def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
     return args
 
 
+def _check_address_space(command: str) -> None:
+    """Refuse a limit under which the libraries of a command end the process when they are loaded.
+
+    Raises:
+        VioError: `ulimit -v` leaves too little.
+    """
+    if sys.platform == "win32" or command in _LIGHT:
+        return
+    import resource
+
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if 0 <= limit < _LEAST_ADDRESS_SPACE:  # RLIM_INFINITY is -1
+        raise VioError(
+            f"the address space is limited to {limit / 1e6:.0f} MB (ulimit -v), and vio {command} loads "
+            f"{_LEAST_ADDRESS_SPACE / 1e6:.0f} MB of libraries; raise the limit, or limit the resident memory "
+            "instead (a container, systemd-run -p MemoryMax)"
+        )
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     for stream in (sys.stdout, sys.stderr):
@@ -141,6 +162,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     try:
         with _orderly_end():
+            _check_address_space(args.command)
             status: int = args.execute(args)
             sys.stdout.flush()
     except StoppedError as stop:

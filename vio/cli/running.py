@@ -121,8 +121,10 @@ def process(
     `command` is kept in the metrics; `finished` gets them before the picture is drawn.
     """
     dataset = _opened(source, config, mapped=map_file is not None)
+    unused = dataset.recording.motion_notes if config.motion == "none" else ()
     for note in dataset.recording.notes:
-        log.log(NOTE, "%s", note)
+        if note not in unused:
+            log.log(NOTE, "%s", note)
     folder = check_out(out if out is not None else free_folder(dataset.recording.path))
     calibration = _calibration_file(dataset, folder, save_calibration)
     first, end = frames_between(dataset.recording, start, stop)

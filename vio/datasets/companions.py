@@ -118,6 +118,7 @@ def read_companions(
         motion=frozenset("velocity" if file.name == "velocity.csv" else "imu" for file in motion_files),
         reference=reference,
         notes=(*notes, *rig.notes, *rectifier.notes, *motion_notes, *unused),
+        motion_notes=tuple(motion_notes),
     )
     return Companions(recording, motion, rectifier, tuple(ImageSize(c.width, c.height, file) for c in rig.cameras))
 

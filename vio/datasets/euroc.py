@@ -112,6 +112,7 @@ def read_euroc(path: Path, settings: DatasetSettings) -> RectifiedDataset:
         motion=motion,
         reference=None if truth is None else _read_reference(truth, imu.T_body_imu, rig.T_imu_cam0),
         notes=(*notes, *imu.notes, *depth_notes, *rectifier.notes, *_unused(path, mav, truth)),
+        motion_notes=imu.notes,
     )
     return RectifiedDataset(
         recording=recording,

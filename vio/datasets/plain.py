@@ -293,15 +293,23 @@ def frame_times(layout: Layout, pairs: ImagePairs) -> tuple[IntArray, Path | Non
             if (file := folder / name).is_file():
                 return times_of(file, pairs), file, ()
     stems = [left.stem for left, _ in pairs]
+    has_list = (file := layout.left.parent / "data.csv").is_file()
+    missing = _missing_note(file, pairs) if has_list else ()
     if all(_is_stamp(stem) or re.fullmatch(r"\d{9,10}\.\d{1,9}", stem) for stem in stems):
-        return parse_stamps(stems, lambda k: str(pairs[k][0])), layout.left, ()
-    if (file := layout.left.parent / "data.csv").is_file():
-        return _listed_times(file, pairs), file, ()
+        return parse_stamps(stems, lambda k: str(pairs[k][0])), layout.left, missing
+    if has_list:
+        return _listed_times(file, pairs), file, missing
     note = (
         f"{layout.root}: no times.txt; frames are taken to be {1 / _ASSUMED_HZ:g} s apart, so speeds are unknown; "
         "write one time an image (seconds or nanoseconds) into times.txt"
     )
     return np.arange(len(pairs), dtype=np.int64) * round(NS_PER_S / _ASSUMED_HZ), None, (note,)
+
+
+def _missing_note(file: Path, pairs: ImagePairs) -> tuple[str, ...]:
+    """Say how many of the images in EuRoC's list of a camera are there, if not all are."""
+    listed = sum(line.strip()[:1] not in ("#", "") for _, line in text_lines(file))
+    return (f"{file} lists {listed} images; the {len(pairs)} that are there are used",) if listed > len(pairs) else ()
 
 
 def _listed_times(file: Path, pairs: ImagePairs) -> IntArray:

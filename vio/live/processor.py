@@ -78,6 +78,11 @@ class EventProcessor:
         return self._chain.monitor.frames_refused
 
     @property
+    def refusal(self) -> str:
+        """Why the last frame of those was refused."""
+        return self._chain.monitor.refusal
+
+    @property
     def frames_waiting(self) -> int:
         """Number of frames without a pose, as the back end could not be initialised yet."""
         return self._chain.monitor.frames_waiting

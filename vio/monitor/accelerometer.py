@@ -15,7 +15,7 @@ from vio.geometry.lie import FloatArray
 from vio.imu.findings import InertialFinding
 from vio.monitor.axes import axes_text, signed_permutations
 from vio.monitor.evidence import Evidence
-from vio.monitor.force_fit import WINDOW_S, ForceFit
+from vio.monitor.force_fit import LEAST_WINDOWS, WINDOW_S, ForceFit
 from vio.monitor.gyro_fit import GyroFit
 from vio.monitor.motion import Record
 from vio.monitor.samples import Size, gravity_removed
@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 
 _SIGN_SIGMAS = 6.0
 AXES_WORSE = 3.0  # ratio of the given axes' squared misfit to that of others
+_AXES_WORSE_EARLY = 9.0  # likewise in fewer windows; right axes came to at most 1.2 in 178 pieces of flights and drives
 _UPSIDE_DOWN = 0.5  # cosine between image-down and up: within 60 degrees
 _UPSIDE_SHARE = 0.95
 _NS = 1e-9
@@ -50,10 +51,11 @@ def judge_force(evidence: Evidence, unit: float) -> tuple[list[InertialFinding],
     """
     gyro_fit, force, R = evidence.gyro_fit, evidence.force, evidence.R_cam0_imu
     readings = gyro_fit.force[gyro_fit.covered]
-    if force is not None:
-        wrong = _wrong_axes(force, R * unit)
+    if evidence.early_force is not None:
+        wrong = _wrong_axes(evidence.early_force, R * unit)
         if wrong is not None:
             return [wrong], True
+    if force is not None:
         scale, sigma = force.sign(R * unit)
         if abs(scale) > _SIGN_SIGMAS * sigma and 0.5 < abs(scale) < 2.0:
             return ([_wrong_sign(scale, sigma)] if scale < 0 else judge_up(readings, R, measured=True)), True
@@ -74,8 +76,9 @@ def _wrong_axes(force: ForceFit, C: FloatArray) -> InertialFinding | None:
     others = [P for P in signed_permutations() if abs(np.trace(P)) < 2.5]
     costs = [force.cost(C @ P) for P in others]
     k = int(np.argmin(costs))
+    worse = AXES_WORSE if force.windows >= LEAST_WINDOWS else _AXES_WORSE_EARLY
     # Neither the given axes nor their negative may explain the readings: the sign is judged separately.
-    if costs[k] * AXES_WORSE > min(given, force.cost(-C)):
+    if costs[k] * worse > min(given, force.cost(-C)):
         return None
     return InertialFinding(
         "accelerometer axes",

@@ -18,6 +18,7 @@ class Evidence:
     R_cam0_imu: FloatArray  # (3, 3) as given
     gyro_fit: GyroFit
     force: ForceFit | None  # None: too few windows without tracking loss, or the readings have no unit
+    early_force: ForceFit | None  # likewise, from fewer windows: enough for axes that are clearly wrong
     force_final: bool  # `force` will not improve: what it leaves undecided is judged without it
     clipped: bool  # readings at the end of the range were found, which make rotations appear smaller
     last: bool  # no later evaluation will follow

@@ -14,7 +14,8 @@ from vio.numerics.robust import jackknife
 from vio.records import BoolArray
 
 WINDOW_S = 2.0
-_LEAST_WINDOWS = 3
+LEAST_WINDOWS = 3  # for all but axes that are clearly wrong
+_FEWEST_WINDOWS = 2
 _BIAS_PRIOR_MPS2 = 0.3
 _LEVER_ARM_PRIOR_M = 1.0
 _MISFIT_M = 0.02  # standard deviation of a window's positions, to weight the priors
@@ -31,6 +32,11 @@ class ForceFit:
     h: FloatArray  # (W, 15)
     c: FloatArray  # (W,)
     weight: FloatArray  # (W,)
+
+    @property
+    def windows(self) -> int:
+        """How many there are."""
+        return len(self.c)
 
     def reduced(self, keep: BoolArray | None = None) -> tuple[FloatArray, FloatArray, float]:
         """Return N, h, c of the cost `c - 2 h a + a N a` of a linear map a (9,), bias and lever arm marginalised."""
@@ -74,7 +80,7 @@ def fit_force(record: Record, gyro_fit: GyroFit, lever_arm: FloatArray) -> Force
         lever_arm: (3,) given position of the IMU in cam0, metres; a correction to it is fitted.
     """
     blocks = [_normal_equations(window, lever_arm) for window in _windows(record, gyro_fit)]
-    if len(blocks) < _LEAST_WINDOWS:
+    if len(blocks) < _FEWEST_WINDOWS:
         return None
     N, h, c = (np.array([b[k] for b in blocks]) for k in range(3))
     weight: FloatArray = np.ones(len(blocks))

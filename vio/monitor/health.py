@@ -66,7 +66,6 @@ class RunHealth:
         lines = [*self._gap(index, estimate), *self._features(index, report, estimate)]
         lines += self._rejections(index, report)
         lines += self._stereo(index, estimate)
-        lines += self._scale(index, estimate)
         lines += self._implausible(index, estimate)
         return tuple(lines)
 
@@ -107,8 +106,8 @@ class RunHealth:
             "off by is estimated while running (msckf.calibrate_stereo)"
         ]
 
-    def _scale(self, index: int, estimate: Estimate) -> list[str]:
-        """Report once that baseline or focal length differ from the calibration significantly and harmfully."""
+    def scale(self, index: int, estimate: Estimate) -> list[str]:
+        """Return once that baseline or focal length differ from the calibration significantly and harmfully."""
         lines: list[str] = []
         found = {} if estimate.stereo_scale is None else estimate.stereo_scale.percent()
         for name, (percent, sigma) in found.items():

@@ -19,7 +19,7 @@ from vio.imu.clocks import SampleCoverage
 from vio.imu.findings import InertialFault, InertialFinding
 from vio.monitor.accelerometer import judge_force, judge_lever_arm, judge_up, resolve_size
 from vio.monitor.evidence import FIRST_EVALUATION, Evidence
-from vio.monitor.force_fit import fit_force
+from vio.monitor.force_fit import LEAST_WINDOWS, fit_force
 from vio.monitor.gyro import judge_gyro
 from vio.monitor.gyro_fit import AGREES, GyroFit, fit_gyro, judge_offset
 from vio.monitor.motion import BATCH, CameraTwists, RecentMotion, Record, record_of
@@ -67,6 +67,7 @@ class InertialCheck:
         self._suspected: set[InertialFault] = set()
         self._done = False
         self.rotation_comparison: RotationComparison | None = None  # the newest comparison; None: too few frames yet
+        self.axes_compared = False  # the accelerometer's with the images' path, or there will be no rotation for it
         self.imu_at_fault = False  # by the newest judgement of units, axes, signs and clocks, reported yet or not
 
     def imu(self, sample: ImuSample) -> None:
@@ -132,12 +133,16 @@ class InertialCheck:
         if gyro_fit is None:
             if self._seen >= _ENOUGH:
                 self.rotation_comparison = self.rotation_comparison or ROTATION_NOT_COMPARABLE
+                self.axes_compared = True
             return self._judge_stationary(size, record, last=last)
-        force = None if size.unit is None else fit_force(record, gyro_fit, self._T[:3, 3])
+        early = None if size.unit is None else fit_force(record, gyro_fit, self._T[:3, 3])
+        force = None if early is None or early.windows < LEAST_WINDOWS else early
+        self.axes_compared |= early is not None
         evidence = Evidence(
             R_cam0_imu=self._T[:3, :3],
             gyro_fit=gyro_fit,
             force=force,
+            early_force=early,
             # The accelerometer decides whether gyro or extrinsics are at fault: wait for it.
             force_final=force is not None or size.unit is None or last or gyro_fit.count >= _ENOUGH,
             clipped="saturation" in self._reported,

@@ -66,10 +66,12 @@ class RunMonitor:
         self._index, self._index_before = -1, -1  # of the present frame, and of the one before it
         self._refused_last = -2
         self.frames_refused = 0
+        self.refusal = ""  # of the last of them
         self.frames_waiting = 0  # that have no pose, as the back end had not begun
         self._waiting_since: int | None = None
         self._waits_for = ""
         self._imu_at_fault = False
+        self._scale_lines: list[str] = []  # not reported yet
         self.imu_verdict = ImuVerdict()  # by the findings so far
         self.lines: list[str] = []
 
@@ -163,7 +165,7 @@ class RunMonitor:
         if self._refused_last != self._index_before:
             self._report([f"frame skipped: {reason}"])
         self._refused_last = index
-        self.frames_refused += 1
+        self.frames_refused, self.refusal = self.frames_refused + 1, reason
 
     @property
     def imu_is_judged(self) -> bool:
@@ -214,6 +216,15 @@ class RunMonitor:
     def update(self, index: int, report: UpdateReport, estimate: Estimate) -> None:
         """Add the back end's report and estimate of a frame."""
         self._report(self._health.frame(index, report, estimate))
+        self._scale_lines += self._health.scale(index, estimate)
+        self._report_scale(last=False)
+
+    def _report_scale(self, *, last: bool) -> None:
+        """Report what the sensor says of the cameras' scale once its axes were compared, and are right."""
+        check = self._inertial
+        if check is None or (not check.imu_at_fault and (check.axes_compared or last)):
+            self._report(self._scale_lines)
+            self._scale_lines = []
 
     def close(self) -> None:
         """Finish at the end of the run, also of a failed one."""
@@ -232,6 +243,7 @@ class RunMonitor:
             if self._faults is not None and self._faults.stuck_at_end:  # which is no matter of clocks
                 findings = tuple(f for f in findings if f.group != "overlap")
             self._report_findings(findings)
+        self._report_scale(last=True)
         if self._waiting_since is not None:
             why = "correct the fault of the IMU that is named above first" if self._imu_at_fault else self._waits_for
             self._report([f"one camera: {self.frames_waiting} frames have no pose; {why}"])

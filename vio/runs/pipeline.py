@@ -313,7 +313,7 @@ class _Loop:
         self._record(processor.finish())
         recorder.revise(processor.smoothed)
         if processor.frames_refused > len(recorder):
-            raise DataError(f"most frames were refused: {processor.warnings[-1]}")
+            raise DataError(f"most frames were refused: {processor.refusal}")
         return stopped
 
     def _between(self, first: int, end: int) -> list[int]:
