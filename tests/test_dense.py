@@ -7,6 +7,7 @@ import shutil
 import signal
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -214,3 +215,26 @@ def test_refusals_are_one_line(run_folder: Path, tmp_path: Path, capsys: pytest.
         capsys.readouterr()
         assert main(["mesh", *arguments]) == 1
         assert message in capsys.readouterr().err
+
+
+def test_exports_keep_the_colours_of_the_images(flight: Path, tmp_path: Path) -> None:
+    """The same flight with images that are tinted: exported in colour, the points too."""
+    tinted = tmp_path / "flight"
+    shutil.copytree(flight, tinted)
+    for file in tinted.glob("mav0/cam*/data/*.png"):
+        gray = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert gray is not None
+        cv2.imwrite(str(file), np.stack([gray // 2, gray, gray], axis=2))  # blue, green, red
+    run = tmp_path / "run"
+    assert main(["run", str(tinted), "--save-observations", "--out", str(run), "--no-plot", "--json"]) == 0
+    assert main(["export", "colmap", str(run), "--keyframes", "3"]) == 0
+    image = cv2.imread(str(next((run / "colmap" / "images").rglob("*.png"))), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    assert image.shape[2] == 3
+    assert np.abs(image[..., 0].astype(int) - image[..., 2] // 2).max() <= 3
+    head, _, body = (run / "colmap" / "points.ply").read_bytes().partition(b"end_header\n")
+    assert b"property uchar red" in head
+    points = np.frombuffer(body, dtype=[("p", "<f4", 3), ("rgb", "u1", 3)])["rgb"].astype(int)
+    assert points[:, 0].mean() > 1.5 * points[:, 2].mean()
+    (model,) = (run / "colmap").glob("sparse/0/points3D.*")
+    assert model.stat().st_size > 0

@@ -53,7 +53,7 @@ def _along(path: FloatArray, step_m: float) -> FloatArray:
 
 
 def _splat(q: FloatArray, colours: FloatArray, size_m: FloatArray, inside: int) -> Image:
-    """Draw squares (N) at (N, 3) right, down and ahead, far ones first, so that the last `inside` are in the picture."""
+    """Draw squares (N) at (N, 3) right, down and ahead, far ones first; the last `inside` are in the picture."""
     image = np.full((_HEIGHT, _WIDTH, 3), _BACKGROUND, dtype=np.uint8)
     low, high = np.quantile(q, (0.02, 0.98), axis=0)
     q = q - (low + high) / 2
