@@ -285,7 +285,7 @@ def test_check_refine_and_export_take_the_calibration_of_the_run(ran: Path, monk
             image[20] = 255
             return [vio.records.StereoFrame(start, 0, image, image)]
 
-    monkeypatch.setattr("vio.offline.saved_run.open_dataset", lambda source, options: Images())
+    monkeypatch.setattr("vio.offline.run_images.open_dataset", lambda source, options: Images())
     (frame,) = run.images.frames(run.tracked.frames[np.array([3])])
     assert frame.left is not None
     assert frame.right is not None
