@@ -329,6 +329,22 @@ def test_every_encoding_becomes_gray(name: str) -> None:
     np.testing.assert_array_equal(raw_gray(fields, "test"), expected)
 
 
+def test_colours_are_kept_where_they_are_asked_for() -> None:
+    for name, expected in (
+        ("bgr8", COLOUR[..., ::-1]),
+        ("rgb8", COLOUR),
+        ("bgra8", COLOUR[..., ::-1]),
+        ("mono8", GRAY),
+    ):
+        np.testing.assert_array_equal(raw_gray(ENCODINGS[name][0], "test", colour=True), expected)
+    red = np.zeros((16, 16), np.uint8)
+    red[::2, ::2] = 200
+    shown = raw_gray(Fields(red, "bayer_rggb8"), "test", colour=True)[4:-4, 4:-4]
+    np.testing.assert_allclose(shown.reshape(-1, 3).mean(axis=0), [200, 0, 0], atol=2)
+    yuv = raw_gray(ENCODINGS["yuv422"][0], "test", colour=True)
+    assert yuv.shape == (8, 12, 3)
+
+
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_bayer_patterns_are_told_apart(pattern: str) -> None:
     """A uniformly red scene, mosaicked by hand: its gray is that of red under the right pattern only."""

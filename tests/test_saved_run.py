@@ -12,7 +12,7 @@ import pytest
 from tests.dataset_makers import calib_text, ece276a_arrays, make_drive, make_kitti, make_npz
 from vio.cli import main
 from vio.errors import DataError
-from vio.offline.saved_run import SavedRun, read_saved_run, stereo_frames, with_poses
+from vio.offline.saved_run import SavedRun, read_saved_run, with_poses
 
 FRAMES = 6
 
@@ -65,13 +65,13 @@ def test_rejects_missing_refined_poses_and_those_of_other_frames(run: SavedRun, 
 
 def test_rejects_recordings_without_the_images_of_the_run(run: SavedRun, tmp_path: Path) -> None:
     rows = np.array([0, 2])
-    with pytest.raises(DataError, match="contains no images; name the recording with --source or use --no-images"):
-        list(stereo_frames(run, None, rows))
+    with pytest.raises(DataError, match="contains no images; name the recording with --source"):
+        list(run.images.frames(run.tracked.frames[rows]))
     with pytest.raises(DataError, match=r"are not available: .*does not exist.*; name the recording with --source"):
-        list(stereo_frames(run, str(tmp_path / "gone"), rows))
+        list(run.images.frames(run.tracked.frames[rows], str(tmp_path / "gone")))
     kitti = make_kitti(tmp_path / "kitti", frames=FRAMES)
     with pytest.raises(DataError, match="has another calibration than the run"):
-        list(stereo_frames(run, str(kitti), rows))
+        list(run.images.frames(run.tracked.frames[rows], str(kitti)))
 
 
 def test_yields_images_in_order_and_reports_an_unreadable_one(run: SavedRun, tmp_path: Path) -> None:
@@ -79,11 +79,11 @@ def test_yields_images_in_order_and_reports_an_unreadable_one(run: SavedRun, tmp
     (kitti / "calib.txt").write_text(calib_text(0.0, 0.54))
     camera = replace(run.tracked.camera, fu=700.0, fv=700.0, cu=600.0, cv=180.0, baseline_m=0.54)
     run = replace(run, tracked=replace(run.tracked, camera=camera))
-    frames = list(stereo_frames(run, str(kitti), np.array([1, 4])))
+    frames = list(run.images.frames(run.tracked.frames[np.array([1, 4])], str(kitti)))
     assert [frame.index for frame in frames] == [1, 4]
     broken = kitti / "image_1" / "000004.png"
     broken.write_bytes(broken.read_bytes()[:40])
     with pytest.raises(
         DataError, match=r"none of 1 frames can be used; the first: .*000004\.png: the PNG is truncated"
     ):
-        list(stereo_frames(run, str(kitti), np.array([1, 4])))
+        list(run.images.frames(run.tracked.frames[np.array([1, 4])], str(kitti)))

@@ -38,7 +38,7 @@ from vio.geometry.distortion import StereoRig, project_point
 from vio.geometry.lie import FloatArray, se3_inverse, so3_log
 from vio.geometry.rectify import rectified_cameras, rectify_pixels
 from vio.geometry.stereo import StereoCamera
-from vio.offline.saved_run import read_saved_run, stereo_frames
+from vio.offline.saved_run import read_saved_run
 from vio.records import Estimate, Observations, Recording, StereoFieldEstimate, StereoScaleEstimate
 from vio.runs.picture import has_calibration_panel
 
@@ -285,8 +285,8 @@ def test_check_refine_and_export_take_the_calibration_of_the_run(ran: Path, monk
             image[20] = 255
             return [vio.records.StereoFrame(start, 0, image, image)]
 
-    monkeypatch.setattr("vio.offline.saved_run.open_dataset", lambda source, options: Images())
-    (frame,) = stereo_frames(run, None, np.array([3]))
+    monkeypatch.setattr("vio.offline.run_images.open_dataset", lambda source, options: Images())
+    (frame,) = run.images.frames(run.tracked.frames[np.array([3])])
     assert frame.left is not None
     assert frame.right is not None
     assert abs(int(np.argmax(frame.right[:, 20])) - int(np.argmax(frame.left[:, 20]))) >= 1

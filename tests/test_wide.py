@@ -30,7 +30,7 @@ from vio.frontend.outliers import RansacProblem, bearing_consensus, epipolar_dis
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, so3_exp, transform_points
 from vio.geometry.rectify import PINHOLE_REACH
 from vio.geometry.stereo import StereoCamera, depth_of, left_rays, project
-from vio.offline.saved_run import read_saved_run, stereo_frames
+from vio.offline.saved_run import read_saved_run
 from vio.offline.source import open_source
 from vio.records import Observations, StereoFrame, observations
 from vio.sim.rigs import wide_rig
@@ -142,7 +142,7 @@ def test_a_saved_run_shows_other_programs_a_pinhole(flight: Path, wide_run: Path
     at = [seen.ids.tolist().index(name) for name in ids.tolist()]
     rays = left_rays(run.dataset.recording.camera, seen.z[at, :2])
     np.testing.assert_allclose(z[:, :2], project(camera, 5.0 * rays)[:, :2], atol=1e-9)
-    (ours,) = stereo_frames(run, None, np.array([frame]))
+    (ours,) = run.images.frames(run.tracked.frames[np.array([frame])])
     other = open_dataset(str(flight), DatasetSettings(projection="pinhole"))
     (theirs,) = [e for e in other.events(frame, frame + 1) if isinstance(e, StereoFrame)]
     assert ours.right is not None

@@ -123,7 +123,7 @@ def fixed_point(maps: tuple[MapArray, MapArray]) -> LookUp:
 
 
 def remap(image: Image, maps: LookUp, interpolation: Interpolation) -> Image:
-    """Return an image (H, W) looked up at the source pixels of a map."""
+    """Return an image (H, W) or (H, W, 3) looked up at the source pixels of a map."""
     import cv2
 
     codes = {"linear": cv2.INTER_LINEAR, "cubic": cv2.INTER_CUBIC, "lanczos4": cv2.INTER_LANCZOS4}

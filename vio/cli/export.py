@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -97,5 +98,7 @@ def _colmap(args: argparse.Namespace) -> int:
         ("keyframes", f"{done.keyframes} stereo pairs, {done.images} images written"),
         ("points", f"{done.points}, {done.loop_points} of them across {done.loops} loops"),
         ("residual", f"{done.mean_reprojection_error_px:.3f} px mean reprojection error, as COLMAP computes it"),
+        ("next", f"ns-train splatfacto --data {shlex.quote(str(out))}"),
+        ("", f"gsplat: python examples/simple_trainer.py default --data_dir {shlex.quote(str(out))} --data_factor 1"),
     )
     return print_result(facts, rows, as_json=args.json)

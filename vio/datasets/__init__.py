@@ -6,6 +6,7 @@ import difflib
 import os
 import zipfile
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 from vio.datasets.settings import DatasetSettings
@@ -13,7 +14,7 @@ from vio.errors import DataError
 from vio.files.inputs import check_regular
 from vio.protocols import Dataset
 
-__all__ = ["READERS", "DatasetSettings", "open_dataset"]
+__all__ = ["READERS", "DatasetSettings", "in_colour", "open_dataset"]
 
 
 def _kitti(path: Path, settings: DatasetSettings) -> Dataset:
@@ -135,6 +136,16 @@ def open_dataset(source: str | os.PathLike[str], options: DatasetSettings | None
     from vio.datasets.left_camera import left_camera
 
     return left_camera(dataset)
+
+
+def in_colour(dataset: Dataset) -> Dataset:
+    """Return a recording whose frames keep the colours of its images, (H, W, 3) red, green, blue; gray ones stay gray.
+
+    No front end takes such frames: they are for those who show images or write them.
+    """
+    if is_dataclass(dataset) and any(f.name == "colour" for f in fields(dataset)):
+        return replace(dataset, colour=True)
+    return dataset
 
 
 def _for_settings(kind: str, path: Path, settings: DatasetSettings) -> str:

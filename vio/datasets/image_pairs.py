@@ -136,8 +136,8 @@ class ImageSize:
     stated_by: Path  # a calibration, or the image that was measured
 
     def check(self, image: Image, path: Path) -> None:
-        """Raise UnreadableImageError unless an image (H, W) has this size."""
-        if image.shape != (self.height, self.width):
+        """Raise UnreadableImageError unless an image (H, W) or (H, W, 3) has this size."""
+        if image.shape[:2] != (self.height, self.width):
             raise UnreadableImageError(
                 f"{path} is {image.shape[1]} x {image.shape[0]} pixels but {self.stated_by} specifies {self.width} x "
                 f"{self.height}; give images of one size, and the calibration of these images"
@@ -154,6 +154,7 @@ class ImageDataset:
     sizes: tuple[ImageSize, ...]  # of the left and the right files; one of one camera
     settings: DatasetSettings
     white: int = field(default=WHITE_16, kw_only=True)  # level of white of 16-bit files, from `full_scale`
+    colour: bool = field(default=False, kw_only=True)  # see `in_colour`
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
@@ -180,7 +181,7 @@ class ImageDataset:
         try:
             images = []
             for size, path in zip(self.sizes[: self.settings.cameras], self.pairs[index], strict=False):
-                images.append(load_gray(path, self.white)[0])
+                images.append(load_gray(path, self.white, colour=self.colour)[0])
                 size.check(images[-1], path)
             return self.frame(index, *images)
         except UnreadableImageError as error:

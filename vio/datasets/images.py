@@ -1,4 +1,4 @@
-"""Read gray image files with strict checks and prefetching, and write them.
+"""Read image files with strict checks and prefetching, as gray ones where nothing else is asked for, and write them.
 
 OpenCV fills the missing part of a truncated file with gray and reports no error, so a file's end is checked before it
 is decoded.
@@ -52,32 +52,33 @@ class UnreadableImageError(DataError):
     """An image file is missing, truncated, corrupt or of another size; a reader may skip its frame."""
 
 
-def load_gray(path: Path, white: int = WHITE_16) -> tuple[Image, int]:
+def load_gray(path: Path, white: int = WHITE_16, *, colour: bool = False) -> tuple[Image, int]:
     """Read a PNG or JPEG as 8-bit gray (H, W); return it with the file's own bits per channel (8 or 16).
 
-    Colour is converted to gray with OpenCV's weights (.299 R + .587 G + .114 B).
+    Colour is converted to gray with OpenCV's weights (.299 R + .587 G + .114 B), or kept as (H, W, 3) with `colour`.
 
     Args:
         path: the file.
         white: the level of a file of 16 bits that becomes 255; brighter pixels do, too. See `white_level`.
+        colour: keep red, green and blue, where the file has them.
 
     Raises:
         UnreadableImageError: the file cannot be read, is truncated or too large, or does not decode.
     """
-    return _as_gray(_load(path), white)
+    return _as_8_bits(_load(path, colour=colour), white)
 
 
-def decode_gray(data: bytes, path: Path | str, white: int = WHITE_16) -> tuple[Image, int]:
+def decode_gray(data: bytes, path: Path | str, white: int = WHITE_16, *, colour: bool = False) -> tuple[Image, int]:
     """Decode an image file in memory as `load_gray` does; `path` names it in messages."""
-    return _as_gray(_decoded(data, path), white)
+    return _as_8_bits(_decoded(data, path, colour=colour), white)
 
 
-def _as_gray(pixels: npt.NDArray[Any], white: int) -> tuple[Image, int]:
+def _as_8_bits(pixels: npt.NDArray[Any], white: int) -> tuple[Image, int]:
     bits = pixels.dtype.itemsize * 8
     if bits == 16:
         pixels = np.minimum(np.rint(pixels / (white / 255)), 255)
-    gray: Image = np.ascontiguousarray(pixels, dtype=np.uint8)
-    return gray, bits
+    image: Image = np.ascontiguousarray(pixels, dtype=np.uint8)
+    return image, bits
 
 
 def white_level(paths: Sequence[Path]) -> int:
@@ -101,17 +102,17 @@ def white_level(paths: Sequence[Path]) -> int:
     return next(fitting, WHITE_16) if level > 0 else WHITE_16
 
 
-def _load(path: Path) -> npt.NDArray[Any]:
-    """Read a file as gray (H, W) of its own depth."""
+def _load(path: Path, *, colour: bool = False) -> npt.NDArray[Any]:
+    """Read a file as gray (H, W) of its own depth, or in colour (H, W, 3) where it has any and it is asked for."""
     try:
         data = read_input(path, _MOST_BYTES)
     except OSError as error:
         raise UnreadableImageError(f"cannot read {path}: {error.strerror or error}") from error
-    return _decoded(data, path)
+    return _decoded(data, path, colour=colour)
 
 
-def _decoded(data: bytes, path: Path | str) -> npt.NDArray[Any]:
-    """Decode a file in memory as gray (H, W) of its own depth."""
+def _decoded(data: bytes, path: Path | str, *, colour: bool) -> npt.NDArray[Any]:
+    """Decode a file in memory as `_load` does."""
     if problem := _damage(data):
         raise UnreadableImageError(f"{path}: {problem}; copy the image again")
     if data.startswith(_PNG_START) and (gray := decode_gray8(data)) is not None:
@@ -125,7 +126,8 @@ def _decoded(data: bytes, path: Path | str) -> npt.NDArray[Any]:
     if pixels is None or pixels.dtype not in (np.uint8, np.uint16):
         raise UnreadableImageError(f"{path}: does not decode as an image of 8 or 16 bits; copy the image again")
     if pixels.ndim == 3:
-        code = {1: None, 3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}[pixels.shape[2]]
+        codes = (cv2.COLOR_BGR2RGB, cv2.COLOR_BGRA2RGB) if colour else (cv2.COLOR_BGR2GRAY, cv2.COLOR_BGRA2GRAY)
+        code = {1: None, 3: codes[0], 4: codes[1]}[pixels.shape[2]]
         pixels = pixels[..., 0] if code is None else cv2.cvtColor(pixels, code)
     return np.asarray(pixels)
 
@@ -145,10 +147,11 @@ def load_depth(path: Path) -> FloatArray:
 
 
 def write_png(path: Path, image: Image) -> None:
-    """Write a gray image (H, W) as PNG, with fast compression."""
+    """Write a gray image (H, W), or one in colour (H, W, 3), as PNG, with fast compression."""
     import cv2
 
-    _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
+    shown = image if image.ndim == 2 else image[:, :, ::-1]
+    _, data = cv2.imencode(".png", shown, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
     path.write_bytes(data.tobytes())
 
 

@@ -66,7 +66,7 @@ class RectifiedDataset(ImageDataset):
 def _depth_m(file: Path, image: Image, factor: float) -> FloatArray:
     """Read the depths (H, W) of an image (H, W), metres."""
     levels = load_depth(file)
-    if levels.shape != image.shape:
+    if levels.shape != image.shape[:2]:
         raise UnreadableImageError(
             f"{file} is {levels.shape[1]} x {levels.shape[0]} pixels, but its image is {image.shape[1]} x "
             f"{image.shape[0]}; depth images must be registered to the images"

@@ -205,7 +205,7 @@ def read_velocity_table(path: Path) -> MotionSamples[VelocitySample]:
 
 def _finite(table: TextTable) -> FloatArray:
     """Return all columns but the first as finite numbers (N, K)."""
-    values = np.array([[_number(x) for x in row[1:]] for row in table.rows])
+    values = numbers_of(table)
     bad = ~np.isfinite(values).all(axis=1)
     if bad.any():
         k = int(np.argmax(bad))
@@ -214,6 +214,11 @@ def _finite(table: TextTable) -> FloatArray:
             "lines in all); remove such lines"
         )
     return values
+
+
+def numbers_of(table: TextTable) -> FloatArray:
+    """Return all columns but the first (N, K); NaN: no number."""
+    return np.array([[_number(x) for x in row[1:]] for row in table.rows])
 
 
 def _number(text: str) -> float:

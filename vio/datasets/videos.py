@@ -121,6 +121,7 @@ class VideoDataset:
     settings: DatasetSettings
     rectifier: Rectifier
     imu_noise: ImuDensities | None = None
+    colour: bool = False  # see `in_colour`
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
@@ -148,7 +149,7 @@ class VideoDataset:
             for capture in captures:
                 for _ in range(after[index], index):
                     capture.grab()
-            images = [self._gray(capture, side, index) for side, capture in enumerate(captures)]
+            images = [self._image(capture, side, index) for side, capture in enumerate(captures)]
             return self.rectifier.frame(index, int(self.recording.frame_times_ns[index]), *images)
 
         try:
@@ -158,7 +159,7 @@ class VideoDataset:
             for capture in captures:
                 capture.release()
 
-    def _gray(self, capture: Any, side: int, index: int) -> Image:
+    def _image(self, capture: Any, side: int, index: int) -> Image:
         import cv2
 
         found, pixels = capture.read()
@@ -167,6 +168,7 @@ class VideoDataset:
                 f"{self.files[side]}: frame {index} of {len(self.recording.frame_times_ns)} cannot be decoded; "
                 f"the file is truncated, or states too many frames: use --stop {index}"
             )
-        gray: Image = np.asarray(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
-        self.sizes[side].check(gray, self.files[side])
-        return gray
+        code = cv2.COLOR_BGR2RGB if self.colour else cv2.COLOR_BGR2GRAY
+        image: Image = np.asarray(pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, code))
+        self.sizes[side].check(image, self.files[side])
+        return image

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vio.files.meshes import ply_points
 from vio.geometry.lie import FloatArray
 from vio.offline.colmap.model import (
     ColourArray,
@@ -17,7 +18,7 @@ from vio.offline.colmap.model import (
     mean_reprojection_error_px,
     write_model,
 )
-from vio.offline.colmap.nerfstudio import coloured_ply, nerfstudio_transforms
+from vio.offline.colmap.nerfstudio import nerfstudio_transforms
 from vio.offline.images import write_images
 from vio.offline.keyframes import choose_keyframes
 from vio.offline.loop_tracks import loop_pairs
@@ -73,7 +74,7 @@ def export_colmap(
     write_model(model, folder / "sparse" / "0")
     transforms = nerfstudio_transforms(camera, T_world_cam0, names.below("images"))
     (folder / "transforms.json").write_text(transforms, encoding="utf-8")
-    (folder / "points.ply").write_bytes(coloured_ply(tracks, colours))
+    (folder / "points.ply").write_bytes(ply_points(tracks.p_world, colours))
     return Exported(
         keyframes=len(keyframes),
         images=2 * len(keyframes) if images else 0,
@@ -94,22 +95,20 @@ def _write_images(
     progress: Callable[[int, int], None],
 ) -> ColourArray:
     """Write the images of the keyframes; return the colours (M, 3) of the points, as the left camera sees them."""
-    total, count = np.zeros(len(tracks.ids)), np.zeros(len(tracks.ids))
+    total, count = np.zeros((len(tracks.ids), 3)), np.zeros((len(tracks.ids), 1))
 
     def sample_colours(keyframe: int, left: Image) -> None:
         rows = tracks.keyframe == keyframe
-        np.add.at(total, tracks.point[rows], _sample_gray(left, tracks.z[rows, :2]))
+        np.add.at(total, tracks.point[rows], _colours_at(left, tracks.z[rows, :2]))
         np.add.at(count, tracks.point[rows], 1)
         progress(keyframe + 1, len(keyframes))
 
     write_images(run, source, keyframes, names, folder, sample_colours)
-    gray = np.rint(total / np.maximum(count, 1)).astype(np.uint8)
-    return np.repeat(gray[:, None], 3, axis=1)
+    return np.rint(total / np.maximum(count, 1)).astype(np.uint8)
 
 
-def _sample_gray(image: Image, uv: FloatArray) -> FloatArray:
-    """Return the gray values (N,) of the pixels nearest to (N, 2)."""
+def _colours_at(image: Image, uv: FloatArray) -> FloatArray:
+    """Return red, green and blue (N, 3) of the pixels of an image (H, W) or (H, W, 3) nearest to (N, 2)."""
     u = np.clip(np.rint(uv[:, 0]).astype(int), 0, image.shape[1] - 1)
     v = np.clip(np.rint(uv[:, 1]).astype(int), 0, image.shape[0] - 1)
-    out: FloatArray = image[v, u].astype(np.float64)
-    return out
+    return np.broadcast_to(image[v, u].astype(np.float64).reshape(len(uv), -1), (len(uv), 3))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from vio.datasets.images import write_png
 from vio.offline.colmap.model import ModelImages
-from vio.offline.saved_run import SavedRun, stereo_frames
+from vio.offline.saved_run import SavedRun
 from vio.records import Image, IntArray
 
 
@@ -19,7 +19,7 @@ def write_images(
     folder: Path,
     each: Callable[[int, Image], None] = lambda keyframe, left: None,
 ) -> None:
-    """Write the rectified images of the keyframes.
+    """Write the rectified images of the keyframes, in colour where the recording has any.
 
     Args:
         run: the run.
@@ -34,7 +34,7 @@ def write_images(
     """
     for name in (names.left[0], names.right[0]):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-    for k, frame in enumerate(stereo_frames(run, source, keyframes)):
+    for k, frame in enumerate(run.images.frames(run.tracked.frames[keyframes], source, colour=True)):
         assert frame.left is not None
         assert frame.right is not None
         for name, image in ((names.left[k], frame.left), (names.right[k], frame.right)):

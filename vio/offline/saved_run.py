@@ -1,8 +1,7 @@
-"""Reader of a run's folder, with its observations and the images of its recording."""
+"""Reader of a run's folder with its observations, and of its images."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,9 +10,6 @@ import numpy as np
 
 from vio.calibration.stereo_field import DisplacementField
 from vio.cameras.rectification_error import METRIC_TERMS, TERMS
-from vio.cameras.rig import Rectifier
-from vio.datasets import DatasetSettings, open_dataset
-from vio.datasets.common import read_npz
 from vio.datasets.features import FeatureDataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError
@@ -21,13 +17,13 @@ from vio.files.trajectories import read_trajectory
 from vio.filters.multiview import Views
 from vio.filters.stereo_calibration import StereoCorrection
 from vio.filters.tracks import measured
-from vio.geometry.distortion import rig_from_rectified
 from vio.geometry.lie import FloatArray
-from vio.geometry.rectify import pinhole_maps, pinhole_pixels, pinhole_within
+from vio.geometry.rectify import pinhole_pixels, pinhole_within
 from vio.geometry.stereo import StereoCamera
 from vio.offline.comparison import GroundTruth
 from vio.offline.keyframes import TrackedPath
-from vio.records import FIELD_TERMS, ROW_TERMS, FeatureTracks, IntArray, LoopEvent, StereoFrame, need_stereo
+from vio.offline.run_images import RunImages, field_coefficients, original_source
+from vio.records import FIELD_TERMS, FeatureTracks, LoopEvent, need_stereo
 from vio.runs.files import RunFile
 from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_loops
@@ -43,6 +39,13 @@ class SavedRun:
     T_cam0_imu: FloatArray  # (4, 4)
     metrics: dict[str, Any]
     field: DisplacementField | None = None  # what the run found its stereo calibration to be off by; None: nothing
+
+    @property
+    def images(self) -> RunImages:
+        """The recording's images as the tracks see them."""
+        return RunImages(
+            self.tracked.where, self.source, self.dataset.recording.camera, self.tracked.camera, self.field
+        )
 
     @property
     def truth(self) -> GroundTruth | None:
@@ -77,7 +80,7 @@ def read_saved_run(folder: Path) -> SavedRun:
             f"{folder}: {poses} and {RunFile.OBSERVATIONS} are not of the same complete run; repeat the run"
         )
     camera, tracks = dataset.recording.camera, dataset.tracks
-    coefficients, field = _field_coefficients(folder, camera, metrics), None
+    coefficients, field = field_coefficients(folder, camera, metrics), None
     if camera.is_cylinder:
         camera, tracks = _in_pinhole(camera, tracks, coefficients)
     elif coefficients is not None:
@@ -85,7 +88,7 @@ def read_saved_run(folder: Path) -> SavedRun:
         tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
         loops = tuple(_without(field, o) for o in loops)
     tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks, loops)
-    return SavedRun(tracked, _original_source(log), dataset, T_cam0_imu, metrics, field)
+    return SavedRun(tracked, original_source(log), dataset, T_cam0_imu, metrics, field)
 
 
 def _without(field: DisplacementField, loop: LoopEvent) -> LoopEvent:
@@ -119,38 +122,6 @@ def _in_pinhole(
     return pinhole, FeatureTracks(offsets, tracks.ids[kept], z, has_right[kept], tracks.stale[kept])
 
 
-def _field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> FloatArray | None:
-    """Return the coefficients (15,) of (R3) and (R2) in a run's metrics; None: the run estimated none.
-
-    Raises:
-        DataError: the metrics are damaged.
-    """
-    stated = metrics.get("stereo_field")
-    if stated is None or stated.get("rows_px") is None:
-        return None
-    try:
-        coefficients = np.array([*stated["coefficients_px"], *stated["rows_px"]], dtype=np.float64) / camera.fu
-    except (KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
-    if coefficients.shape != (FIELD_TERMS + ROW_TERMS,) or not np.isfinite(coefficients).all():
-        raise DataError(
-            f"{folder}: stereo_field of its metrics holds no {FIELD_TERMS + ROW_TERMS} finite numbers; repeat the run"
-        )
-    return coefficients
-
-
-def _original_source(log: Path) -> str:
-    """Return the recording of the images, through any number of replayed logs."""
-    source = str(read_npz(log, ["source"])["source"])
-    kind, _, path = source.partition(":")
-    seen = {log.resolve()}
-    while kind == "log" and Path(path).is_file() and Path(path).resolve() not in seen:
-        seen.add(Path(path).resolve())
-        source = str(read_npz(Path(path), ["source"])["source"])
-        kind, _, path = source.partition(":")
-    return source
-
-
 def with_poses(run: SavedRun, folder: Path) -> SavedRun:
     """Return the run with the poses of another folder, such as that of `vio refine`.
 
@@ -163,59 +134,3 @@ def with_poses(run: SavedRun, folder: Path) -> SavedRun:
     if trajectory.frame_indices is None or not np.array_equal(trajectory.frame_indices, run.tracked.frames):
         raise DataError(f"{folder} contains other frames than {run.tracked.where}; refine again")
     return replace(run, tracked=replace(run.tracked, trajectory=trajectory))
-
-
-def stereo_frames(run: SavedRun, source: str | None, rows: IntArray) -> Iterator[StereoFrame]:
-    """Yield the rectified image pairs of rows (K,) of the trajectory, in order, as the run corrected their calibration.
-
-    Args:
-        run: the run.
-        source: the recording, if it is not at the path stored in the run.
-        rows: increasing.
-
-    Raises:
-        DataError: the recording is missing, has no images or another camera, or a frame cannot be read.
-    """
-    seen = run.dataset.recording.camera  # by the front end
-    try:
-        dataset = open_dataset(source or run.source, DatasetSettings(projection=seen.projection))
-    except DataError as error:
-        raise DataError(
-            f"the images of {run.tracked.where} are not available: {error}; name the recording with --source"
-        ) from error
-    recording = dataset.recording
-    if not recording.has_images:
-        raise DataError(
-            f"{source or run.source} contains no images; name the recording with --source or use --no-images"
-        )
-    ours, theirs = seen if seen.is_cylinder else run.tracked.camera, recording.camera
-    if not np.allclose(
-        [ours.fu, ours.fv, ours.cu, ours.cv, ours.baseline_m],
-        [theirs.fu, theirs.fv, theirs.cu, theirs.cv, theirs.baseline_m],
-        rtol=1e-9,
-    ):
-        raise DataError(f"{recording.path} has another calibration than the run {run.tracked.where}; repeat the run")
-    correct = _image_correction(run, theirs)
-    for row in rows.tolist():
-        index = int(run.tracked.frames[row])
-        found = [e for e in dataset.events(index, index + 1) if isinstance(e, StereoFrame)]
-        if not found or found[0].left is None or found[0].right is None:
-            raise DataError(f"{recording.path}: frame {index} cannot be read; see the warnings above")
-        if correct is None:
-            yield found[0]
-        else:
-            left, right = correct(found[0].left, found[0].right)
-            yield replace(found[0], left=left, right=right)
-
-
-def _image_correction(run: SavedRun, shown: StereoCamera) -> Rectifier | None:
-    """Return the map of image pairs, of the camera that is `shown`, to those of the tracks; None: they are the same."""
-    # Features may state no size.
-    seen, camera = run.dataset.recording.camera, replace(run.tracked.camera, width=shown.width, height=shown.height)
-    if seen.is_cylinder:
-        maps = (pinhole_maps(seen, camera),) * 2
-    elif run.field is not None:
-        maps = replace(run.field, camera=camera).maps()
-    else:
-        return None
-    return Rectifier(rig_from_rectified(camera, np.eye(4)), camera, np.eye(4), maps, "linear")

@@ -14,7 +14,7 @@ from vio.files.printable import printable
 from vio.report.figures import COLOURS, ReportSection, sections
 from vio.report.words import calibration_findings, run_figures, summary
 from vio.runs.curves import curves_of
-from vio.runs.files import RunFile
+from vio.runs.files import MeshFile, RunFile
 from vio.runs.finished import FinishedRun
 
 _STYLE = """
@@ -72,17 +72,25 @@ def _words(runs: Sequence[FinishedRun]) -> str:
 
 
 def _images(runs: Sequence[FinishedRun]) -> str:
-    """Show the annotated image that each run kept."""
-    shown = []
-    for run in runs:
-        if (file := run.folder / RunFile.FEATURES).is_file():
-            data = b64encode(read_input(file)).decode("ascii")
-            head = f"<p>{_text(run.name)}</p>" if len(runs) > 1 else ""
-            shown.append(f'{head}<img alt="features" src="data:image/jpeg;base64,{data}">')
+    """Show the annotated image that each run kept, and the picture of its mesh."""
+    features = _pictures(runs, Path(RunFile.FEATURES), "jpeg")
+    meshes = _pictures(runs, Path(MeshFile.FOLDER, MeshFile.PICTURE), "png")
     remark = (
         '<p class="remark">The left image half-way through the run. Gray circles have no match in the right image.</p>'
     )
-    return f"<section><h2>Features and disparities</h2>{remark}{''.join(shown)}</section>" if shown else ""
+    out = f"<section><h2>Features and disparities</h2>{remark}{features}</section>" if features else ""
+    return out + (f"<section><h2>Mesh</h2>{meshes}</section>" if meshes else "")
+
+
+def _pictures(runs: Sequence[FinishedRun], name: Path, kind: str) -> str:
+    """Return an image file of each run's folder that has it."""
+    shown = []
+    for run in runs:
+        if (file := run.folder / name).is_file():
+            data = b64encode(read_input(file)).decode("ascii")
+            head = f"<p>{_text(run.name)}</p>" if len(runs) > 1 else ""
+            shown.append(f'{head}<img alt="{_text(name.stem)}" src="data:image/{kind};base64,{data}">')
+    return "".join(shown)
 
 
 def _calibration(runs: Sequence[FinishedRun]) -> str:

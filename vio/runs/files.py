@@ -27,6 +27,18 @@ class RunFile:
     UNFINISHED = "unfinished"  # folder, while the run goes on or can go on
 
 
+class MeshFile:
+    """What `vio mesh` writes: a folder in the run's folder, and its files."""
+
+    FOLDER = "mesh"
+    FACTS = "mesh.json"
+    MESH = "mesh.ply"
+    POINTS = "points.ply"
+    GLTF = "mesh.glb"  # y is up
+    PICTURE = "preview.png"
+    OCCUPANCY = "occupancy"  # .pgm and .yaml
+
+
 FILES = tuple(value for name, value in vars(RunFile).items() if name.isupper())
 CHECKPOINT = "checkpoint"  # in UNFINISHED, as are the tables
 REQUEST = "run.json"  # likewise: what the run was asked to do

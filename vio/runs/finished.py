@@ -75,7 +75,7 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
         raise DataError(f"{folder}: this run was ended before its end; `vio run --resume {folder}` goes on with it")
     estimates = _read_estimates(folder / RunFile.ESTIMATES)
     frames = _read_frames(folder / RunFile.FRAMES, len(estimates))
-    points = _read_points(folder / RunFile.LANDMARKS)
+    points = read_points(folder / RunFile.LANDMARKS)
     trajectory = Trajectory(
         np.array(estimates["T_world_imu"]),
         np.array(estimates["time_ns"]),
@@ -147,7 +147,7 @@ def _read_frames(path: Path, count: int) -> dict[str, FloatArray]:
         raise DataError(f"{path}: {error}; repeat the run") from error
 
 
-def _read_points(path: Path) -> np.ndarray[Any, Any]:
+def read_points(path: Path) -> np.ndarray[Any, Any]:
     """Read the points (M,) of `write_landmarks_ply`; a missing file has none."""
     if not path.is_file():
         return np.zeros(0, dtype=_PLY_POINT)

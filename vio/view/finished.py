@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,9 +13,11 @@ import numpy as np
 from vio.datasets import DatasetSettings, open_dataset
 from vio.datasets.observation_log import read_observation_log
 from vio.errors import DataError, VioError
+from vio.files.inputs import read_input
+from vio.files.meshes import R_GLTF_UPRIGHT
 from vio.geometry.stereo import Projection, StereoCamera
 from vio.records import Image, Landmarks, LoopEvent, StereoFrame, UpdateReport
-from vio.runs.files import RunFile
+from vio.runs.files import MeshFile, RunFile
 from vio.runs.finished import FinishedRun
 from vio.runs.tables import estimate_of
 from vio.view.live import SERIES, RerunViewer, ViewedRig, states_of
@@ -57,7 +61,22 @@ def show_finished_run(stream: rr.RecordingStream, run: FinishedRun) -> None:
         viewer.places(index, estimate, is_keyframe=index in keyframes, loops=loops.get(index, ()))
     ids = np.arange(len(run.points))
     viewer.landmarks(Landmarks(ids, run.points, np.zeros((len(ids), 3, 3))))
+    _show_mesh(stream, run.folder / MeshFile.FOLDER)
     viewer.close()
+
+
+def _show_mesh(stream: rr.RecordingStream, folder: Path) -> None:
+    """Show the mesh of `vio mesh`, where there is one; its file has y up, the run's world need not."""
+    import rerun as rr
+
+    if not (folder / MeshFile.GLTF).is_file() or not (folder / MeshFile.FACTS).is_file():
+        return
+    try:
+        R = np.array(json.loads(read_input(folder / MeshFile.FACTS))["R_upright_world"], dtype=np.float64)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{folder / MeshFile.FACTS}: is damaged ({error}); repeat vio mesh") from error
+    stream.log("world/run/mesh", rr.Transform3D(mat3x3=(R_GLTF_UPRIGHT @ R).T), static=True)
+    stream.log("world/run/mesh", rr.Asset3D(path=folder / MeshFile.GLTF), static=True)
 
 
 def _rig_of(run: FinishedRun) -> ViewedRig:

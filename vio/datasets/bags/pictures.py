@@ -1,4 +1,4 @@
-"""Decode ROS image messages to 8-bit gray."""
+"""Decode ROS image messages to 8-bit gray, or colour."""
 
 from __future__ import annotations
 
@@ -17,32 +17,34 @@ _YUV = {"yuv422": "UYVY", "uyvy": "UYVY", "yuv422_yuy2": "YUY2", "yuyv": "YUY2"}
 _SENSOR_BITS = (10, 12, 14)  # of cameras whose pixels are stored in the low bits of 16
 
 
-def gray_of(fields: Any, where: str, *, compressed: bool, white: int = WHITE_16) -> Image:
-    """Return a sensor_msgs/Image or CompressedImage as gray (H, W).
+def gray_of(fields: Any, where: str, *, compressed: bool, white: int = WHITE_16, colour: bool = False) -> Image:
+    """Return a sensor_msgs/Image or CompressedImage as gray (H, W), or in colour (H, W, 3) where it is asked for.
 
     Args:
         fields: the decoded message.
         where: topic and frame, for messages.
         compressed: whether it is a CompressedImage.
         white: the level of 16-bit pixels that becomes 255.
+        colour: keep red, green and blue, where the message has them.
 
     Raises:
         UnreadableImageError: the pixels are truncated or do not decode.
         DataError: the encoding is not read.
     """
-    pixels = compressed_pixels(fields, where) if compressed else raw_gray(fields, where)
+    read = compressed_pixels if compressed else raw_gray
+    pixels = read(fields, where, colour=colour)
     if pixels.dtype == np.uint16:
         pixels = np.minimum(np.rint(pixels / (white / 255)), 255).astype(np.uint8)
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
 
-def compressed_pixels(fields: Any, where: str) -> npt.NDArray[Any]:
-    """Decode a CompressedImage: gray (H, W), 8 bits; of 16-bit files by full scale."""
-    return decode_gray(bytes(fields.data), where)[0]
+def compressed_pixels(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[Any]:
+    """Decode a CompressedImage: gray (H, W) or colour (H, W, 3), 8 bits; of 16-bit files by full scale."""
+    return decode_gray(bytes(fields.data), where, colour=colour)[0]
 
 
-def raw_gray(fields: Any, where: str) -> npt.NDArray[Any]:
-    """Return the pixels of a sensor_msgs/Image as gray (H, W) of its own depth."""
+def raw_gray(fields: Any, where: str, *, colour: bool = False) -> npt.NDArray[Any]:
+    """Return the pixels of a sensor_msgs/Image as gray (H, W), or colour (H, W, 3), of its own depth."""
     import cv2
 
     encoding, height, width = str(fields.encoding), int(fields.height), int(fields.width)
@@ -59,14 +61,15 @@ def raw_gray(fields: Any, where: str) -> npt.NDArray[Any]:
         )
     rows = np.ascontiguousarray(data[: row * height].reshape(height, row)[:, :needed])
     pixels = rows.view(dtype).astype(np.dtype(depth), copy=False).reshape(height, width, channels)
+    to = "RGB" if colour else "GRAY"
     if bayer:
-        return np.asarray(cv2.cvtColor(pixels[..., 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding[6:10]]}2GRAY")))
+        return np.asarray(cv2.cvtColor(pixels[..., 0], getattr(cv2, f"COLOR_Bayer{_BAYER[encoding[6:10]]}2{to}")))
     if yuv is not None:
-        return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_YUV2GRAY_{yuv}")))
+        return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_YUV2{to}_{yuv}")))
     if channels == 1:
         return pixels[..., 0]
     name = encoding.rstrip("0123456789").upper() if not encoding[:1].isdigit() else {3: "BGR", 4: "BGRA"}[channels]
-    return np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{name}2GRAY")))
+    return pixels if name == to else np.asarray(cv2.cvtColor(pixels, getattr(cv2, f"COLOR_{name}2{to}")))
 
 
 def _form(encoding: str, where: str, *, bayer: bool, yuv: str | None) -> tuple[str, int]:

@@ -45,6 +45,7 @@ class BagDataset:
     white: int  # level of white of 16-bit images
     unstamped: tuple[bool, ...]  # of each topic: the headers have no stamps, the times of logging serve
     imu_noise: ImuDensities | None = None
+    colour: bool = False  # see `in_colour`
 
     def events(self, start: int = 0, stop: int | None = None, *, images: bool = True) -> Iterator[Event]:
         """Yield events of the frames `start <= index < stop` in time order.
@@ -97,7 +98,8 @@ class BagDataset:
         for topic, fields, size in islice(zip(self.topics, messages, self.sizes, strict=True), self.settings.cameras):
             where = f"{self.recording.path}, {topic.name}, frame {index}"
             try:
-                images.append(gray_of(fields, where, compressed=topic.kind == COMPRESSED, white=self.white))
+                compressed = topic.kind == COMPRESSED
+                images.append(gray_of(fields, where, compressed=compressed, white=self.white, colour=self.colour))
                 size.check(images[-1], Path(where))
             except UnreadableImageError as error:
                 return BadFrame(index, str(error))

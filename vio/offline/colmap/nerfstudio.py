@@ -9,8 +9,7 @@ import numpy as np
 from vio.geometry.lie import FloatArray
 from vio.geometry.stereo import StereoCamera
 from vio.offline.colmap import HALF_PX
-from vio.offline.colmap.model import ColourArray, ModelImages
-from vio.offline.points import PointTracks
+from vio.offline.colmap.model import ModelImages
 
 
 def nerfstudio_transforms(camera: StereoCamera, T_world_cam0: FloatArray, names: ModelImages) -> str:
@@ -39,17 +38,3 @@ def nerfstudio_transforms(camera: StereoCamera, T_world_cam0: FloatArray, names:
         "frames": frames,
     }
     return json.dumps(document, indent=1) + "\n"
-
-
-def coloured_ply(tracks: PointTracks, colours: ColourArray | None) -> bytes:
-    """Return the points as a binary PLY: x y z in metres, red green blue; black where there are no colours (M, 3)."""
-    fields = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1")]
-    points = np.zeros(len(tracks.ids), dtype=fields)
-    points["x"], points["y"], points["z"] = tracks.p_world.T
-    if colours is not None:
-        points["red"], points["green"], points["blue"] = colours.T
-    kinds = {"<f4": "float", "u1": "uchar"}
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n" + "".join(
-        f"property {kinds[kind]} {name}\n" for name, kind in fields
-    )
-    return f"{header}end_header\n".encode("ascii") + points.tobytes()

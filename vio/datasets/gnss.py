@@ -1,0 +1,72 @@
+"""Readers of GNSS positions: a table, KITTI's `oxts`, and NavSatFix messages of a bag."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from vio.datasets.bags import is_bag
+from vio.datasets.bags.gnss import read_navsatfix
+from vio.datasets.dates import drive_times
+from vio.datasets.tables import numbers_of, read_table, stamps_ns
+from vio.earth.gnss import GnssFixes, checked_fixes
+from vio.errors import DataError
+from vio.files.text import text_lines
+
+_FORM = "time_s,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m"
+_OXTS_COLUMNS = 30
+_OXTS_ACCURACY = 23  # column of pos_accuracy, m
+_OXTS_LEAST_M = 0.02
+
+
+def read_gnss(path: Path, topic: str | None = None) -> GnssFixes:
+    """Read positions from a table, a KITTI raw drive or its `oxts`, or a ROS bag.
+
+    Args:
+        path: the file or folder.
+        topic: of a bag with several of NavSatFix.
+
+    Raises:
+        DataError: it holds no positions, or they are damaged.
+    """
+    oxts = path if path.name == "oxts" else path / "oxts"
+    if (oxts / "data").is_dir():
+        return _read_oxts(oxts)
+    if path.exists() and is_bag(path):
+        return read_navsatfix(path, topic)
+    if not path.is_file():
+        raise DataError(f"{path}: holds no GNSS positions; give a table {_FORM}, a drive with oxts/data, or a bag")
+    return _read_csv(path)
+
+
+def _read_csv(path: Path) -> GnssFixes:
+    """Read a table with or without the standard deviations; empty or NaN: not known."""
+    lines = [line for _, line in text_lines(path) if line.strip() and not line.lstrip().startswith("#")]
+    columns = 4 if lines and len(lines[-1].replace(";", ",").split(",")) == 4 else 7
+    table = read_table(path, columns, _FORM)
+    if table.header and not all(word in name for word, name in zip(("time", "lat", "lon"), table.header, strict=False)):
+        raise DataError(f"{path}: has the columns {','.join(table.header)}; expected {_FORM}")
+    values = numbers_of(table)
+    sigmas = values[:, 3:] if columns == 7 else np.full((len(values), 3), np.nan)
+    return checked_fixes(stamps_ns(table), values[:, :3], np.eye(3) * sigmas[:, None, :] ** 2, str(path))
+
+
+def _read_oxts(folder: Path) -> GnssFixes:
+    """Read KITTI's records of its GNSS/INS unit; the position is that of the IMU."""
+    files = sorted((folder / "data").glob("*.txt"))
+    if not files:
+        raise DataError(f"{folder / 'data'}: holds no record; copy it again")
+    rows = []
+    for file in files:
+        words = " ".join(line for _, line in text_lines(file)).split()
+        if len(words) != _OXTS_COLUMNS:
+            raise DataError(f"{file}: has {len(words)} values, not the {_OXTS_COLUMNS} of KITTI's oxts; copy it again")
+        try:
+            rows.append([float(word) for word in words])
+        except ValueError as error:
+            raise DataError(f"{file}: {error}; copy it again") from error
+    values = np.array(rows)
+    times_ns = drive_times(folder / "timestamps.txt", np.array([int(file.stem) for file in files], dtype=np.int64))
+    sigma = np.maximum(values[:, _OXTS_ACCURACY], _OXTS_LEAST_M)
+    return checked_fixes(times_ns, values[:, :3], sigma[:, None, None] ** 2 * np.eye(3), str(folder))

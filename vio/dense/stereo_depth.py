@@ -1,0 +1,128 @@
+"""Depth of every pixel of a rectified pair by semi-global matching, and its errors against a known depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from vio.geometry.lie import FloatArray
+from vio.geometry.stereo import StereoCamera
+from vio.records import Image
+
+DepthImage = npt.NDArray[np.float32]  # (H, W) metres along the optical axis, 0 where unknown
+
+DISPARITY_SIGMA_PX = 0.25  # of a match, as rendered images show it
+_WIDTH_SHARE = 8  # the largest disparity is the image's width over this
+_BLOCK_PX = 5
+_UNIQUENESS_PERCENT = 10  # by which the best match must beat the others
+_SPECKLE_PX, _SPECKLE_RANGE = 200, 2  # smaller regions of one disparity are dropped
+_SLANT_BOX_PX, _SLANT_STEP_PX = 9, 12  # over which the surface's direction is measured
+_LEAST_SLANT = 0.05  # a road 1.6 m below the camera, 30 m ahead
+_FIXED_POINT = 16.0  # parts of a pixel in OpenCV's disparities
+
+
+class StereoMatcher:
+    """Semi-global matching (Hirschmueller, 2008) by OpenCV, with one set of parameters for all cameras."""
+
+    def __init__(self, camera: StereoCamera, width: int) -> None:
+        """Prepare for images of a width in pixels."""
+        import cv2
+
+        self._camera = camera
+        self._count = 16 * max(1, round(width / _WIDTH_SHARE / 16))
+        self._sgm = cv2.StereoSGBM.create(
+            minDisparity=0,
+            numDisparities=self._count,
+            blockSize=_BLOCK_PX,
+            P1=8 * _BLOCK_PX**2,
+            P2=32 * _BLOCK_PX**2,
+            disp12MaxDiff=1,
+            preFilterCap=31,
+            uniquenessRatio=_UNIQUENESS_PERCENT,
+            speckleWindowSize=_SPECKLE_PX,
+            speckleRange=_SPECKLE_RANGE,
+            mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        )
+
+    def depth(self, left: Image, right: Image) -> DepthImage:
+        """Return the depth (H, W) of the left image's pixels (H, W), of gray images."""
+        # Columns left of the first disparity would stay unknown: the pair is continued there.
+        pad = [np.pad(image, ((0, 0), (self._count, 0)), mode="edge") for image in (left, right)]
+        disparity = self._sgm.compute(*pad)[:, self._count :].astype(np.float32) / np.float32(_FIXED_POINT)
+        # A match that lies left of the right image is one with the padding.
+        inside = (disparity > 0.5) & (disparity <= np.arange(left.shape[1], dtype=np.float32))
+        scale = np.float32(self._camera.fu * self._camera.baseline_m)
+        return np.where(inside, scale / np.maximum(disparity, np.float32(0.5)), np.float32(0.0))
+
+
+def slant(depth: DepthImage, camera: StereoCamera) -> DepthImage:
+    """Return by what (H, W) a difference of depths is multiplied to be a distance from the surface at that pixel.
+
+    The inverse depth of a plane `n p = 1` is `n ray`: its differences in the image are the first two of n, and
+    `(1 - n p) / |n|` is the distance of a point p. Of the differences to both sides, the smaller one is that of the
+    surface, and not across its outline; it is 1 where neither is known.
+    """
+    import cv2
+
+    known = (depth > 0).astype(np.float32)
+    size = (_SLANT_BOX_PX, _SLANT_BOX_PX)
+    share = cv2.blur(known, size)
+    inverse = cv2.blur(known / np.maximum(depth, np.float32(1e-3)), size) / np.maximum(share, np.float32(1e-6))
+    height, width = depth.shape
+    rays = [
+        (np.arange(n, dtype=np.float32) - c) / f
+        for n, c, f in ((width, camera.cu, camera.fu), (height, camera.cv, camera.fv))
+    ]
+    slopes = []
+    for axis, focal in ((1, camera.fu), (0, camera.fv)):
+        step = np.full_like(inverse, np.inf)
+        inner, ahead = [slice(None)] * 2, [slice(None)] * 2
+        inner[axis], ahead[axis] = slice(0, -_SLANT_STEP_PX), slice(_SLANT_STEP_PX, None)
+        here, there = tuple(inner), tuple(ahead)
+        both = (known[here] > 0) & (known[there] > 0)
+        difference = np.where(both, inverse[there] - inverse[here], np.inf).astype(np.float32)
+        step[here] = difference
+        closer = np.abs(difference) < np.abs(step[there])
+        step[there][closer] = difference[closer]
+        slopes.append(np.where(np.isfinite(step), step * np.float32(focal / _SLANT_STEP_PX), 0).astype(np.float32))
+    x, y = rays[0][None, :], rays[1][:, None]
+    third = inverse - slopes[0] * x - slopes[1] * y
+    length = np.sqrt(slopes[0] ** 2 + slopes[1] ** 2 + third**2)
+    return np.clip(inverse / np.maximum(length, np.float32(1e-9)), np.float32(_LEAST_SLANT), np.float32(1.5))
+
+
+def depth_sigma_m(camera: StereoCamera, depth_m: float) -> float:
+    """Return the standard deviation of a depth."""
+    return depth_m**2 * DISPARITY_SIGMA_PX / (camera.fu * camera.baseline_m)
+
+
+def farthest_m(camera: StereoCamera, sigma_m: float) -> float:
+    """Return the depth whose standard deviation is `sigma_m`."""
+    return float(np.sqrt(sigma_m * camera.fu * camera.baseline_m / DISPARITY_SIGMA_PX))
+
+
+@dataclass(frozen=True, slots=True)
+class DepthErrors:
+    """Errors of depth images within a range of true depths."""
+
+    nearest_m: float
+    farthest_m: float
+    pixels: int  # whose true depth is in the range
+    known: float  # share of them with a depth
+    median_m: float  # of the absolute errors; NaN: none is known
+    percentile_90_m: float
+
+
+def depth_errors(depth_m: FloatArray, truth_m: FloatArray, edges_m: FloatArray) -> list[DepthErrors]:
+    """Return the errors of depths (...), 0 where unknown, against true ones (...), by ranges between edges (E,)."""
+    out = []
+    for nearest, farthest in zip(edges_m[:-1].tolist(), edges_m[1:].tolist(), strict=True):
+        inside = (truth_m >= nearest) & (truth_m < farthest)
+        known = inside & (depth_m > 0)
+        error = np.abs(depth_m[known] - truth_m[known])
+        median, high = np.percentile(error, (50, 90)).tolist() if len(error) else (np.nan, np.nan)
+        pixels = int(inside.sum())
+        out.append(DepthErrors(nearest, farthest, pixels, len(error) / max(pixels, 1), median, high))
+    return out

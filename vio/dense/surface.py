@@ -1,0 +1,177 @@
+"""The surface of a signed distance function as triangles: naive surface nets.
+
+Gibson, Constrained elastic surface nets, MICCAI 1998: one vertex in each cell that the surface crosses, at the mean of
+its crossings of the cell's edges, and one quadrilateral for each crossed edge of the lattice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+
+from vio.dense.voxel_grid import SIDE, VoxelGrid, pack
+from vio.geometry.lie import FloatArray
+from vio.numerics.compiled import compiled
+from vio.records import IntArray
+
+_LEAST_SEEN = 3  # images that must show a sample
+_LEAST_TRIANGLES = 100  # of a connected piece; smaller ones are noise
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A coloured surface."""
+
+    vertices: npt.NDArray[np.float32]  # (V, 3) metres
+    normals: npt.NDArray[np.float32]  # (V, 3) unit length, towards where it was seen from
+    colours: npt.NDArray[np.uint8]  # (V, 3) red, green, blue
+    triangles: npt.NDArray[np.uint32]  # (T, 3) vertices, counter-clockwise from where it was seen
+
+
+def extract_surface(grid: VoxelGrid, *, least_seen: int = _LEAST_SEEN) -> Mesh:
+    """Return the surface between samples that at least so many images show, without small loose pieces."""
+    keys, points, colours, quads = [], [], [], []
+    for first, block in grid.padded():
+        if not (block["seen"] >= least_seen).any():
+            continue
+        cell = np.empty((SIDE**3, 3), dtype=np.int64)
+        point = np.empty((SIDE**3, 3), dtype=np.float32)
+        colour = np.empty((SIDE**3, 3), dtype=np.uint8)
+        quad = np.empty((3 * SIDE**3, 4, 3), dtype=np.int64)
+        vertices, faces = _surface_nets(
+            block["distance"], block["seen"], block["colour"], least_seen, first, cell, point, colour, quad
+        )
+        keys.append(pack(cell[:vertices]))
+        points.append(grid.voxel_m * point[:vertices])
+        colours.append(colour[:vertices].copy())
+        quads.append(pack(quad[:faces].reshape(-1, 3)).reshape(-1, 4))
+    if not keys:
+        none = np.zeros((0, 3), dtype=np.float32)
+        return Mesh(none, none, none.astype(np.uint8), none.astype(np.uint32))
+    key = np.concatenate(keys)
+    order = np.argsort(key)
+    corners = order[np.searchsorted(key[order], np.concatenate(quads))]
+    triangles = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
+    return _tidied(np.concatenate(points).astype(np.float32), np.concatenate(colours), triangles)
+
+
+def _tidied(points: npt.NDArray[np.float32], colours: npt.NDArray[np.uint8], triangles: IntArray) -> Mesh:
+    """Return the mesh without loose pieces and vertices of no triangle, with normals."""
+    count = len(points)
+    edges = triangles[:, :2]
+    edges = np.concatenate([edges, triangles[:, 1:]])
+    graph = coo_matrix((np.ones(len(edges), dtype=np.bool_), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    _, piece = connected_components(graph, directed=False)
+    sizes = np.bincount(piece[triangles[:, 0]], minlength=int(piece.max()) + 1)
+    triangles = triangles[sizes[piece[triangles[:, 0]]] >= _LEAST_TRIANGLES]
+    used = np.unique(triangles)
+    place = np.zeros(count, dtype=np.int64)
+    place[used] = np.arange(len(used))
+    points, colours, triangles = points[used], colours[used], place[triangles]
+    normals = _normals(points.astype(np.float64), triangles)
+    return Mesh(points, normals.astype(np.float32), colours, triangles.astype(np.uint32))
+
+
+def _normals(points: FloatArray, triangles: IntArray) -> FloatArray:
+    """Return unit normals (V, 3) of vertices, of the adjacent triangles by their areas."""
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    area = np.cross(b - a, c - a)
+    total = np.stack(
+        [np.bincount(triangles.ravel(), np.repeat(area[:, k], 3), minlength=len(points)) for k in range(3)], axis=1
+    )
+    out: FloatArray = total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-30)
+    return out
+
+
+@compiled
+def _surface_nets(
+    distance: npt.NDArray[np.float32],
+    seen: npt.NDArray[np.uint8],
+    colour: npt.NDArray[np.uint8],
+    least: int,
+    first: IntArray,
+    cell: IntArray,
+    point: npt.NDArray[np.float32],
+    shade: npt.NDArray[np.uint8],
+    quad: IntArray,
+) -> tuple[int, int]:
+    """Write vertices and quadrilaterals of one block with a margin of one sample; return how many of both.
+
+    A sample (i, j, k) of the block is at [i + 1, j + 1, k + 1]; a cell has the coordinates of its first sample.
+    """
+    side = len(distance)
+    vertices, faces = 0, 0
+    whole = np.zeros((side, side, side), dtype=np.uint8)  # cells of samples that were all seen
+    for i in range(side - 1):
+        for j in range(side - 1):
+            for k in range(side - 1):
+                all_seen = True
+                for corner in range(8):
+                    if seen[i + (corner >> 2), j + ((corner >> 1) & 1), k + (corner & 1)] < least:
+                        all_seen = False
+                        break
+                whole[i, j, k] = 1 if all_seen else 0
+    for i in range(1, side - 1):
+        for j in range(1, side - 1):
+            for k in range(1, side - 1):
+                if whole[i, j, k]:
+                    crossings, x, y, z, r, g, b = 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+                    for low in range(8):
+                        for axis in range(3):
+                            bit = 4 >> axis
+                            if low & bit:
+                                continue
+                            high = low | bit
+                            ai, aj, ak = i + (low >> 2), j + ((low >> 1) & 1), k + (low & 1)
+                            bi, bj, bk = i + (high >> 2), j + ((high >> 1) & 1), k + (high & 1)
+                            da, db = distance[ai, aj, ak], distance[bi, bj, bk]
+                            if (da < 0.0) == (db < 0.0):
+                                continue
+                            t = da / (da - db)
+                            x += ai + t * (bi - ai)
+                            y += aj + t * (bj - aj)
+                            z += ak + t * (bk - ak)
+                            r += colour[ai, aj, ak, 0] * (1 - t) + colour[bi, bj, bk, 0] * t
+                            g += colour[ai, aj, ak, 1] * (1 - t) + colour[bi, bj, bk, 1] * t
+                            b += colour[ai, aj, ak, 2] * (1 - t) + colour[bi, bj, bk, 2] * t
+                            crossings += 1
+                    if crossings:
+                        cell[vertices, 0], cell[vertices, 1], cell[vertices, 2] = (
+                            first[0] + i - 1, first[1] + j - 1, first[2] + k - 1,
+                        )  # fmt: skip
+                        point[vertices, 0] = first[0] - 1 + x / crossings
+                        point[vertices, 1] = first[1] - 1 + y / crossings
+                        point[vertices, 2] = first[2] - 1 + z / crossings
+                        shade[vertices, 0] = np.uint8(r / crossings + 0.5)
+                        shade[vertices, 1] = np.uint8(g / crossings + 0.5)
+                        shade[vertices, 2] = np.uint8(b / crossings + 0.5)
+                        vertices += 1
+                for axis in range(3):
+                    ni, nj, nk = i + (axis == 0), j + (axis == 1), k + (axis == 2)
+                    inside = distance[i, j, k] < 0.0
+                    if inside == (distance[ni, nj, nk] < 0.0):
+                        continue
+                    # The two directions across the edge, so that (axis, one, two) is right-handed.
+                    one, two = (axis + 1) % 3, (axis + 2) % 3
+                    all_seen = True
+                    for corner in range(4):
+                        # Around the edge: (0, 0), (-1, 0), (-1, -1), (0, -1), seen along the axis.
+                        back = corner if inside else 3 - corner
+                        a, b2 = -(back == 1 or back == 2), -(back >= 2)
+                        ci, cj, ck = i, j, k
+                        ci += a * (one == 0) + b2 * (two == 0)
+                        cj += a * (one == 1) + b2 * (two == 1)
+                        ck += a * (one == 2) + b2 * (two == 2)
+                        if not whole[ci, cj, ck]:
+                            all_seen = False
+                            break
+                        quad[faces, corner, 0] = first[0] + ci - 1
+                        quad[faces, corner, 1] = first[1] + cj - 1
+                        quad[faces, corner, 2] = first[2] + ck - 1
+                    if all_seen:
+                        faces += 1
+    return vertices, faces

@@ -1,0 +1,367 @@
+"""A trajectory on the earth: GNSS positions as factors on the graph of its poses, with a robust loss.
+
+The unknowns are the poses in east, north, up at an origin, and the logarithm of the scale. Motions between neighbours
+(and across loops) are those of the finished trajectory, which itself never changes. A position by GNSS measures the
+antenna between two poses; its horizontal and its vertical part are decided on apart, by truncated least squares with
+graduated non-convexity (Yang et al., 2020), so that jumps and wrong heights end with weight zero. Equations (E1) to
+(E4) of docs/math.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.linalg import splu
+
+from vio.earth.geodesy import LocalFrame
+from vio.earth.gnss import GnssFixes
+from vio.errors import EstimationError
+from vio.geometry.lie import (
+    FloatArray,
+    se3_adjoint,
+    se3_exp,
+    se3_from_parts,
+    se3_inverse,
+    se3_left_jacobian,
+    se3_log,
+    so3_hat,
+)
+from vio.numerics.statistics import chi_square_quantile
+from vio.records import BoolArray, IntArray
+
+# What odometry drifts by between neighbours beyond its scale: 0.2 m and 0.3 deg over 100 m, as random walks.
+_DRIFT_M, _DRIFT_RAD = 0.02, float(np.radians(0.03))  # per square root of a metre
+_LEAST_M, _LEAST_RAD = 1e-3, 1e-5  # of a motion at standstill
+_SCALE_SIGMA = 0.01  # prior
+_CORRELATED_S = 5.0  # errors of GNSS last: positions within it count as one
+_TIMING_M = 0.1  # of the antenna beside the stated error: 10 ms of the clocks at 10 m/s, the lever arm
+_TRUNCATION = 0.999  # probability at which a residual is cut off
+_MU_GROWTH, _MOST_STEPS, _SETTLED = 1.6, 40, 1e-5
+_START_STEPS = 20  # of the robust alignment that it starts from
+_LEAST_FIXES = 3
+_METRE_PER_RAD = 100.0  # weights a turn of a pose against its position in the rigid fit
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """A finished trajectory as a graph; K poses."""
+
+    times_ns: IntArray  # (K,) increasing within a session
+    T_map_body: FloatArray  # (K, 4, 4)
+    first: IntArray  # (E,) motions that the trajectory knows, besides those of neighbours: loops
+    second: IntArray  # (E,)
+    up_map: FloatArray  # (3,) unit vector upwards in its frame
+    up_sigma_rad: float
+    breaks: IntArray  # rows at which a new session begins; no GNSS position is between it and the row before
+
+
+@dataclass(frozen=True, slots=True)
+class Georeference:
+    """Where a trajectory is on the earth."""
+
+    frame: LocalFrame
+    T_enu_map: FloatArray  # (4, 4) the rigid fit of the whole trajectory
+    covariance: FloatArray  # (6, 6) of xi in T_enu_map exp(xi)
+    T_enu_body: FloatArray  # (K, 4, 4) the poses, bent as GNSS and scale demand
+    position_covariance: FloatArray  # (K, 3, 3) of them, in east, north, up
+    scale: float  # of the trajectory's lengths, by which they were multiplied
+    scale_sigma: float
+    used: BoolArray  # (N,) positions whose horizontal part agrees
+    used_height: BoolArray  # (N,)
+    inside: BoolArray  # (N,) positions within the trajectory's time
+    residuals: FloatArray  # (N, 3) position minus antenna, m; NaN outside
+
+    @property
+    def heading_sigma_deg(self) -> float:
+        """Standard deviation of the heading of the map."""
+        R = self.T_enu_map[:3, :3]
+        return float(np.degrees(np.sqrt((R @ self.covariance[3:, 3:] @ R.T)[2, 2])))
+
+
+def georeference(path: Path, fixes: GnssFixes, lever_arm_m: FloatArray, time_offset_ns: int = 0) -> Georeference:
+    """Return where a trajectory is on the earth.
+
+    Args:
+        path: the trajectory.
+        fixes: positions of an antenna.
+        lever_arm_m: (3,) the antenna in the body frame.
+        time_offset_ns: added to the stamps of the positions.
+
+    Raises:
+        EstimationError: fewer than three positions are within the trajectory's time, or they determine nothing.
+    """
+    between = _Between.of(path, fixes.times_ns + time_offset_ns)
+    inside = between.inside
+    if int(inside.sum()) < _LEAST_FIXES:
+        own_ns = fixes.times_ns + time_offset_ns
+        spans = [f"{t[0] * 1e-9:.3f} to {t[-1] * 1e-9:.3f} s" for t in (own_ns, path.times_ns)]
+        raise EstimationError(
+            f"only {int(inside.sum())} GNSS positions ({spans[0]}) are within the trajectory ({spans[1]}); give "
+            "those of this drive, or the offset of the clocks with --time-offset"
+        )
+    frame = LocalFrame(fixes.geodetic[int(np.argmax(inside))].copy())
+    measured = frame.enu(fixes.geodetic)[inside]
+    problem = _Problem(
+        path, between.chosen(), measured, fixes.covariance[inside], fixes.has_height[inside], lever_arm_m
+    )
+    T, log_scale, weight = problem.solve()
+    normal = problem.factorised(T, log_scale, weight)
+    used, used_height, residuals = (
+        np.zeros(len(fixes), dtype=np.bool_),
+        np.zeros(len(fixes), dtype=np.bool_),
+        np.full((len(fixes), 3), np.nan),
+    )
+    used[inside], used_height[inside] = weight[:, 0] > 0.5, weight[:, 1] > 0.5
+    if int(used.sum()) < _LEAST_FIXES:
+        raise EstimationError(f"only {int(used.sum())} of {int(inside.sum())} GNSS positions agree with the trajectory")
+    residuals[inside] = measured - problem.antenna(T)
+    T_enu_map, gain = _rigid_fit(path.T_map_body, T)
+    spread = normal.solve(np.concatenate([gain.T, np.zeros((1, 6))]))
+    unit = np.zeros((6 * len(T) + 1, 1))
+    unit[-1] = 1.0
+    return Georeference(
+        frame=frame,
+        T_enu_map=T_enu_map,
+        covariance=gain @ spread[:-1],
+        T_enu_body=T,
+        position_covariance=_position_covariances(normal, T),
+        scale=float(np.exp(log_scale)),
+        scale_sigma=float(np.sqrt(normal.solve(unit)[-1, 0])),
+        used=used,
+        used_height=used_height,
+        inside=inside,
+        residuals=residuals,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Between:
+    """The two poses that each position lies between."""
+
+    before: IntArray  # (N,)
+    share: FloatArray  # (N,) of the way to the next one
+    inside: BoolArray  # (N,)
+
+    @classmethod
+    def of(cls, path: Path, times_ns: IntArray) -> _Between:
+        starts = np.concatenate([[0], path.breaks, [len(path.times_ns)]]).astype(np.int64)
+        before, share = np.zeros(len(times_ns), dtype=np.int64), np.zeros(len(times_ns))
+        inside = np.zeros(len(times_ns), dtype=np.bool_)
+        for start, stop in zip(starts[:-1].tolist(), starts[1:].tolist(), strict=True):
+            own = path.times_ns[start:stop]
+            if len(own) < 2:
+                continue
+            here = (times_ns >= own[0]) & (times_ns <= own[-1]) & ~inside
+            k = np.clip(np.searchsorted(own, times_ns[here], side="right") - 1, 0, len(own) - 2)
+            before[here] = start + k
+            share[here] = (times_ns[here] - own[k]) / (own[k + 1] - own[k])
+            inside |= here
+        return cls(before, share, inside)
+
+    def chosen(self) -> _Between:
+        return _Between(self.before[self.inside], self.share[self.inside], self.inside[self.inside])
+
+
+class _Problem:
+    """Residuals and normal equations of the graph."""
+
+    def __init__(
+        self,
+        path: Path,
+        between: _Between,
+        measured: FloatArray,
+        covariance: FloatArray,
+        has_height: BoolArray,
+        lever_arm_m: FloatArray,
+    ) -> None:
+        self._path, self._between, self._measured, self._lever = path, between, measured, lever_arm_m
+        self._has_height = has_height
+        k = np.arange(len(path.times_ns) - 1)
+        self._i = np.concatenate([k, path.first])
+        self._j = np.concatenate([k + 1, path.second])
+        self._T_i_j = se3_inverse(path.T_map_body[self._i]) @ path.T_map_body[self._j]
+        length = np.linalg.norm(self._T_i_j[:, :3, 3], axis=1)
+        root = np.sqrt(length + np.linalg.norm(se3_log(self._T_i_j)[:, 3:], axis=1))
+        sigma_m, sigma_rad = np.maximum(_DRIFT_M * root, _LEAST_M), np.maximum(_DRIFT_RAD * root, _LEAST_RAD)
+        self._edge_weight = 1 / np.repeat(np.stack([sigma_m, sigma_rad], axis=1), 3, axis=1) ** 2
+        self._up_body = path.up_map @ path.T_map_body[:, :3, :3]
+        covariance = covariance + _TIMING_M**2 * np.eye(3)
+        self._horizontal = np.linalg.inv(covariance[:, :2, :2])
+        self._vertical = 1 / covariance[:, 2, 2]
+        times = (1 - between.share) * path.times_ns[between.before] + between.share * path.times_ns[between.before + 1]
+        gap_s = float(np.median(np.diff(times))) * 1e-9 if len(times) > 1 else _CORRELATED_S
+        self._independent = float(np.clip(gap_s / _CORRELATED_S, 1e-3, 1.0))  # share of information
+
+    def antenna(self, T: FloatArray) -> FloatArray:
+        """Return where the antenna is (N, 3) at the times of the positions."""
+        b, a = self._between, T[:, :3, :3] @ self._lever + T[:, :3, 3]
+        out: FloatArray = a[b.before] + b.share[:, None] * (a[b.before + 1] - a[b.before])
+        return out
+
+    def solve(self) -> tuple[FloatArray, float, FloatArray]:
+        """Return the poses (K, 4, 4), the logarithm of the scale, and the weights (N, 2) horizontal and vertical."""
+        T = _start(self.antenna(self._path.T_map_body), self._measured, self._path.up_map) @ self._path.T_map_body
+        known = np.stack([np.ones(len(self._measured)), self._has_height], axis=1).astype(np.float64)
+        log_scale, weight = 0.0, known
+        limits = np.array([chi_square_quantile(_TRUNCATION, n) for n in (2, 1)], dtype=np.float64)
+        mu = None
+        for _ in range(_MOST_STEPS):
+            squared = self._squared(T)
+            if mu is None:
+                worst = (squared / limits * (weight > 0)).max(axis=0)
+                mu = 1 / np.maximum(2 * worst - 1, 1e-3)
+            weight = _gnc_weight(squared, mu, limits) * known
+            moved = 0.0
+            for _ in range(2):
+                T, log_scale, moved = self._step(T, log_scale, weight)
+            if (mu > 1e3).all() or (((weight == 0) | (weight == 1)).all() and moved < _SETTLED and (mu > 1).all()):
+                break
+            mu = mu * _MU_GROWTH
+        weight = (self._squared(T) < limits) * known
+        for _ in range(_MOST_STEPS):
+            T, log_scale, moved = self._step(T, log_scale, weight)
+            if moved < _SETTLED:
+                break
+        return T, log_scale, weight
+
+    def factorised(self, T: FloatArray, log_scale: float, weight: FloatArray) -> _Factors:
+        """Return the factors of the normal matrix (6K + 1, 6K + 1)."""
+        return _Factors(self._normal(T, log_scale, weight)[0])
+
+    def _squared(self, T: FloatArray) -> FloatArray:
+        """Return the squared normalised residuals (N, 2), horizontal and vertical."""
+        r = self._measured - self.antenna(T)
+        return np.stack(
+            [np.einsum("ni,nij,nj->n", r[:, :2], self._horizontal, r[:, :2]), self._vertical * r[:, 2] ** 2], 1
+        )
+
+    def _step(self, T: FloatArray, log_scale: float, weight: FloatArray) -> tuple[FloatArray, float, float]:
+        H, g = self._normal(T, log_scale, weight)
+        x = _Factors(H).solve(g[:, None])[:, 0]
+        return T @ se3_exp(x[:-1].reshape(-1, 6)), log_scale + float(x[-1]), float(np.abs(x).max())
+
+    def _normal(self, T: FloatArray, log_scale: float, weight: FloatArray) -> tuple[csc_matrix, FloatArray]:
+        """Return the normal matrix and the right-hand side of the step, for T <- T exp(xi)."""
+        count = len(T)
+        g, rows, columns, values = np.zeros(6 * count + 1), [], [], []
+
+        def add(at: list[IntArray], J: list[FloatArray], r: FloatArray, W: FloatArray) -> None:
+            """Add factors: Jacobians (F, m, n) at first columns (F,), residuals (F, m), information (F, m, m)."""
+            for a, Ja in zip(at, J, strict=True):
+                JW = np.swapaxes(Ja, 1, 2) @ W
+                ia = a[:, None] + np.arange(Ja.shape[2])
+                np.add.at(g, ia, -np.einsum("fij,fj->fi", JW, r))
+                for b, Jb in zip(at, J, strict=True):
+                    ib = b[:, None] + np.arange(Jb.shape[2])
+                    block = JW @ Jb
+                    rows.append(np.broadcast_to(ia[:, :, None], block.shape).ravel())
+                    columns.append(np.broadcast_to(ib[:, None, :], block.shape).ravel())
+                    values.append(block.ravel())
+
+        scaled = self._T_i_j.copy()
+        scaled[:, :3, 3] *= np.exp(log_scale)
+        r = se3_log(se3_inverse(scaled) @ se3_inverse(T[self._i]) @ T[self._j])
+        r_D_j = np.asarray(np.linalg.inv(se3_left_jacobian(-r)), dtype=np.float64)
+        r_D_i: FloatArray = -r_D_j @ se3_adjoint(se3_inverse(T[self._j]) @ T[self._i])
+        # A longer motion is T_i_j exp([R^T t ds; 0]) before what follows it: minus the left Jacobian's inverse.
+        r_D_scale = np.zeros((len(r), 6, 1))
+        r_D_scale[:, :3, 0] = -np.einsum("eji,ej->ei", scaled[:, :3, :3], scaled[:, :3, 3])
+        r_D_scale = np.linalg.inv(se3_left_jacobian(r)) @ r_D_scale
+        last = np.full(len(r), 6 * count)
+        add([6 * self._i, 6 * self._j, last], [r_D_i, r_D_j, r_D_scale], r, self._edge_weight[:, :, None] * np.eye(6))
+        b = self._between
+        p = self._measured - self.antenna(T)
+        W = np.zeros((len(p), 3, 3))
+        W[:, :2, :2] = self._horizontal * weight[:, 0, None, None]
+        W[:, 2, 2] = self._vertical * weight[:, 1]
+        move = T[:, :3, :3] @ np.concatenate([np.eye(3), -so3_hat(self._lever)], axis=1)
+        J = [-(1 - b.share)[:, None, None] * move[b.before], -b.share[:, None, None] * move[b.before + 1]]
+        add([6 * b.before, 6 * b.before + 6], J, p, self._independent * W)
+        up = T[:, 2, :3]
+        D = np.zeros((count, 3, 6))
+        D[:, :, 3:] = so3_hat(up)
+        # The vertical has one error in all poses: so many count as one.
+        tilt = np.broadcast_to(np.eye(3) / (self._path.up_sigma_rad**2 * count), (count, 3, 3))
+        add([6 * np.arange(count)], [D], up - self._up_body, tilt)
+        add(
+            [np.array([6 * count])], [np.ones((1, 1, 1))], np.array([[log_scale]]), np.full((1, 1, 1), _SCALE_SIGMA**-2)
+        )
+        size = 6 * count + 1
+        H = coo_matrix((np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))), shape=(size, size))
+        return H.tocsc(), g
+
+
+class _Factors:
+    """The factors of a sparse symmetric matrix whose last row is full: it is eliminated last."""
+
+    def __init__(self, H: csc_matrix) -> None:
+        self._rest = splu(
+            H[:-1, :-1], permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
+        )
+        self._border = H[:-1, -1:].toarray()
+        self._solved = self._rest.solve(self._border)
+        self._last = float(H[-1, -1] - (self._border.T @ self._solved)[0, 0])
+
+    def solve(self, right: FloatArray) -> FloatArray:
+        """Return the solution (6K + 1, n) for a right-hand side."""
+        first = self._rest.solve(np.ascontiguousarray(right[:-1]))
+        last = (right[-1:] - self._border.T @ first) / self._last
+        return np.concatenate([first - self._solved @ last, last])
+
+
+def _gnc_weight(squared: FloatArray, mu: FloatArray, limit: FloatArray) -> FloatArray:
+    """Weights (N, 2) of truncated least squares, Yang et al. (2020), equation (14)."""
+    middle = np.sqrt(limit * mu * (mu + 1) / np.maximum(squared, 1e-12)) - mu
+    out: FloatArray = np.where(
+        squared >= limit * (mu + 1) / mu, 0.0, np.where(squared <= limit * mu / (mu + 1), 1.0, middle)
+    )
+    return out
+
+
+def _start(p: FloatArray, measured: FloatArray, up: FloatArray) -> FloatArray:
+    """Return the transform (4, 4) of points (N, 3) to others that fits most, with `up` (3,) as z, reweighted."""
+    side = np.cross(up, np.eye(3)[int(np.argmin(np.abs(up)))])
+    side /= np.linalg.norm(side)
+    level = np.stack([side, np.cross(up, side), up])
+    p = p @ level.T
+    T, weight = np.eye(4), np.ones(len(p))
+    for _ in range(_START_STEPS):
+        share = weight / weight.sum()
+        mean_p, mean_m = share @ p, share @ measured
+        q, m = (p - mean_p)[:, :2], share[:, None] * (measured - mean_m)[:, :2]
+        yaw = np.arctan2(np.sum(q[:, 0] * m[:, 1] - q[:, 1] * m[:, 0]), np.sum(q * m))
+        R = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
+        T = se3_from_parts(R @ level, mean_m - R @ mean_p)
+        off = np.linalg.norm((measured - p @ R.T - T[:3, 3])[:, :2], axis=1)
+        weight = 1 / (1 + (off / max(2 * float(np.median(off)), 1e-3)) ** 2)
+    return T
+
+
+def _rigid_fit(T_map: FloatArray, T_enu: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the transform (4, 4) that takes poses (K, 4, 4) nearest to others, and its Jacobian (6, 6K) by those."""
+    W = np.repeat([1.0, _METRE_PER_RAD], 3) ** 2
+    T = T_enu[len(T_enu) // 2] @ se3_inverse(T_map[len(T_map) // 2])
+    A = se3_adjoint(se3_inverse(T_map))
+    AW = np.swapaxes(A, 1, 2) * W
+    normal = np.sum(AW @ A, axis=0)
+    for _ in range(10):
+        e = se3_log(se3_inverse(T_map) @ se3_inverse(T) @ T_enu)
+        T = T @ se3_exp(np.linalg.solve(normal, np.einsum("kij,kj->i", AW, e)))
+    gain = np.linalg.solve(normal, AW).transpose(1, 0, 2).reshape(6, -1)
+    return T, gain
+
+
+def _position_covariances(normal: _Factors, T: FloatArray) -> FloatArray:
+    """Return the covariances (K, 3, 3) of the poses' positions, exact at some of them and interpolated between."""
+    count = len(T)
+    rows = np.unique(np.linspace(0, count - 1, min(count, 200)).astype(np.int64))
+    out = np.empty((len(rows), 3, 3))
+    for n, k in enumerate(rows.tolist()):
+        unit = np.zeros((6 * count + 1, 3))
+        unit[6 * k : 6 * k + 3] = np.eye(3)
+        R = T[k, :3, :3]
+        out[n] = R @ normal.solve(unit)[6 * k : 6 * k + 3] @ R.T
+    at = np.arange(count)
+    return np.stack([np.interp(at, rows, out[:, i, j]) for i in range(3) for j in range(3)], axis=1).reshape(-1, 3, 3)

@@ -1,0 +1,78 @@
+"""Positions by GNSS."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vio.errors import DataError
+from vio.geometry.lie import FloatArray
+from vio.records import BoolArray, IntArray
+
+SIGMA_M = 3.0  # horizontal, where nothing states it: a receiver without corrections under open sky
+UP_SHARE = 2.0  # of a vertical standard deviation to a horizontal one, likewise
+_LEAST_SIGMA_M = 0.01
+_HEIGHTS_M = (-1000.0, 50_000.0)
+
+
+@dataclass(frozen=True, slots=True)
+class GnssFixes:
+    """WGS84 positions of an antenna."""
+
+    times_ns: IntArray  # (N,) increasing
+    geodetic: FloatArray  # (N, 3) latitude, longitude (degrees), ellipsoidal height (m)
+    covariance: FloatArray  # (N, 3, 3) east, north, up, m^2
+    has_height: BoolArray  # (N,)
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        """Number of positions."""
+        return len(self.times_ns)
+
+
+def checked_fixes(
+    times_ns: IntArray, geodetic: FloatArray, covariance: FloatArray | None, where: str, notes: tuple[str, ...] = ()
+) -> GnssFixes:
+    """Return positions in the order of time, without those that are not finite or repeat a stamp.
+
+    Args:
+        times_ns: (N,) stamps.
+        geodetic: (N, 3) latitude, longitude, height; NaN: not known.
+        covariance: (N, 3, 3); NaN or zero: not known; None: of none.
+        where: for messages.
+        notes: about what was read.
+
+    Raises:
+        DataError: there is no position, or one is none of WGS84.
+    """
+    order = np.argsort(times_ns, kind="stable")
+    times_ns, geodetic = times_ns[order], geodetic[order]
+    C = np.full((len(order), 3, 3), np.nan) if covariance is None else covariance[order]
+    keep = np.isfinite(geodetic[:, :2]).all(axis=1) & np.concatenate([[True], np.diff(times_ns) > 0])
+    if not keep.any():
+        raise DataError(f"{where}: holds no position; give a record with a fix")
+    notes += (f"{int((~keep).sum())} of {len(keep)} rows without a position or of a repeated time are skipped",) * bool(
+        (~keep).any()
+    )
+    times_ns, geodetic, C = times_ns[keep], geodetic[keep].copy(), C[keep].copy()
+    outside = (np.abs(geodetic[:, 0]) > 90) | (np.abs(geodetic[:, 1]) > 360)
+    if outside.any() or (np.abs(geodetic[:, :2]) < 1e-9).all():
+        lat, lon = geodetic[int(np.argmax(outside)), :2]
+        raise DataError(
+            f"{where}: {lat:g}, {lon:g} is no latitude and longitude in degrees; give positions in WGS84 (convert "
+            "those of another datum or projection first)"
+        )
+    has_height = np.isfinite(geodetic[:, 2]) & (geodetic[:, 2] > _HEIGHTS_M[0]) & (geodetic[:, 2] < _HEIGHTS_M[1])
+    geodetic[~has_height, 2] = 0.0
+    if not has_height.all():
+        notes += (f"{int((~has_height).sum())} positions have no height",)
+    variances = np.diagonal(C, axis1=1, axis2=2)
+    stated = np.isfinite(C).all(axis=(1, 2)) & (variances > 0).all(axis=1)
+    C[~stated] = SIGMA_M**2 * np.diag([1.0, 1.0, UP_SHARE**2])
+    if not stated.all():
+        taken = f"{SIGMA_M:g} m is taken, {UP_SHARE * SIGMA_M:g} m in height"
+        notes += (f"{int((~stated).sum())} positions state no covariance; {taken}",)
+    C = (C + np.swapaxes(C, 1, 2)) / 2 + _LEAST_SIGMA_M**2 * np.eye(3)
+    C[np.linalg.eigvalsh(C)[:, 0] <= 0] = SIGMA_M**2 * np.diag([1.0, 1.0, UP_SHARE**2])
+    return GnssFixes(times_ns, geodetic, C, has_height, notes)

@@ -1,0 +1,155 @@
+"""A run or a map on the earth, by GNSS positions of its drive."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from vio.earth.alignment import Georeference, Path, georeference
+from vio.earth.exports import write_geojson, write_kml, write_points_geojson, write_utm
+from vio.earth.gnss import GnssFixes
+from vio.errors import DataError
+from vio.files.trajectories import read_trajectory, write_tum
+from vio.geometry.lie import FloatArray, se3_inverse
+from vio.geometry.upright import up_of
+from vio.mapping.map_store import MapStore
+from vio.records import Trajectory
+from vio.runs.files import RunFile
+from vio.runs.finished import read_points
+from vio.runs.folder import read_metrics
+from vio.runs.mapped import read_loops
+
+FACTS = "earth.json"
+_UP_RAD, _MOUNT_RAD = float(np.radians(0.3)), float(np.radians(5.0))  # of an IMU's vertical; of an upright camera's
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A finished trajectory, ready to be placed on the earth."""
+
+    name: str
+    path: Path
+    trajectory: Trajectory  # the same poses
+    points: FloatArray  # (M, 3) landmarks in its frame
+
+
+def placed(source: FilePath) -> Placed:
+    """Read the trajectory of a run's folder, or the keyframes of a map.
+
+    Raises:
+        DataError: it is neither, or states no times.
+    """
+    return _of_run(source) if source.is_dir() else _of_map(source)
+
+
+def _of_run(folder: FilePath) -> Placed:
+    metrics, T_cam0_imu = read_metrics(folder)
+    mapped = (folder / RunFile.MAP_TRAJECTORY).is_file()
+    trajectory = read_trajectory(folder / (RunFile.MAP_TRAJECTORY if mapped else RunFile.TRAJECTORY))
+    if trajectory.times_ns is None or len(trajectory) < 2:
+        raise DataError(f"{folder}: its trajectory has no times, which GNSS positions are compared by")
+    place = {} if trajectory.frame_indices is None else {int(f): k for k, f in enumerate(trajectory.frame_indices)}
+    loops = [(place.get(o.keyframe_frame or -1), place.get(o.frame)) for o in read_loops(folder) if o.kept]
+    known = [(i, j) for i, j in loops if i is not None and j is not None and i < j - 1]
+    up = up_of(metrics.get("motion"), None)
+    camera = trajectory.in_cam0(T_cam0_imu).T_world_body
+    path = _path(trajectory, known, -camera[0, :3, 1] if up is None else up, _MOUNT_RAD if up is None else _UP_RAD)
+    points = read_points(folder / RunFile.LANDMARKS)
+    p = np.stack([points[name] for name in "xyz"], axis=1).astype(np.float64)
+    return Placed(folder.resolve().name, path, trajectory, p[np.isfinite(p).all(axis=1)])
+
+
+def _of_map(file: FilePath) -> Placed:
+    store = MapStore(file, read_only=True)
+    try:
+        sessions, rows, loops = store.sessions(), store.keyframes(), store.loops()
+    finally:
+        store.close()
+    home = sessions[0].part if sessions else 0
+    kept = [k for k, row in enumerate(rows) if sessions[row.session].part == home]
+    if len(kept) < 2:
+        raise DataError(f"{file}: has fewer than two keyframes; there is nothing to place")
+    place = {k: n for n, k in enumerate(kept)}
+    known = [(place[o.first], place[o.second]) for o in loops if o.kept and o.first in place and o.second in place]
+    T = np.array([rows[k].T_map_cam for k in kept])
+    trajectory = Trajectory(T, np.array([rows[k].time_ns for k in kept], dtype=np.int64), "cam0")
+    upright = sessions[0].upright
+    up = np.array([0.0, 0.0, 1.0]) if upright else -T[0, :3, 1]
+    path = _path(trajectory, known, up, _UP_RAD if upright else _MOUNT_RAD)
+    breaks = np.flatnonzero(np.diff([rows[k].session for k in kept])) + 1
+    return Placed(file.stem, replace(path, breaks=breaks), trajectory, np.zeros((0, 3)))
+
+
+def _path(trajectory: Trajectory, loops: list[tuple[int, int]], up: FloatArray, sigma_rad: float) -> Path:
+    assert trajectory.times_ns is not None
+    ends = np.array(loops, dtype=np.int64).reshape(-1, 2)
+    none = np.zeros(0, dtype=np.int64)
+    return Path(trajectory.times_ns, trajectory.T_world_body, ends[:, 0], ends[:, 1], up, sigma_rad, none)
+
+
+def place_on_earth(
+    of: Placed, fixes: GnssFixes, lever_arm_m: FloatArray, time_offset_s: float, folder: FilePath
+) -> dict[str, Any]:
+    """Fuse a trajectory with GNSS positions, write all files into a folder, and return what is said of it.
+
+    Args:
+        of: the trajectory.
+        fixes: positions of an antenna.
+        lever_arm_m: (3,) the antenna in the body frame.
+        time_offset_s: added to the stamps of the positions.
+        folder: exists.
+
+    Raises:
+        EstimationError: the positions do not determine its place.
+    """
+    found = georeference(of.path, fixes, lever_arm_m, round(1e9 * time_offset_s))
+    T = found.T_enu_body
+    write_tum(folder / "trajectory_enu.tum", replace(of.trajectory, T_world_body=T))
+    track = found.frame.geodetic(T[:, :3, 3])
+    write_geojson(folder / "trajectory.geojson", of.name, track, fixes.geodetic, found.used)
+    write_kml(folder / "trajectory.kml", of.name, track)
+    epsg = write_utm(folder / "trajectory_utm.csv", track, of.path.times_ns)
+    if len(of.points):
+        # Each landmark moves with the pose nearest to it.
+        T_map = of.path.T_map_body
+        _, nearest = cKDTree(T_map[:, :3, 3]).query(of.points)
+        before, after = se3_inverse(T_map[nearest]), T[nearest]
+        p = found.scale * (np.einsum("nij,nj->ni", before[:, :3, :3], of.points) + before[:, :3, 3])
+        landmarks = found.frame.geodetic(np.einsum("nij,nj->ni", after[:, :3, :3], p) + after[:, :3, 3])
+        write_points_geojson(folder / "landmarks.geojson", of.name, landmarks)
+        write_utm(folder / "landmarks_utm.csv", landmarks)
+    return _facts(of, fixes, found, epsg)
+
+
+def _facts(of: Placed, fixes: GnssFixes, found: Georeference, epsg: str) -> dict[str, Any]:
+    r, used = found.residuals, found.used
+    sigma = np.sqrt(np.diagonal(found.position_covariance, axis1=1, axis2=2))
+    heading = float(np.degrees(np.arctan2(found.T_enu_map[1, 0], found.T_enu_map[0, 0])))
+    rigid = found.T_enu_map @ of.path.T_map_body
+    bent = np.linalg.norm(rigid[:, :3, 3] - found.T_enu_body[:, :3, 3], axis=1)
+    horizontal = np.linalg.norm(r[used, :2], axis=1)
+    return {
+        "origin": {"latitude_deg": found.frame.origin[0], "longitude_deg": found.frame.origin[1]}
+        | {"height_m": found.frame.origin[2], "datum": "WGS84"},
+        "T_enu_map": found.T_enu_map.tolist(),
+        "covariance": found.covariance.tolist(),
+        "heading_deg": heading,
+        "heading_sigma_deg": found.heading_sigma_deg,
+        "scale": found.scale,
+        "scale_sigma": found.scale_sigma,
+        "positions": len(fixes),
+        "positions_inside": int(found.inside.sum()),
+        "positions_used": int(used.sum()),
+        "heights_used": int(found.used_height.sum()),
+        "residual_median_m": float(np.median(horizontal)),
+        "residual_90_m": float(np.percentile(horizontal, 90)),
+        "sigma_horizontal_m": float(np.median(np.linalg.norm(sigma[:, :2], axis=1))),
+        "sigma_up_m": float(np.median(sigma[:, 2])),
+        "bent_rms_m": float(np.sqrt(np.mean(bent**2))),
+        "crs": epsg,
+        "notes": list(fixes.notes),
+    }

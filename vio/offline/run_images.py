@@ -1,0 +1,160 @@
+"""The images of a run's recording, as the run corrected their calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vio.calibration.stereo_field import DisplacementField
+from vio.cameras.rig import Rectifier
+from vio.config import load_config
+from vio.datasets import DatasetSettings, in_colour, open_dataset
+from vio.datasets.common import read_npz
+from vio.datasets.image_pairs import ImageDataset
+from vio.errors import DataError
+from vio.geometry.distortion import rig_from_rectified
+from vio.geometry.lie import FloatArray
+from vio.geometry.rectify import pinhole_maps, pinhole_within
+from vio.geometry.stereo import StereoCamera
+from vio.protocols import Dataset
+from vio.records import FIELD_TERMS, ROW_TERMS, IntArray, StereoFrame
+from vio.runs.files import RunFile
+
+
+@dataclass(frozen=True, slots=True)
+class RunImages:
+    """Where the images of a run are, and how they are corrected."""
+
+    where: Path  # the run's folder, for messages
+    source: str  # the recording, as `kind:path`
+    seen: StereoCamera  # of the images that the front end saw
+    camera: StereoCamera  # of the corrected images: a pinhole's, without the field
+    field: DisplacementField | None  # what the run found its stereo calibration to be off by; None: nothing
+
+    def frames(self, indices: IntArray, source: str | None = None, *, colour: bool = False) -> Iterator[StereoFrame]:
+        """Yield the corrected images of frames (K,), in order, with the depths of a camera that has them.
+
+        Args:
+            indices: frame numbers, increasing.
+            source: the recording, if it is not at the path stored in the run.
+            colour: keep the images' colours, (H, W, 3).
+
+        Raises:
+            DataError: the recording is missing, has no images or another camera, or a frame cannot be read.
+        """
+        dataset = self._opened(source)
+        correct = self._correction(dataset.recording.camera)
+        for frame in _chosen(in_colour(dataset) if colour else dataset, indices.tolist()):
+            assert frame.left is not None
+            if correct is None:
+                yield frame
+            elif frame.right is None:
+                depth = None if frame.depth is None else correct.depth(frame.depth)
+                yield replace(frame, left=correct.left(frame.left), depth=depth)
+            else:
+                left, right = correct(frame.left, frame.right)
+                yield replace(frame, left=left, right=right)
+
+    def _opened(self, source: str | None) -> Dataset:
+        file = self.where / RunFile.CONFIG
+        settings = load_config(file).dataset if file.is_file() else DatasetSettings()
+        settings = replace(settings, projection=self.seen.projection, max_frame_rate=None, camera="both")
+        try:
+            dataset = open_dataset(source or self.source, settings)
+        except DataError as error:
+            raise DataError(
+                f"the images of {self.where} are not available: {error}; name the recording with --source"
+            ) from error
+        recording = dataset.recording
+        if not recording.has_images:
+            raise DataError(f"{source or self.source} contains no images; name the recording with --source")
+        ours, theirs = self.seen if self.seen.is_cylinder else self.camera, recording.camera
+        if not np.allclose(
+            [ours.fu, ours.fv, ours.cu, ours.cv, ours.baseline_m],
+            [theirs.fu, theirs.fv, theirs.cu, theirs.cv, theirs.baseline_m],
+            rtol=1e-9,
+        ):
+            raise DataError(f"{recording.path} has another calibration than the run {self.where}; repeat the run")
+        return dataset
+
+    def _correction(self, shown: StereoCamera) -> Rectifier | None:
+        """Return the map of images, of the camera that is `shown`, to the corrected ones; None: they are the same."""
+        camera = replace(self.camera, width=shown.width, height=shown.height)  # features may state no size
+        if self.seen.is_cylinder:
+            maps = (pinhole_maps(self.seen, camera),) * 2
+        elif self.field is not None:
+            maps = replace(self.field, camera=camera).maps()
+        else:
+            return None
+        return Rectifier(rig_from_rectified(camera, np.eye(4)), camera, np.eye(4), maps, "linear")
+
+
+def _chosen(dataset: Dataset, indices: list[int]) -> Iterator[StereoFrame]:
+    """Yield some frames: image files one by one, others, which are read in order, in one pass."""
+    files = isinstance(dataset, ImageDataset)
+    spans = [(k, k + 1) for k in indices] if files else [(indices[0], indices[-1] + 1)] if indices else []
+    waiting = iter(indices)
+    due = next(waiting, None)
+    for start, stop in spans:
+        for event in dataset.events(start, stop):
+            if isinstance(event, StereoFrame) and event.index == due and event.left is not None:
+                yield event
+                due = next(waiting, None)
+        if due is not None and due < stop:
+            break
+    if due is not None:
+        raise DataError(f"{dataset.recording.path}: frame {due} cannot be read; see the warnings above")
+
+
+def run_images(folder: Path, metrics: dict[str, Any]) -> RunImages:
+    """Return where the images of a run are, from the metrics in its folder.
+
+    Raises:
+        DataError: the metrics are damaged.
+    """
+    try:
+        seen = StereoCamera(**metrics["camera"])
+        source = f"{metrics['kind']}:{metrics['source']}"
+    except (KeyError, TypeError) as error:
+        raise DataError(f"{folder}: its metrics.json does not hold camera and source; repeat the run") from error
+    if metrics["kind"] == "log":
+        source = original_source(Path(metrics["source"]))
+    coefficients = None if seen.kind == "rgbd" else field_coefficients(folder, seen, metrics)
+    field = None if coefficients is None or seen.is_cylinder else DisplacementField(seen, coefficients)
+    return RunImages(folder, source, seen, pinhole_within(seen) if seen.is_cylinder else seen, field)
+
+
+def field_coefficients(folder: Path, camera: StereoCamera, metrics: dict[str, Any]) -> FloatArray | None:
+    """Return the coefficients (15,) of (R3) and (R2) in a run's metrics; None: the run estimated none.
+
+    Raises:
+        DataError: the metrics are damaged.
+    """
+    stated = metrics.get("stereo_field")
+    if stated is None or stated.get("rows_px") is None:
+        return None
+    try:
+        coefficients = np.array([*stated["coefficients_px"], *stated["rows_px"]], dtype=np.float64) / camera.fu
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{folder}: stereo_field of its metrics is damaged ({error}); repeat the run") from error
+    if coefficients.shape != (FIELD_TERMS + ROW_TERMS,) or not np.isfinite(coefficients).all():
+        raise DataError(
+            f"{folder}: stereo_field of its metrics holds no {FIELD_TERMS + ROW_TERMS} finite numbers; repeat the run"
+        )
+    return coefficients
+
+
+def original_source(log: Path) -> str:
+    """Return the recording of the images, through any number of replayed logs."""
+    source = str(read_npz(log, ["source"])["source"])
+    kind, _, path = source.partition(":")
+    seen = {log.resolve()}
+    while kind == "log" and Path(path).is_file() and Path(path).resolve() not in seen:
+        seen.add(Path(path).resolve())
+        source = str(read_npz(Path(path), ["source"])["source"])
+        kind, _, path = source.partition(":")
+    return source
