@@ -88,6 +88,9 @@ def _take_up(other: MapStore, number: int, store: MapStore) -> None:
     builder = MapBuilder(store, session.source, session.camera, upright=session.upright, localise=False)
     for k, row in enumerate(other.keyframes()):
         if row.session == number:
-            keyframe = Keyframe(row.frame, row.time_ns, row.T_odom_cam, motions.get(k), row.up_cam, row.up_sigma_rad)
+            motion = motions.get(k)
+            keyframe = Keyframe(
+                row.frame, row.time_ns, row.T_odom_cam, motion, row.up_cam, row.up_sigma_rad, session.field
+            )
             builder.add(keyframe, other.features(k))
     builder.finish()

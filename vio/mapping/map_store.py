@@ -1,4 +1,4 @@
-"""The map's file: SQLite, version 3, described in docs/maps.md; older ones are read, and become 3 when written to.
+"""The map's file: SQLite, version 4, described in docs/maps.md; older ones are read, and become 4 when written to.
 
 What belongs together is written in one transaction, so that a process that dies leaves the state before it. A file is
 checked when it is opened: it has our tables and nothing else, SQLite finds its pages whole, each row agrees with its
@@ -20,19 +20,23 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from vio.calibration.stereo_field import TERMS, DisplacementField
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
 
-VERSION = 3
+VERSION = 4
 _OLDEST = 1
 _SINCE = {
     "projection": 2,
     "kind": 2,
     "crc32": 3,
+    "field": 4,
+    "field_covariance": 4,
 }  # version that brought a column; before 2 all were pinhole stereo pairs
+_BEFORE = {"projection": "'pinhole'", "kind": "'stereo'", "crc32": "0"}  # what rows of older versions get; else NULL
 _KEYS = {"sessions": "id", "keyframes": "id", "features": "keyframe", "odometry": "second", "loops": "id"}
 _ROTATION_TOLERANCE = 1e-3  # of R R^T
 _MOST_S = 300.0  # of one step with the file
@@ -41,7 +45,8 @@ APPLICATION_ID = 0x53564D50  # "SVMP" in the file's header
 _SCHEMA = """
 CREATE TABLE sessions (id INTEGER PRIMARY KEY, source TEXT NOT NULL, part INTEGER NOT NULL, upright INTEGER NOT NULL,
     fu REAL NOT NULL, fv REAL NOT NULL, cu REAL NOT NULL, cv REAL NOT NULL, baseline_m REAL NOT NULL,
-    width INTEGER, height INTEGER, projection TEXT NOT NULL, kind TEXT NOT NULL, crc32 INTEGER NOT NULL);
+    width INTEGER, height INTEGER, projection TEXT NOT NULL, kind TEXT NOT NULL, field BLOB, field_covariance BLOB,
+    crc32 INTEGER NOT NULL);
 CREATE TABLE keyframes (id INTEGER PRIMARY KEY, session INTEGER NOT NULL, frame INTEGER NOT NULL,
     time_ns INTEGER NOT NULL, T_map_cam BLOB NOT NULL, T_odom_cam BLOB NOT NULL, drift BLOB NOT NULL,
     path_m REAL NOT NULL, up_cam BLOB, up_sigma_rad REAL, crc32 INTEGER NOT NULL);
@@ -65,6 +70,7 @@ class SessionRow:
     camera: StereoCamera
     upright: bool  # whether z of its odometry frame is up
     part: int  # sessions that loops have joined share the number
+    field: DisplacementField | None = None  # what its stereo calibration is off by; None: not estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,14 +194,16 @@ class MapStore:
 
     def _bring_up_to_date(self) -> None:
         """Add what older versions had not."""
-        version = self.version
-        if version < 2:
-            for column, value in (("projection", "pinhole"), ("kind", "stereo")):
-                self._db.execute(f"ALTER TABLE sessions ADD COLUMN {column} TEXT NOT NULL DEFAULT '{value}'")
-        if version < 3:
-            for table in _KEYS:
-                self._db.execute(f"ALTER TABLE {table} ADD COLUMN crc32 INTEGER NOT NULL DEFAULT 0")
-                self._sign(table)
+        if self.version == VERSION:
+            return
+        for table, statement in zip(_KEYS, _SCHEMA.strip().split(";\n"), strict=True):
+            before = set(self._columns(table))
+            self._db.execute(f"ALTER TABLE {table} RENAME TO older")
+            self._db.execute(statement)
+            values = ", ".join(c if c in before else _BEFORE.get(c, "NULL") for c in self._columns(table))
+            self._db.execute(f"INSERT INTO {table} SELECT {values} FROM older")
+            self._db.execute("DROP TABLE older")
+            self._sign(table)
         self._db.execute(f"PRAGMA user_version = {VERSION}")
 
     @property
@@ -253,7 +261,7 @@ class MapStore:
         c = row.camera
         values = (row.source, row.part, row.upright, c.fu, c.fv, c.cu, c.cv, c.baseline_m, c.width, c.height)
         number = self._count("sessions")
-        self._insert("sessions", (number, *values, c.projection, c.kind))
+        self._insert("sessions", (number, *values, c.projection, c.kind, *_field_blobs(row.field)))
         return number
 
     def add_keyframe(self, row: KeyframeRow, features: KeyframeFeatures) -> int:
@@ -290,6 +298,19 @@ class MapStore:
         """Replace the part of each session."""
         self._set("sessions", "part", parts)
 
+    def set_loops(self, rows: Sequence[LoopRow]) -> None:
+        """Replace what is measured of each loop."""
+        self._set("loops", "T_i_j", [_blob(row.pose.T_i_j) for row in rows])
+        self._set("loops", "covariance", [_blob(row.pose.covariance) for row in rows])
+        self._set("loops", "inliers", [row.inliers for row in rows])
+
+    def set_field(self, session: int, field: DisplacementField | None) -> None:
+        """Replace what a session found its stereo calibration to be off by."""
+        with self._errors():
+            update = "UPDATE sessions SET field = ?, field_covariance = ? WHERE id = ?"
+            self._db.execute(update, (*_field_blobs(field), session))
+            self._sign("sessions", f"WHERE id = {int(session)}")
+
     def truncate(self, sessions: int, keyframes: int, loops: int) -> None:
         """Forget what was added after there were so many."""
         with self._errors():
@@ -311,8 +332,10 @@ class MapStore:
 
     def _sign(self, table: str, which: str = "") -> None:
         """Write the checksums of rows, of their values as they are stored."""
-        columns = [name for name, *_ in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))]
-        self._db.execute(f"UPDATE {table} SET crc32 = row_crc32({', '.join(columns[:-1])}) {which}")
+        self._db.execute(f"UPDATE {table} SET crc32 = row_crc32({', '.join(self._columns(table)[:-1])}) {which}")
+
+    def _columns(self, table: str) -> list[str]:
+        return [name for (name,) in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))]
 
     def _count(self, table: str) -> int:
         with self._errors():
@@ -325,12 +348,13 @@ class MapStore:
 
         def made(_: int, source: str, part: int, upright: int, *camera: Any) -> SessionRow:
             lengths: list[Any] = [_number(value) for value in camera[:5]]
-            size, names = camera[5:7], [source, *camera[7:]]
+            size, names, field = camera[5:7], [source, *camera[7:9]], camera[9:]
             if not all(isinstance(value, (int, type(None))) for value in size) or min(lengths[:2]) <= 0:
                 raise ValueError("its camera is none")
             if not all(isinstance(value, str) for value in names):
                 raise ValueError("a name is no text")
-            return SessionRow(source, StereoCamera(*lengths, *camera[5:]), bool(upright), _integer(part))
+            pair = StereoCamera(*lengths, *camera[5:9])
+            return SessionRow(source, pair, bool(upright), _integer(part), _field_of(pair, *field))
 
         return self._read("sessions", made)
 
@@ -430,6 +454,21 @@ def _row_crc32(*values: Any) -> int:
     for value in values:
         crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r};".encode(), crc)
     return crc
+
+
+def _field_blobs(field: DisplacementField | None) -> tuple[bytes | None, bytes | None]:
+    if field is None:
+        return None, None
+    return _blob(field.coefficients), None if field.covariance is None else _blob(field.covariance)
+
+
+def _field_of(
+    camera: StereoCamera, coefficients: bytes | None = None, covariance: bytes | None = None
+) -> DisplacementField | None:
+    if coefficients is None:
+        return None
+    P = None if covariance is None else _array(covariance, TERMS, TERMS)
+    return DisplacementField(camera, _array(coefficients, TERMS), P)
 
 
 def _blob(array: FloatArray) -> bytes:
