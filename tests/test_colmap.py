@@ -453,7 +453,10 @@ def test_a_step_that_only_a_loop_joins_is_a_gap() -> None:
     points = np.zeros((8, 8), dtype=np.int64)
     for a, b in [(0, 1), (1, 2), (2, 3), (4, 5), (5, 6), (6, 7), (0, 7)]:
         points[a, b] = points[b, a] = 20
-    assert linked_steps(points).tolist() == [True, True, True, False, True, True, True]
+    assert linked_steps(points, np.arange(8)).tolist() == [True, True, True, False, True, True, True]
+    points[3, 4] = points[4, 3] = 20
+    assert linked_steps(points, np.arange(8)).all()
+    assert not linked_steps(points, np.array([0, 1, 2, 3, 30, 31, 32, 33]))[3], "far apart in time"
 
 
 def test_images_without_texture_are_not_observable(

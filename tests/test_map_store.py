@@ -222,7 +222,8 @@ def test_a_merge_of_two_rigs_names_files_that_the_user_knows(tmp_path: Path, cap
     store = MapStore(tmp_path / "b.map", create=True)
     store.add_session(SessionRow("there", replace(CAMERA, baseline_m=0.5), True, 0))
     store.close()
-    merge_maps(tmp_path / "a.map", tmp_path / "b.map", tmp_path / "both.map")
+    with pytest.raises(DataError, match="shows no place of"):
+        merge_maps(tmp_path / "a.map", tmp_path / "b.map", tmp_path / "both.map")
     assert f"{tmp_path / 'both.map'}: was made with another rig" in caplog.text
     assert "partial" not in caplog.text
 

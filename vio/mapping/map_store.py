@@ -8,6 +8,7 @@ checksum (from version 3 on), and its values fit together.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import math
 import sqlite3
 import time
@@ -38,6 +39,7 @@ _SINCE = {
 }  # version that brought a column; before 2 all were pinhole stereo pairs
 _BEFORE = {"projection": "'pinhole'", "kind": "'stereo'", "crc32": "0"}  # what rows of older versions get; else NULL
 _KEYS = {"sessions": "id", "keyframes": "id", "features": "keyframe", "odometry": "second", "loops": "id"}
+_TELLING_FEATURES = 20
 _ROTATION_TOLERANCE = 1e-3  # of R R^T
 _MOST_S = 300.0  # of one step with the file
 _STEP = 10_000  # instructions of SQLite between two looks at the clock, and at signals
@@ -145,13 +147,13 @@ class MapStore:
         check_path(path)
         if not create and not path.is_file():
             raise DataError(f"{path}: there is no such map; vio run --map {path} makes one")
-        with self._errors():
+        with contextlib.ExitStack() as undo, self._errors():
             if read_only:
                 uri = f"{path.absolute().as_uri()}?mode=ro"
                 self._db = sqlite3.connect(uri, uri=True, check_same_thread=False, timeout=1.0)
             else:
                 self._db = sqlite3.connect(path, check_same_thread=False, timeout=1.0)
-                self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
+            undo.callback(self._db.close)
             self._db.isolation_level = None
             self._db.create_function("row_crc32", -1, _row_crc32, deterministic=True)
             self._db.set_progress_handler(self._is_late, _STEP)
@@ -168,10 +170,15 @@ class MapStore:
                     f"{path}: is a map of version {self._pragma('user_version')}, this program reads {VERSION}; use "
                     "the program that wrote it, or build the map again"
                 )
+            if read_only:
+                self._db.execute("BEGIN")  # one state of the file, whatever another process commits
             self._check()
             if not read_only:
+                # Readers see the last commit while this process writes; its transaction never ends, so no other writes.
+                self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute("BEGIN IMMEDIATE")
                 self._bring_up_to_date()
+            undo.pop_all()
 
     def _check(self) -> None:
         """Raise DataError unless the file holds our tables, whole, with values that fit together."""
@@ -241,7 +248,16 @@ class MapStore:
         with self._errors():
             if self._db.in_transaction:
                 self._db.execute("COMMIT")
+                with contextlib.suppress(sqlite3.OperationalError):  # it stays so while another process reads
+                    self._db.execute("PRAGMA journal_mode = DELETE")
             self._db.close()
+
+    def images(self) -> set[bytes]:
+        """Return a hash of the descriptors of each keyframe that shows enough to be told from any other."""
+        with self._errors():
+            least = _TELLING_FEATURES * DESCRIPTOR_BYTES
+            rows = self._db.execute("SELECT descriptors FROM features WHERE length(descriptors) >= ?", (least,))
+            return {hashlib.blake2b(bits, digest_size=16).digest() for (bits,) in rows}
 
     def copy_to(self, path: Path, *, known_as: Path) -> None:
         """Write a copy of the whole map.

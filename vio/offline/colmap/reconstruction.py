@@ -23,7 +23,7 @@ _EXHAUSTIVE = 60  # keyframes up to which all left images are matched, so that a
 _AROUND_LOOP = (-1, 0, 1)  # index offsets from both keyframes of a loop, whose left images are matched with one another
 _LEAST_REGISTERED = 3
 LEAST_SHARED = 15  # points that two left images show, from which the model counts as joined there
-_LINK = 3  # keyframes on either side of a step of the path, of which two must be joined
+_LINK = 6  # keyframes across which a step of the path may be joined; those further apart are joined by a loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +154,7 @@ def reconstruct(
         int(model.num_points3D()),
         mean_reprojection_error_px(model),
         of_loops.astype(np.int64),
-        linked_steps(points),
+        linked_steps(points, keyframes),
         _revisits(points, keyframes),
     )
 
@@ -166,10 +166,11 @@ def _common_points(model: pycolmap.Reconstruction, names: Sequence[str]) -> IntA
     return np.array([[len(a & b) for b in seen] for a in seen], dtype=np.int64)
 
 
-def linked_steps(points: IntArray) -> BoolArray:
-    """Return whether a model is joined from each keyframe to the next (R - 1,), by the points (R, R) they share."""
-    near = (points[max(n - _LINK, 0) : n, n : n + _LINK].max() for n in range(1, len(points)))
-    return np.array([most >= LEAST_SHARED for most in near], dtype=np.bool_)
+def linked_steps(points: IntArray, keyframes: IntArray) -> BoolArray:
+    """Return whether a model is joined from each keyframe (R,) to the next (R - 1,), by the points (R, R) shared."""
+    near = np.abs(keyframes[None, :] - keyframes[:, None]) <= _LINK
+    joined = near & (points >= LEAST_SHARED)
+    return np.array([joined[:n, n:].any() for n in range(1, len(points))], dtype=np.bool_)
 
 
 def _revisits(points: IntArray, keyframes: IntArray) -> IntArray:
