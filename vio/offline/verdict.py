@@ -60,9 +60,10 @@ def overall_verdict(results: Sequence[MapperResult]) -> str:
     found = {result.mapper: result.found[1] for result in results if result.found is not None}
     if not found:
         return f"none: {results[0].verdict}"
-    fullest = max((r for r in results if r.found is not None), key=lambda r: r.found[1].piece.sum() if r.found else 0)
-    assert fullest.found is not None
-    return unconnected(fullest.total, fullest.found[1]) + _judged(results, found) + _revisits(results)
+    agreeing = [name for name, comparison in found.items() if _grade(comparison, comparison.segments) == "negligible"]
+    agreeing.sort(key=lambda name: -int(found[name].piece.sum()))
+    compared = found[agreeing[0]] if agreeing else max(found.values(), key=lambda c: int(c.piece.sum()))
+    return unconnected(results[0].total, compared) + _judged(found, agreeing) + _revisits(results)
 
 
 def _revisits(results: Sequence[MapperResult]) -> str:
@@ -75,9 +76,8 @@ def _revisits(results: Sequence[MapperResult]) -> str:
     return ""
 
 
-def _judged(results: Sequence[MapperResult], found: dict[Mapper, KeyframeComparison]) -> str:
-    """Say whether a run and COLMAP agree where they are compared."""
-    agreeing = [name for name, comparison in found.items() if _grade(comparison, comparison.segments) == "negligible"]
+def _judged(found: dict[Mapper, KeyframeComparison], agreeing: Sequence[Mapper]) -> str:
+    """Say whether a run and COLMAP agree where they are compared; models that do, that of most keyframes first."""
     if not agreeing:
         return _disagreement(found)
     comparison = found[agreeing[0]]
