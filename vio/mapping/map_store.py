@@ -188,8 +188,9 @@ class MapStore:
         ((answer,),) = self._db.execute("PRAGMA quick_check(1)")
         if answer != "ok":
             raise _damaged(self.path, " ".join(answer.split()))
-        sessions, keyframes = len(self.sessions()), len(self.keyframes())
-        if any(not 0 <= k.session < sessions for k in self.keyframes()):
+        sessions, rows = len(self.sessions()), self.keyframes()
+        keyframes = len(rows)
+        if any(not 0 <= k.session < sessions for k in rows):
             raise _damaged(self.path, "a keyframe belongs to no session")
         pairs = [(i, j) for i, j, _ in self.odometry()] + [(o.first, o.second) for o in self.loops()]
         if any(not 0 <= i < j < keyframes for i, j in pairs):
