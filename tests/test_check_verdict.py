@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vio.geometry.lie import FloatArray, se3_exp
+from vio.geometry.lie import FloatArray, se3_exp, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.offline.check import draw_check, expected_minutes
 from vio.offline.colmap.reconstruction import Mapper, Reconstructed
@@ -18,6 +20,7 @@ from vio.offline.verdict import MapperResult, overall_verdict
 from vio.records import FeatureTracks, Trajectory
 
 COUNT = 30
+MAPPERS: tuple[Mapper, ...] = ("incremental", "global")
 CAMERA = StereoCamera(fu=400.0, fv=400.0, cu=320.0, cv=240.0, baseline_m=0.1, width=640, height=480)
 NOTHING = FeatureTracks(
     offsets=np.zeros(COUNT + 1, dtype=np.int64),
@@ -40,13 +43,17 @@ def _poses(seed: int | None = None) -> FloatArray:
     return T @ se3_exp(np.column_stack([2e-3 * rng.normal(size=(COUNT, 3)), 2e-4 * rng.normal(size=(COUNT, 3))]))
 
 
-def _result(mapper: Mapper, T_run: FloatArray, T_world_cam0: FloatArray) -> MapperResult:
+def _result(
+    mapper: Mapper, T_run: FloatArray, T_world_cam0: FloatArray, connected: Sequence[int] = range(COUNT)
+) -> MapperResult:
     path = TrackedPath(
         Path("run"), CAMERA, Trajectory(T_run, None, "cam0", frame_indices=10 * np.arange(COUNT)), NOTHING
     )
-    rows = np.arange(COUNT)
-    model = Reconstructed(mapper, T_world_cam0, rows, 1000, 0.5, shared=np.zeros(0, dtype=np.int64))
-    return MapperResult(mapper, COUNT, (model, compare_keyframes(path, rows, T_world_cam0)))
+    rows = np.array(connected)
+    no_pairs = np.zeros((0, 2), dtype=np.int64)
+    linked = np.diff(connected) <= 3
+    model = Reconstructed(mapper, T_world_cam0[rows], rows, 1000, 0.5, np.zeros(0, dtype=np.int64), linked, no_pairs)
+    return MapperResult(mapper, COUNT, (model, compare_keyframes(path, rows, T_world_cam0[rows], linked=linked)))
 
 
 def _jumped(T: FloatArray, by_m: float, row: int = 20) -> FloatArray:
@@ -87,6 +94,37 @@ def test_a_model_that_broke_in_two_is_not_held_against_the_run() -> None:
     assert comparison.piece.sum() == 20
     assert comparison.ate_m < 0.01, "the longer piece is compared, not the two as one"
     assert comparison.scale == pytest.approx(1.0, abs=0.005)
+
+
+def test_motions_across_a_gap_are_not_compared() -> None:
+    """COLMAP connected both ends of the run, which a loop joins, and nothing between them."""
+    run, ends = _poses(), [*range(12), *range(18, COUNT)]
+    results = [_result(m, run, _jumped(_poses(s), 3.0, row=15), ends) for s, m in enumerate(MAPPERS)]
+    text = overall_verdict(results)
+    assert text.startswith(
+        "6 of 30 keyframes not connected, the others in 2 pieces, of which frames 0 to 110 are compared; "
+    )
+    assert "the run and COLMAP agree" in text
+    assert "off" not in text
+
+
+def test_a_run_that_bends_evenly_does_not_agree() -> None:
+    """No motion stands out from the others: 60 degrees over 29 of them."""
+    turn = se3_exp([0.0, 0.0, 0.0, 0.0, np.radians(60 / (COUNT - 1)), 0.0])
+    run = [np.eye(4)]
+    for motion in se3_inverse(_poses()[:-1]) @ _poses()[1:]:
+        run.append(run[-1] @ motion @ turn)
+    results = [_result("incremental", np.array(run), _poses(1)), _result("global", np.array(run), _poses(2))]
+    text = overall_verdict(results)
+    assert re.match(r"the run is probably off by [\d.]+ m \(.* m per 100 m\) and 60.* deg at frames 0 to 290", text)
+
+
+def test_a_missed_loop_is_named() -> None:
+    result = _result("incremental", _poses(), _poses(1))
+    assert result.found is not None
+    model = replace(result.found[0], revisits=np.array([[1, 28], [2, 29]]))
+    text = overall_verdict([replace(result, found=(model, result.found[1]))])
+    assert text.endswith("; frames 10 and 280 show one place, which the run did not close as a loop")
 
 
 def test_models_that_contradict_one_another_convict_nobody() -> None:

@@ -22,7 +22,7 @@ from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, s
 from vio.geometry.stereo import project
 from vio.live.build import Parts
 from vio.offline.colmap.model import ModelImages, build_model, keyframe_images, mean_reprojection_error_px, write_model
-from vio.offline.colmap.reconstruction import pairs_to_match
+from vio.offline.colmap.reconstruction import linked_steps, pairs_to_match
 from vio.offline.colmap.trajectory import read_colmap_trajectory
 from vio.offline.comparison import GroundTruth, KeyframeComparison, compare_keyframes
 from vio.offline.keyframes import TrackedPath, choose_keyframes
@@ -434,13 +434,29 @@ def test_check_agrees_with_a_correct_run_and_estimates_the_scale(
 
 
 def test_keyframes_at_both_ends_of_a_loop_are_matched() -> None:
-    names = keyframe_images(np.arange(40))
+    names = keyframe_images(np.arange(70))
     without = pairs_to_match(names, np.zeros((0, 2), dtype=np.int64))
-    pairs = pairs_to_match(names, np.array([[2, 33], [3, 33], [0, 39]]))
+    pairs = pairs_to_match(names, np.array([[2, 33], [3, 33], [0, 69]]))
     assert len(set(pairs)) == len(pairs), "each once"
     added = {(names.left.index(a), names.left.index(b)) for a, b in set(pairs) - set(without)}
-    assert {(2, 33), (1, 32), (3, 34), (4, 33), (0, 39), (1, 38)} <= added
+    assert {(2, 33), (1, 32), (3, 34), (4, 33), (0, 69), (1, 68)} <= added
     assert all(b - a > 25 for a, b in added)
+
+
+def test_all_keyframes_of_a_short_run_are_matched_with_one_another() -> None:
+    names = keyframe_images(np.arange(40))
+    pairs = set(pairs_to_match(names, np.zeros((0, 2), dtype=np.int64)))
+    assert {(names.left[a], names.left[b]) for b in range(40) for a in range(b)} <= pairs
+
+
+def test_a_step_that_only_a_loop_joins_is_a_gap() -> None:
+    points = np.zeros((8, 8), dtype=np.int64)
+    for a, b in [(0, 1), (1, 2), (2, 3), (4, 5), (5, 6), (6, 7), (0, 7)]:
+        points[a, b] = points[b, a] = 20
+    assert linked_steps(points, np.arange(8)).tolist() == [True, True, True, False, True, True, True]
+    points[3, 4] = points[4, 3] = 20
+    assert linked_steps(points, np.arange(8)).all()
+    assert not linked_steps(points, np.array([0, 1, 2, 3, 30, 31, 32, 33]))[3], "far apart in time"
 
 
 def test_images_without_texture_are_not_observable(

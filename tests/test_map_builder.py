@@ -12,6 +12,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from vio.calibration.stereo_field import DisplacementField
 from vio.geometry.lie import FloatArray, se3_exp, se3_from_parts, se3_inverse, se3_log, transform_points
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import project, triangulate
@@ -292,3 +293,48 @@ def test_a_checkpoint_goes_on_to_the_same_map(room_walk: Walk, whole_map: MapBui
     rows = [[r.T_map_cam.tobytes() for r in MapStore(p, read_only=True).keyframes()] for p in (path, whole_map.path)]
     assert rows[0] == rows[1]
     assert rows[0] == [T.tobytes() for T in resumed.graph.T_map_cam.rows], "the file holds what was optimised"
+
+
+def test_the_map_is_made_of_pixels_without_what_the_calibration_is_found_to_be_off_by(
+    room_walk: Walk, tmp_path: Path
+) -> None:
+    """The field is wrong while the session goes on, and known at its end."""
+    camera, found = room_walk.camera, {}
+    coefficients = np.zeros(15)
+    coefficients[[0, 2, 4]] = 1e-2, 1e-2, -2e-2  # 1.6 px and more in disparities
+    covariance = np.diag(np.full(15, 1e-10))
+    right, none = (DisplacementField(camera, c, covariance) for c in (coefficients, 0 * coefficients))
+    for name, ended in (("right", right), ("none", none)):
+        store = MapStore(tmp_path / f"{name}.map", create=True)
+        builder = MapBuilder(store, "walk", camera, upright=False, localise=False)
+        for keyframe, seen in room_walk.keyframes(seed=0):
+            off = replace(seen, z=seen.z + right.at(seen.z))
+            builder.add(replace(keyframe, field=none), off)
+        builder.finish(ended)
+        builder.close()
+        held = MapStore(tmp_path / f"{name}.map", read_only=True)
+        field = held.sessions()[0].field
+        assert field is not None
+        np.testing.assert_array_equal(field.coefficients, ended.coefficients)
+        errors = []
+        for loop in held.loops():
+            E = se3_inverse(loop.pose.T_i_j) @ se3_inverse(room_walk.T[loop.first]) @ room_walk.T[loop.second]
+            errors.append(float(np.linalg.norm(E[:3, 3])))
+        assert errors
+        found[name] = float(np.median(errors))
+    assert found["right"] < 0.7 * found["none"]
+    assert found["right"] < 0.02
+
+
+def test_loops_carry_the_covariance_of_the_stereo_field(room_walk: Walk, tmp_path: Path) -> None:
+    """Pixels without noise, a field that is not known to a hundredth of a focal length: loops are no better."""
+    camera, sigmas = room_walk.camera, []
+    for sigma in (0.0, 5e-3):
+        field = DisplacementField(camera, np.zeros(15), np.diag(np.repeat([sigma**2, 0.0], [1, 14])))
+        store = MapStore(tmp_path / f"{sigma}.map", create=True)
+        builder = MapBuilder(store, "walk", camera, upright=False, localise=False)
+        for keyframe, seen in room_walk.keyframes(seed=0):
+            builder.add(replace(keyframe, field=field), seen)
+        sigmas.append([float(np.sqrt(loop.pose.covariance[:3, :3].trace())) for loop in builder.graph.loops])
+        builder.close()
+    assert np.median(sigmas[1]) > 1.3 * np.median(sigmas[0])

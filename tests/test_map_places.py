@@ -8,6 +8,7 @@ import pytest
 
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log, transform_points
 from vio.geometry.stereo import StereoCamera, project
+from vio.mapping import place_index
 from vio.mapping.features import KeyframeFeatures, _most_alike, _near_rows, extract, no_keyframe_features
 from vio.mapping.loop_geometry import LEAST_INLIERS, match, verify
 from vio.mapping.place_index import PlaceIndex, words_of
@@ -199,3 +200,16 @@ def test_an_empty_index_and_an_empty_view_have_no_candidates() -> None:
     index.add(no_keyframe_features().descriptors)
     assert index.candidates(bits, np.ones(1, dtype=np.bool_), 3).tolist() == []
     assert index.candidates(no_keyframe_features().descriptors, np.ones(1, dtype=np.bool_), 3).tolist() == []
+
+
+def test_words_are_the_chosen_bits_and_counted_once_a_keyframe() -> None:
+    rng = np.random.default_rng(0)
+    descriptors = rng.integers(0, 256, (300, 32), dtype=np.uint8)
+    bits, index = np.unpackbits(descriptors, axis=1).astype(np.int64), place_index.PlaceIndex()
+    expected = np.stack([bits[:, columns] @ (1 << np.arange(14)) for columns in place_index._chosen_bits()])
+    np.testing.assert_array_equal(place_index.words_of(descriptors), expected)
+    index.add(descriptors)
+    index.add(descriptors[:100])
+    counts = [np.bincount(row, minlength=1 << 14) > 0 for row in expected]
+    again = [np.bincount(row[:100], minlength=1 << 14) > 0 for row in expected]
+    np.testing.assert_array_equal(index._frequency, np.add(counts, again, dtype=np.int64))

@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -129,14 +130,21 @@ def test_localising_finds_the_place_and_leaves_the_map(flight: Path, mapped: Pat
     assert np.abs(se3_log(se3_inverse(expected) @ found)[:, :3]).max() < 0.05
 
 
-def test_maps_are_shown_and_merged(mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, out = mapped.parent / "yard.map", tmp_path / "both.map"
-    shutil.copyfile(path, tmp_path / "other.map")
+def test_maps_are_shown_and_merged(
+    flight: Path, mapped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, out, darker = mapped.parent / "yard.map", tmp_path / "both.map", tmp_path / "darker"
+    shutil.copytree(flight, darker)
+    for image in darker.rglob("*.png"):  # another recording of the place, not the same one twice
+        cv2.imwrite(str(image), (0.8 * cv2.imread(str(image), cv2.IMREAD_GRAYSCALE)).astype(np.uint8))
+    arguments = ["--map", str(tmp_path / "other.map"), "--out", str(tmp_path / "other"), "--json", "--quiet"]
+    assert main(["run", str(darker), *arguments]) == 0
+    capsys.readouterr()
     assert main(["map", "merge", str(path), str(tmp_path / "other.map"), "--out", str(out), "--json"]) == 0
     merged = json.loads(capsys.readouterr().out)
     assert main(["map", "show", str(path), "--json"]) == 0
     single = json.loads(capsys.readouterr().out)
-    assert merged["keyframes"] == 2 * single["keyframes"]
+    assert merged["keyframes"] > single["keyframes"] > 0
     assert [s["joined"] for s in merged["sessions"]] == [True, True]
     assert main(["map", "show", str(out)]) == 0
     assert "session 1" in capsys.readouterr().out

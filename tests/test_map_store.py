@@ -17,10 +17,12 @@ import numpy as np
 import pytest
 
 from tests.conftest import ROOT
+from vio.calibration.stereo_field import DisplacementField
 from vio.errors import ConfigError, DataError, VioError
 from vio.geometry.lie import se3_exp
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
+from vio.mapping import map_store
 from vio.mapping.builder import MapBuilder
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.files import merge_maps
@@ -54,6 +56,18 @@ def fill(path: Path, count: int = 4) -> MapStore:
             store.add_odometry(k - 1, k, _pose(k))
     store.add_loop(LoopRow(0, count - 1, _pose(9), 40, True))
     return store
+
+
+def test_the_stereo_field_of_a_session_comes_back(tmp_path: Path) -> None:
+    store = fill(tmp_path / "a.map")
+    rng = np.random.default_rng(0)
+    field = DisplacementField(CAMERA, rng.normal(size=15), np.diag(rng.random(15)))
+    store.set_field(0, field)
+    store.close()
+    found = MapStore(tmp_path / "a.map", read_only=True).sessions()[0].field
+    assert found is not None
+    np.testing.assert_array_equal(found.coefficients, field.coefficients)
+    np.testing.assert_array_equal(found.covariance, field.covariance)
 
 
 def test_what_is_written_comes_back_to_the_bit(tmp_path: Path) -> None:
@@ -152,19 +166,25 @@ def test_a_map_of_another_version_is_refused(tmp_path: Path) -> None:
 def _make_older(path: Path, version: int) -> None:
     """Make a map as earlier versions wrote it."""
     with contextlib.closing(sqlite3.connect(path)) as database:
-        for table in ("sessions", "keyframes", "features", "odometry", "loops"):
-            database.execute(f"ALTER TABLE {table} DROP COLUMN crc32")
-        for column in ("projection", "kind") if version == 1 else ():
-            database.execute(f"ALTER TABLE sessions DROP COLUMN {column}")
+        database.create_function("row_crc32", -1, map_store._row_crc32, deterministic=True)
+        for table in map_store._KEYS:
+            columns = [name for (name,) in database.execute("SELECT name FROM pragma_table_info(?)", (table,))]
+            newer = [name for name in columns if map_store._SINCE.get(name, 1) > version]
+            for column in newer:
+                database.execute(f"ALTER TABLE {table} DROP COLUMN {column}")
+            if "crc32" not in newer:
+                kept = ", ".join(name for name in columns if name not in (*newer, "crc32"))
+                database.execute(f"UPDATE {table} SET crc32 = row_crc32({kept})")
         database.execute(f"PRAGMA user_version = {version}")
         database.commit()
 
 
-def test_a_map_of_version_1_is_read_and_continued(tmp_path: Path) -> None:
-    """It did not say of what cameras its images were."""
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_a_map_of_an_older_version_is_read_and_continued(version: int, tmp_path: Path) -> None:
+    """The first one did not say of what cameras its images were; none what the calibration is off by."""
     path = tmp_path / "a.map"
     fill(path).close()
-    _make_older(path, 1)
+    _make_older(path, version)
     for read_only in (True, False, True):
         store = MapStore(path, read_only=read_only)
         assert store.sessions() == [SessionRow("a place", CAMERA, True, 0)]
@@ -202,7 +222,8 @@ def test_a_merge_of_two_rigs_names_files_that_the_user_knows(tmp_path: Path, cap
     store = MapStore(tmp_path / "b.map", create=True)
     store.add_session(SessionRow("there", replace(CAMERA, baseline_m=0.5), True, 0))
     store.close()
-    merge_maps(tmp_path / "a.map", tmp_path / "b.map", tmp_path / "both.map")
+    with pytest.raises(DataError, match="shows no place of"):
+        merge_maps(tmp_path / "a.map", tmp_path / "b.map", tmp_path / "both.map")
     assert f"{tmp_path / 'both.map'}: was made with another rig" in caplog.text
     assert "partial" not in caplog.text
 

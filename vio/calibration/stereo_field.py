@@ -74,12 +74,18 @@ class DisplacementField:
 
     camera: StereoCamera
     coefficients: FloatArray  # (15,) of (R3) and of the rows (R2), in focal lengths
+    covariance: FloatArray | None = None  # (15, 15) of the coefficients; None: they count as known
 
     @classmethod
     def of(cls, camera: StereoCamera, estimate: StereoFieldEstimate) -> DisplacementField:
         """Return the field of an estimate, without rows where they are not known."""
-        rows = np.zeros(ROW_TERMS) if estimate.rows is None else estimate.rows
-        return cls(camera, np.concatenate([estimate.coefficients, rows]))
+        coefficients, covariance = np.zeros(TERMS), np.zeros((TERMS, TERMS))
+        coefficients[:FIELD_TERMS], covariance[:FIELD_TERMS, :FIELD_TERMS] = estimate.coefficients, estimate.covariance
+        if estimate.rows is not None:
+            coefficients[FIELD_TERMS:] = estimate.rows
+        if estimate.rows_covariance is not None:
+            covariance[FIELD_TERMS:, FIELD_TERMS:] = estimate.rows_covariance
+        return cls(camera, coefficients, covariance)
 
     def at(self, z: FloatArray) -> FloatArray:
         """Return how far pixels `[ul vl ur vr]` (N, 4) are off, (N, 4) pixels."""
@@ -91,6 +97,14 @@ class DisplacementField:
         off = self.at(z)
         off[~has_right, 2:] = 0
         return z - off
+
+    def deviations(self, z: FloatArray) -> FloatArray:
+        """Return by how much pixels (N, 4) move (N, 4, 15) for one standard deviation of independent combinations."""
+        if self.covariance is None:
+            return np.zeros((*z.shape, TERMS))
+        variances, V = np.linalg.eigh(self.covariance)
+        out: FloatArray = error_basis(self.camera, z) @ (V * np.sqrt(np.maximum(variances, 0.0)))
+        return out
 
     def maps(self) -> tuple[tuple[MapArray, MapArray], tuple[MapArray, MapArray]]:
         """Return where each pixel of the left and right images without the field lies in the images as they are.

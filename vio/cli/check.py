@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 MARKER = "check.json"
 KEYFRAMES = 40
-LEAST_SHARED = 15  # points that both images of a loop show, from which the model counts as joined there
 
 
 def add_parser(commands: Any) -> None:
@@ -91,6 +90,8 @@ def execute(args: argparse.Namespace) -> int:
 def _facts(result: MapperResult) -> dict[str, Any]:
     from dataclasses import asdict
 
+    from vio.offline.colmap.reconstruction import LEAST_SHARED
+
     if result.found is None:
         return {"verdict": result.verdict, "registered": 0}
     model, comparison = result.found
@@ -114,12 +115,19 @@ def _facts(result: MapperResult) -> dict[str, Any]:
 def _rows(result: MapperResult) -> list[tuple[str, str]]:
     if result.found is None:
         return [("result", result.verdict)]
+    from vio.offline.colmap.reconstruction import LEAST_SHARED
+
     model, comparison = result.found
     whole = int(comparison.piece.sum()) == len(comparison.piece)
     in_one = "" if whole else f", {int(comparison.piece.sum())} of them in one piece, which is compared below"
     rows = [
         ("keyframes", f"{len(model.keyframes)} of {result.total} connected{in_one}, {model.points} points"),
         ("ATE", f"{comparison.ate_m:.4f} m to the run after SE(3) alignment, {comparison.ate_deg:.3f} deg"),
+        (
+            "end",
+            f"{comparison.end_m:.4f} m and {comparison.end_deg:.3f} deg apart at the end; up to "
+            f"{comparison.expected_end_m:.3g} m and {comparison.expected_end_deg:.3g} deg expected",
+        ),
     ]
     if len(model.shared):
         joined = int((model.shared >= LEAST_SHARED).sum())

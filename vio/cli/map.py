@@ -1,18 +1,37 @@
-"""`vio map`: show what a map holds, and make one of two."""
+"""`vio map`: show and check what a map holds, make one of two, take parts out of one."""
 
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any
+
+DENSITY = 10
+
+
+def parse_point(text: str) -> tuple[float, float, float]:
+    """Return three coordinates.
+
+    Raises:
+        argparse.ArgumentTypeError: there are not three finite numbers.
+    """
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not all(map(math.isfinite, (x, y, z))):
+        raise argparse.ArgumentTypeError(f"{text} is no point; give three numbers, such as 1,2.5,0")
+    return x, y, z
 
 
 def add_parser(commands: Any) -> None:
     """Add the subcommand."""
     parser = commands.add_parser(
         "map",
-        help="show or merge maps",
-        description="Show what a map holds, or merge two maps that show places in common. `vio run --map` makes maps.",
+        help="show, check, merge and prune maps",
+        description="Show what a map holds, check it, merge two maps that show places in common, or keep a part of "
+        "one. `vio run --map` makes maps.",
     )
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     show = actions.add_parser("show", help="what a map holds")
@@ -21,7 +40,20 @@ def add_parser(commands: Any) -> None:
     merge.add_argument("first", type=Path, metavar="A", help="a map's file")
     merge.add_argument("second", type=Path, metavar="B", help="a map's file")
     merge.add_argument("--out", type=Path, required=True, metavar="MAP", help="the merged map, a new file")
-    for action in (show, merge):
+    check = actions.add_parser("check", help="read everything in a map against its checksums")
+    drop = actions.add_parser("drop", help="take a session out of a map, as `vio map show` numbers it")
+    prune = actions.add_parser("prune", help="keep the most informative keyframes of each cubic metre")
+    extract = actions.add_parser("extract", help="a new map of the keyframes around a point")
+    for action in (check, drop, prune, extract):
+        action.add_argument("map", type=Path, metavar="MAP", help="a map's file")
+    drop.add_argument("session", type=int, metavar="SESSION", help="its number")
+    prune.add_argument(
+        "--density", type=int, default=DENSITY, metavar="N", help=f"in a cubic metre (default {DENSITY})"
+    )
+    extract.add_argument("--around", type=parse_point, required=True, metavar="X,Y,Z", help="m, in the map")
+    extract.add_argument("--radius", type=float, required=True, metavar="M", help="m")
+    extract.add_argument("--out", type=Path, required=True, metavar="MAP", help="a new file")
+    for action in (show, merge, check, drop, prune, extract):
         action.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(execute=execute)
 
@@ -29,9 +61,20 @@ def add_parser(commands: Any) -> None:
 def execute(args: argparse.Namespace) -> int:
     """Run the subcommand."""
     from vio.cli.output import print_result
-    from vio.mapping.files import describe_map, merge_maps
+    from vio.errors import ConfigError
+    from vio.mapping import files
 
-    facts = describe_map(args.map) if args.action == "show" else merge_maps(args.first, args.second, args.out)
+    if args.action == "prune" and args.density < 1:
+        raise ConfigError("--density must be at least 1")
+    actions = {
+        "show": lambda: files.describe_map(args.map),
+        "merge": lambda: files.merge_maps(args.first, args.second, args.out),
+        "check": lambda: files.check_map(args.map),
+        "drop": lambda: files.drop_session(args.map, args.session),
+        "prune": lambda: files.prune_map(args.map, args.density),
+        "extract": lambda: files.extract_map(args.map, args.out, args.around, args.radius),
+    }
+    facts = actions[args.action]()
     return print_result(facts, _rows(facts), as_json=args.json)
 
 

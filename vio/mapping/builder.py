@@ -8,26 +8,27 @@ same. All follows from the keyframes alone, so that equal keyframes give equal m
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vio.calibration.stereo_field import DisplacementField
 from vio.errors import ConfigError, DataError
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera, triangulate
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.guided_search import LEAST_CORNERS, Guided, PlaceView, Shown, place_points, search, shown
-from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, verify
+from vio.mapping.loop_geometry import LEAST_DISPARITY_PX, Verified, matches_of, verify
 from vio.mapping.map_graph import UNKNOWN, MapGraph
 from vio.mapping.map_store import KeyframeRow, LoopRow, MapStore, SessionRow
 from vio.mapping.overlap import Overlaps
 from vio.mapping.place_index import PlaceIndex
 from vio.numerics.statistics import chi_square_quantile
-from vio.records import BoolArray, IntArray, LoopEvent, LoopMatches
+from vio.records import BoolArray, IntArray, LoopEvent
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +58,7 @@ _SHOWN = 64  # keyframes whose points are held, 6 MB: from query to query, most 
 _OF_THE_FILE = ("_store", "_index", "_overlaps", "_shown")
 _ONLY = ("pinhole", "stereo")  # projection and kind of the cameras that maps know
 _SAME_RIG = 0.03  # by which two calibrations of one rig may differ in focal length and baseline
+_FIELD_MOVED_PX = 0.02  # by which a stereo field moves the pixels of a keyframe before all are corrected anew
 _LOCAL = 20  # keyframes of a localised session that are optimised together
 
 
@@ -107,6 +109,7 @@ class Keyframe:
     motion: RelativePose | None  # of the camera since the last keyframe; None: the session begins
     up_cam: FloatArray | None  # (3,) unit vector against gravity; None: not known
     up_sigma_rad: float  # standard deviation of its direction
+    field: DisplacementField | None = None  # what the stereo calibration is off by, as known now
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +156,7 @@ class MapBuilder:
         self._shown = lru_cache(_SHOWN)(self._read_shown)
         self._index, self._overlaps = PlaceIndex(), Overlaps()
         for k in range(len(self.graph)):
-            self._remember(self.graph.sessions[int(self.graph.session[k])].camera, store.features(k))
+            self._remember(self.graph.sessions[int(self.graph.session[k])].camera, self._features(k))
         self.first = len(self.graph)  # keyframe of this session
         sessions = self.graph.sessions
         self._own = len(sessions)
@@ -207,6 +210,9 @@ class MapBuilder:
             self._store.add_keyframe(row, features)
             if motion is not None:
                 self._store.add_odometry(number - 1, number, motion)
+        if keyframe.field is not None:
+            self._correct(keyframe.field, features)
+        features = features.without(self.graph.sessions[self._own].field)
         events = self._close_loops(number, features)
         if not self._localise:
             self._remember(self._camera, features)
@@ -214,8 +220,16 @@ class MapBuilder:
                 self.commit()
         return self._update(events)
 
-    def finish(self) -> MapUpdate:
-        """Optimise once more, write everything, and return the last correction."""
+    def finish(self, field: DisplacementField | None = None) -> MapUpdate:
+        """Optimise once more, write everything, and return the last correction.
+
+        Args:
+            field: what the session found its stereo calibration to be off by at its end: loops are measured again in
+                pixels without it.
+        """
+        if field is not None and not self._localise and len(self.graph) > self.first:
+            self._correct(field, None)
+            self._measure_again()
         if self._waiting:
             self._optimise()
         if not self._optimised:
@@ -233,6 +247,8 @@ class MapBuilder:
             self._store.set_poses(self.graph.T_map_cam.rows)
             self._store.set_kept([o.kept for o in self.graph.loops])
             self._store.set_parts([s.part for s in self.graph.sessions])
+        self._store.set_field(self._own, self.graph.sessions[self._own].field)
+        if self._moved:
             self._moved = False
         self._store.commit()
 
@@ -253,7 +269,41 @@ class MapBuilder:
             store.truncate(len(graph.sessions), len(graph), len(graph.loops))
             self._moved = True
         for k in range(self.first if self._localise else len(graph)):
-            self._remember(graph.sessions[int(graph.session[k])].camera, store.features(k))
+            self._remember(graph.sessions[int(graph.session[k])].camera, self._features(k))
+
+    def _features(self, keyframe: int) -> KeyframeFeatures:
+        """Return a keyframe's features without what its session found the stereo calibration to be off by."""
+        graph = self.graph
+        return self._store.features(keyframe).without(graph.sessions[int(graph.session[keyframe])].field)
+
+    def _correct(self, field: DisplacementField, features: KeyframeFeatures | None) -> None:
+        """Take a newer estimate of the stereo field of this session, where it differs in a keyframe's features.
+
+        All that was made of pixels before is forgotten.
+        """
+        sessions, own = self.graph.sessions, self._own
+        before = sessions[own].field
+        if before is not None and features is not None:
+            moved = (field.at(features.z) - before.at(features.z))[features.has_right]
+            if not len(moved) or np.sqrt(np.mean(moved**2)) < _FIELD_MOVED_PX:
+                return
+        sessions[own] = replace(sessions[own], field=field)
+        self._shown.cache_clear()
+
+    def _measure_again(self) -> None:
+        """Measure the loops of this session once more, from where the map has its keyframes now."""
+        graph = self.graph
+        for n, loop in enumerate(graph.loops):
+            i, k = loop.first, loop.second
+            if k < self.first:
+                continue
+            views = place_points(self._views(i, i))
+            seen = search(views, self._camera, self._features(k), loop.pose, loop.pose)
+            if seen is not None:
+                graph.loops[n] = replace(loop, pose=seen.pose, inliers=seen.inliers)
+                self._waiting += 1
+        if self._waiting:
+            self._store.set_loops(graph.loops)
 
     def _remember(self, camera: StereoCamera, features: KeyframeFeatures) -> None:
         """Let the next keyframe be found again."""
@@ -303,7 +353,7 @@ class MapBuilder:
         found: list[FoundPlace] = []
         for i in self._index.candidates(features.descriptors, allowed, _CANDIDATES).tolist():
             camera = self.graph.sessions[int(self.graph.session[i])].camera
-            seen = verify(camera, self._store.features(i), self._camera, features)
+            seen = verify(camera, self._features(i), self._camera, features)
             if seen is not None and self._fits(i, number, seen, drift[i]):
                 lost = drift[i, :3, :3].trace() > _LOST_M**2 and seen.inliers < _SURE_INLIERS
                 found.append(FoundPlace(i, number, seen, _CONFIRMATIONS_LOST if lost else _CONFIRMATIONS))
@@ -386,7 +436,7 @@ class MapBuilder:
 
     def _read_shown(self, keyframe: int) -> Shown:
         graph = self.graph
-        return shown(graph.sessions[int(graph.session[keyframe])].camera, self._store.features(keyframe))
+        return shown(graph.sessions[int(graph.session[keyframe])].camera, self._features(keyframe))
 
     def _is_rival(self, other: FoundPlace, best: FoundPlace, depth: float) -> bool:
         """Whether another place of the same part of the map fits nearly as well as the best one."""
@@ -522,7 +572,7 @@ def _as_place(views: list[PlaceView], number: int, seen: Guided, features: Keyfr
     most = int(np.argmax(np.bincount(seen.view)))
     best, own = views[most], seen.view == most
     a, b, f = seen.row[own], seen.row_here[own], views[most].shown.features
-    matches = LoopMatches(f.z[a], features.z[b], f.has_right[a], features.has_right[b])
+    matches = matches_of(f, a, features, b)
     pose = RelativePose(se3_inverse(best.place.T_i_j) @ seen.pose.T_i_j, seen.pose.covariance)
     return FoundPlace(best.keyframe, number, Verified(pose, seen.inliers, len(seen.row), matches), needed)
 

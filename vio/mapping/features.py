@@ -7,13 +7,14 @@ ORB (Rublee et al. 2011) from OpenCV: its bits are compared in a microsecond and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from vio.calibration.stereo_field import DisplacementField
 from vio.geometry.lie import FloatArray
 from vio.records import BoolArray, Image, IntArray
 
@@ -44,9 +45,22 @@ class KeyframeFeatures:
     has_right: BoolArray  # (N,)
     sigma_px: FloatArray  # (N,) standard deviation of a pixel coordinate: larger on the coarse levels
     descriptors: Bits  # (N, 32)
+    field: DisplacementField | None = None  # that was taken out of z; one object for all keyframes that share it
+    z_seen: FloatArray | None = None  # (N, 4) pixels with it, as they were measured; None: z
 
     def __len__(self) -> int:
         return len(self.z)
+
+    def without(self, field: DisplacementField | None) -> KeyframeFeatures:
+        """Return them without what the stereo calibration is off by; None: it is right."""
+        if field is None:
+            return self
+        return replace(self, z=field.without(self.z, self.has_right), field=field, z_seen=self.z)
+
+    @property
+    def measured(self) -> FloatArray:
+        """Pixels (N, 4) as the images show them."""
+        return self.z if self.z_seen is None else self.z_seen
 
 
 def no_keyframe_features() -> KeyframeFeatures:

@@ -1,19 +1,24 @@
-"""Maps as files: what one holds, and two made into one."""
+"""Maps as files: what one holds, two made into one, and parts of one."""
 
 from __future__ import annotations
 
 import contextlib
 import os
 import uuid
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vio.errors import DataError
+from vio.geometry.lie import FloatArray
+from vio.geometry.relative_pose import RelativePose
 from vio.mapping.builder import Keyframe, MapBuilder
-from vio.mapping.map_store import MapStore, check_path
+from vio.mapping.map_store import MapStore, SessionRow, check_path
+from vio.records import BoolArray, IntArray
+
+_M_PER_RAD = 2.0  # a turn of a radian shows as much that is new as a step of so many metres
 
 
 def describe_map(path: Path) -> dict[str, Any]:
@@ -53,11 +58,13 @@ def describe_map(path: Path) -> dict[str, Any]:
 def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
     """Write a map that holds the sessions of two, joined where they show one place; return what it holds.
 
-    The keyframes of the second map are taken up again one after the other, so that its loops are found anew, and those
-    with the first map beside them. The frame is that of the first map.
+    Nothing is written where they hold the same recording, or show no place in common. The keyframes of the second map
+    are taken up again one after the other, so that its loops are found anew, and those with the first map beside them.
+    The frame is that of the first map.
 
     Raises:
-        DataError: a file is no map, both are the same, or `out` exists or cannot be written.
+        DataError: a file is no map, both hold the same recording or no common place, or `out` exists or cannot be
+            written.
     """
     if out.exists():
         raise DataError(f"{out}: exists; give another name for the merged map")
@@ -71,14 +78,145 @@ def merge_maps(first: Path, second: Path, out: Path) -> dict[str, Any]:
         source.close()
         other, store = MapStore(second, read_only=True), MapStore(partial, known_as=out)
         with contextlib.closing(other), contextlib.closing(store):
+            if shared := len(store.images() & other.images()):
+                raise DataError(
+                    f"{second}: {shared} of its keyframes are in {first} already: both hold one recording; "
+                    "vio map drop takes a session out of one"
+                )
+            before = len(store.sessions())
             for number in range(len(other.sessions())):
                 _take_up(other, number, store)
+            parts = [s.part for s in store.sessions()]
+            if not set(parts[before:]) & set(parts[:before]):
+                raise DataError(f"{second}: shows no place of {first}; keep two maps, or record a way between them")
         os.replace(partial, out)
     except OSError as error:
         raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
     finally:
         partial.unlink(missing_ok=True)
     return describe_map(out)
+
+
+def check_map(path: Path) -> dict[str, Any]:
+    """Read every row of a map, features too, against its checksum; return what it holds.
+
+    Raises:
+        DataError: the file is damaged, or no map.
+    """
+    store = MapStore(path, read_only=True)
+    with contextlib.closing(store):
+        for k in range(len(store.keyframes())):
+            store.features(k)
+    return describe_map(path)
+
+
+def drop_session(path: Path, session: int) -> dict[str, Any]:
+    """Take a session out of a map, in place; return what it holds then.
+
+    Raises:
+        DataError: there is no such session, it is the only one, or the file cannot be used.
+    """
+    sessions, owner, _ = _outline(path)
+    if not 0 <= session < len(sessions) or len(sessions) == 1:
+        raise DataError(f"{path}: has sessions 0 to {len(sessions) - 1}; name one of several")
+    return _keep(path, path, owner != session)
+
+
+def prune_map(path: Path, density: int) -> dict[str, Any]:
+    """Leave at most so many keyframes in a cubic metre, in place; return what the map holds then.
+
+    Of the two keyframes of a cell that show the most alike, that with fewer loops goes, or the older one.
+
+    Raises:
+        DataError: the file cannot be used.
+    """
+    _, _, T = _outline(path)
+    store = MapStore(path, read_only=True)
+    with contextlib.closing(store):
+        loops = np.bincount([k for o in store.loops() if o.kept for k in (o.first, o.second)], minlength=len(T))
+        parts = np.array([s.part for s in store.sessions()])[[k.session for k in store.keyframes()]]
+    kept = np.ones(len(T), dtype=np.bool_)
+    cells = np.concatenate([np.floor(T[:, :3, 3]), parts[:, None]], axis=1)
+    for cell in np.unique(cells, axis=0):
+        rows = np.flatnonzero((cells == cell).all(axis=1))
+        position, axis = T[rows, :3, 3], T[rows, :3, 2]
+        apart = np.linalg.norm(position[:, None] - position, axis=2) + _M_PER_RAD * np.arccos(
+            np.clip(axis @ axis.T, -1.0, 1.0)
+        )
+        np.fill_diagonal(apart, np.inf)
+        for _ in range(len(rows) - density):
+            a, b = sorted(np.unravel_index(int(np.argmin(apart)), apart.shape))
+            gone = b if loops[rows[b]] < loops[rows[a]] else a
+            kept[rows[gone]] = False
+            apart[gone], apart[:, gone] = np.inf, np.inf
+    return _keep(path, path, kept)
+
+
+def extract_map(path: Path, out: Path, centre: tuple[float, float, float], radius_m: float) -> dict[str, Any]:
+    """Write the keyframes of a map's first part within a radius of a point (m, in the map) to a new map.
+
+    Raises:
+        DataError: there are none, or a file cannot be used.
+    """
+    if out.exists():
+        raise DataError(f"{out}: exists; give another name for the new map")
+    sessions, owner, T = _outline(path)
+    home = np.array([s.part == sessions[0].part for s in sessions])[owner] if len(owner) else np.zeros(0, np.bool_)
+    return _keep(path, out, home & (np.linalg.norm(T[:, :3, 3] - centre, axis=1) <= radius_m))
+
+
+def _outline(path: Path) -> tuple[list[SessionRow], IntArray, FloatArray]:
+    """Return the sessions of a map, and of each keyframe its session (K,) and pose (K, 4, 4)."""
+    store = MapStore(path, read_only=True)
+    with contextlib.closing(store):
+        rows = store.keyframes()
+        owner = np.array([k.session for k in rows], dtype=np.int64)
+        return store.sessions(), owner, np.array([k.T_map_cam for k in rows]).reshape(-1, 4, 4)
+
+
+def _keep(path: Path, out: Path, kept: BoolArray) -> dict[str, Any]:
+    """Write a map with those keyframes (K,) alone; motions over others are put together, their loops go."""
+    if not kept.any():
+        raise DataError(f"{path}: no keyframe would be left")
+    check_path(out)
+    partial = out.with_name(f".{out.name}.{uuid.uuid4().hex[:12]}.partial")
+    source = MapStore(path, read_only=out != path)  # in place, no other process writes meanwhile
+    try:
+        store = MapStore(partial, create=True, known_as=out)
+        with contextlib.closing(source), contextlib.closing(store):
+            _copy_rows(source, store, kept)
+        if out.with_name(f"{out.name}-wal").exists():  # its changes would be taken for those of the new file
+            raise DataError(f"{out}: another process reads it; try again when that has ended")
+        os.replace(partial, out)
+    except OSError as error:
+        raise DataError(f"{out}: cannot be written ({error.strerror or error}); check the folder") from error
+    finally:
+        partial.unlink(missing_ok=True)
+    return describe_map(out)
+
+
+def _copy_rows(source: MapStore, store: MapStore, kept: BoolArray) -> None:
+    rows, sessions = source.keyframes(), source.sessions()
+    owners = np.unique([rows[k].session for k in np.flatnonzero(kept).tolist()]).tolist()
+    parts = [sessions[n].part for n in owners]
+    for n in owners:
+        store.add_session(replace(sessions[n], part=parts.index(sessions[n].part)))
+    number = (np.cumsum(kept) - 1).tolist()
+    motions = {second: motion for _, second, motion in source.odometry()}
+    since: RelativePose | None = None  # the session's last keyframe that is kept
+    for k, row in enumerate(rows):
+        if k == 0 or rows[k - 1].session != row.session:
+            since = None
+        elif since is not None:
+            since = since.then(motions[k]) if k in motions else None
+        if kept[k]:
+            store.add_keyframe(replace(row, session=owners.index(row.session)), source.features(k))
+            if since is not None:
+                store.add_odometry(number[k] - 1, number[k], since)
+            since = RelativePose(np.eye(4), np.zeros((6, 6)))
+    for loop in source.loops():
+        if kept[loop.first] and kept[loop.second]:
+            store.add_loop(replace(loop, first=number[loop.first], second=number[loop.second]))
 
 
 def _take_up(other: MapStore, number: int, store: MapStore) -> None:
@@ -88,6 +226,9 @@ def _take_up(other: MapStore, number: int, store: MapStore) -> None:
     builder = MapBuilder(store, session.source, session.camera, upright=session.upright, localise=False)
     for k, row in enumerate(other.keyframes()):
         if row.session == number:
-            keyframe = Keyframe(row.frame, row.time_ns, row.T_odom_cam, motions.get(k), row.up_cam, row.up_sigma_rad)
+            motion = motions.get(k)
+            keyframe = Keyframe(
+                row.frame, row.time_ns, row.T_odom_cam, motion, row.up_cam, row.up_sigma_rad, session.field
+            )
             builder.add(keyframe, other.features(k))
     builder.finish()

@@ -17,15 +17,17 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from vio.calibration.stereo_field import DisplacementField
 from vio.geometry.lie import FloatArray, se3_inverse, so3_hat, transform_points
 from vio.geometry.relative_pose import RelativePose
-from vio.geometry.stereo import StereoCamera, project, triangulate
+from vio.geometry.stereo import StereoCamera, p_cam_D_z, project, triangulate
 from vio.mapping.features import KeyframeFeatures
 from vio.mapping.loop_geometry import (
     LEAST_DISPARITY_PX,
     Fitted,
     StereoPoints,
     Terms,
+    covariance_by_shifts,
     differing_bits,
     fit_terms,
     points_of,
@@ -110,6 +112,20 @@ class PlacePoints:
             P[own] = R @ (seen.covariance + D @ place.covariance @ np.swapaxes(D, 1, 2)) @ R.T
         return StereoPoints(self.p, P, np.ones(len(P), dtype=np.bool_))
 
+    def fields(self) -> list[DisplacementField | None]:
+        """Return the stereo field (K,) that was taken out of each point's pixels."""
+        return [self.views[n].shown.features.field for n in self.view.tolist()]
+
+    def shifts(self, field: DisplacementField) -> FloatArray:
+        """Return by how much one standard deviation of a field's combinations moves the points (K, 3, S)."""
+        out = np.zeros((len(self.p), 3, field.coefficients.size))
+        for n in np.unique(self.view).tolist():
+            (camera, f, *_), own = self.views[n].shown, self.view == n
+            if f.field is field:
+                z = f.z[self.row[own]]
+                out[own] = self.views[n].place.T_i_j[:3, :3] @ p_cam_D_z(camera, z) @ field.deviations(z)
+        return out
+
 
 @dataclass(frozen=True, slots=True)
 class Guided:
@@ -192,7 +208,28 @@ def search(
     weak = None if prior is None else RelativePose(prior.T_i_j, prior.covariance / _PRIOR_SHARE)
     terms = Terms(stereo.take(own), camera, here, rows[own], inverse=True)
     measured = fit_terms([terms], fitted.T_i_j, prior=weak, least=_LEAST_SAMPLE)
-    return None if measured is None else _guided(measured, points.take(own), rows[own], inliers, chance)
+    if measured is None:
+        return None
+    by_fields = _covariance_by_fields(points.take(own), here, rows[own], terms, measured.T_i_j, weak)
+    return _guided(measured, points.take(own), rows[own], inliers, chance, by_fields)
+
+
+def _covariance_by_fields(
+    points: PlacePoints,
+    here: KeyframeFeatures,
+    rows: IntArray,
+    terms: Terms,
+    T_i_k: FloatArray,
+    prior: RelativePose | None,
+) -> FloatArray:
+    """Covariance (6, 6) of a fitted pose by what is not known of the stereo fields, which sessions share."""
+    fields = {id(f): f for f in (*points.fields(), here.field) if f is not None}
+    total = np.zeros((6, 6))
+    for field in fields.values():
+        z = here.z[rows]
+        dz = field.deviations(z) if here.field is field else np.zeros((*z.shape, field.coefficients.size))
+        total += covariance_by_shifts(terms, T_i_k, prior, points.shifts(field), dz)
+    return total
 
 
 def _of_one_segment(points: PlacePoints, here: KeyframeFeatures, rows: IntArray, agree: IntArray) -> IntArray:
@@ -204,11 +241,15 @@ def _of_one_segment(points: PlacePoints, here: KeyframeFeatures, rows: IntArray,
     return own if _corners(here.z[rows[own]]) >= LEAST_CORNERS else agree
 
 
-def _guided(measured: Fitted, points: PlacePoints, rows: IntArray, inliers: int, chance: float) -> Guided:
+def _guided(
+    measured: Fitted, points: PlacePoints, rows: IntArray, inliers: int, chance: float, by_fields: FloatArray
+) -> Guided:
     """Return a place by the fit to pairs of its points and features `rows` (P,)."""
     found, rows = points.take(np.flatnonzero(measured.fits)), rows[measured.fits]
     depth = float(np.median(transform_points(se3_inverse(measured.T_i_j), found.p)[:, 2]))
-    return Guided(measured.motion(depth), inliers, chance, found.view, found.row, rows)
+    motion = measured.motion(depth)
+    pose = RelativePose(motion.T_i_j, motion.covariance + by_fields)
+    return Guided(pose, inliers, chance, found.view, found.row, rows)
 
 
 def _in_reach(place: PlacePoints, camera: StereoCamera, T_i_k: FloatArray) -> IntArray:

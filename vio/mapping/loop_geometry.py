@@ -7,6 +7,7 @@ refines it. A pair that agrees with the motion from i to j but not with that fro
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import cv2
@@ -118,7 +119,12 @@ def verify(camera_i: StereoCamera, i: KeyframeFeatures, camera_j: StereoCamera, 
     if good.sum() < max(LEAST_INLIERS, _LEAST_SHARE * len(pairs)):
         return None
     a, b = a[good], b[good]
-    return Verified(pose, len(a), len(pairs), LoopMatches(i.z[a], j.z[b], i.has_right[a], j.has_right[b]))
+    return Verified(pose, len(a), len(pairs), matches_of(i, a, j, b))
+
+
+def matches_of(i: KeyframeFeatures, a: IntArray, j: KeyframeFeatures, b: IntArray) -> LoopMatches:
+    """Return pairs (K,) of features as the images show them."""
+    return LoopMatches(i.measured[a], j.measured[b], i.has_right[a], j.has_right[b])
 
 
 def _points(camera: StereoCamera, f: KeyframeFeatures, rows: IntArray) -> tuple[FloatArray, BoolArray]:
@@ -219,6 +225,31 @@ class Fitted:
         return RelativePose(self.T_i_j, covariance)
 
 
+def covariance_by_shifts(
+    terms: Terms, T_i_j: FloatArray, prior: RelativePose | None, dp: FloatArray, dz: FloatArray
+) -> FloatArray:
+    """Covariance (6, 6) of a fitted motion by independent errors that all its pairs share.
+
+    Args:
+        terms: pixels that were fitted.
+        T_i_j: (4, 4) the motion.
+        prior: that the fit had.
+        dp: (K, 3, S) by how much one standard deviation of each error moves the points, m.
+        dz: (K, 4, S) likewise the pixels that are predicted.
+    """
+
+    def step(terms: Terms) -> tuple[FloatArray, FloatArray]:
+        normal, pull = np.zeros((6, 6)), np.zeros(6)
+        terms.add(T_i_j, _GATE, normal, pull)
+        return normal, pull
+
+    normal, pull = step(terms)
+    P = 1e-9 * np.eye(6) if prior is None else np.linalg.inv(prior.covariance)
+    pulls = [step(terms.shifted(dp[..., s], dz[..., s]))[1] - pull for s in range(dp.shape[-1])]
+    xi = np.linalg.solve(normal + P, np.transpose(pulls))
+    return np.asarray(xi @ xi.T)
+
+
 def fit_terms(
     parts: Sequence[Terms], T_i_j: FloatArray, *, prior: RelativePose | None = None, least: int = LEAST_INLIERS
 ) -> Fitted | None:
@@ -304,6 +335,12 @@ class Terms:
         self._p, self._P, self._used = source.p, source.covariance, source.valid
         self._z, self.stereo = t.z[rows_t], t.has_right[rows_t]
         self._variance = t.sigma_px[rows_t] ** 2
+
+    def shifted(self, dp: FloatArray, dz: FloatArray) -> Terms:
+        """Return them with points moved by dp (K, 3), m, and pixels by dz (K, 4)."""
+        out = copy(self)
+        out._p, out._z = self._p + dp, self._z + dz
+        return out
 
     def add(self, T_i_j: FloatArray, width: float, normal: FloatArray, pull: FloatArray) -> FloatArray:
         """Add the normal equations of xi in T_i_j <- T_i_j exp(xi); return squared residuals (K,), infinite where none.

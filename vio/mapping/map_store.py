@@ -1,4 +1,4 @@
-"""The map's file: SQLite, version 3, described in docs/maps.md; older ones are read, and become 3 when written to.
+"""The map's file: SQLite, version 4, described in docs/maps.md; older ones are read, and become 4 when written to.
 
 What belongs together is written in one transaction, so that a process that dies leaves the state before it. A file is
 checked when it is opened: it has our tables and nothing else, SQLite finds its pages whole, each row agrees with its
@@ -8,6 +8,7 @@ checksum (from version 3 on), and its values fit together.
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import math
 import sqlite3
 import time
@@ -20,20 +21,25 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from vio.calibration.stereo_field import TERMS, DisplacementField
 from vio.errors import DataError
 from vio.geometry.lie import FloatArray
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
 from vio.mapping.features import DESCRIPTOR_BYTES, KeyframeFeatures
 
-VERSION = 3
+VERSION = 4
 _OLDEST = 1
 _SINCE = {
     "projection": 2,
     "kind": 2,
     "crc32": 3,
+    "field": 4,
+    "field_covariance": 4,
 }  # version that brought a column; before 2 all were pinhole stereo pairs
+_BEFORE = {"projection": "'pinhole'", "kind": "'stereo'", "crc32": "0"}  # what rows of older versions get; else NULL
 _KEYS = {"sessions": "id", "keyframes": "id", "features": "keyframe", "odometry": "second", "loops": "id"}
+_TELLING_FEATURES = 20
 _ROTATION_TOLERANCE = 1e-3  # of R R^T
 _MOST_S = 300.0  # of one step with the file
 _STEP = 10_000  # instructions of SQLite between two looks at the clock, and at signals
@@ -41,7 +47,8 @@ APPLICATION_ID = 0x53564D50  # "SVMP" in the file's header
 _SCHEMA = """
 CREATE TABLE sessions (id INTEGER PRIMARY KEY, source TEXT NOT NULL, part INTEGER NOT NULL, upright INTEGER NOT NULL,
     fu REAL NOT NULL, fv REAL NOT NULL, cu REAL NOT NULL, cv REAL NOT NULL, baseline_m REAL NOT NULL,
-    width INTEGER, height INTEGER, projection TEXT NOT NULL, kind TEXT NOT NULL, crc32 INTEGER NOT NULL);
+    width INTEGER, height INTEGER, projection TEXT NOT NULL, kind TEXT NOT NULL, field BLOB, field_covariance BLOB,
+    crc32 INTEGER NOT NULL);
 CREATE TABLE keyframes (id INTEGER PRIMARY KEY, session INTEGER NOT NULL, frame INTEGER NOT NULL,
     time_ns INTEGER NOT NULL, T_map_cam BLOB NOT NULL, T_odom_cam BLOB NOT NULL, drift BLOB NOT NULL,
     path_m REAL NOT NULL, up_cam BLOB, up_sigma_rad REAL, crc32 INTEGER NOT NULL);
@@ -65,6 +72,7 @@ class SessionRow:
     camera: StereoCamera
     upright: bool  # whether z of its odometry frame is up
     part: int  # sessions that loops have joined share the number
+    field: DisplacementField | None = None  # what its stereo calibration is off by; None: not estimated
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,13 +147,13 @@ class MapStore:
         check_path(path)
         if not create and not path.is_file():
             raise DataError(f"{path}: there is no such map; vio run --map {path} makes one")
-        with self._errors():
+        with contextlib.ExitStack() as undo, self._errors():
             if read_only:
                 uri = f"{path.absolute().as_uri()}?mode=ro"
                 self._db = sqlite3.connect(uri, uri=True, check_same_thread=False, timeout=1.0)
             else:
                 self._db = sqlite3.connect(path, check_same_thread=False, timeout=1.0)
-                self._db.execute("PRAGMA locking_mode = EXCLUSIVE")
+            undo.callback(self._db.close)
             self._db.isolation_level = None
             self._db.create_function("row_crc32", -1, _row_crc32, deterministic=True)
             self._db.set_progress_handler(self._is_late, _STEP)
@@ -162,10 +170,15 @@ class MapStore:
                     f"{path}: is a map of version {self._pragma('user_version')}, this program reads {VERSION}; use "
                     "the program that wrote it, or build the map again"
                 )
+            if read_only:
+                self._db.execute("BEGIN")  # one state of the file, whatever another process commits
             self._check()
             if not read_only:
+                # Readers see the last commit while this process writes; its transaction never ends, so no other writes.
+                self._db.execute("PRAGMA journal_mode = WAL")
                 self._db.execute("BEGIN IMMEDIATE")
                 self._bring_up_to_date()
+            undo.pop_all()
 
     def _check(self) -> None:
         """Raise DataError unless the file holds our tables, whole, with values that fit together."""
@@ -175,8 +188,9 @@ class MapStore:
         ((answer,),) = self._db.execute("PRAGMA quick_check(1)")
         if answer != "ok":
             raise _damaged(self.path, " ".join(answer.split()))
-        sessions, keyframes = len(self.sessions()), len(self.keyframes())
-        if any(not 0 <= k.session < sessions for k in self.keyframes()):
+        sessions, rows = len(self.sessions()), self.keyframes()
+        keyframes = len(rows)
+        if any(not 0 <= k.session < sessions for k in rows):
             raise _damaged(self.path, "a keyframe belongs to no session")
         pairs = [(i, j) for i, j, _ in self.odometry()] + [(o.first, o.second) for o in self.loops()]
         if any(not 0 <= i < j < keyframes for i, j in pairs):
@@ -188,14 +202,16 @@ class MapStore:
 
     def _bring_up_to_date(self) -> None:
         """Add what older versions had not."""
-        version = self.version
-        if version < 2:
-            for column, value in (("projection", "pinhole"), ("kind", "stereo")):
-                self._db.execute(f"ALTER TABLE sessions ADD COLUMN {column} TEXT NOT NULL DEFAULT '{value}'")
-        if version < 3:
-            for table in _KEYS:
-                self._db.execute(f"ALTER TABLE {table} ADD COLUMN crc32 INTEGER NOT NULL DEFAULT 0")
-                self._sign(table)
+        if self.version == VERSION:
+            return
+        for table, statement in zip(_KEYS, _SCHEMA.strip().split(";\n"), strict=True):
+            before = set(self._columns(table))
+            self._db.execute(f"ALTER TABLE {table} RENAME TO older")
+            self._db.execute(statement)
+            values = ", ".join(c if c in before else _BEFORE.get(c, "NULL") for c in self._columns(table))
+            self._db.execute(f"INSERT INTO {table} SELECT {values} FROM older")
+            self._db.execute("DROP TABLE older")
+            self._sign(table)
         self._db.execute(f"PRAGMA user_version = {VERSION}")
 
     @property
@@ -233,7 +249,16 @@ class MapStore:
         with self._errors():
             if self._db.in_transaction:
                 self._db.execute("COMMIT")
+                with contextlib.suppress(sqlite3.OperationalError):  # it stays so while another process reads
+                    self._db.execute("PRAGMA journal_mode = DELETE")
             self._db.close()
+
+    def images(self) -> set[bytes]:
+        """Return a hash of the descriptors of each keyframe that shows enough to be told from any other."""
+        with self._errors():
+            least = _TELLING_FEATURES * DESCRIPTOR_BYTES
+            rows = self._db.execute("SELECT descriptors FROM features WHERE length(descriptors) >= ?", (least,))
+            return {hashlib.blake2b(bits, digest_size=16).digest() for (bits,) in rows}
 
     def copy_to(self, path: Path, *, known_as: Path) -> None:
         """Write a copy of the whole map.
@@ -253,7 +278,7 @@ class MapStore:
         c = row.camera
         values = (row.source, row.part, row.upright, c.fu, c.fv, c.cu, c.cv, c.baseline_m, c.width, c.height)
         number = self._count("sessions")
-        self._insert("sessions", (number, *values, c.projection, c.kind))
+        self._insert("sessions", (number, *values, c.projection, c.kind, *_field_blobs(row.field)))
         return number
 
     def add_keyframe(self, row: KeyframeRow, features: KeyframeFeatures) -> int:
@@ -290,6 +315,19 @@ class MapStore:
         """Replace the part of each session."""
         self._set("sessions", "part", parts)
 
+    def set_loops(self, rows: Sequence[LoopRow]) -> None:
+        """Replace what is measured of each loop."""
+        self._set("loops", "T_i_j", [_blob(row.pose.T_i_j) for row in rows])
+        self._set("loops", "covariance", [_blob(row.pose.covariance) for row in rows])
+        self._set("loops", "inliers", [row.inliers for row in rows])
+
+    def set_field(self, session: int, field: DisplacementField | None) -> None:
+        """Replace what a session found its stereo calibration to be off by."""
+        with self._errors():
+            update = "UPDATE sessions SET field = ?, field_covariance = ? WHERE id = ?"
+            self._db.execute(update, (*_field_blobs(field), session))
+            self._sign("sessions", f"WHERE id = {int(session)}")
+
     def truncate(self, sessions: int, keyframes: int, loops: int) -> None:
         """Forget what was added after there were so many."""
         with self._errors():
@@ -311,8 +349,10 @@ class MapStore:
 
     def _sign(self, table: str, which: str = "") -> None:
         """Write the checksums of rows, of their values as they are stored."""
-        columns = [name for name, *_ in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))]
-        self._db.execute(f"UPDATE {table} SET crc32 = row_crc32({', '.join(columns[:-1])}) {which}")
+        self._db.execute(f"UPDATE {table} SET crc32 = row_crc32({', '.join(self._columns(table)[:-1])}) {which}")
+
+    def _columns(self, table: str) -> list[str]:
+        return [name for (name,) in self._db.execute("SELECT name FROM pragma_table_info(?)", (table,))]
 
     def _count(self, table: str) -> int:
         with self._errors():
@@ -325,12 +365,13 @@ class MapStore:
 
         def made(_: int, source: str, part: int, upright: int, *camera: Any) -> SessionRow:
             lengths: list[Any] = [_number(value) for value in camera[:5]]
-            size, names = camera[5:7], [source, *camera[7:]]
+            size, names, field = camera[5:7], [source, *camera[7:9]], camera[9:]
             if not all(isinstance(value, (int, type(None))) for value in size) or min(lengths[:2]) <= 0:
                 raise ValueError("its camera is none")
             if not all(isinstance(value, str) for value in names):
                 raise ValueError("a name is no text")
-            return SessionRow(source, StereoCamera(*lengths, *camera[5:]), bool(upright), _integer(part))
+            pair = StereoCamera(*lengths, *camera[5:9])
+            return SessionRow(source, pair, bool(upright), _integer(part), _field_of(pair, *field))
 
         return self._read("sessions", made)
 
@@ -430,6 +471,21 @@ def _row_crc32(*values: Any) -> int:
     for value in values:
         crc = zlib.crc32(value if isinstance(value, bytes) else f"{value!r};".encode(), crc)
     return crc
+
+
+def _field_blobs(field: DisplacementField | None) -> tuple[bytes | None, bytes | None]:
+    if field is None:
+        return None, None
+    return _blob(field.coefficients), None if field.covariance is None else _blob(field.covariance)
+
+
+def _field_of(
+    camera: StereoCamera, coefficients: bytes | None = None, covariance: bytes | None = None
+) -> DisplacementField | None:
+    if coefficients is None:
+        return None
+    P = None if covariance is None else _array(covariance, TERMS, TERMS)
+    return DisplacementField(camera, _array(coefficients, TERMS), P)
 
 
 def _blob(array: FloatArray) -> bytes:

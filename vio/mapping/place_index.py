@@ -9,6 +9,7 @@ Zisserman 2003).
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -32,10 +33,16 @@ _UNIT = 1 << 16  # of the weights
 
 def words_of(descriptors: Bits) -> Words:
     """Return the words (T, N) of descriptors (N, 32), one row a table."""
-    bits = np.unpackbits(np.ascontiguousarray(descriptors), axis=1)
-    chosen = np.random.default_rng(_SEED).permutation(8 * DESCRIPTOR_BYTES)[: _TABLES * _BITS].reshape(_TABLES, _BITS)
-    value = 1 << np.arange(_BITS)
-    return np.stack([(bits[:, columns] @ value).astype(np.uint16) for columns in chosen])
+    out = np.zeros((_TABLES, len(descriptors)), dtype=np.uint16)
+    _write_words(np.ascontiguousarray(descriptors), _chosen_bits(), out)
+    return out
+
+
+@cache
+def _chosen_bits() -> IntArray:
+    """Return the bits (T, B) of each table's words."""
+    chosen = np.random.default_rng(_SEED).permutation(8 * DESCRIPTOR_BYTES)[: _TABLES * _BITS]
+    return chosen.reshape(_TABLES, _BITS).astype(np.int64)
 
 
 class PlaceIndex:
@@ -52,6 +59,7 @@ class PlaceIndex:
         self._merged = 0  # keyframes in the index; the others are the tail
         self._tail: list[Words] = []
         self._sizes: list[int] = []  # features of each keyframe
+        self._newest: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)  # keyframe that showed a word last, from 1
         self._frequency: IntArray = np.zeros((_TABLES, _WORDS), dtype=np.int64)  # keyframes with a word
 
     def __len__(self) -> int:
@@ -69,8 +77,7 @@ class PlaceIndex:
         words = words_of(descriptors)
         self._tail.append(words)
         self._sizes.append(words.shape[1])
-        for table, row in enumerate(words):
-            self._frequency[table, np.unique(row)] += 1
+        _count_words(words, self._newest, len(self._sizes), self._frequency)
         if len(self._tail) >= max(_LEAST_TAIL, int(_TAIL_SHARE * len(self))):
             self._merge()
 
@@ -115,6 +122,29 @@ class PlaceIndex:
             out.append(near.start + int(np.argmax(score[near])))
             left[max(middle - 2 * _NEIGHBOURS, 0) : middle + 2 * _NEIGHBOURS + 1] = 0.0  # those that share its sum
         return np.array(out, dtype=np.int64)
+
+
+@compiled
+def _write_words(descriptors: Bits, chosen: IntArray, out: Words) -> None:
+    """Write the words (T, N) of descriptors (N, 32): bits (T, B), the highest of a byte being its first."""
+    for t in range(len(chosen)):
+        for n in range(len(descriptors)):
+            word = 0
+            for j in range(chosen.shape[1]):
+                bit = chosen[t, j]
+                word |= ((descriptors[n, bit >> 3] >> (7 - (bit & 7))) & 1) << j
+            out[t, n] = word
+
+
+@compiled
+def _count_words(words: Words, newest: IntArray, number: int, frequency: IntArray) -> None:
+    """Count a keyframe's words (T, N) in `frequency` (T, W), each once."""
+    for t in range(len(words)):
+        for n in range(words.shape[1]):
+            w = words[t, n]
+            if newest[t, w] != number:
+                newest[t, w] = number
+                frequency[t, w] += 1
 
 
 @compiled

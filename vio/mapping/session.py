@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from vio.calibration.stereo_field import DisplacementField
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat
 from vio.geometry.relative_pose import RelativePose
 from vio.geometry.stereo import StereoCamera
@@ -80,6 +81,8 @@ class MapSession:
         """
         check_camera(path, camera)
         self._localise, self._imu, self._alone, self._wait = localise, imu, alone, wait
+        self._camera = camera
+        self._field: DisplacementField | None = None  # what the stereo calibration is off by, at the newest frame
         self._T_cam_body, self._T_body_cam = T_cam0_body, se3_inverse(T_cam0_body)
         store = MapStore(path, create=not localise, read_only=localise)
         self._builder = MapBuilder(store, source, camera, upright=imu, localise=localise)
@@ -120,6 +123,8 @@ class MapSession:
         """
         self._frames += 1
         self._T_odom_body = estimate.T_world_imu
+        if estimate.stereo_field is not None:
+            self._field = DisplacementField.of(self._camera, estimate.stereo_field)
         events = self._take(lambda due, done: due <= self._frames and (done or self._wait))
         fresh = seen.take(seen.has_right & ~seen.stale)
         seen_now = len(fresh) >= _LEAST_TRACKED
@@ -145,7 +150,8 @@ class MapSession:
         """Wait for everything, and write the map."""
         events = self._take(lambda due, done: True)
         if self._frames:
-            self._T_map_odom, self._T_map_cam = self._executor.submit(self._builder.finish).result().T_map_odom, None
+            ended = self._executor.submit(self._builder.finish, self._field).result()
+            self._T_map_odom, self._T_map_cam = ended.T_map_odom, None
         return events
 
     def close(self) -> None:
@@ -275,7 +281,7 @@ class MapSession:
         up, sigma = self._vertical(estimate)
         if motion is not None:
             motion = _inflated(motion)
-        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, motion, up, sigma)
+        keyframe = Keyframe(frame.index, frame.time_ns, T_odom_cam, motion, up, sigma, self._field)
         result = self._executor.submit(_add, self._builder, keyframe, frame.left, frame.right)
         self._waiting.append((self._frames + HANDOVER_FRAMES, frame.index, result))
         if motion is not None:

@@ -15,7 +15,7 @@ from vio.offline.colmap.model import keyframe_images
 from vio.offline.colmap.reconstruction import Mapper, match_images, reconstruct
 from vio.offline.comparison import compare_keyframes
 from vio.offline.images import write_images
-from vio.offline.keyframes import choose_keyframes
+from vio.offline.keyframes import keyframes_by_overlap
 from vio.offline.loop_tracks import loop_pairs
 from vio.offline.saved_run import SavedRun
 from vio.offline.verdict import MapperResult, overall_verdict
@@ -69,7 +69,7 @@ def check_run(
         VioError: the run has too few views, or its images are not available.
     """
     path, steps = run.tracked, 2 + len(mappers)
-    keyframes = choose_keyframes(path, most=most)
+    keyframes = keyframes_by_overlap(path, most=most)
     names = keyframe_images(path.frames[keyframes])
     images, database = folder / "images", folder / "database.db"
     minutes = expected_minutes(len(keyframes), mappers)
@@ -85,7 +85,7 @@ def check_run(
         found = None
         if model is not None:
             rows = keyframes[model.keyframes]
-            found = model, compare_keyframes(path, rows, model.T_world_cam0, run.truth)
+            found = model, compare_keyframes(path, rows, model.T_world_cam0, run.truth, linked=model.linked)
         results.append(MapperResult(mapper, len(keyframes), found))
         progress(2 + len(results), steps)
     write_picture(folder / "check.png", lambda: draw_check(path.trajectory, results))

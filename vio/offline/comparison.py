@@ -17,6 +17,9 @@ _SCALE_SIGMA = 0.02  # a scale with a larger standard deviation is not reported
 _LEAST_MOTIONS = 8  # keyframes needed to detect outlying motions
 _LEAST_PIECE = 3  # keyframes that an alignment needs
 _OUTLYING = 6.0  # robust standard deviations
+# What COLMAP's own path may be off by at its end, beside the run's standard deviations.
+_END_SHARE, _END_DEG, _END_DEG_PER_M = 0.01, 0.5, 0.01
+_END_SIGMAS = 3.0
 _BROKEN = 1.0  # of the motion between two keyframes: beyond it, one of both trajectories has jumped there
 
 
@@ -44,12 +47,17 @@ class KeyframeComparison:
 
     total: int  # keyframes compared
     frames: IntArray  # (R,) frame numbers
-    piece: BoolArray  # (R,) keyframes of the longest segment without a jump of either trajectory
+    piece: BoolArray  # (R,) keyframes of the longest segment without a gap, and without a jump of either trajectory
+    pieces: int  # between gaps
     aligned: FloatArray  # (R, 4, 4) the other poses in the run's world, after SE(3) alignment of this piece
     difference_m: FloatArray  # (R,)
     difference_deg: FloatArray  # (R,)
     ate_m: float  # of the piece
     ate_deg: float
+    end_m: float  # by which the motion from the first to the last keyframe of the piece differs, at one scale
+    end_deg: float
+    expected_end_m: float  # that it may differ by, by the run's covariance and COLMAP's own errors
+    expected_end_deg: float
     scale: float | None  # length of the other trajectory over the run's; None: see why_no_scale
     scale_sigma: float | None  # standard error
     why_no_scale: str | None
@@ -60,7 +68,12 @@ class KeyframeComparison:
 
 
 def compare_keyframes(
-    run: TrackedPath, rows: IntArray, T_other_cam0: FloatArray, truth: GroundTruth | None = None
+    run: TrackedPath,
+    rows: IntArray,
+    T_other_cam0: FloatArray,
+    truth: GroundTruth | None = None,
+    *,
+    linked: BoolArray | None = None,
 ) -> KeyframeComparison:
     """Compare poses of the left camera from another source with those of a run.
 
@@ -69,11 +82,14 @@ def compare_keyframes(
         rows: (R,) rows of its trajectory.
         T_other_cam0: (R, 4, 4) poses from the other source at these rows, in any world frame.
         truth: ground truth to compare both with.
+        linked: (R - 1,) whether the other source joins each keyframe to the next; motions where it does not are not
+            compared. None: all of them.
 
     Reference: Umeyama (1991) for the alignment, as in `vio.evaluation.trajectories`.
     """
     own = run.trajectory.T_world_body[rows]
-    piece = _longest_piece(own, T_other_cam0)
+    linked = np.ones(len(rows) - 1, dtype=np.bool_) if linked is None else linked
+    piece, pieces = _longest_piece(own, T_other_cam0, linked)
     aligned = apply_alignment(align_poses(T_other_cam0[piece], own[piece], "se3"), T_other_cam0)
     difference_m = np.linalg.norm(aligned[:, :3, 3] - own[:, :3, 3], axis=1)
     # Rotations are aligned separately: on a straight path an alignment by positions leaves the roll unobservable.
@@ -81,24 +97,52 @@ def compare_keyframes(
     difference_deg = rotation_angle_deg(np.swapaxes(own[:, :3, :3], 1, 2) @ turn @ T_other_cam0[:, :3, :3])
     ate_m, ate_deg = (float(np.sqrt(np.mean(d[piece] ** 2))) for d in (difference_m, difference_deg))
     scale, sigma, why = _scale_ratio(T_other_cam0[piece], own[piece], ate_m)
+    segments = _disagreements(run.frames[rows], own, T_other_cam0, linked)
+    path_m = float(np.linalg.norm(np.diff(own[piece, :3, 3], axis=0), axis=1).sum())
+    ends = np.flatnonzero(piece)[[0, -1]]
+    same = T_other_cam0.copy()  # of the run's length: another scale is said apart
+    same[:, :3, 3] /= scale or 1.0
+    end_m, end_deg = (float(d[0]) for d in motion_differences(own[ends], same[ends]))
+    most_m, most_deg = _expected_end(run, rows[ends], path_m)
+    off_m = max(end_m, _ate_m(same[piece], own[piece]))
+    if not segments and (off_m > most_m or end_deg > most_deg):
+        first, last = run.frames[rows[ends]].tolist()
+        segments = (Segment(first, last, off_m, end_deg),)
     against = (None, None, None) if truth is None else _against(truth, run, rows, T_other_cam0)
     return KeyframeComparison(
         total=len(rows),
         frames=run.frames[rows],
         piece=piece,
+        pieces=pieces,
         aligned=aligned,
         difference_m=difference_m,
         difference_deg=difference_deg,
         ate_m=ate_m,
         ate_deg=ate_deg,
+        end_m=end_m,
+        end_deg=end_deg,
+        expected_end_m=most_m,
+        expected_end_deg=most_deg,
         scale=scale,
         scale_sigma=sigma,
         why_no_scale=why,
-        segments=_disagreements(run.frames[rows], own, T_other_cam0),
+        segments=segments,
         reference_ate_m=against[0],
         reference_scale=against[1],
         run_reference_ate_m=against[2],
     )
+
+
+def _expected_end(run: TrackedPath, ends: IntArray, path_m: float) -> tuple[float, float]:
+    """Return by how much the motion between two rows (2,) of a right run may differ from COLMAP's, m and degrees."""
+    sigma_m, sigma_deg = (0.0, 0.0) if run.sigmas is None else run.sigmas[ends[1]].tolist()
+    by_colmap = _END_SHARE * path_m, _END_DEG + _END_DEG_PER_M * path_m
+    return _END_SIGMAS * sigma_m + by_colmap[0], _END_SIGMAS * sigma_deg + by_colmap[1]
+
+
+def _ate_m(T_other: FloatArray, T_own: FloatArray) -> float:
+    aligned = apply_alignment(align_poses(T_other, T_own, "se3"), T_other)
+    return float(np.sqrt(np.mean(np.sum((aligned[:, :3, 3] - T_own[:, :3, 3]) ** 2, axis=1))))
 
 
 def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[float | None, float | None, str | None]:
@@ -118,12 +162,12 @@ def _scale_ratio(T_other: FloatArray, T_own: FloatArray, ate_m: float) -> tuple[
     return 1 / alignment.scale, sigma, None
 
 
-def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray) -> tuple[Segment, ...]:
-    """Return segments where motions between neighbouring keyframes differ by outliers."""
-    if len(frames) < _LEAST_MOTIONS:
+def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray, linked: BoolArray) -> tuple[Segment, ...]:
+    """Return segments where motions between neighbouring keyframes, where there is no gap, differ by outliers."""
+    if linked.sum() < _LEAST_MOTIONS - 1:
         return ()
     off_m, off_deg = motion_differences(T_own, T_other)
-    bad = _stands_out(off_m) | _stands_out(off_deg)
+    bad = _stands_out(off_m, linked) | _stands_out(off_deg, linked)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], bad, [False]]).astype(np.int8)))
     return tuple(
         Segment(int(frames[a]), int(frames[b]), float(off_m[a:b].max()), float(off_deg[a:b].max()))
@@ -131,16 +175,19 @@ def _disagreements(frames: IntArray, T_own: FloatArray, T_other: FloatArray) -> 
     )
 
 
-def _longest_piece(T_own: FloatArray, T_other: FloatArray) -> BoolArray:
-    """Return the rows (R,) of the longest segment in which no motion differs by more than its own length."""
-    if len(T_own) < _LEAST_MOTIONS:
-        return np.ones(len(T_own), dtype=bool)
+def _longest_piece(T_own: FloatArray, T_other: FloatArray, linked: BoolArray) -> tuple[BoolArray, int]:
+    """Return the rows (R,) of the longest segment without a gap in which no motion differs by more than its own length.
+
+    And how many there are between gaps.
+    """
+    if len(T_own) < _LEAST_MOTIONS and linked.all():
+        return np.ones(len(T_own), dtype=bool), 1
     moved_m = np.linalg.norm(np.diff(T_own[:, :3, 3], axis=0), axis=1)
     off_m, _ = motion_differences(T_own, T_other)
-    broken = _stands_out(off_m) & (off_m > _BROKEN * np.maximum(moved_m, np.median(moved_m)))
+    broken = ~linked | _stands_out(off_m, linked) & (off_m > _BROKEN * np.maximum(moved_m, np.median(moved_m)))
     number = np.concatenate([[0], np.cumsum(broken)])
     piece: BoolArray = number == np.bincount(number).argmax()
-    return piece if piece.sum() >= _LEAST_PIECE else np.ones_like(piece)
+    return piece, int((~linked).sum()) + 1
 
 
 def motion_differences(T_own: FloatArray, T_other: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -151,9 +198,13 @@ def motion_differences(T_own: FloatArray, T_other: FloatArray) -> tuple[FloatArr
     return off_m, rotation_angle_deg(np.swapaxes(motion_own[:, :3, :3], 1, 2) @ motion_other[:, :3, :3])
 
 
-def _stands_out(values: FloatArray) -> BoolArray:
-    middle = float(np.median(values))
-    return values > middle + _OUTLYING * max(robust_sigma(values - middle), 0.1 * middle, 1e-9)
+def _stands_out(values: FloatArray, linked: BoolArray) -> BoolArray:
+    """Mask (R - 1,) of the values that stand out of those of steps without a gap."""
+    usual = values[linked]
+    if not len(usual):
+        return np.zeros_like(linked)
+    middle = float(np.median(usual))
+    return linked & (values > middle + _OUTLYING * max(robust_sigma(usual - middle), 0.1 * middle, 1e-9))
 
 
 def _against(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from vio.calibration.egomotion import CameraMotion
 from vio.errors import DataError, EstimationError
 from vio.evaluation.trajectories import rotation_angle_deg
-from vio.geometry.lie import se3_exp
+from vio.geometry.lie import FloatArray, se3_exp
 from vio.geometry.stereo import StereoCamera
 from vio.offline.loop_tracks import loop_pairs
 from vio.records import FeatureTracks, IntArray, LoopEvent, Observations, Trajectory
@@ -20,6 +21,8 @@ _ALL_FRAMES = 300  # in a shorter run, every frame is a keyframe
 _SCENE_SHARE = 0.08  # of the median depth: translation to a new keyframe …
 _TURN_DEG = 6.0  # … or rotation to it
 _SPARSER = 1.15  # factor on both limits, from one attempt to the next
+_LOST_SHARE = 0.2  # of the features that are seen, from keyframe to keyframe
+_LEAST_SEEN = 10  # features of a frame that may become a keyframe
 _LEAST_STRETCH = 20  # frames
 _LOOP_SHARE = 3  # of the keyframes that may be spent on loops: one in three
 
@@ -33,6 +36,7 @@ class TrackedPath:
     trajectory: Trajectory  # of cam0, one pose a frame, with frame numbers
     tracks: FeatureTracks  # of all frames of the recording, by frame number
     loops: tuple[LoopEvent, ...] = ()  # between two frames of the trajectory, whose poses agree with them
+    sigmas: FloatArray | None = None  # (N, 2) standard deviations of position (m) and attitude (deg) since the start
 
     @property
     def frames(self) -> IntArray:
@@ -76,6 +80,30 @@ def choose_keyframes(run: TrackedPath, *, most: int | None = None) -> IntArray:
         if most is None or len(chosen) + len(ends) <= max(most, 2):
             return np.union1d(np.array(chosen, dtype=np.int64), ends)
         factor *= _SPARSER
+
+
+def keyframes_by_overlap(run: TrackedPath, *, most: int) -> IntArray:
+    """Return the rows (K,) of the trajectory that become keyframes, close where the view changes fast.
+
+    From one to the next an equal share of the features is lost, counted from frame to frame: a fifth, or more
+    where that takes more than `most`. Both frames of loops are keyframes, as in `choose_keyframes`.
+
+    Raises:
+        DataError: the run is shorter than two frames.
+    """
+    if len(run.frames) < 2:
+        raise DataError(f"{run.where}: a run of {len(run.frames)} frames has fewer than two views; process more frames")
+    _median_depth_m(run)
+    if len(run.frames) <= most:
+        return np.arange(len(run.frames))
+    ends = _loop_ends(run, most)
+    ids = [run.fresh(k).ids for k in range(len(run.frames))]
+    shown = [k for k in range(len(ids)) if k in (0, len(ids) - 1) or len(ids[k]) >= _LEAST_SEEN]
+    lost = [1 - np.isin(ids[a], ids[b]).mean() if len(ids[a]) else 0.0 for a, b in itertools.pairwise(shown)]
+    total = np.concatenate([[0.0], np.cumsum(lost)])
+    count = int(np.clip(np.ceil(total[-1] / _LOST_SHARE) + 1, 2, max(most - len(ends), 2)))
+    chosen = np.searchsorted(total, np.linspace(0, total[-1], count)).clip(0, len(shown) - 1)
+    return np.union1d(np.array(shown)[np.append(chosen, len(shown) - 1)], ends)
 
 
 def _loop_ends(run: TrackedPath, most: int | None) -> IntArray:

@@ -17,7 +17,7 @@ from vio.files.trajectories import read_trajectory
 from vio.filters.multiview import Views
 from vio.filters.stereo_calibration import StereoCorrection
 from vio.filters.tracks import measured
-from vio.geometry.lie import FloatArray
+from vio.geometry.lie import FloatArray, se3_inverse, so3_hat
 from vio.geometry.rectify import pinhole_pixels, pinhole_within
 from vio.geometry.stereo import StereoCamera
 from vio.offline.comparison import GroundTruth
@@ -25,6 +25,7 @@ from vio.offline.keyframes import TrackedPath
 from vio.offline.run_images import RunImages, field_coefficients, original_source
 from vio.records import FIELD_TERMS, FeatureTracks, LoopEvent, need_stereo
 from vio.runs.files import RunFile
+from vio.runs.finished import read_estimates
 from vio.runs.folder import read_metrics
 from vio.runs.mapped import read_loops
 
@@ -87,8 +88,20 @@ def read_saved_run(folder: Path) -> SavedRun:
         field = DisplacementField(camera, coefficients)
         tracks = replace(tracks, z=field.without(tracks.z, tracks.has_right))
         loops = tuple(_without(field, o) for o in loops)
-    tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks, loops)
+    sigmas = _sigmas(folder / RunFile.ESTIMATES, T_cam0_imu)
+    tracked = TrackedPath(folder, camera, trajectory.in_cam0(T_cam0_imu), tracks, loops, sigmas)
     return SavedRun(tracked, original_source(log), dataset, T_cam0_imu, metrics, field)
+
+
+def _sigmas(path: Path, T_cam0_imu: FloatArray) -> FloatArray | None:
+    """Return standard deviations (N, 2) of the left camera's position and attitude; None: the run has no such file."""
+    if not path.is_file():
+        return None
+    rows = read_estimates(path)
+    P, c = np.array(rows["covariance"]), se3_inverse(T_cam0_imu)[:3, 3]
+    p_D_xi = np.concatenate([-np.eye(3), so3_hat(c)], axis=1)
+    position = np.trace(p_D_xi @ P @ p_D_xi.T, axis1=1, axis2=2)
+    return np.sqrt(np.stack([position, np.degrees(np.degrees(np.trace(P[:, 3:, 3:], axis1=1, axis2=2)))], axis=1))
 
 
 def _without(field: DisplacementField, loop: LoopEvent) -> LoopEvent:

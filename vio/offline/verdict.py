@@ -12,6 +12,7 @@ from vio.offline.colmap.reconstruction import Mapper, Reconstructed
 from vio.offline.comparison import KeyframeComparison, Segment, motion_differences
 from vio.records import IntArray
 
+_NAMED_DEG = 1.0  # turns from which they are named
 _TURN_DEG = 0.2  # a motion that differs by more turns the rest of the path
 _SCALE = 0.01  # by which lengths may differ without a word: matches that are off by 0.1 px make as much at far points
 
@@ -32,13 +33,22 @@ class MapperResult:
                 "not observable because COLMAP could not connect the keyframes; too few images, no overlap between "
                 "them, or too little texture"
             )
-        model, comparison = self.found
-        missing = self.total - len(model.keyframes)
-        left_out = f"; {missing} of {self.total} keyframes could not be connected" if missing else ""
+        comparison = self.found[1]
+        left_out = unconnected(self.total, comparison)
         if comparison.scale is None:
-            return f"poses compared, scale not observable because {comparison.why_no_scale}{left_out}"
+            return f"{left_out}poses compared, scale not observable because {comparison.why_no_scale}"
         where = f"disagrees in {len(comparison.segments)} segments" if comparison.segments else "agrees throughout"
-        return f"{where}{left_out}"
+        return f"{left_out}{where}"
+
+
+def unconnected(total: int, comparison: KeyframeComparison) -> str:
+    """Return which of the keyframes are not compared, as the beginning of a sentence; nothing if all are."""
+    missing, compared = total - len(comparison.frames), comparison.frames[comparison.piece]
+    text = f"{missing} of {total} keyframes not connected" if missing else ""
+    if comparison.pieces > 1:
+        text += f"{', the others' if missing else 'keyframes connected'} in {comparison.pieces} pieces, of which "
+        text += f"frames {compared[0]} to {compared[-1]} are compared"
+    return f"{text}; " if text else ""
 
 
 def overall_verdict(results: Sequence[MapperResult]) -> str:
@@ -51,6 +61,23 @@ def overall_verdict(results: Sequence[MapperResult]) -> str:
     if not found:
         return f"none: {results[0].verdict}"
     agreeing = [name for name, comparison in found.items() if _grade(comparison, comparison.segments) == "negligible"]
+    agreeing.sort(key=lambda name: -int(found[name].piece.sum()))
+    compared = found[agreeing[0]] if agreeing else max(found.values(), key=lambda c: int(c.piece.sum()))
+    return unconnected(results[0].total, compared) + _judged(found, agreeing) + _revisits(results)
+
+
+def _revisits(results: Sequence[MapperResult]) -> str:
+    """Say where COLMAP sees a place again that the run did not close."""
+    for result in results:
+        if result.found is not None and len(result.found[0].revisits) and not len(result.found[0].shared):
+            frames = dict(zip(result.found[0].keyframes.tolist(), result.found[1].frames.tolist(), strict=True))
+            a, b = (frames[k] for k in result.found[0].revisits[0].tolist())
+            return f"; frames {a} and {b} show one place, which the run did not close as a loop"
+    return ""
+
+
+def _judged(found: dict[Mapper, KeyframeComparison], agreeing: Sequence[Mapper]) -> str:
+    """Say whether a run and COLMAP agree where they are compared; models that do, that of most keyframes first."""
     if not agreeing:
         return _disagreement(found)
     comparison = found[agreeing[0]]
@@ -63,9 +90,6 @@ def overall_verdict(results: Sequence[MapperResult]) -> str:
     elif abs(comparison.scale - 1) > max(_SCALE, 3 * (comparison.scale_sigma or 0.0)):
         grade = length_grade(100 * abs(comparison.scale - 1))
         text += f", but COLMAP's path is {_longer(comparison.scale)}, {grade}: one of both has disparities that are off"
-    missing = results[0].total - len(comparison.frames)
-    if missing:
-        text += f"; {missing} of {results[0].total} keyframes could not be compared"
     for name in found.keys() - set(agreeing):
         text += f"; COLMAP's {name} model breaks at frames {_ranges(found[name].segments)}, the other one does not"
     return text
@@ -89,7 +113,7 @@ def _disagreement(found: dict[Mapper, KeyframeComparison]) -> str:
 
 
 def _length(comparison: KeyframeComparison) -> float:
-    return float(np.linalg.norm(np.diff(comparison.aligned[:, :3, 3], axis=0), axis=1).sum())
+    return float(np.linalg.norm(np.diff(comparison.aligned[comparison.piece, :3, 3], axis=0), axis=1).sum())
 
 
 def _per_100_m(comparison: KeyframeComparison, segments: Sequence[Segment]) -> float:
@@ -105,7 +129,9 @@ def _grade(comparison: KeyframeComparison, segments: Sequence[Segment]) -> Grade
 
 def _size(comparison: KeyframeComparison, segments: Sequence[Segment]) -> str:
     by = max((s.difference_m for s in segments), default=0.0)
-    return f"{_metres(by)} ({_per_100_m(comparison, segments):.2g} m per 100 m)"
+    turned = max((s.difference_deg for s in segments), default=0.0)
+    text = f"{_metres(by)} ({_per_100_m(comparison, segments):.2g} m per 100 m)"
+    return text if turned < _NAMED_DEG else f"{text} and {turned:.3g} deg"
 
 
 def _shared(first: KeyframeComparison, second: KeyframeComparison) -> list[Segment]:

@@ -73,7 +73,7 @@ def read_finished_run(folder: Path, reference: Path | None = None) -> FinishedRu
     metrics, T_cam0_body = read_metrics(folder)
     if not (folder / RunFile.ESTIMATES).is_file() and (folder / RunFile.UNFINISHED).is_dir():
         raise DataError(f"{folder}: this run was ended before its end; `vio run --resume {folder}` goes on with it")
-    estimates = _read_estimates(folder / RunFile.ESTIMATES)
+    estimates = read_estimates(folder / RunFile.ESTIMATES)
     frames = _read_frames(folder / RunFile.FRAMES, len(estimates))
     points = read_points(folder / RunFile.LANDMARKS)
     trajectory = Trajectory(
@@ -113,7 +113,7 @@ def with_distinct_names(runs: Sequence[FinishedRun]) -> list[FinishedRun]:
     return [replace(run, name=name) for run, name in zip(runs, names, strict=True)]
 
 
-def _read_estimates(path: Path) -> Rows:
+def read_estimates(path: Path) -> Rows:
     """Read the table of estimates; columns that an older version did not write are NaN."""
     try:
         found = np.load(path, allow_pickle=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -13,13 +14,16 @@ from vio.geometry.lie import FloatArray, se3_inverse
 from vio.geometry.stereo import StereoCamera
 from vio.offline.colmap import HALF_PX, SEED, SIFT_FEATURES
 from vio.offline.colmap.model import ModelImages, mean_reprojection_error_px, pose_rows, rectified_rig
-from vio.records import IntArray
+from vio.records import BoolArray, IntArray
 
 Mapper: TypeAlias = Literal["incremental", "global"]
 _NEXT = (1, 2, 3, 5, 8, 16)  # index offsets of later keyframes that left images are matched with
 _CROSS_NEXT = (1,)  # likewise between right images and later left ones
+_EXHAUSTIVE = 60  # keyframes up to which all left images are matched, so that a loop that the run missed is found
 _AROUND_LOOP = (-1, 0, 1)  # index offsets from both keyframes of a loop, whose left images are matched with one another
 _LEAST_REGISTERED = 3
+LEAST_SHARED = 15  # points that two left images show, from which the model counts as joined there
+_LINK = 6  # keyframes across which a step of the path may be joined; those further apart are joined by a loop
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +36,8 @@ class Reconstructed:
     points: int
     mean_reprojection_error_px: float
     shared: IntArray  # (L,) points that both left images of each loop show
+    linked: BoolArray  # (R - 1,) whether the model is joined from each keyframe to the next, and not by a loop alone
+    revisits: IntArray  # (M, 2) keyframes far apart in time that show one place by the model, best first
 
 
 def match_images(
@@ -91,7 +97,8 @@ def pairs_to_match(names: ModelImages, loops: IntArray) -> list[tuple[str, str]]
     """Return the pairs of image files to match, each once."""
     count = len(names.left)
     out = list(zip(names.left, names.right, strict=True))
-    out += [(names.left[k], names.left[k + step]) for step in _NEXT for k in range(count - step)]
+    steps = range(1, count) if count <= _EXHAUSTIVE else _NEXT
+    out += [(names.left[k], names.left[k + step]) for step in steps for k in range(count - step)]
     out += [(names.right[k], names.left[k + step]) for step in _CROSS_NEXT for k in range(count - step)]
     around = {(a + i, b + j) for a, b in loops.tolist() for i in _AROUND_LOOP for j in _AROUND_LOOP}
     out += [(names.left[a], names.left[b]) for a, b in sorted(around) if 0 <= a < b < count]
@@ -136,21 +143,41 @@ def reconstruct(
     )
     if len(found) < _LEAST_REGISTERED:
         return None
+    keyframes = np.array([k for k, _ in found], dtype=np.int64)
+    points = _common_points(model, [names.left[k] for k in keyframes.tolist()])
+    ends = np.searchsorted(keyframes, loops).clip(0, len(keyframes) - 1)
+    of_loops = np.where((keyframes[ends] == loops).all(axis=1), points[ends[:, 0], ends[:, 1]], 0)
     return Reconstructed(
         mapper,
         se3_inverse(np.array([T for _, T in found])),
-        np.array([k for k, _ in found], dtype=np.int64),
+        keyframes,
         int(model.num_points3D()),
         mean_reprojection_error_px(model),
-        np.array([_shared_points(model, names.left[a], names.left[b]) for a, b in loops.tolist()], dtype=np.int64),
+        of_loops.astype(np.int64),
+        linked_steps(points, keyframes),
+        _revisits(points, keyframes),
     )
 
 
-def _shared_points(model: pycolmap.Reconstruction, one: str, other: str) -> int:
-    """Return how many points of a model two images show; zero where it has not both."""
-    images = [model.find_image_with_name(name) for name in (one, other)]
-    seen = [{p.point3D_id for p in image.points2D if p.has_point3D()} for image in images if image is not None]
-    return len(seen[0] & seen[1]) if len(seen) == 2 else 0
+def _common_points(model: pycolmap.Reconstruction, names: Sequence[str]) -> IntArray:
+    """Return how many points of a model each two of the images (R,) show, (R, R)."""
+    images = [model.find_image_with_name(name) for name in names]
+    seen = [{p.point3D_id for p in image.points2D if p.has_point3D()} for image in images]
+    return np.array([[len(a & b) for b in seen] for a in seen], dtype=np.int64)
+
+
+def linked_steps(points: IntArray, keyframes: IntArray) -> BoolArray:
+    """Return whether a model is joined from each keyframe (R,) to the next (R - 1,), by the points (R, R) shared."""
+    near = np.abs(keyframes[None, :] - keyframes[:, None]) <= _LINK
+    joined = near & (points >= LEAST_SHARED)
+    return np.array([joined[:n, n:].any() for n in range(1, len(points))], dtype=np.bool_)
+
+
+def _revisits(points: IntArray, keyframes: IntArray) -> IntArray:
+    far = keyframes[None, :] - keyframes[:, None] > _NEXT[-1]
+    a, b = np.nonzero(far & (points >= LEAST_SHARED))
+    best = np.argsort(-points[a, b], kind="stable")
+    return np.stack([keyframes[a[best]], keyframes[b[best]]], axis=1)
 
 
 def _incremental_options(threads: int) -> pycolmap.IncrementalPipelineOptions:
