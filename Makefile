@@ -13,6 +13,9 @@ else
 BIN := $(VENV)/bin
 EXE :=
 endif
+# Loops are compiled once on a machine: begin while the first command is still reading or rendering.
+PRECOMPILE = @echo "compiling loops in the background, once: about 30 s of CPU"; \
+	$(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 &
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 # `make test CONSTRAINTS=` installs the newest versions that pyproject.toml allows.
 CONSTRAINTS ?= constraints.txt
@@ -60,7 +63,8 @@ results: $(VENV)/.base
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-# Build the wheel, and run it in an environment and a folder of its own, with the newest versions of what it needs.
+# Build the wheel, and run it in an environment and a folder of its own, with the newest versions of what it needs. On Linux
+# x86-64 this also writes, and then runs, a wheel with the machine code of its loops for this Python.
 wheel: | $(BIN)/python$(EXE)
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
@@ -77,6 +81,7 @@ $(BIN)/python$(EXE):
 $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e .
 	@touch $@
+	$(PRECOMPILE)
 
 $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[docs]'
@@ -85,10 +90,12 @@ $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev]'
 	@touch $@ $(VENV)/.docs $(VENV)/.base
+	$(PRECOMPILE)
 
 $(VENV)/.learned: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev,learned]'
 	@touch $@ $(VENV)/.dev $(VENV)/.base
+	$(PRECOMPILE)
 
 # Take the exact versions of the present environment, all extras included, as the new constraints.
 constraints: $(VENV)/.learned
