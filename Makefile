@@ -50,9 +50,12 @@ coverage: $(TESTED)
 mutations: $(TESTED)
 	$(BIN)/python -m tools.mutate
 
-# Run the small suite of `vio bench`, rendered on the spot: exit status 1 where a run has no result (half a minute).
+# Run the small suite of `vio bench`, rendered on the spot: exit status 1 where a run has no result (half a minute). Then what
+# a frame costs beside the last commit; a change of it belongs into tools/speed.json (--write).
 bench: $(VENV)/.base
 	$(BIN)/vio bench small --out bench/small --cache bench/cache
+	test -d bench/speed || $(BIN)/vio render --out bench/speed --rig small --width 320 --rate 20 --duration 1.5 --format euroc
+	$(BIN)/python -m tools.speed bench/speed
 
 # Run the suites behind docs/results.md and the README and write their tables (VIO_DATA=recordings; an hour and a half on two
 # cores); RESULTS="--only paper" runs one, RESULTS="--peers DIR" puts other systems beside. docs/results.md says what lies where.
