@@ -14,6 +14,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.frontend.columns import share_of
 from vio.frontend.image_check import FrameImages, ImageCheck
 from vio.frontend.patches import mean_and_contrast, statistics
 from vio.numerics.compiled import compiled_sums
@@ -124,7 +125,7 @@ class RightCamera(ImageCheck):
 
     def doubts(self, matched: BoolArray) -> bool:
         """Whether so few of the points (K,) of known depth are where they should be that a cause is looked for."""
-        return self._cause not in _BY_IMAGE and len(matched) >= _LEAST_POINTS and matched.mean() < _AGREES
+        return self._cause not in _BY_IMAGE and len(matched) >= _LEAST_POINTS and share_of(matched) < _AGREES
 
     def check_matches(self, index: int, matched: BoolArray, *, moved: bool) -> bool:
         """Judge the matches of a frame near their known depths, and return whether the right image may be used.
@@ -137,7 +138,7 @@ class RightCamera(ImageCheck):
         if self._cause in _BY_IMAGE:
             return False
         tested = moved and len(matched) >= _LEAST_POINTS
-        share = float(matched.mean()) if tested else None
+        share = share_of(matched) if tested else None
         if self._cause is None:
             if share is not None and share < _CONTRADICTS:
                 self._distrust("contradicts", index - 1, index)
