@@ -13,9 +13,6 @@ else
 BIN := $(VENV)/bin
 EXE :=
 endif
-# Loops are compiled once on a machine: begin while the first command is still reading or rendering.
-PRECOMPILE = @echo "compiling loops in the background, once: about 30 s of CPU"; \
-	$(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 &
 TESTED := $(VENV)/$(if $(LEARNED),.learned,.dev)
 # `make test CONSTRAINTS=` installs the newest versions that pyproject.toml allows.
 CONSTRAINTS ?= constraints.txt
@@ -84,7 +81,9 @@ $(BIN)/python$(EXE):
 $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e .
 	@touch $@
-	$(PRECOMPILE)
+	@# What tests compile, they compile themselves; here the first command still renders or reads meanwhile.
+	@echo "compiling loops in the background, once: about 30 s of CPU"
+	@$(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 &
 
 $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[docs]'
@@ -93,12 +92,10 @@ $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 $(VENV)/.dev: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev]'
 	@touch $@ $(VENV)/.docs $(VENV)/.base
-	$(PRECOMPILE)
 
 $(VENV)/.learned: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[dev,learned]'
 	@touch $@ $(VENV)/.dev $(VENV)/.base
-	$(PRECOMPILE)
 
 # Take the exact versions of the present environment, all extras included, as the new constraints.
 constraints: $(VENV)/.learned

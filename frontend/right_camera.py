@@ -17,7 +17,7 @@ import numpy as np
 from vio.frontend.columns import share_of
 from vio.frontend.image_check import FrameImages, ImageCheck
 from vio.frontend.patches import mean_and_contrast, statistics
-from vio.numerics.compiled import compiled_sums
+from vio.numerics.compiled import compiled, compiled_sums
 from vio.records import BoolArray, Image
 
 Cause: TypeAlias = Literal["frozen", "dark", "contradicts"]
@@ -93,7 +93,10 @@ class RightCamera(ImageCheck):
         left, right = images.views
         if self.left_is_frozen(images.frame.index, left.half, right.half):
             return None
-        return replace(images, right_lives=self._cause not in _BY_IMAGE)
+        lives = self._cause not in _BY_IMAGE
+        return (
+            images if lives == images.right_lives else replace(images, right_lives=lives)
+        )  # a copy halves images anew
 
     def left_is_frozen(self, index: int, left: Image, right: Image) -> bool:
         """Compare the images (H/2, W/2) of a frame with those before; return whether the left one is frozen.
@@ -191,10 +194,23 @@ def image_change(image: Image, other: Image) -> float:
 
     Pixels at the end of the scale are left out, as far as others are left: an exposure that changes clips others.
     """
-    kept = (image < _CLIPPED) & (other < _CLIPPED)
-    if not kept.all() and kept.mean() > _LEAST_UNCLIPPED:
-        image, other = image[kept][None], other[kept][None]
+    kept = np.empty((2, image.size), dtype=np.uint8)
+    count = _keep_unclipped(image, other, kept)
+    if count < image.size and count / image.size > _LEAST_UNCLIPPED:
+        image, other = kept[:1, :count], kept[1:, :count]
     return float(_CONTRAST * _difference(image, other))
+
+
+@compiled
+def _keep_unclipped(image: Image, other: Image, kept: Image) -> int:
+    """Write the pixels that are clipped in neither image one after another, and return their number."""
+    height, width = image.shape
+    count = 0
+    for y in range(height):
+        for x in range(width):
+            kept[0, count], kept[1, count] = image[y, x], other[y, x]
+            count += (image[y, x] < _CLIPPED) & (other[y, x] < _CLIPPED)
+    return count
 
 
 @compiled_sums
