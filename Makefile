@@ -47,9 +47,12 @@ coverage: $(TESTED)
 mutations: $(TESTED)
 	$(BIN)/python -m tools.mutate
 
-# Run the small suite of `vio bench`, rendered on the spot: exit status 1 where a run has no result (half a minute).
+# Run the small suite of `vio bench`, rendered on the spot: exit status 1 where a run has no result (half a minute). Then what
+# a frame costs beside the last commit; a change of it belongs into tools/speed.json (--write).
 bench: $(VENV)/.base
 	$(BIN)/vio bench small --out bench/small --cache bench/cache
+	test -d bench/speed || $(BIN)/vio render --out bench/speed --rig small --width 320 --rate 20 --duration 1.5 --format euroc
+	$(BIN)/python -m tools.speed bench/speed
 
 # Run the suites behind docs/results.md and the README and write their tables (VIO_DATA=recordings; an hour and a half on two
 # cores); RESULTS="--only paper" runs one, RESULTS="--peers DIR" puts other systems beside. docs/results.md says what lies where.
@@ -60,7 +63,8 @@ results: $(VENV)/.base
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
-# Build the wheel, and run it in an environment and a folder of its own, with the newest versions of what it needs.
+# Build the wheel, and run it in an environment and a folder of its own, with the newest versions of what it needs. On Linux
+# x86-64 this also writes, and then runs, a wheel with the machine code of its loops for this Python.
 wheel: | $(BIN)/python$(EXE)
 	rm -rf build dist
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
@@ -77,6 +81,9 @@ $(BIN)/python$(EXE):
 $(VENV)/.base: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e .
 	@touch $@
+	@# What tests compile, they compile themselves; here the first command still renders or reads meanwhile.
+	@echo "compiling loops in the background, once: about 30 s of CPU"
+	@$(BIN)/python -m tools.prebuild > $(VENV)/compiled.log 2>&1 &
 
 $(VENV)/.docs: pyproject.toml $(CONSTRAINTS) | $(BIN)/python$(EXE)
 	$(PIP_INSTALL) -e '.[docs]'

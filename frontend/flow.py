@@ -49,7 +49,7 @@ def track_with_retries(
     found, good = _track_forward_backward(last, view, points, guess, few, trusted=trusted)
     attempts = [(guess, _RETRY_SHARE), (points, _LOST_SHARE)] if trusted else [(points, _LOST_SHARE)]
     for start, share in attempts:
-        retry = np.flatnonzero(~good)
+        retry = (~good).nonzero()[0]
         if len(retry) <= share * len(points):
             break
         found[retry], good[retry] = _track_forward_backward(
@@ -87,10 +87,11 @@ def _track_forward_backward(
     good &= inside(view.full, forward, ANCHOR_RADIUS_PX + 2)
     tolerance = _MAX_FORWARD_BACKWARD_PX
     expected = np.linalg.norm(forward - guess, axis=1) <= tolerance
-    doubtful = np.flatnonzero(good & ~expected if trusted else good)
+    doubtful = (good & ~expected if trusted else good).nonzero()[0]
     if len(doubtful):
-        backward, seen_back = _flow(view.half, last, forward[doubtful], points[doubtful], levels)
-        error = np.linalg.norm(backward - points[doubtful], axis=1)
+        before = points.take(doubtful, axis=0)
+        backward, seen_back = _flow(view.half, last, forward.take(doubtful, axis=0), before, levels)
+        error = np.linalg.norm(backward - before, axis=1)
         good[doubtful] = seen_back & (error <= tolerance)
     return forward, good
 

@@ -143,7 +143,7 @@ def make_output(
         warnings: what the frame says of the images.
         shown: mask (N,) of the features to output; None: all.
     """
-    rows = np.arange(len(features.ids)) if shown is None else np.flatnonzero(shown)
+    rows = np.arange(len(features.ids)) if shown is None else shown.nonzero()[0]
     z = np.empty((len(rows), 4))
     z[:, :2], z[:, 2:] = features.left[rows], features.right[rows]
     has_right = features.has_right[rows]

@@ -42,7 +42,7 @@ class FrameImages:
 
     def with_raw(self, raw: tuple[Image, ...]) -> FrameImages:
         """Return the frame with other images."""
-        return replace(self, raw=raw)
+        return self if all(a is b for a, b in zip(raw, self.raw, strict=True)) else replace(self, raw=raw)
 
 
 class ImageCheck:

@@ -205,27 +205,30 @@ class KltFrontend:
         index: int,
     ) -> tuple[BoolArray, Consensus | None]:
         """Return the mask (N,) of the found features that are static, and the consensus motion if there is one."""
-        camera, rows = self._camera, np.flatnonzero(seen)
+        camera, rows = self._camera, seen.nonzero()[0]
         has_depth = (old.has_point & (old.has_right | (not self._needs_right)))[rows]
+        deep = has_depth.nonzero()[0]
+        point, deep_point = old.point.take(rows, axis=0), old.point.take(rows[deep], axis=0)
         R_prior = T_prior = None
         if prior is not None:
-            known, predicted = prior_rows(old, rows[has_depth], prior)
+            known, predicted = prior_rows(old, rows[deep], prior)
             R_prior = prior.R_cam_prev
             T_prior = predicted_motion(camera, old.point[known], predicted, expected)
-        before, after = old.left[rows], found[rows]
-        kept, motion = static_tracks(problem, before, old.point[rows], has_depth, after, expected, R_prior, T_prior)
+        before, after = old.left.take(rows, axis=0), found.take(rows, axis=0)
+        kept, motion = static_tracks(problem, before, point, has_depth, after, expected, R_prior, T_prior)
         if motion is not None:
             expected_motion = None if prior is None else prior.motion
+            after_deep = after.take(deep, axis=0)
             chosen = choose_motion(
                 problem,
-                old.point[rows[has_depth]],
-                after[has_depth],
+                deep_point,
+                after_deep,
                 motion,
                 expected_motion,
-                voting=voters(old.age[rows[has_depth]]),
+                voting=voters(old.age[rows[deep]]),
                 in_event=self._objects.active,
             )
-            if stereo.rows_are_off and one_motion_explains(problem, chosen, before[has_depth], after[has_depth]):
+            if stereo.rows_are_off and one_motion_explains(problem, chosen, before[has_depth], after_deep):
                 chosen = replace(chosen, object_share=0.0)
             motion, kept[has_depth] = chosen.motion, chosen.motion.inliers
             self._objects.frame(index, chosen)

@@ -17,6 +17,7 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.frontend.columns import share_of
 from vio.frontend.image_check import ImageCheck
 from vio.frontend.outliers import Consensus, RansacProblem, bearing_consensus, best_motion, pixel_errors
 from vio.geometry.lie import FloatArray, circledot, se3_inverse, se3_log, transform_points
@@ -101,7 +102,7 @@ def choose_motion(
         return TwoMotions(found, reported, "predicted" if first_agrees and not second_agrees else "undecided")
     T = second if second_agrees else predicted.T_curr_prev
     inliers = pixel_errors(problem.camera, T, p_prev, pixels) <= problem.limit_px
-    share = float(found.inliers.mean())
+    share = share_of(found.inliers)
     return TwoMotions(Consensus(T, inliers), share if share >= _LARGE_SHARE else 0.0, "predicted")
 
 
@@ -140,7 +141,7 @@ def one_motion_explains(problem: RansacProblem, chosen: TwoMotions, before: Floa
     if chosen.object_share == 0.0:
         return False
     static = bearing_consensus(problem, before, after, chosen.motion.T_curr_prev[:3, :3], None)
-    smaller = min(chosen.object_share, float(chosen.motion.inliers.mean()))  # of the groups: the larger one is fitted
+    smaller = min(chosen.object_share, share_of(chosen.motion.inliers))  # of the groups: the larger one is fitted
     return static is not None and float((~static).mean()) < _SEEN_SHARE * smaller
 
 

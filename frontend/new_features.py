@@ -64,7 +64,7 @@ class NewFeatures:
             new = stereo.match_near(new, right, np.arange(with_depth), disparity_new[chosen[:with_depth]])
         new = replace(new, left_only_frames=np.where(new.has_right, 0, 1))
         room = max(0, self._grid.target_features - len(tracks))
-        good = np.flatnonzero(new.has_right | (len(chosen) > with_depth))
+        good = (new.has_right | (len(chosen) > with_depth)).nonzero()[0]
         return joined(tracks, take(new, good[np.argsort(~new.has_right[good], kind="stable")][:room]))
 
     def _search_right(
@@ -92,7 +92,7 @@ class NewFeatures:
         if motion is not None:
             # A feature with a known point that was not matched near it must not be matched elsewhere.
             unmatched &= ~tracks.has_point
-        rows = np.flatnonzero(unmatched)
+        rows = unmatched.nonzero()[0]
         if not len(rows) + len(corners):
             return self._without_old_left_only(tracks), *nothing
         disparity, unique = stereo.search(left, right, np.concatenate([tracks.left[rows], corners]))
@@ -118,9 +118,9 @@ class NewFeatures:
         target, matched = self._grid.target_features, int(tracks.has_right.sum())
         room, least = max(0, target - len(tracks)), _LEAST_FEATURES * target
         tried = round(_TRIED * room)
-        staying, leaving = np.flatnonzero(unique & stays)[:tried], np.flatnonzero(unique & ~stays)[:tried]
+        staying, leaving = (unique & stays).nonzero()[0][:tried], (unique & ~stays).nonzero()[0][:tried]
         leaving = leaving[: max(0, round(_TRIED * (least - matched - len(staying) / _TRIED)))]
-        no_depth = np.flatnonzero(~unique)[:room]
+        no_depth = (~unique).nonzero()[0][:room]
         if matched > _FEW * least and not delayed:
             no_depth = no_depth[:0]
         return np.concatenate([staying, leaving, no_depth]), len(staying) + len(leaving)

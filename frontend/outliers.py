@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, moved_pixel, turn_to
+from vio.frontend.columns import share_of
 from vio.geometry.lie import FloatArray, se3_from_parts, so3_exp, so3_log, transform_points
 from vio.geometry.stereo import StereoCamera, depth_of, facing, left_rays, project
 from vio.numerics.compiled import compiled, move_by_twist, solve_positive
@@ -208,7 +209,7 @@ def _ransac(
     begin = starts[_best_start(camera, starts, p_prev, pixels, limit)]
     refined = _refine(camera, begin, p_prev, pixels, limit / 2, free)
     inliers = pixel_errors(camera, refined, p_prev, pixels) <= limit
-    if inliers.mean() >= _SURE_SHARE:
+    if share_of(inliers) >= _SURE_SHARE:
         return refined, inliers
     sets = problem.rng.integers(0, len(p_prev), size=(_SAMPLES, 3))
     T = np.broadcast_to(begin, (len(sets), 4, 4))
@@ -390,7 +391,7 @@ def fit_motion(
     )[0]
     T = _refine(camera, T, p, z, limit_px, slice(0, 6))
     fits = pixel_errors(camera, T, p, z) <= limit_px
-    return T if fits.mean() > 0.5 else None
+    return T if share_of(fits) > 0.5 else None
 
 
 def predicted_motion(

@@ -47,7 +47,7 @@ def _common_rows(ids: IntArray, prior: TrackPrior) -> tuple[IntArray, IntArray]:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     order = np.argsort(prior.ids)
     at = order[np.minimum(np.searchsorted(prior.ids, ids, sorter=order), len(order) - 1)]
-    rows = np.flatnonzero(prior.ids[at] == ids)
+    rows = (prior.ids[at] == ids).nonzero()[0]
     return rows, at[rows]
 
 
@@ -57,7 +57,7 @@ def prior_depths(camera: StereoCamera, ids: IntArray, prior: TrackPrior) -> tupl
     Ids below zero are in no prior; depths outside the mask are one metre.
     """
     depth, known = np.ones(len(ids)), np.zeros(len(ids), dtype=np.bool_)
-    named = np.flatnonzero(ids >= 0)
+    named = (ids >= 0).nonzero()[0]
     rows, given = _common_rows(ids[named], prior)
     disparity = prior.z[given, 0] - prior.z[given, 2]
     ahead = np.isfinite(disparity) & (disparity > 0)
@@ -108,7 +108,7 @@ def guessed_pixels(
 
 def _points_with_borrowed_depth(camera: StereoCamera, old: Tracks) -> FloatArray:
     """Points (N, 3) of the features; unknown depths are the median depth of the nearest neighbours in the image."""
-    known, unknown = np.flatnonzero(old.has_point), np.flatnonzero(~old.has_point)
+    known, unknown = old.has_point.nonzero()[0], (~old.has_point).nonzero()[0]
     if len(unknown) == 0 or len(known) < _NEIGHBOURS:
         return np.where(old.has_point[:, None], old.point, left_rays(camera, old.left) * _FAR_M)
     depth = depth_of(camera, old.point)[known]

@@ -14,9 +14,10 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from vio.frontend.columns import share_of
 from vio.frontend.image_check import FrameImages, ImageCheck
 from vio.frontend.patches import mean_and_contrast, statistics
-from vio.numerics.compiled import compiled_sums
+from vio.numerics.compiled import compiled, compiled_sums
 from vio.records import BoolArray, Image
 
 Cause: TypeAlias = Literal["frozen", "dark", "contradicts"]
@@ -92,7 +93,10 @@ class RightCamera(ImageCheck):
         left, right = images.views
         if self.left_is_frozen(images.frame.index, left.half, right.half):
             return None
-        return replace(images, right_lives=self._cause not in _BY_IMAGE)
+        lives = self._cause not in _BY_IMAGE
+        return (
+            images if lives == images.right_lives else replace(images, right_lives=lives)
+        )  # a copy halves images anew
 
     def left_is_frozen(self, index: int, left: Image, right: Image) -> bool:
         """Compare the images (H/2, W/2) of a frame with those before; return whether the left one is frozen.
@@ -124,7 +128,7 @@ class RightCamera(ImageCheck):
 
     def doubts(self, matched: BoolArray) -> bool:
         """Whether so few of the points (K,) of known depth are where they should be that a cause is looked for."""
-        return self._cause not in _BY_IMAGE and len(matched) >= _LEAST_POINTS and matched.mean() < _AGREES
+        return self._cause not in _BY_IMAGE and len(matched) >= _LEAST_POINTS and share_of(matched) < _AGREES
 
     def check_matches(self, index: int, matched: BoolArray, *, moved: bool) -> bool:
         """Judge the matches of a frame near their known depths, and return whether the right image may be used.
@@ -137,7 +141,7 @@ class RightCamera(ImageCheck):
         if self._cause in _BY_IMAGE:
             return False
         tested = moved and len(matched) >= _LEAST_POINTS
-        share = float(matched.mean()) if tested else None
+        share = share_of(matched) if tested else None
         if self._cause is None:
             if share is not None and share < _CONTRADICTS:
                 self._distrust("contradicts", index - 1, index)
@@ -190,10 +194,23 @@ def image_change(image: Image, other: Image) -> float:
 
     Pixels at the end of the scale are left out, as far as others are left: an exposure that changes clips others.
     """
-    kept = (image < _CLIPPED) & (other < _CLIPPED)
-    if not kept.all() and kept.mean() > _LEAST_UNCLIPPED:
-        image, other = image[kept][None], other[kept][None]
+    kept = np.empty((2, image.size), dtype=np.uint8)
+    count = _keep_unclipped(image, other, kept)
+    if count < image.size and count / image.size > _LEAST_UNCLIPPED:
+        image, other = kept[:1, :count], kept[1:, :count]
     return float(_CONTRAST * _difference(image, other))
+
+
+@compiled
+def _keep_unclipped(image: Image, other: Image, kept: Image) -> int:
+    """Write the pixels that are clipped in neither image one after another, and return their number."""
+    height, width = image.shape
+    count = 0
+    for y in range(height):
+        for x in range(width):
+            kept[0, count], kept[1, count] = image[y, x], other[y, x]
+            count += (image[y, x] < _CLIPPED) & (other[y, x] < _CLIPPED)
+    return count
 
 
 @compiled_sums

@@ -12,7 +12,7 @@ import numpy as np
 
 from vio.cameras.projection import CameraArgs, camera_args, point_at
 from vio.frontend.align import align, on_peak
-from vio.frontend.columns import take
+from vio.frontend.columns import share_of, take
 from vio.frontend.patches import ImageLevels
 from vio.frontend.settings import DisparitySettings
 from vio.frontend.stereo_match import MIN_MATCH_DISPARITY_PX, EpipolarRowModel, match_rows, shifted_rows
@@ -75,7 +75,7 @@ class StereoFit:
         pixels, skew, valid = self._fit(known, right, expected)
         if moved:
             valid &= np.abs(known.left[:, 0] - pixels[:, 0] - expected) <= INLIER_PX
-        return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
+        return self._with_right_pixels(tracks, rows, pixels, skew, valid.nonzero()[0])
 
     def track_off_right(self, tracks: Tracks, left: ImageLevels, right: ImageLevels, *, by_motion: bool) -> Tracks:
         """Match features of known depth anywhere on their rows, as far as a common offset explains their disparities.
@@ -106,7 +106,7 @@ class StereoFit:
         tolerance = INLIER_PX + (_DEPTH_SLACK * expected if by_motion else 0.0)
         agree = np.abs(off - offset * grows - slope * expected) <= tolerance
         self._offset_px = (1.0 - _OFFSET_GAIN) * offset
-        return self._with_right_pixels(tracks, rows[agree], pixels[agree], skew[agree])
+        return self._with_right_pixels(tracks, rows, pixels, skew, agree.nonzero()[0])
 
     def _offset_growth(self, left: FloatArray) -> FloatArray:
         """By how much more (N,) a turn of the right camera moves pixels at left pixels (N, 2) than in the centre."""
@@ -116,7 +116,7 @@ class StereoFit:
     def _expected(self, tracks: Tracks) -> tuple[IntArray, FloatArray]:
         """Rows (K,) of the features of known depth, and the disparities (K,) that follow from it."""
         depth = depth_of(self._camera, tracks.point)
-        rows = np.flatnonzero(tracks.has_point & (depth > _MIN_DEPTH_M))
+        rows = (tracks.has_point & (depth > _MIN_DEPTH_M)).nonzero()[0]
         return rows, self._camera.fu * self._camera.baseline_m / depth[rows]
 
     def match_near(self, tracks: Tracks, right: ImageLevels, rows: IntArray, disparity: FloatArray) -> Tracks:
@@ -124,7 +124,7 @@ class StereoFit:
         if not len(rows):
             return tracks
         pixels, skew, valid = self._fit(take(tracks, rows), right, disparity)
-        return self._with_right_pixels(tracks, rows[valid], pixels[valid], skew[valid])
+        return self._with_right_pixels(tracks, rows, pixels, skew, valid.nonzero()[0])
 
     def search(self, left: ImageLevels, right: ImageLevels, points: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Coarse disparities (N,) of left pixels (N, 2), and a mask (N,) of those that are unique."""
@@ -180,7 +180,7 @@ class StereoFit:
 
     def update_rows(self, tracks: Tracks) -> None:
         """Update the row differences with the matches of a frame."""
-        few = len(tracks) >= _LEAST_POINTS and tracks.has_right.mean() < _FEW_MATCHES
+        few = len(tracks) >= _LEAST_POINTS and share_of(tracks.has_right) < _FEW_MATCHES
         self._unmatched = self._unmatched + 1 if few else 0
         self._rows.update(tracks.left[tracks.has_right], tracks.right[tracks.has_right])
 
@@ -216,8 +216,11 @@ class StereoFit:
         )
         return pixels, skew, valid
 
-    def _with_right_pixels(self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray) -> Tracks:
-        """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of the given rows (K,)."""
+    def _with_right_pixels(
+        self, tracks: Tracks, rows: IntArray, pixels: FloatArray, skew: FloatArray, good: IntArray
+    ) -> Tracks:
+        """Set right pixels (K, 2), skews (K, 2, 2) and triangulated points of those rows (K,) that are `good` (M,)."""
+        rows, pixels, skew = rows[good], pixels.take(good, axis=0), skew.take(good, axis=0)
         if self._offset_px:
             pixels = pixels + self._offset_px * np.stack(
                 [self._offset_growth(tracks.left[rows]), np.zeros(len(rows))], 1

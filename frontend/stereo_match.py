@@ -226,9 +226,9 @@ def match_rows(
     reach = int(np.ceil(max_disparity / 2))
     shift, score, second = _search(left_half, right_half, points / 2, -reach, 1)
     valid = (score >= min_correlation) & (score - second >= margin)
-    rows = np.flatnonzero(valid)
+    rows = valid.nonzero()[0]
     if len(rows):
-        there = points[rows] / 2 + np.stack([shift[rows], np.zeros(len(rows))], axis=1)
+        there = points.take(rows, axis=0) / 2 + np.stack([shift[rows], np.zeros(len(rows))], axis=1)
         back, _, _ = _search(right_half, left_half, there, -1, reach)
         valid[rows] = np.abs(shift[rows] + back) <= 1.0
     return -2 * shift, valid

@@ -16,6 +16,7 @@ from vio.frontend import contrast, detect, flow, klt, new_features, one_opencv_t
 from vio.frontend.detect import cell_index, grid_shape, min_distance_px
 from vio.frontend.klt import KltFrontend
 from vio.frontend.outliers import fit_motion
+from vio.frontend.patches import half_image
 from vio.frontend.settings import FrontendSettings, GridSettings, KltSettings
 from vio.frontend.tracks import INLIER_PX
 from vio.geometry.lie import FloatArray, se3_exp, se3_inverse, se3_log
@@ -602,3 +603,10 @@ def test_opencv_has_its_threads_back_after_a_run_that_failed() -> None:
         failing()
     assert inside == [1]
     assert cv2.getNumThreads() == before
+
+
+def test_each_image_is_halved_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    halved: list[object] = []
+    monkeypatch.setattr(klt, "half_image", lambda image: (halved.append(image), half_image(image))[1])
+    run(FRAMES[:3])
+    assert len(halved) == 6

@@ -220,6 +220,21 @@ def test_local_maxima_keep_their_distance_from_each_other_and_from_tracks() -> N
     assert inside(PLAIN, found.astype(np.float64), 12).all()
 
 
+@pytest.mark.parametrize("width", [31, 32, 37, 40])
+def test_local_maxima_are_all_there_are(width: int) -> None:
+    """Against each pixel's neighbourhood, in equal steps with many ties, and in rows of any length."""
+    response = np.random.default_rng(width).integers(0, 9, (29, width)).astype(np.float32)
+    for distance, border, least in ((1, 1, 3.0), (2, 4, 0.0), (5, 7, 8.0)):
+        found = local_maxima(response, np.zeros((0, 2)), distance, border, least)
+        padded = np.pad(response, distance)
+        shape = (2 * distance + 1, 2 * distance + 1)
+        largest = response >= np.lib.stride_tricks.sliding_window_view(padded, shape).max(axis=(2, 3))
+        largest &= response >= max(least, 1e-12)
+        inner = np.zeros_like(largest)
+        inner[border:-border, border:-border] = True
+        np.testing.assert_array_equal(found[:, ::-1], np.argwhere(largest & inner))
+
+
 HALF = half_image(PLAIN)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from vio.geometry.lie import FloatArray
+from vio.numerics.prebuilt import attach
 
 log = logging.getLogger(__name__)
 
@@ -47,10 +48,10 @@ def compiled_sums(function: Function) -> Function:
 
 def _compiled(function: Function, **options: Any) -> Function:
     try:
-        return numba.njit(function, cache=True, **_OPTIONS, **options)
+        return attach(numba.njit(function, cache=True, **_OPTIONS, **options))
     except RuntimeError:  # numba found no folder that it may write to
         log.debug("no folder for numba's cache is writable: %s is compiled in each process", function.__qualname__)
-        return numba.njit(function, **_OPTIONS, **options)
+        return attach(numba.njit(function, **_OPTIONS, **options))
 
 
 @compiled
