@@ -119,6 +119,7 @@ def soak(args: argparse.Namespace) -> None:
     names = (
         "simulated",
         "resident MiB",
+        "points",
         "CPU ms a frame",
         "ms a frame, median",
         "95 %",
@@ -127,7 +128,7 @@ def soak(args: argparse.Namespace) -> None:
     )
     print("|", " | ".join((*names, "collections")), "|")
     print("|", " | ".join(["---"] * (len(names) + 1)), "|")
-    with vio.LiveOdometry(pair, on_frame=on_frame, drop="block") as live:
+    with vio.LiveOdometry(pair, on_frame=on_frame, drop="block", keep_landmarks=args.keep_landmarks) as live:
         live.warm_up()
         pauses.ms.clear()
         source = SwayingCamera(live.camera, T_cam0_imu, 9.81)
@@ -141,7 +142,7 @@ def soak(args: argparse.Namespace) -> None:
                 left, right, _ = source.images(time_ns)
                 assert right is not None
                 live.add_stereo(time_ns, left, right)
-            live.landmarks()  # once all frames so far are done
+            points = len(live.landmarks().ids)  # once all frames so far are done
             with open("/proc/self/statm") as stream:
                 resident = int(stream.read().split()[1]) * resource.getpagesize() / 2**20
             used_ms = 1e3 * (time.process_time() - began_s) * _PARTS / args.frames
@@ -149,6 +150,7 @@ def soak(args: argparse.Namespace) -> None:
             cells = [
                 f"{(frame + 1) * _STEP_NS * 1e-9 / 60:.1f} min",
                 f"{resident:.0f}",
+                f"{points}",
                 f"{used_ms:.1f}",
                 *(f"{v:.1f}" for v in shown),
             ]
@@ -171,6 +173,7 @@ def main() -> int:
     two = commands.add_parser("soak")
     two.add_argument("--frames", type=int, default=36_000)
     two.add_argument("--width", type=int, default=376)
+    two.add_argument("--keep-landmarks", type=int, default=100_000)
     two.set_defaults(run=soak)
     args = parser.parse_args()
     args.run(args)
