@@ -144,6 +144,26 @@ def test_calls_return_while_the_worker_is_busy(held: Held, drop: Any, kept: list
     assert live.figures.results == len(kept)
 
 
+@pytest.mark.parametrize("copied", [True, False])
+def test_images_are_copied_unless_the_caller_leaves_them_alone(copied: bool) -> None:
+    taken: list[StereoFrame] = []
+
+    class Noting:
+        def process(self, frame: StereoFrame, prior: Any = None) -> FrontendOutput:
+            taken.append(frame)
+            raise DataError("seen enough")
+
+    left, right = IMAGES[0].copy(), IMAGES[1][::-1]
+    parts = Parts(frontend=Noting())
+    with LiveOdometry(CAMERA, IMAGES_ALONE, T_cam0_imu=T_CAM0_IMU, parts=parts, copy_images=copied) as live:
+        live.add_stereo(0, left, right)
+    (frame,) = taken
+    assert (frame.left is left) != copied
+    assert frame.right is not None
+    assert frame.right.flags.c_contiguous
+    np.testing.assert_array_equal(frame.right, right)
+
+
 def test_blocking_waits_for_room() -> None:
     queue, added = EventQueue(1, "block"), threading.Event()
     queue.put(QueuedCall(lambda: None, frame=True))

@@ -42,7 +42,7 @@ _TAKES = {
 
 @dataclass(frozen=True, slots=True)
 class GivenFrame:
-    """A frame as a program gave it: checked, numbered and copied."""
+    """A frame as a program gave it, checked and numbered."""
 
     index: int
     time_ns: int
@@ -84,9 +84,17 @@ class Inputs:
         self._kind: str | None = None  # of frames: images or observations
 
     def images(
-        self, t_ns: Any, left: npt.ArrayLike, right: npt.ArrayLike | None = None, depth_m: npt.ArrayLike | None = None
+        self,
+        t_ns: Any,
+        left: npt.ArrayLike,
+        right: npt.ArrayLike | None = None,
+        depth_m: npt.ArrayLike | None = None,
+        *,
+        copy: bool = True,
     ) -> GivenFrame | None:
         """Return a frame of images; None: its stamp jumps ahead, or it comes sooner than the frame rate allows.
+
+        Without `copy`, contiguous arrays with memory of their own are taken as they are.
 
         Raises:
             DataError: a wrong type, shape or size, a time not after the last frame's, or images of another rig's kind.
@@ -102,7 +110,10 @@ class Inputs:
                 raise DataError(f"the images differ in size: {sizes[0]} left, {sizes[1]} right")
         depth = None if depth_m is None else checked_depths(depth_m, images[0].shape[:2])
         numbered = self._numbered(t_ns, "images")
-        return None if numbered is None else GivenFrame(*numbered, tuple(map(_copied, images)), depth)
+        if numbered is None:
+            return None
+        taken = [_copied(i) if copy or not (i.flags.carray and i.flags.owndata) else i for i in images]
+        return GivenFrame(*numbered, tuple(taken), depth)
 
     def observations(
         self, t_ns: Any, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None

@@ -57,6 +57,7 @@ class LiveOdometry:
         drop: Drop = "oldest",
         queue_frames: int = 3,
         keep_landmarks: int = 100_000,
+        copy_images: bool = True,
     ) -> None:
         """Start the worker; the first frame begins the trajectory.
 
@@ -73,6 +74,7 @@ class LiveOdometry:
                 so that latency is bounded; "none" leaves out none; "block" makes the call wait, for recordings.
             queue_frames: that may wait.
             keep_landmarks: of the points that do not change any more, how many are kept for `landmarks`, at least.
+            copy_images: False: the caller does not write into an array again that it has added.
 
         Raises:
             VioError: as `Odometry`.
@@ -99,7 +101,7 @@ class LiveOdometry:
         self._collector = QuietCollector()
         self._streams: list[EstimateStream] = []
         self._points: deque[Landmarks] = deque()  # that do not change any more
-        self._keep_landmarks = keep_landmarks
+        self._keep_landmarks, self._copies = keep_landmarks, copy_images
         self._lines: list[str] = []
         self._forget()
         self._worker = Worker(queue_frames, drop, finish=self._odometry.finish, close=self._let_go)
@@ -141,7 +143,7 @@ class LiveOdometry:
         self._add_samples(self._odometry.inputs.samples("velocity", t_ns, linear, angular))
 
     def add_stereo(self, t_ns: int, left: npt.ArrayLike, right: npt.ArrayLike) -> None:
-        """Take a pair of images, see `Odometry.add_stereo`; they are copied, and processed by the worker.
+        """Take a pair of images, see `Odometry.add_stereo`; they are copied first, see `copy_images`.
 
         Raises:
             VioError: a wrong type, shape or size, a time not after the last frame's, or the worker has ended.
@@ -161,7 +163,7 @@ class LiveOdometry:
         Raises:
             VioError: as `add_stereo`, or images of another rig's kind.
         """
-        self._add_frame(self._odometry.inputs.images(t_ns, left, right, depth_m))
+        self._add_frame(self._odometry.inputs.images(t_ns, left, right, depth_m, copy=self._copies))
 
     def add_observations(
         self, t_ns: int, ids: npt.ArrayLike, z: npt.ArrayLike, has_right: npt.ArrayLike | None = None

@@ -82,7 +82,7 @@ def run_source(
                 watcher(result)
 
         samples = 0
-        with LiveOdometry(rig, config, on_frame=on_frame, map=map, drop=drop) as odometry:
+        with LiveOdometry(rig, config, on_frame=on_frame, map=map, drop=drop, copy_images=False) as odometry:
             say("warming up")
             odometry.warm_up()
             watcher = on_start(odometry, rig)
