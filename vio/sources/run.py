@@ -21,7 +21,7 @@ from vio.live.event_queue import Drop
 from vio.live.figures import LiveFigures
 from vio.live.live_odometry import LiveOdometry
 from vio.records import BodyFrame, FrameResult, Trajectory
-from vio.sources.recorder import Recorder
+from vio.sources.recorder import Form, Recorder
 from vio.sources.source import LiveSource, SourceFrame
 
 
@@ -43,6 +43,7 @@ def run_source(
     say: Callable[[str], None],
     out: Path | None = None,
     record: Path | None = None,
+    record_as: Form = "plain",
     map: MapUse | None = None,
     drop: Drop = "oldest",
     on_start: Callable[[LiveOdometry, Rig], Callable[[FrameResult], None] | None] = lambda odometry, rig: None,
@@ -57,6 +58,7 @@ def run_source(
         say: reports that it is ready.
         out: folder for `trajectory.tum` and the calibration that was found.
         record: new folder for what the source gave, which `vio run` repeats.
+        record_as: its form, see `Recorder`.
         map: a map to begin or to continue.
         drop: see `LiveOdometry`.
         on_start: may return what is called with each result, a viewer's.
@@ -87,7 +89,11 @@ def run_source(
             odometry.warm_up()
             watcher = on_start(odometry, rig)
             with contextlib.ExitStack() as stack:
-                recorder = None if record is None else stack.enter_context(contextlib.closing(Recorder(record, rig)))
+                recorder = (
+                    None
+                    if record is None
+                    else stack.enter_context(contextlib.closing(Recorder(record, rig, record_as)))
+                )
                 say("ready")
                 for event in source.events():
                     if should_stop():
