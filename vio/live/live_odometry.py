@@ -186,6 +186,8 @@ class LiveOdometry:
 
     def _reset(self) -> None:
         self._odometry.reset()
+        for stream in self._streams:
+            stream.reset()
         self._forget()
 
     def _forget(self) -> None:

@@ -17,6 +17,7 @@ from vio.files.atomic import atomic_write_text
 from vio.files.trajectories import write_tum
 from vio.geometry.lie import FloatArray, se3_inverse
 from vio.live.live_odometry import LiveOdometry
+from vio.live.stream import EstimateStream
 from vio.offline.export_bag import ros_covariance
 from vio.records import NS_PER_S, BodyFrame, Estimate, Trajectory
 from vio.ros2.publishing import publisher
@@ -93,14 +94,15 @@ class Outputs:
         with contextlib.suppress(VioError):  # of a rig that no calibration file holds
             atomic_write_text(folder / "camchain-imucam.yaml", kalibr_text(self._odometry.calibrated_rig().rig))
 
-    def _run(self, estimates: object) -> None:
-        for estimate in estimates:  # type: ignore[attr-defined]
+    def _run(self, estimates: EstimateStream) -> None:
+        trajectory = 0
+        for estimate in estimates:
+            if estimates.trajectory != trajectory:
+                trajectory, self._poses, self._slow_ns = estimates.trajectory, [], None
             self._publish(estimate)
 
     def _publish(self, estimate: Estimate) -> None:
         time_ns, T = estimate.time_ns, estimate.T_world_imu
-        if self._poses and time_ns <= self._poses[-1][0]:  # a new trajectory
-            self._poses, self._slow_ns = [], None
         self._poses.append((time_ns, T))
         names = self._frames
         covariance = ros_covariance(T, estimate.covariance)
