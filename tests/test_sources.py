@@ -83,7 +83,7 @@ def test_a_live_run_is_repeated_from_its_recording(
     again = vio.run(vio.open_dataset(tmp_path / "kept"), Config()).trajectory
     assert len(live) == len(again)
     np.testing.assert_array_equal(live.T_world_body[:, :3, 3], again.T_world_body[:, :3, 3])
-    assert (tmp_path / "out" / "calibration.yaml").is_file()
+    assert (tmp_path / "out" / "camchain-imucam.yaml").is_file()
     assert (tmp_path / "run.rrd").stat().st_size > 10_000
     assert main(["live", f"video:{video}", *options]) == 1
     assert "kept: is not empty; give --record a new folder" in capsys.readouterr().err

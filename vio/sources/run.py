@@ -7,20 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from vio.cameras.rig import Rig
 from vio.config import Config
-from vio.datasets.rigs.kalibr import kalibr_text
-from vio.errors import CalibrationError, DataError, VioError
-from vio.files.atomic import atomic_write_text
-from vio.files.trajectories import write_tum
+from vio.errors import CalibrationError, DataError
 from vio.geometry.lie import FloatArray
 from vio.live.build import MapUse
 from vio.live.event_queue import Drop
 from vio.live.figures import LiveFigures
 from vio.live.live_odometry import LiveOdometry
-from vio.records import BodyFrame, FrameResult, Trajectory
+from vio.live.results import write_results
+from vio.records import FrameResult
 from vio.sources.recorder import Form, Recorder
 from vio.sources.source import LiveSource, SourceFrame
 
@@ -109,16 +105,7 @@ def run_source(
                         samples += 1
                         odometry.add_imu(event.time_ns, event.gyro, event.accel)
         if out is not None:
-            _write(out, odometry, poses)
+            if not poses:
+                raise DataError(f"{out}: no frame has a pose; nothing was written")
+            write_results(out, odometry, poses)
         return LiveRun(odometry.figures, odometry.warnings, samples)
-
-
-def _write(folder: Path, odometry: LiveOdometry, poses: list[tuple[int, FloatArray]]) -> None:
-    if not poses:
-        raise DataError(f"{folder}: no frame has a pose; nothing was written")
-    folder.mkdir(parents=True, exist_ok=True)
-    body: BodyFrame = "imu" if odometry.motion == "imu" else "cam0"
-    times = np.array([time_ns for time_ns, _ in poses], dtype=np.int64)
-    write_tum(folder / "trajectory.tum", Trajectory(np.array([T for _, T in poses]), times, body))
-    with contextlib.suppress(VioError):  # of a rig that no calibration file holds
-        atomic_write_text(folder / "calibration.yaml", kalibr_text(odometry.calibrated_rig().rig))
