@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, cast
 
+import cv2  # noqa: F401 # has a BLAS of its own in 4.10, whose threads are counted from its import on
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import cv2  # noqa: F401 # has a BLAS of its own in 4.10, whose threads are counted from its import on
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
