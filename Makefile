@@ -44,7 +44,7 @@ OLDEST := .venv-oldest
 oldest:
 	$(PYTHON) -m venv $(OLDEST)
 	$(OLDEST)/bin/python -m pip install --quiet --disable-pip-version-check uv
-	echo 'rerun-sdk ; sys_platform == "never"' > $(OLDEST)/without.txt
+	printf 'rerun-sdk ; sys_platform == "never"\npyparsing < 3.3\n' > $(OLDEST)/without.txt # matplotlib 3.8 uses its old names
 	$(OLDEST)/bin/uv pip install --quiet --python $(OLDEST)/bin/python --compile-bytecode --resolution lowest-direct \
 		--override $(OLDEST)/without.txt -e '.[dev]'
 	$(OLDEST)/bin/python -m pytest -n auto --dist loadfile
