@@ -25,7 +25,7 @@ from vio.records import BoolArray, Estimate, ImuSample, IntArray, MotionSource, 
 
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
-SETTINGS = MsckfSettings(calibrate_stereo="off", stereo_scale_sigma=0.0)  # the rig is exact
+SETTINGS = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)  # the rig is exact
 _IMU_HZ = 200
 Spoil = Callable[[int, Observations], Observations]
 

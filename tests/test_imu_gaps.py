@@ -157,7 +157,9 @@ def _without(first_s: float, length_s: float) -> type[Flight]:
 def test_images_carry_a_gap_while_turning_and_accelerating(length_s: float) -> None:
     """Errors stay those of images, and the NEES of the motion since before the gap stays within its bound."""
     # A mount known to 1 cm, seen for two seconds, adds 6 mm, and a stereo field that is not known yet as much.
-    settings = MsckfSettings(calibrate_camera_imu="none", calibrate_stereo="off", stereo_scale_sigma=0.0)
+    settings = MsckfSettings(
+        calibrate_camera_imu="none", calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0
+    )
     seeds, first = 5, 40
     errors, covariances = [], []
     frames = first + 10 + min(round(20 * length_s), 60)

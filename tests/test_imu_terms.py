@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from vio.runs.pipeline import RunResult
 
 T_IMU_CAM0 = se3_inverse(T_CAM0_IMU)
-EXACT = MsckfSettings(calibrate_stereo="off", stereo_scale_sigma=0.0)  # the stereo pair
+EXACT = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)  # the stereo pair
 OFF = replace(EXACT, calibrate_camera_imu="none")
 FULL = replace(EXACT, calibrate_camera_imu="none", calibrate_imu="full")  # the terms alone
 GRAVITY = np.array([0.0, 0.0, -9.81])

@@ -42,7 +42,7 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera, project
 from vio.records import ImuSample, IntArray, Observations, UpdateReport, VelocitySample, observations
 
-EXACT_RIG = MsckfSettings(calibrate_stereo="off", stereo_scale_sigma=0.0)
+EXACT_RIG = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)
 CAMERA = StereoCamera(460.0, 458.0, 370.0, 240.0, 0.11, 752, 480)
 T_CAM0_IMU = se3_from_parts(np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), np.array([0.05, -0.02, 0.1]))
 STEP_NS = 50_000_000
@@ -567,13 +567,14 @@ def test_a_new_landmark_hangs_on_the_poses_as_its_triangulation_does(monkeypatch
         p_world: FloatArray,
         A: FloatArray,
         covariance: FloatArray,
+        by_considered: FloatArray | None = None,
     ) -> None:
         table = filt._frame.tracks.table
         rows = table.rows()
         views = table.views(rows[np.isin(table.ids(rows), ids[:1])], len(window.clones))
         T = np.array([c.T_world_imu for c in window.clones])
         made.append((T, p_world[:1], A[:3, window.state.clones.start : window.state.landmarks.start], views))
-        add(window, ids, p_world, A, covariance)
+        add(window, ids, p_world, A, covariance, by_considered)
 
     monkeypatch.setattr(Window, "add_landmarks", spy)
     settings, flight, noise = replace(EXACT_RIG, clones=5), Flight(frames=6), np.random.default_rng(0)

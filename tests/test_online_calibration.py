@@ -31,7 +31,7 @@ from vio.geometry.lie import (
 from vio.geometry.stereo import StereoCamera
 from vio.records import Estimate, ImuSample
 
-EXACT = MsckfSettings(calibrate_stereo="off", stereo_scale_sigma=0.0)  # the stereo pair
+EXACT = MsckfSettings(calibrate_stereo="off", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.0)  # the stereo pair
 BOTH = replace(EXACT, calibrate_camera_imu="both")
 OFF = replace(EXACT, calibrate_camera_imu="none")
 
@@ -374,7 +374,7 @@ def test_wrong_calibration_is_found(seed: int) -> None:
 @pytest.mark.usefixtures("no_walk")
 def test_a_baseline_that_is_off_by_10_percent_is_found_where_it_is_in_doubt() -> None:
     """The accelerometer tells the scale; without landmarks until it does, as they bias what is open."""
-    wide = replace(BOTH, stereo_baseline_sigma=0.05)
+    wide = replace(BOTH, calibrate_scale="on", stereo_baseline_sigma=0.05)
     short = replace(CAMERA, baseline_m=CAMERA.baseline_m / 1.1)
     run = _fly(Shaking(160), wide, 0, xi=np.zeros(6), offset_s=0.0, camera=short)
     scale = run.estimates[-1].stereo_scale

@@ -114,7 +114,9 @@ def test_two_runs_give_the_same_bits() -> None:
 
 def test_a_lag_gives_each_pose_what_later_frames_know() -> None:
     drive = FakeDrive(velocity=False)
-    exact = load_config(overrides=["msckf.stereo_scale_sigma=0"])  # which no later frame makes better
+    exact = load_config(
+        overrides=["msckf.stereo_baseline_sigma=0", "msckf.stereo_focal_sigma=0"]
+    )  # which no later frame makes better
     causal = run(drive, exact)
     late = run(FakeDrive(velocity=False), replace(exact, lag_frames=3))
     np.testing.assert_allclose(late.trajectory.T_world_body[-1], causal.trajectory.T_world_body[-1], atol=1e-9)

@@ -11,6 +11,7 @@ from tests.test_filter_truth import CAMERA, SETTINGS, T_CAM0_IMU, Course, fly
 from tests.test_online_calibration import CAMERA as HAND_HELD
 from tests.test_online_calibration import OFF, Shaking, _fly
 from vio.filters.msckf import Msckf
+from vio.filters.prior import Prior
 from vio.filters.scale_test import ScaleTest
 from vio.geometry.stereo import StereoCamera
 from vio.records import Observations, StereoScaleEstimate, VelocitySample
@@ -58,7 +59,7 @@ def test_relinearised_images_alone_say_nothing_of_the_scale() -> None:
     def each(run: object) -> None:
         window = run.filter._window  # type: ignore[attr-defined]
         if window.prior.scale_test is None:
-            window.prior.scale_test = ScaleTest(len(window.prior.P))
+            window.prior.scale_test = ScaleTest()
         sigmas.append(window.prior.scale_test.estimate()[1])
 
     fly(Course(20, 2.5, velocity=(0.5, 0.3, 0.0), yaw_rate=0.3, pixel_sigma_px=0.3), None, each=each)
@@ -90,24 +91,22 @@ def test_the_test_equals_a_filter_with_the_scale_as_a_state(scaled: bool) -> Non
     """Two measurements of four errors, some of which depend on the scale; against dense equations in five unknowns."""
     rng, D, sigma = np.random.default_rng(3), 4, 0.1
     P, moved = np.diag(rng.uniform(0.5, 2.0, D)), rng.normal(size=D) * scaled
-    test, mean = ScaleTest(D), np.zeros(D)
-    test.error_D_scale = rng.normal(size=D)
+    prior = Prior(P)
+    prior.scale_test = ScaleTest()
+    prior.error_D_constants[:, 0] = rng.normal(size=D)
     joint, vector = np.zeros((D + 1, D + 1)), np.zeros(D + 1)
-    J = np.column_stack([np.eye(D), -test.error_D_scale])  # the prior: x - V s
+    J = np.column_stack([np.eye(D), -prior.error_D_constants[:, 0]])  # the prior: x - V s
     joint += J.T @ np.linalg.solve(P, J)
     joint[D, D] += sigma**-2
     for _ in range(2):
         H, r = rng.normal(size=(2, D)), rng.normal(size=2)
-        A, b = H.T @ H, H.T @ r
-        P_new = np.linalg.inv(np.linalg.inv(P) + A)
-        mean = mean + P_new @ (b - A @ mean)
-        P = P_new
-        test.absorb(A, b, mean, P, moved if scaled else None)
+        prior.absorb(H.T @ H, H.T @ r, scaled=moved if scaled else None)
         row = np.column_stack([H, H @ moved])
         joint, vector = joint + row.T @ row, vector + row.T @ r
     covariance = np.linalg.inv(joint)
-    s, s_sigma = test.estimate()
+    s, s_sigma = prior.scale_test.estimate()
     np.testing.assert_allclose(s, (covariance @ vector)[D])
     np.testing.assert_allclose(s_sigma, np.sqrt(covariance[D, D]))
-    np.testing.assert_allclose(test.error_D_scale * s_sigma**2, covariance[:D, D])
-    np.testing.assert_allclose(mean + test.error_D_scale * s, (covariance @ vector)[:D])
+    V = prior.error_D_constants[:, 0]
+    np.testing.assert_allclose(V * s_sigma**2, covariance[:D, D])
+    np.testing.assert_allclose(V * s - prior.delta, (covariance @ vector)[:D])

@@ -432,7 +432,7 @@ def _scaled(baseline: float, focal: float) -> Spoil:
 
 def test_a_focal_length_that_is_off_by_5_percent_is_found() -> None:
     """The gyro tells how far the rig turned, and pixels how far the points went."""
-    settings = replace(SETTINGS, stereo_focal_sigma=0.005)
+    settings = replace(SETTINGS, calibrate_scale="on", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.005)
     off, right = fly(ROUND, "imu", settings, spoil=_scaled(1.0, 1.05)), fly(ROUND, "imu", settings)
     for run, true in ((off, 5.0), (right, 0.0)):
         scale = run.estimates[-1].stereo_scale
@@ -452,7 +452,12 @@ def test_distortion_of_both_lenses_is_no_focal_length() -> None:
         left, right = (project_point(lens, _rays(c, seen.z[:, s]))[0] for s in (slice(0, 2), slice(2, 4)))
         return replace(seen, z=np.concatenate([left, right], axis=1))
 
-    run = fly(replace(ROUND, depth=(1.5, 8.0)), "imu", replace(ON, stereo_focal_sigma=0.05), spoil=bent)
+    run = fly(
+        replace(ROUND, depth=(1.5, 8.0)),
+        "imu",
+        replace(ON, calibrate_scale="on", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.05),
+        spoil=bent,
+    )
     scale = run.estimates[-1].stereo_scale
     assert scale is not None
     percent, sigma = scale.percent()["focal length"]
@@ -464,7 +469,11 @@ def test_distortion_of_both_lenses_is_no_focal_length() -> None:
 
 @pytest.mark.parametrize("motion", [None, "imu"])
 def test_images_alone_say_nothing_of_the_scale(motion: MotionSource | None) -> None:
-    run = fly(replace(ROUND, seconds=0.2), motion, replace(SETTINGS, stereo_focal_sigma=0.005))
+    run = fly(
+        replace(ROUND, seconds=0.2),
+        motion,
+        replace(SETTINGS, calibrate_scale="on", stereo_baseline_sigma=0.0, stereo_focal_sigma=0.005),
+    )
     assert (run.estimates[-1].stereo_scale is None) == (motion is None)
     assert fly(replace(ROUND, seconds=0.2), motion, SETTINGS).estimates[-1].stereo_scale is None
 

@@ -79,7 +79,7 @@ def settings_of(rig: Rig, pixel_sigma_px: float) -> MsckfSettings:
     if rig == "camera-IMU":
         return replace(known, calibrate_camera_imu="both")
     if rig == "baseline":
-        return replace(known, stereo_baseline_sigma=_BASELINE_SIGMA)
+        return replace(known, calibrate_scale="on", stereo_baseline_sigma=_BASELINE_SIGMA)
     return replace(known, calibrate_stereo="on")
 
 

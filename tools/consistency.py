@@ -201,9 +201,16 @@ class FirstEstimates(StandardErrors):
         super().keep_landmarks(chosen)
         self._first_landmarks = self._first_landmarks[chosen]
 
-    def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
+    def add_landmarks(
+        self,
+        ids: IntArray,
+        p_world: FloatArray,
+        A: FloatArray,
+        covariance: FloatArray,
+        by_considered: FloatArray | None = None,
+    ) -> None:
         """Add landmarks (K, 3); where they are now is their first estimate."""
-        super().add_landmarks(ids, p_world, A, covariance)
+        super().add_landmarks(ids, p_world, A, covariance, by_considered)
         self._first_landmarks = np.concatenate([self._first_landmarks, p_world])
 
     def right_invariant(self, P: FloatArray) -> FloatArray:
@@ -340,7 +347,8 @@ class Scenario:
             accel_bias_sigma_mps2=0.05,
             calibrate_camera_imu="none",  # the other variants know the errors of the motion alone
             calibrate_stereo="off",
-            stereo_scale_sigma=0.0,  # the rig is exact
+            stereo_baseline_sigma=0.0,
+            stereo_focal_sigma=0.0,  # the rig is exact
         )
         if learn_noise:
             return s

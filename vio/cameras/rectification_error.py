@@ -21,13 +21,15 @@ from vio.records import FIELD_TERMS, RIGHT_TERMS, ROW_TERMS
 
 METRIC_TERMS = 2  # logarithms of baseline and focal length over the calibrated ones, (R4)
 TERMS = FIELD_TERMS + METRIC_TERMS
+CONSIDERED = METRIC_TERMS + 2  # what may be considered in place of estimated: those two, and the principal point
 _COLUMNS = FIELD_TERMS + ROW_TERMS - 1
 
 
 def error_jacobian(camera: StereoCamera, z: FloatArray, first: int = 0, terms: int = TERMS) -> FloatArray:
     """Derivatives of pixels `[ul vl ur vr]` (..., 4) by coefficients of (R3) and (R4), (..., 4, terms), pixels.
 
-    The row of `vr` is zero: right rows are not measured. On a cylinder (R4) does not apply; its columns are zero.
+    The row of `vr` is zero: right rows are not measured. On a cylinder the column of the focal length is zero. Behind
+    the ten coefficients come those of the principal point (u, v), over the focal length.
     """
     out = np.empty((*z.shape[:-1], 4, terms))
     _write_jacobian(camera_args(camera), np.ascontiguousarray(z).reshape(-1, 4), first, out.reshape(-1, 4, terms))
@@ -148,10 +150,14 @@ def _write_jacobian(camera: CameraArgs, z: FloatArray, first: int, out: FloatArr
             out[m, 1, s] = left[1, k] if 4 <= k < 8 else 0.0
             out[m, 2, s] = right[0, k] if k < 8 else 0.0
             out[m, 3, s] = 0.0
-            if k == 8 and not cylinder:
+            if k == 8:
                 out[m, 2, s] = z[m, 2] - z[m, 0]
             if k == 9 and not cylinder:
                 out[m, 0, s], out[m, 1, s], out[m, 2, s] = fu * x, fv * y, fu * xr
+            if k == 10:
+                out[m, 0, s] = out[m, 2, s] = fu
+            if k == 11:
+                out[m, 1, s] = fv
 
 
 @compiled
@@ -225,7 +231,7 @@ def _correct_pinhole(
 def _correct_cylinder(
     camera: CameraArgs, coefficients: FloatArray, rows: FloatArray, z: FloatArray, weight: FloatArray, out: FloatArray
 ) -> None:
-    """Write a cylinder's pixels (M, 4) without their errors; (R4) does not apply."""
+    """Write a cylinder's pixels (M, 4) without their errors; of (R4) the baseline's alone."""
     fu, fv, cu, cv, _, _ = camera
     left, right = np.empty((2, _COLUMNS)), np.empty((2, _COLUMNS))
     for m in range(len(z)):
@@ -244,3 +250,4 @@ def _correct_cylinder(
             for j in range(6):
                 out[m, 2] -= right[0, 8 + j] * rows[j]
             out[m, 2] += rows[6] * (z[m, 2] - cu) * (z[m, 0] - z[m, 2]) / fu * np.sin(y)
+            out[m, 2] = out[m, 0] - (out[m, 0] - out[m, 2]) * np.exp(-coefficients[8])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from vio.cameras.rectification_error import CONSIDERED, error_jacobian
 from vio.filters import track_loops
 from vio.filters.landmark_gate import LandmarkGate, leave_one_out_nis
 from vio.filters.multiview import (
@@ -27,7 +28,14 @@ from vio.filters.prior import Fit
 from vio.filters.propagation import FramePosterior, Propagation
 from vio.filters.rig_calibration import RigCalibration
 from vio.filters.settings import MsckfSettings
-from vio.filters.stereo_calibration import StereoInformation, eliminate_points_from_columns, landmark_columns
+from vio.filters.stereo_calibration import (
+    StereoColumns,
+    StereoCorrection,
+    StereoInformation,
+    eliminate_points_from_columns,
+    landmark_columns,
+    stereo_columns,
+)
 from vio.filters.tracks import measured, rows_of
 from vio.filters.window import Window
 from vio.filters.window_posterior import WindowPosterior
@@ -35,7 +43,7 @@ from vio.filters.window_tracks import MIN_TRACKS_FOR_NOISE, LinearTracks, Window
 from vio.geometry.lie import FloatArray, se3_adjoint, se3_inverse, se3_log, so3_hat, transform_points
 from vio.geometry.stereo import depth_of, project
 from vio.numerics.robust import median
-from vio.records import BoolArray, IntArray, MotionPrior, Observations, TrackPrior, UpdateReport
+from vio.records import FIELD_TERMS, BoolArray, IntArray, MotionPrior, Observations, TrackPrior, UpdateReport
 
 _FIRST_STEPS, _LATER_STEPS = 0, 1  # Gauss-Newton steps on each point, before and after the poses moved
 # Standard deviations of a point's inverse depth over itself, at most. A landmark is linearised and marginalised frame
@@ -156,10 +164,8 @@ class FrameUpdate:
         """Drop the landmarks outside a mask (M,) from the state; their points go to the map."""
         if kept.all():
             return
-        first, gone, P = window.state.landmarks.start, ~kept, window.prior.P
-        rows = [slice(first + 3 * k, first + 3 * k + 3) for k in np.flatnonzero(gone).tolist()]
-        blocks = np.array([P[r, r] for r in rows]).reshape(-1, 3, 3)
-        self._points.store(window.landmark_ids[gone], window.landmarks[gone], blocks)
+        gone, covariances = ~kept, self._rig.landmark_covariances(window)
+        self._points.store(window.landmark_ids[gone], window.landmarks[gone], covariances[gone])
         window.keep_landmarks(kept)
 
     def _linearise(self, window: Window, rows: IntArray, steps: int) -> LinearTracks:
@@ -252,6 +258,43 @@ class FrameUpdate:
             track_loops.add_landmarks(at.r, at.J, at.weight / variance, *rows, A, b)
         return A, b
 
+    def _joint_columns(self, window: Window, tracks: LinearTracks) -> StereoColumns | None:
+        """The tracks' columns of the coefficients estimated and of those considered; None: none is considered."""
+        if not self._rig.considered_sigmas(window).any():
+            return None
+        H = self._joint_jacobian(tracks.field, tracks.z)
+        return stereo_columns(tracks.at, H, tracks.information.q.p_D_q, tracks.weight)
+
+    def _joint_jacobian(self, field: StereoCorrection | None, z: FloatArray) -> FloatArray:
+        """Derivatives (..., 4, S + 4) of predicted pixels by the coefficients estimated and by those considered."""
+        by_considered = error_jacobian(self._rig.camera, z, FIELD_TERMS, CONSIDERED)
+        return by_considered if field is None else np.concatenate([field.jacobian(z), by_considered], axis=-1)
+
+    def _by_considered(
+        self, window: Window, tracks: LinearTracks, joint: StereoColumns | None, chosen: BoolArray, pixels: Views | None
+    ) -> FloatArray:
+        """Information (D, 4) that chosen tracks and this frame's landmarks have of all errors with what is considered.
+
+        Args:
+            window: with its means.
+            tracks: linearised there.
+            joint: their columns.
+            chosen: mask (F,).
+            pixels: of the landmarks; None: without them.
+        """
+        state = window.state
+        out = np.zeros((state.size, CONSIDERED))
+        if joint is None:
+            return out
+        field, S = self._rig.field(window), state.stereo.stop - state.stereo.start
+        of_all = StereoInformation.none(S + CONSIDERED, state.size - state.clones.start)
+        of_all = of_all + eliminate_points_from_columns(joint, tracks.information, chosen)
+        at = self._landmark_residuals(window, pixels) if pixels is not None and len(pixels.z) else None
+        if at is not None and pixels is not None:
+            of_all = of_all + landmark_columns(at, self._joint_jacobian(field, pixels.z - at.r), len(window.clones))
+        out[state.stereo], out[state.clones.start :] = of_all.A[:S, S:], of_all.cross[S:].T
+        return out / self._variance
+
     def _landmark_residuals(self, window: Window, pixels: Views) -> LandmarkResiduals:
         """Residuals of the landmarks' pixels in the newest exposure."""
         field = self._rig.field(window)
@@ -299,19 +342,31 @@ class FrameUpdate:
             self._overdispersion.add(table.ids(tracks.rows[ended]), *self.tracks.field_scores(tracks, ended))
         # Errors that neighbours share are not in the factor, and the field takes them in with every frame.
         repeated = self._overdispersion.factor
-        window.absorb(*self._information(window, tracks, ending & good, pixels), repeated=repeated)
+        joint = self._joint_columns(window, tracks)
+        considered = self._by_considered(window, tracks, joint, ending & good, pixels)
+        window.absorb(
+            *self._information(window, tracks, ending & good, pixels), repeated=repeated, considered=considered
+        )
         depth_sigma = np.sqrt(self.tracks.variance) * tracks.information.relative_depth_sigma()
-        promoted = self._promote(window, tracks, leaving & good & seen[:, newest], depth_sigma)
+        promoted = self._promote(window, tracks, joint, leaving & good & seen[:, newest], depth_sigma)
 
         A, b = self._information(window, tracks, good & ~ending, None)
-        P = self._move_to_optimum(window, tracks, A, b, window.state.clones.stop).covariance()  # without landmarks
-        with_scale = P + self._rig.scale_covariance(window, A, P)
+        C = self._by_considered(window, tracks, joint, good & ~ending, None)
+        size = window.state.clones.stop
+        P = self._move_to_optimum(window, tracks, A, b, size).covariance()  # without landmarks
+        V = window.prior.error_D_constants[:size, 1:]
+        V = V - P @ (A[:size, :size] @ V + C[:size])
+        reported = P + self._rig.uncertainty(window, V)
         self._propagation.posterior = FramePosterior.of(window, P)
-        self._propagation.reported = FramePosterior.of(window, with_scale)
-        self.smoothed = WindowPosterior.of(window, P, with_scale)
+        self._propagation.reported = FramePosterior.of(window, reported)
+        self.smoothed = WindowPosterior.of(window, P, reported)
 
         done = np.flatnonzero(ending & good & (depth_sigma < _MAP_DEPTH_SIGMA))
         covariance = self._variance * tracks.information.point_covariance(done)
+        if joint is not None:
+            of_points = tracks.information.point_D_clones(done) @ V[window.state.clones]
+            of_points += joint.point_D_stereo(tracks.information)[done, :, -CONSIDERED:]
+            covariance = covariance + self._rig.uncertainty(window, of_points)
         self._points.store(table.ids(tracks.rows[done]), table.points[tracks.rows[done]], covariance)
         spent = leaving & ~lost
         spent[promoted] = False
@@ -322,13 +377,19 @@ class FrameUpdate:
         return len(promoted)
 
     def _promote(
-        self, window: Window, tracks: LinearTracks, candidates: BoolArray, depth_sigma: FloatArray
+        self,
+        window: Window,
+        tracks: LinearTracks,
+        joint: StereoColumns | None,
+        candidates: BoolArray,
+        depth_sigma: FloatArray,
     ) -> IntArray:
         """Make landmarks of the best known points whose tracks leave the window; return which tracks (indices).
 
         Args:
             window: receives the landmarks.
             tracks: linearised at its means.
+            joint: their columns of the coefficients estimated and of those considered.
             candidates: mask (F,) of the tracks that may become landmarks.
             depth_sigma: (F,) standard deviation of each inverse depth, over itself.
         """
@@ -359,7 +420,11 @@ class FrameUpdate:
             point_D_stereo = tracks.stereo.point_D_stereo(tracks.information)[chosen]
         A = window.state.jacobian(point_D_poses, point_D_stereo)
         ids = table.ids(tracks.rows[chosen])
-        window.add_landmarks(ids, p, A.reshape(-1, window.state.size), covariance)
+        by_considered = None
+        if joint is not None:
+            points = joint.point_D_stereo(tracks.information)[chosen]
+            by_considered = points[..., -CONSIDERED:].reshape(-1, CONSIDERED)
+        window.add_landmarks(ids, p, A.reshape(-1, window.state.size), covariance, by_considered)
         return chosen
 
 

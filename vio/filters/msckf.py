@@ -85,7 +85,7 @@ class Msckf(Backend):
         if settings.calibrate_imu != "off" and motion != "imu":
             raise ConfigError(f"msckf.calibrate_imu: {settings.calibrate_imu} needs --motion imu; set it to off")
         if camera.is_cylinder:  # equation (R4) is a pinhole's
-            settings = replace(settings, stereo_focal_sigma=0.0, stereo_baseline_sigma=0.0)
+            settings = replace(settings, calibrate_scale="off")
         self._settings = settings
         self._calibration = first_calibration(checked_extrinsics(T_cam0_imu), settings, motion)
         self._order = InputOrder("msckf")
@@ -315,7 +315,8 @@ class Msckf(Backend):
 
         A point that came back under its id appears once, as it was seen last.
         """
-        return self._points.with_landmarks(self._started())
+        window = self._started()
+        return self._points.with_landmarks(window, self._rig.landmark_covariances(window))
 
     def take_landmarks(self) -> Landmarks:
         """Return the points that have left the state since the last call, and forget them; `landmarks` has the others.

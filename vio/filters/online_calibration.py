@@ -35,7 +35,7 @@ _NOISE_ONLY = float(chi_square_quantile(0.999, 3))  # squared half of a twist in
 _EXTRINSIC_ROTATION_WALK_DEG = 2.0e-3
 _EXTRINSIC_TRANSLATION_WALK_M = 1.0e-4
 _TIME_OFFSET_WALK_S = 2.0e-6
-STEREO_YAW_SIGMA_DEG = 0.1  # initial standard deviation of the right camera's rotation about its vertical axis
+STEREO_YAW_SIGMA_DEG = 0.05  # initial standard deviation of the right camera's rotation about its vertical axis
 LEAST_FIELD_SIGMA, MOST_FIELD_SIGMA = 5.0e-4, 2.0e-3  # the same of the stereo field's other terms, in focal lengths
 _LEAST_COMMON_SIGMA = 1.0e-3  # at least that of what both lenses have in common, which moves no rows of far points
 _RADIAL = 5.0  # a lens is left with more radial than tangential distortion
@@ -255,7 +255,7 @@ class _StereoScaleBlock(StereoBlock):
     name, terms = "stereo_scale", slice(FIELD_TERMS, TERMS)
 
     def is_estimated(self, settings: MsckfSettings, motion: MotionSource | None) -> bool:
-        return motion is not None and max(settings.stereo_focal_sigma, settings.stereo_baseline_sigma) > 0
+        return motion is not None and settings.calibrate_scale == "on"
 
     def sigmas(self, settings: MsckfSettings) -> FloatArray:
         return np.array([settings.stereo_baseline_sigma, settings.stereo_focal_sigma])

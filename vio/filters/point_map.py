@@ -33,12 +33,9 @@ class PointMap:
         self.parts, self._stored = [], 0
         return taken
 
-    def with_landmarks(self, window: Window) -> Landmarks:
-        """Return all points, and the landmarks that are states."""
-        first, n, P = window.state.landmarks.start, len(window.landmarks), window.prior.P
-        blocks = [P[first + 3 * k : first + 3 * k + 3, first + 3 * k : first + 3 * k + 3] for k in range(n)]
-        states = Landmarks(window.landmark_ids, window.landmarks, np.array(blocks).reshape(n, 3, 3))
-        return _newest([*self.parts, states])
+    def with_landmarks(self, window: Window, covariances: FloatArray) -> Landmarks:
+        """Return all points, and the landmarks that are states, with their covariances (M, 3, 3)."""
+        return _newest([*self.parts, Landmarks(window.landmark_ids, window.landmarks, covariances)])
 
     def turn(self, R: FloatArray) -> None:
         """Turn the world by R (3, 3)."""

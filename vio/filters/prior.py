@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import blas, lapack
 
+from vio.cameras.rectification_error import CONSIDERED
 from vio.filters import pose_loops as loops
 from vio.filters.scale_test import ScaleTest
 from vio.geometry.lie import FloatArray
@@ -25,6 +26,8 @@ class Prior:
         self.P = P
         self.delta: FloatArray = np.zeros(len(P))
         self.scale_test: ScaleTest | None = None
+        # How the errors depend on constants that are not estimated: the scale that is tested, then those considered.
+        self.error_D_constants: FloatArray = np.zeros((len(P), 1 + CONSIDERED))
 
     @property
     def P(self) -> FloatArray:
@@ -44,8 +47,7 @@ class Prior:
         """Turn the errors into `M error`, with M (D, D)."""
         self.P = M @ self.P @ M.T
         self.delta = M @ self.delta
-        if self.scale_test is not None:
-            self.scale_test.error_D_scale = M @ self.scale_test.error_D_scale
+        self.error_D_constants = M @ self.error_D_constants
 
     def insert(self, first: int, covariance: FloatArray) -> None:
         """Add errors with a covariance (S, S), from the row `first` on, that depend on no other."""
@@ -55,10 +57,7 @@ class Prior:
         P[np.ix_(old, old)], delta[old] = self.P, self.delta
         P[first : first + S, first : first + S] = covariance
         self.P, self.delta = P, delta
-        if self.scale_test is not None:
-            V = np.zeros(D + S)
-            V[old] = self.scale_test.error_D_scale
-            self.scale_test.error_D_scale = V
+        self.error_D_constants = np.insert(self.error_D_constants, [first] * S, 0.0, axis=0)
 
     def insert_dependent(self, at: int, J: FloatArray, noise: FloatArray, of_scale: FloatArray | None) -> None:
         """Add errors `J error + noise` at a row.
@@ -77,20 +76,21 @@ class Prior:
         P[end, :at], P[end, end] = self.P[at:, :at], self.P[at:, at:]
         P[new, :at], P[new, end] = added[:, :at], added[:, at:]
         P[:at, new], P[end, new], P[new, new] = beside[:at], beside[at:], added[:, own] @ J.T + noise
-        delta = self.delta
+        delta, V = self.delta, self.error_D_constants
         self.delta = np.concatenate([delta[:at], J @ delta[own], delta[at:]])
-        if self.scale_test is not None:
-            V = self.scale_test.error_D_scale
-            of_new = J @ V[own] if of_scale is None else of_scale
-            self.scale_test.error_D_scale = np.concatenate([V[:at], of_new, V[at:]])
+        of_new = J @ V[own]
+        if of_scale is not None:
+            of_new[:, 0] = of_scale
+        self.error_D_constants = np.concatenate([V[:at], of_new, V[at:]])
         self.P = P
 
-    def append(self, A: FloatArray, blocks: FloatArray) -> None:
-        """Add errors `A error + noise` of points behind the others.
+    def append(self, A: FloatArray, blocks: FloatArray, by_considered: FloatArray | None = None) -> None:
+        """Add errors `A error + B constants + noise` of points behind the others.
 
         Args:
             A: (3K, D).
             blocks: covariances of the noise (K, 3, 3).
+            by_considered: B (3K, 4); None: zero.
         """
         D, n = len(self.P), len(A)
         P = np.zeros((D + n, D + n))
@@ -100,9 +100,10 @@ class Prior:
         for k, block in enumerate(blocks):
             P[D + 3 * k : D + 3 * k + 3, D + 3 * k : D + 3 * k + 3] += block
         self.delta = np.concatenate([self.delta, A @ self.delta])
-        if self.scale_test is not None:
-            V = self.scale_test.error_D_scale
-            self.scale_test.error_D_scale = np.concatenate([V, A @ V])
+        V = A @ self.error_D_constants
+        if by_considered is not None:
+            V[:, 1:] += by_considered
+        self.error_D_constants = np.concatenate([self.error_D_constants, V])
         self.P = 0.5 * (P + P.T)
 
     def keep(self, rows: IntArray) -> None:
@@ -110,9 +111,7 @@ class Prior:
         P = np.empty((len(rows), len(rows)))
         loops.take_rows(self.P, rows, P)
         self.P = P
-        self.delta = self.delta[rows]
-        if self.scale_test is not None:
-            self.scale_test.error_D_scale = self.scale_test.error_D_scale[rows]
+        self.delta, self.error_D_constants = self.delta[rows], self.error_D_constants[rows]
 
     def optimum(self, information: FloatArray, vector: FloatArray, size: int, first: int = 0) -> tuple[Fit, FloatArray]:
         """Where the prior and given information agree best.
@@ -143,6 +142,7 @@ class Prior:
         first: int = 0,
         scaled: FloatArray | None = None,
         repeated: tuple[slice, float] | None = None,
+        considered: FloatArray | None = None,
     ) -> None:
         """Absorb measurements.
 
@@ -154,21 +154,27 @@ class Prior:
             repeated: rows of constants, and the factor by which the measurements repeat what was said of them: these
                 take in that part of it only, while all others take in the whole; the partial-update filter of Brink,
                 Partial-update Schmidt-Kalman filter, JGCD (2017), which keeps the covariance of all errors true.
+            considered: `H' R^-1 C` (D, 4), C being the derivatives of the residuals by the constants considered.
         """
         prior = self._factor(information, len(self.P), first)
         own = slice(prior.first, None)
         P = fit(prior, information[own, own]).covariance()
-        delta, test = self.delta - P @ (vector + information @ self.delta), self.scale_test
-        V = None if test is None else test.error_D_scale
-        if test is not None:
-            test.absorb(information, vector, -delta, P, scaled)
+        delta = self.delta - P @ (vector + information @ self.delta)
+        V = self.error_D_constants.copy()
+        if scaled is not None:
+            V[:, 0] += scaled
+        W = information @ V
+        if considered is not None:
+            W[:, 1:] += considered
+        if self.scale_test is not None:
+            self.scale_test.absorb(V[:, 0], W[:, 0], vector + information @ delta, P)
+        V = self.error_D_constants - P @ W
         if repeated is not None:
             rows, kept = repeated[0], 1 - 1 / repeated[1]
             delta[rows] += np.sqrt(kept) * (self.delta[rows] - delta[rows])
             P[rows, rows] += kept * (self.P[rows, rows] - P[rows, rows])
-            if test is not None and V is not None:
-                test.error_D_scale[rows] += np.sqrt(kept) * (V[rows] - test.error_D_scale[rows])
-        self.P, self.delta = P, delta
+            V[rows] += np.sqrt(kept) * (self.error_D_constants[rows] - V[rows])
+        self.P, self.delta, self.error_D_constants = P, delta, V
 
     def _factor(self, information: FloatArray, size: int, first: int) -> Factor:
         """The factor of the present covariance, up to row `size`, of the errors that information (D, D) is about.

@@ -29,6 +29,7 @@ from vio.records import (
     StereoScaleEstimate,
 )
 
+_PRINCIPAL_POINT = 1 / 3  # standard deviation of its coordinates, in focal lengths, over that of the focal length
 _COLUMNS_BY_ROWS = 3.0  # of the standard deviation of a lens term, over the root mean square of the rows' field
 
 
@@ -50,8 +51,7 @@ class RigCalibration:
     def test_scale(self, window: Window, source: MotionSource | None, before: ScaleTest | None) -> None:
         """Begin to test the scale beside the states of a window without clones, with what a test before has found."""
         if source is not None and "stereo_scale" not in window.state:
-            size = window.state.size
-            window.prior.scale_test = ScaleTest(size) if before is None else before.restarted(size)
+            window.prior.scale_test = ScaleTest() if before is None else before
 
     def learn_rows(self, window: Window, seen: Observations) -> None:
         """Learn the rows of a frame; the first ones say how far off the lenses may be, and begin to estimate the field.
@@ -76,23 +76,30 @@ class RigCalibration:
         if window.prior.scale_test is not None:
             window.prior.scale_test.end_frame()
 
-    def scale_covariance(self, window: Window, information: FloatArray, P: FloatArray) -> FloatArray:
-        """What the uncertainty of the calibrated scale adds to the covariance of the first errors, equation (S4).
+    def considered_sigmas(self, window: Window) -> FloatArray:
+        """Standard deviations (4,) of baseline, focal length and principal point (u, v); zero where one is estimated.
 
-        Args:
-            window: with its prior.
-            information: about the errors (D, D), not yet absorbed.
-            P: covariance of the first errors (k, k) with it, the scale known.
+        The baseline's is over its length, the others are over the focal length.
         """
-        if self.camera.kind == "mono" or "stereo_scale" in window.state:
-            return np.zeros(P.shape)
-        test, first = window.prior.scale_test, slice(0, len(P))
-        V = window.scaled()[first]
-        if test is not None:
-            of_scale = test.error_D_scale[first]
-            V = V + of_scale - P @ (information[first, first] @ of_scale)
-        out: FloatArray = self.settings.stereo_scale_sigma**2 * np.outer(V, V)
+        s = self.settings
+        centre = _PRINCIPAL_POINT * s.stereo_focal_sigma
+        sigmas = np.array([s.stereo_baseline_sigma, s.stereo_focal_sigma, centre, centre])
+        if "stereo_scale" in window.state:
+            sigmas[:2] = 0.0
+        return sigmas
+
+    def uncertainty(self, window: Window, V: FloatArray) -> FloatArray:
+        """What the constants considered add to a covariance (..., k, k), by how its errors follow them (..., k, 4)."""
+        V = V * self.considered_sigmas(window)
+        out: FloatArray = V @ np.swapaxes(V, -1, -2)
         return out
+
+    def landmark_covariances(self, window: Window) -> FloatArray:
+        """Covariances (M, 3, 3) of the landmarks in the state, with what is considered."""
+        first, prior = window.state.landmarks.start, window.prior
+        rows = first + np.arange(3 * len(window.landmarks)).reshape(-1, 3)
+        out: FloatArray = prior.P[rows[:, :, None], rows[:, None, :]]
+        return out + self.uncertainty(window, prior.error_D_constants[rows, 1:])
 
     def field(self, window: Window) -> StereoCorrection | None:
         """The stereo calibration's faults at the window's present means; None where they are not estimated."""

@@ -9,12 +9,9 @@ Reference: Friedland, Treatment of bias in recursive filtering, IEEE TAC (1969).
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import replace
-
 import numpy as np
 
-from vio.filters.navigation import DIM, NavState
+from vio.filters.navigation import NavState
 from vio.geometry.lie import FloatArray, se3_inverse
 
 _SIGMA = 0.1  # of the logarithm; a unit that is wrong is off by more, and is found as well
@@ -46,19 +43,12 @@ class ScaleTest:
     relinearising cannot pass for knowledge of the scale.
     """
 
-    def __init__(self, size: int) -> None:
-        """Start with errors (D,) that do not depend on the scale."""
-        self.error_D_scale: FloatArray = np.zeros(size)  # by the logarithm, in a world that is scaled with it
+    def __init__(self) -> None:
+        """Start without knowledge."""
         self._frames = 0  # since the start
         self._doubted = 0  # at which of them the scale was contradicted without a break since; 0: it is not
         self._information, self._vector = _SIGMA**-2, 0.0
         self.is_confirmed = False  # whether as many frames again have contradicted it as it took to find
-
-    def restarted(self, size: int) -> ScaleTest:
-        """Return the test with what it knows, for new errors (D,) that do not depend on the scale."""
-        out = copy(self)
-        out.error_D_scale = np.zeros(size)
-        return out
 
     def end_frame(self) -> None:
         """Count a frame, and ask whether the scale is contradicted."""
@@ -69,32 +59,17 @@ class ScaleTest:
             self._doubted = self._frames
         self.is_confirmed |= self._doubted > 0 and self._frames >= 2 * self._doubted
 
-    def absorb(
-        self, A: FloatArray, b: FloatArray, mean: FloatArray, P: FloatArray, scaled: FloatArray | None = None
-    ) -> None:
+    def absorb(self, V: FloatArray, W: FloatArray, remaining: FloatArray, P: FloatArray) -> None:
         """Take in measurements that the filter has absorbed, equations (S2) and (S3).
 
         Args:
-            A: their information about the errors (D, D).
-            b: its vector (D,), at the filter's means.
-            mean: of the errors (D,) after them.
+            V: how the errors (D,) depend on the scale, for measurements in metres those of the scaled world.
+            W: their information (D, D) times V, (D,).
+            remaining: their information vector (D,) at the means after them.
             P: covariance of the errors (D, D) after them.
-            scaled: how the scaled world moves the errors (D,), for measurements in metres; None: pixels.
         """
-        V = self.error_D_scale if scaled is None else self.error_D_scale + scaled
-        W = A @ V
         self._information += float(V @ W - W @ P @ W)
-        self._vector += float(V @ (b - A @ mean))
-        self.error_D_scale = self.error_D_scale - P @ W
-
-    def of_clone(
-        self, nav: NavState, T_exposed: FloatArray, camera_D_own: FloatArray, T_cam0_imu: FloatArray
-    ) -> FloatArray:
-        """How the error (6,) of a clone of the navigation state depends on the scale, its own pose being scaled too."""
-        V = self.error_D_scale[: camera_D_own.shape[1]].copy()
-        V[:DIM] += scaled_nav(nav, T_cam0_imu)
-        out: FloatArray = camera_D_own @ V - scaled_nav(replace(nav, T_world_imu=T_exposed), T_cam0_imu)[:6]
-        return out
+        self._vector += float(V @ remaining)
 
     def estimate(self) -> tuple[float, float]:
         """Logarithm of the true scale over the filter's, and its standard deviation."""

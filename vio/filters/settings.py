@@ -117,19 +117,19 @@ class MsckfSettings(Section):
     calibrate_stereo: Literal["on", "off"] = setting(
         "on", "estimate what the calibration of a stereo pair is off by, a low-order field over the image"
     )
-    stereo_scale_sigma: float = setting(
+    stereo_baseline_sigma: float = setting(
         0.005,
-        "standard deviation of the scale that baseline and focal length give, over it, as calibrations leave it; it is "
-        "part of the covariances and corrects nothing",
+        "standard deviation of the baseline's length, over it, as calibrations leave it; it is part of the covariances",
         at_least=0,
     )
     stereo_focal_sigma: float = setting(
-        0.0,
-        "initial standard deviation of the focal length, over it; 0: it is known; else it is estimated, with IMU or "
-        "velocities only, on whose scale the result depends",
-        at_least=0,
+        0.003, "the same of the focal length; the principal point is taken for three times as well known", at_least=0
     )
-    stereo_baseline_sigma: float = setting(0.0, "the same of the baseline's length", at_least=0)
+    calibrate_scale: Literal["off", "on"] = setting(
+        "off",
+        "estimate baseline and focal length with these standard deviations at the start, with IMU or velocities only, "
+        "on whose scale the result depends; off: they are considered, and not corrected",
+    )
     extrinsic_rotation_sigma_deg: float = setting(
         0.5, "calibrate_camera_imu: initial standard deviation of T_cam0_imu's rotation", unit="deg", at_least=0
     )

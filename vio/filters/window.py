@@ -133,10 +133,9 @@ class Window:
         state, prior, before = self.state, self.prior, self.nav
         Phi = self.calibration.transition(state, step, step.nav.T_world_imu @ se3_inverse(before.T_world_imu))
         own, T_cam0_imu = state.own, self.calibration.T_cam0_imu
-        if prior.scale_test is not None:
-            V = prior.scale_test.error_D_scale
-            V[own] = Phi @ V[own]
-            V[:DIM] += step.Phi @ scaled_nav(before, T_cam0_imu) - scaled_nav(step.nav, T_cam0_imu)
+        V = prior.error_D_constants
+        V[own] = Phi @ V[own]
+        V[:DIM, 0] += step.Phi @ scaled_nav(before, T_cam0_imu) - scaled_nav(step.nav, T_cam0_imu)
         self.nav = step.nav
         P = prior.to_change()
         P[own] = Phi @ P[own]
@@ -208,9 +207,10 @@ class Window:
             exposure: what `camera_D_own` has returned for it; None: the navigation state is that of the exposure.
         """
         T, camera_D_own, noise = self.camera_D_own(0.0, NO_TWIST) if exposure is None else exposure
-        test, T_cam0_imu = self.prior.scale_test, self.calibration.T_cam0_imu
-        of_scale = None if test is None else test.of_clone(self.nav, T, camera_D_own, T_cam0_imu)
-        self.prior.insert_dependent(self.state.clones.stop, camera_D_own, noise, of_scale)
+        of_scale = self.prior.error_D_constants[self.state.own, 0].copy()
+        of_scale[:DIM] += scaled_nav(self.nav, self.calibration.T_cam0_imu)
+        scaled_clone = scaled_nav(replace(self.nav, T_world_imu=T), self.calibration.T_cam0_imu)[:6]
+        self.prior.insert_dependent(self.state.clones.stop, camera_D_own, noise, camera_D_own @ of_scale - scaled_clone)
         self.clones.append(Clone(frame_index, time_ns, T, self.nav.velocity))
         self._lay_out()
         if len(self.landmarks):
@@ -255,9 +255,8 @@ class Window:
         P[first:, first:] += (P[first:, turn] - P[first:, before]) @ p_cross.T
         P[:first, first:] = P[first:, :first].T
         delta[first:] += p_cross @ (delta[turn] - delta[before])
-        if self.prior.scale_test is not None:
-            V = self.prior.scale_test.error_D_scale
-            V[first:] += p_cross @ (V[turn] - V[before])
+        V = self.prior.error_D_constants
+        V[first:] += p_cross @ (V[turn] - V[before])
 
     def drop_oldest_clone(self) -> None:
         """Forget the oldest clone."""
@@ -274,9 +273,19 @@ class Window:
         self.landmark_ids, self.landmarks = self.landmark_ids[chosen], self.landmarks[chosen]
         self._lay_out()
 
-    def add_landmarks(self, ids: IntArray, p_world: FloatArray, A: FloatArray, covariance: FloatArray) -> None:
-        """Add landmarks (K, 3) whose errors are `A xi + noise`, with A (3K, D) and noise covariance (K, 3, 3)."""
-        self.prior.append(A, covariance)
+    def add_landmarks(
+        self,
+        ids: IntArray,
+        p_world: FloatArray,
+        A: FloatArray,
+        covariance: FloatArray,
+        by_considered: FloatArray | None = None,
+    ) -> None:
+        """Add landmarks (K, 3) whose errors are `A xi + B c + noise`.
+
+        A is (3K, D), the noise's covariance (K, 3, 3), B (3K, 4) by the constants considered; None: zero.
+        """
+        self.prior.append(A, covariance, by_considered)
         self.landmark_ids = np.concatenate([self.landmark_ids, ids])
         self.landmarks = np.concatenate([self.landmarks, p_world])
         self._lay_out()
@@ -286,7 +295,12 @@ class Window:
         return self.prior.optimum(information, vector, size, self.state.first_of_pixels)
 
     def absorb(
-        self, information: FloatArray, vector: FloatArray, scaled: FloatArray | None = None, repeated: float = 1.0
+        self,
+        information: FloatArray,
+        vector: FloatArray,
+        scaled: FloatArray | None = None,
+        repeated: float = 1.0,
+        considered: FloatArray | None = None,
     ) -> None:
         """Absorb measurements into the prior, see `Prior.absorb`; the means stay where they are.
 
@@ -295,9 +309,10 @@ class Window:
             vector: (D,).
             scaled: for measurements in metres.
             repeated: for pixels, the factor by which they repeat what was said of the stereo field.
+            considered: for pixels, the part (D, 4) of the constants considered.
         """
         partly = (self.state["stereo_field"], repeated) if repeated > 1 and "stereo_field" in self.state else None
-        self.prior.absorb(information, vector, self.state.first_of_pixels, scaled, partly)
+        self.prior.absorb(information, vector, self.state.first_of_pixels, scaled, partly, considered)
 
     def absorb_measurement(self, measurement: Measurement) -> None:
         """Absorb a measurement of the navigation state; the means stay where they are."""
@@ -367,7 +382,5 @@ class Window:
         self.clones = [replace(c, T_world_imu=T @ c.T_world_imu, velocity=R @ c.velocity) for c in self.clones]
         self.landmarks = self.landmarks @ R.T
         P = M @ prior.P @ M.T
-        prior.P, prior.delta = 0.5 * (P + P.T), turn @ prior.delta
-        if prior.scale_test is not None:
-            prior.scale_test.error_D_scale = M @ prior.scale_test.error_D_scale
+        prior.P, prior.delta, prior.error_D_constants = 0.5 * (P + P.T), turn @ prior.delta, M @ prior.error_D_constants
         return R, M

@@ -53,6 +53,7 @@ class LinearTracks:
     rows: IntArray  # (F,) in the table
     p_world: FloatArray  # (F, 3)
     at: Residuals
+    z: FloatArray  # (F, N, 4) pixels as they are predicted
     weight: FloatArray  # (F, N) robust weight of each view
     information: TrackInformation
     stereo: StereoColumns | None  # where the stereo field is estimated
@@ -162,11 +163,11 @@ class WindowTracks:
         weight = robust_weights(at, self.variance)
         information = track_information(self._camera, T_cam0_world, at, p_world, weight)
         columns = None
+        # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
+        z = z - at.r
         if field is not None:
-            # At the predicted pixels: those seen share their noise with the residuals, which biases the coefficients.
-            H = field.jacobian(z - at.r)
-            columns = stereo_columns(at, H, information.q.p_D_q, weight)
-        return LinearTracks(T_cam0_world, rows, p_world, at, weight, information, columns, field)
+            columns = stereo_columns(at, field.jacobian(z), information.q.p_D_q, weight)
+        return LinearTracks(T_cam0_world, rows, p_world, at, z, weight, information, columns, field)
 
     def field_scores(self, tracks: LinearTracks, chosen: IntArray) -> tuple[FloatArray, FloatArray]:
         """Scores and information (K, 8) of tracks (K,) by the terms of (R3), their points eliminated, the poses known.
@@ -177,8 +178,7 @@ class WindowTracks:
         if columns is None or tracks.field is None or tracks.field.terms[0] > 0:
             none = StereoCorrection(self._camera, np.zeros(ROW_TERMS), np.zeros(TERMS), np.arange(FIELD_TERMS))
             at = Residuals(tracks.at.r[chosen], tracks.at.z_D_p[chosen], tracks.at.ahead[chosen])
-            z = self._views(tracks.rows[chosen], len(tracks.T_cam0_world), tracks.field).z
-            columns = stereo_columns(at, none.jacobian(z - at.r), info.q.p_D_q, tracks.weight[chosen])
+            columns = stereo_columns(at, none.jacobian(tracks.z[chosen]), info.q.p_D_q, tracks.weight[chosen])
         else:
             columns = columns.take(chosen)
         G, A, b = (x[..., :FIELD_TERMS] for x in (columns.G, np.einsum("fss->fs", columns.A), columns.b))

@@ -57,7 +57,11 @@ def judge_rotations(compared: RotationComparison, camera: StereoCamera) -> list[
     cause = "the focal length or the lens is not as calibrated"
     if not compared.gyro_agrees:
         cause += ", or the gyro's scale is off"
-    estimate = "" if camera.is_cylinder else ", or have the focal length estimated (msckf.stereo_focal_sigma: 0.05)"
+    estimate = (
+        ""
+        if camera.is_cylinder
+        else ", or have the focal length estimated (msckf.calibrate_scale: on, msckf.stereo_focal_sigma: 0.05)"
+    )
     return [
         InertialFinding(
             "camera turns",

@@ -412,7 +412,7 @@ def rig_scale_sigma(result: RunResult) -> float | None:
     settings, camera = result.config.msckf, result.recording.camera
     if result.config.backend != "msckf" or camera.kind == "mono" or result.estimates[-1].stereo_scale is not None:
         return None
-    return settings.stereo_scale_sigma
+    return float(np.hypot(settings.stereo_baseline_sigma, settings.stereo_focal_sigma))
 
 
 def camera_imu(result: RunResult) -> dict[str, Any] | None:
